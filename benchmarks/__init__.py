@@ -1,0 +1,1 @@
+"""Performance and accuracy measurements, kept apart from the tests."""

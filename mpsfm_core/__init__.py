@@ -1,0 +1,1 @@
+"""Structure-from-Motion with monocular depth and normal priors from swappable plugins."""

@@ -1,0 +1,59 @@
+"""The errors a user can meet. Each message says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+
+class MpsfmError(Exception):
+    """Base of every error raised on purpose; ``exit_code`` is what the command line returns."""
+
+    exit_code = 1
+
+
+class InputError(MpsfmError):
+    """The user's input is wrong: images, intrinsics, configuration, weights, options."""
+
+    exit_code = 2
+
+
+class ConfigError(InputError):
+    """A configuration key, value or name is wrong; the message gives file and YAML path."""
+
+
+class ProviderError(InputError):
+    """A provider cannot be found, imported or constructed."""
+
+
+class WeightsError(InputError):
+    """Weights are missing, cannot be fetched, or do not have the expected hash."""
+
+
+class DataError(MpsfmError, ValueError):
+    """A value breaks a rule of the boundary types in :mod:`mpsfm_core.data`.
+
+    ``field`` names the offending field, ``rule`` the rule in words.
+    """
+
+    def __init__(self, field: str, rule: str) -> None:
+        super().__init__(f"{field}: {rule}")
+        self.field = field
+        self.rule = rule
+
+
+class ProviderOutputError(MpsfmError):
+    """A provider returned something that breaks the contract.
+
+    The message names provider, image, field and rule, so that the plugin's author can act on it.
+    """
+
+    def __init__(self, provider: str, image: str, field: str, rule: str) -> None:
+        super().__init__(f"provider {provider!r}, image {image!r}: {field}: {rule}")
+        self.provider = provider
+        self.image = image
+        self.field = field
+        self.rule = rule
+
+
+class ReconstructionError(MpsfmError):
+    """The input is fine, but no reconstruction was possible; reasons are in summary.json."""
+
+    exit_code = 3

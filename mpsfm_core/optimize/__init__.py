@@ -1,0 +1,1 @@
+"""The numerical engines: depth integration, bundle adjustment, covariances."""
