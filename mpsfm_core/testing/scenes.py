@@ -1,0 +1,298 @@
+"""Analytic scenes: exact depth, normals, colours and correspondences by casting rays.
+
+The world is metric with z up; cameras follow the conventions of the package (x right, y down,
+z forward, pixel centres at half integers). A pose is a (3, 4) matrix `cam_from_world`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
+
+# Rays closer than this to a surface's plane or start count as leaving it (metres).
+_EPSILON = 1e-9
+
+
+class Surface(Protocol):
+    """A surface that can be hit by rays."""
+
+    def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
+        """First hits at `origin + t * direction`: t (n,), inf where missed, and normals (n, 3).
+
+        Normals are unit and face the origin of the ray; they are arbitrary where nothing is hit.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Plane:
+    """An infinite plane through `point` with any non-zero `normal`."""
+
+    point: tuple[float, float, float]
+    normal: tuple[float, float, float]
+
+    def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
+        normal = np.asarray(self.normal) / np.linalg.norm(self.normal)
+        t = (np.asarray(self.point) - origin) @ normal / _away_from_zero(directions @ normal)
+        facing = np.where(directions @ normal > 0, -1.0, 1.0)
+        return np.where(t > _EPSILON, t, np.inf), facing[:, None] * normal
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box turned about the world's z axis; seen from inside it is a room."""
+
+    center: tuple[float, float, float]
+    half_size: tuple[float, float, float]
+    yaw_deg: float = 0.0
+
+    def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
+        cos, sin = np.cos(np.deg2rad(self.yaw_deg)), np.sin(np.deg2rad(self.yaw_deg))
+        world_from_box = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        start = (origin - np.asarray(self.center)) @ world_from_box
+        rays = _away_from_zero(directions @ world_from_box)
+        t_low = (-np.sign(rays) * self.half_size - start) / rays
+        t_high = (np.sign(rays) * self.half_size - start) / rays
+        t_enter, t_leave = t_low.max(1), t_high.min(1)
+        outside = t_enter > _EPSILON
+        axis = np.where(outside, t_low.argmax(1), t_high.argmin(1))
+        t = np.where(outside, t_enter, t_leave)
+        t = np.where((t_leave >= t_enter) & (t > _EPSILON), t, np.inf)
+        facing = -np.sign(np.take_along_axis(rays, axis[:, None], 1))
+        return t, facing * world_from_box.T[axis]
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere, seen from outside or inside."""
+
+    center: tuple[float, float, float]
+    radius: float
+
+    def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
+        start = origin - np.asarray(self.center)
+        a = np.einsum("ni,ni->n", directions, directions)
+        b = directions @ start
+        discriminant = b * b - a * (start @ start - self.radius**2)
+        root = np.sqrt(np.maximum(discriminant, 0.0))
+        near, far = (-b - root) / a, (-b + root) / a
+        t = np.where(near > _EPSILON, near, far)
+        t = np.where((discriminant >= 0) & (t > _EPSILON), t, np.inf)
+        outward = start + np.where(np.isfinite(t), t, 0.0)[:, None] * directions
+        outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), _EPSILON)
+        inside = np.einsum("ni,ni->n", outward, directions) > 0
+        return t, np.where(inside, -1.0, 1.0)[:, None] * outward
+
+
+@dataclass(frozen=True)
+class Texture:
+    """A smooth random colour field of space: octaves of plane waves of random direction and phase.
+
+    It repeats nowhere in practice. `footprint` band-limits it to what a pixel of that size (metres)
+    resolves, as a real sensor would, so that renderings do not alias.
+    """
+
+    longest_wave: float = 1.2  # metres
+    octaves: int = 6
+    waves_per_octave: int = 24
+    decay: float = 0.85  # amplitude of an octave relative to the one before
+    contrast: float = 0.7  # standard deviation before the soft clipping to [-1, 1]
+    seed: int = 0
+
+    def colors(self, points: Float64, surface: Int64, footprint: Float64) -> UInt8:
+        """RGB (n, 3) of world points (n, 3) on numbered surfaces (n,); each surface differs."""
+        rng = np.random.default_rng(self.seed)
+        amplitudes = self.decay ** np.arange(self.octaves)
+        amplitudes *= self.contrast / np.sqrt(0.5 * self.waves_per_octave * (amplitudes**2).sum())
+        shifts = rng.uniform(-20.0, 20.0, (256, 3))
+        where = (points + shifts[surface % 256]).astype(np.float32)
+        value = rng.uniform(-0.4, 0.4, (256, 3))[surface % 256]
+        for octave, amplitude in enumerate(amplitudes):
+            frequency = 2.0**octave / self.longest_wave
+            vectors = rng.normal(size=(3, self.waves_per_octave))
+            vectors *= 2 * np.pi * frequency / np.linalg.norm(vectors, axis=0)
+            phase = rng.uniform(0, 2 * np.pi, self.waves_per_octave)
+            mix = rng.normal(1.0, 0.5, (self.waves_per_octave, 3))
+            waves = np.sin(where @ vectors.astype(np.float32) + phase.astype(np.float32))
+            # Gaussian pixel of standard deviation half a footprint, applied exactly to each wave.
+            kept = amplitude * np.exp(-0.5 * (np.pi * frequency * footprint) ** 2)
+            value += kept[:, None] * (waves @ mix.astype(np.float32))
+        return np.round(127.5 + 127.5 * np.tanh(value)).astype(np.uint8)
+
+
+class Rendering(NamedTuple):
+    """What a pinhole camera sees; everything is zero where no surface is.
+
+    Normals face the camera along the ray, so at grazing sight off the axis n_z can be positive.
+    """
+
+    depth: Float32  # (h, w), metres along z
+    normals: Float32  # (h, w, 3), unit, camera frame
+    rgb: UInt8  # (h, w, 3)
+
+
+class Samples(NamedTuple):
+    """Surface points seen through given pixels; entries are 0 where `valid` is false."""
+
+    points: Float64  # (n, 3), world
+    depth: Float64  # (n,), metres along z
+    normals: Float64  # (n, 3), camera frame, facing the camera
+    surface: Int64  # (n,), index into the scene's surfaces
+    valid: Bool  # (n,)
+
+
+class Correspondences(NamedTuple):
+    """Exact positions in view b of points seen in view a."""
+
+    xy_b: Float64  # (n, 2), pixels; 0 where not visible
+    points: Float64  # (n, 3), world
+    visible: Bool  # (n,): inside image b and not occluded there
+
+
+@dataclass(frozen=True)
+class AnalyticScene:
+    """Surfaces with a texture; the nearest hit of a ray is what is seen."""
+
+    surfaces: tuple[Surface, ...]
+    texture: Texture = Texture()
+
+    def first_hit(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64, Int64]:
+        """Nearest hits of rays (n, 3) from one origin (3,): t (inf if none), normals, surface."""
+        t = np.full(len(directions), np.inf)
+        normals = np.zeros((len(directions), 3))
+        surface = np.zeros(len(directions), np.int64)
+        for index, candidate in enumerate(self.surfaces):
+            t_new, normals_new = candidate.intersect(origin, directions)
+            nearer = t_new < t
+            t[nearer], normals[nearer] = t_new[nearer], normals_new[nearer]
+            surface[nearer] = index
+        return t, normals, surface
+
+    def sample(self, camera: PinholeCamera, cam_from_world: ArrayLike, xy: ArrayLike) -> Samples:
+        """What is seen through pixels `xy` (n, 2) of a camera."""
+        rotation, origin = _split_pose(cam_from_world)
+        pixels = np.asarray(xy, np.float64).reshape(-1, 2)
+        rays = np.column_stack(
+            [
+                (pixels[:, 0] - camera.cx) / camera.fx,
+                (pixels[:, 1] - camera.cy) / camera.fy,
+                np.ones(len(pixels)),
+            ]
+        )
+        directions = rays @ rotation
+        depth, normals, surface = self.first_hit(origin, directions)
+        valid = np.isfinite(depth)
+        depth = np.where(valid, depth, 0.0)
+        points = np.where(valid[:, None], origin + depth[:, None] * directions, 0.0)
+        return Samples(points, depth, normals @ rotation.T, surface, valid)
+
+    def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
+        """Depth, normals and colours at every pixel centre."""
+        columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        xy = np.column_stack([columns.ravel(), rows.ravel()])
+        seen = self.sample(camera, cam_from_world, xy)
+        rgb = self.texture.colors(seen.points, seen.surface, seen.depth / camera.fx)
+        rgb[~seen.valid] = 0
+        shape = (camera.height, camera.width)
+        return Rendering(
+            seen.depth.reshape(shape).astype(np.float32),
+            seen.normals.reshape(*shape, 3).astype(np.float32),
+            rgb.reshape(*shape, 3),
+        )
+
+    def correspondences(
+        self,
+        camera_a: PinholeCamera,
+        a_from_world: ArrayLike,
+        camera_b: PinholeCamera,
+        b_from_world: ArrayLike,
+        xy_a: ArrayLike,
+    ) -> Correspondences:
+        """Where the points seen through pixels `xy_a` (n, 2) of view a lie in view b."""
+        seen = self.sample(camera_a, a_from_world, xy_a)
+        xy_b, depth_b = project(camera_b, b_from_world, seen.points)
+        inside = (xy_b >= 0).all(1) & (xy_b <= (camera_b.width, camera_b.height)).all(1)
+        _, origin = _split_pose(b_from_world)
+        t, _, _ = self.first_hit(origin, seen.points - origin)
+        visible = seen.valid & (depth_b > 0) & inside & (np.abs(t - 1.0) < 1e-6)
+        return Correspondences(np.where(visible[:, None], xy_b, 0.0), seen.points, visible)
+
+
+def project(
+    camera: PinholeCamera, cam_from_world: ArrayLike, points: Float64
+) -> tuple[Float64, Float64]:
+    """Pixels (n, 2) and depths (n,) of world points (n, 3); pixels are 0 where depth <= 0."""
+    pose = np.asarray(cam_from_world, np.float64)
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    depth = local[:, 2]
+    safe = np.where(depth > 0, depth, np.inf)
+    xy = np.column_stack(
+        [
+            camera.fx * local[:, 0] / safe + camera.cx,
+            camera.fy * local[:, 1] / safe + camera.cy,
+        ]
+    )
+    return np.where((depth > 0)[:, None], xy, 0.0), depth
+
+
+def look_at(eye: ArrayLike, target: ArrayLike) -> Float64:
+    """`cam_from_world` (3, 4) of an upright camera at `eye` looking at `target`, not vertically."""
+    position = np.asarray(eye, np.float64)
+    forward = np.asarray(target, np.float64) - position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.column_stack([rotation, -rotation @ position])
+
+
+def room_scene(seed: int = 0) -> AnalyticScene:
+    """A furnished room of 6 x 5 x 2.6 m around the origin, floor at z = 0."""
+    room = Box((0.0, 0.0, 1.3), (3.0, 2.5, 1.3))
+    furniture: Sequence[Surface] = (
+        Box((0.6, 0.5, 0.35), (0.6, 0.4, 0.35), yaw_deg=25.0),  # table
+        Box((2.7, -1.0, 0.9), (0.3, 0.7, 0.9)),  # cupboard
+        Box((2.3, 1.6, 0.45), (0.4, 0.5, 0.45), yaw_deg=-15.0),
+        Box((-1.2, 1.9, 0.3), (0.7, 0.4, 0.3), yaw_deg=8.0),
+        Sphere((0.5, 0.5, 0.95), 0.25),  # on the table
+        Sphere((1.5, -1.2, 0.4), 0.4),
+        Sphere((0.0, -1.6, 0.3), 0.3),
+        Sphere((2.3, 1.6, 1.15), 0.25),
+    )
+    return AnalyticScene((room, *furniture), Texture(seed=seed))
+
+
+def arc_poses(
+    count: int,
+    step_deg: float,
+    *,
+    target: tuple[float, float, float] = (1.2, 0.0, 0.8),
+    radius: float = 3.4,
+    height: float = 1.6,
+) -> list[Float64]:
+    """`count` poses on an arc around `target`, `step_deg` apart, all looking at it.
+
+    The defaults stay inside `room_scene` up to 60 degrees to either side of the middle.
+    """
+    angles = np.deg2rad(180.0 + step_deg * (np.arange(count) - (count - 1) / 2))
+    eyes = np.asarray(target) + radius * np.column_stack(
+        [np.cos(angles), np.sin(angles), np.zeros(count)]
+    )
+    eyes[:, 2] = height
+    return [look_at(eye, target) for eye in eyes]
+
+
+def _split_pose(cam_from_world: ArrayLike) -> tuple[Float64, Float64]:
+    """Rotation (3, 3) and the camera's centre (3,) in the world."""
+    pose = np.asarray(cam_from_world, np.float64)
+    return pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+
+
+def _away_from_zero(values: Float64) -> Float64:
+    return np.where(np.abs(values) < 1e-12, 1e-12, values)
