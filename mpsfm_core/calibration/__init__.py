@@ -1,0 +1,1 @@
+"""The uncertainty model of priors, fitting it, and its report."""

@@ -1,0 +1,1 @@
+"""Compares reconstructions with ground truth."""

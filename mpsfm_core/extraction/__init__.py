@@ -1,0 +1,1 @@
+"""Where providers run: pairs, priors, features, verified matches; cached, resumable, parallel."""

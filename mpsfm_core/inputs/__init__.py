@@ -1,0 +1,1 @@
+"""From a folder of photos to undistorted views with known cameras."""

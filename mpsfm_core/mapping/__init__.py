@@ -1,0 +1,1 @@
+"""The prior-aware incremental mapper: pure numerics, no files, no plugins, no printing."""

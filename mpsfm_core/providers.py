@@ -1,0 +1,228 @@
+"""What a provider is: the protocols, the specification a plugin registers, and the hooks.
+
+A plugin is an installed package with an entry point in the group ``mpsfm.plugins``. The entry
+point names a light module (it must not import torch, onnxruntime or the like) that implements the
+hook :func:`Hooks.mpsfm_providers`::
+
+    from mpsfm_core import ProviderSpec, hookimpl
+
+    @hookimpl
+    def mpsfm_providers():
+        return [ProviderSpec(kind="depth", name="my-depth", factory="my_package.model:MyDepth")]
+
+The factory is called as ``factory(options, context)`` (a wrapper's as
+``factory(inner, options, context)``) when the provider is first used. What it returns must have
+the method of its kind's protocol below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol, get_args, runtime_checkable
+
+import pluggy
+from pydantic import BaseModel
+
+from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
+from mpsfm_core.data import (
+    Bool,
+    DepthPrior,
+    Features,
+    Float32,
+    NormalPrior,
+    PairMatches,
+    View,
+)
+from mpsfm_core.options import Options
+
+API_VERSION = 1
+"""Version of this contract. A plugin that names a newer one is listed as unavailable."""
+
+ENTRY_POINT_GROUP = "mpsfm.plugins"
+
+Kind = Literal["depth", "normals", "features", "matcher", "retrieval", "mask", "wrapper"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+Capability = Literal[
+    "metric",  # depth in metres
+    "variance",  # depth or normals come with a variance from the network
+    "joint-normals",  # depth provider that also has predict_joint()
+    "needs-depth",  # normals provider that wants the depth prior of the view
+    "sparse",  # matcher that needs features and returns sparse matches
+    "dense",  # matcher that works on the views alone and returns dense matches
+    "pair-depth",  # matcher that returns depth of both views
+    "wraps-depth",  # wrapper for depth providers
+    "wraps-normals",  # wrapper for normals providers
+    "intrinsics-aware",  # the output depends on the focal length
+    "estimates-focal",  # depth provider that also has estimate_focal()
+]
+CAPABILITIES: tuple[Capability, ...] = get_args(Capability)
+
+
+@dataclass(frozen=True)
+class ProviderContext:
+    """What the core gives a provider's factory.
+
+    ``device``: ``"cpu"`` or ``"cuda"``, already resolved. ``threads``: how many the provider may
+    use. ``seed``: for anything random. ``resolve_weights(uri, sha256)``: local path of a weights
+    file (see :mod:`mpsfm_core.weights`); raises :class:`~mpsfm_core.errors.WeightsError`.
+    """
+
+    resolve_weights: Callable[[str, str | None], Path]
+    device: str = "cpu"
+    threads: int = 1
+    seed: int = 0
+
+
+@runtime_checkable
+class DepthProvider(Protocol):
+    """Predicts z-depth of a view on a grid of its own size that covers the view."""
+
+    def predict(self, view: View) -> DepthPrior: ...
+
+
+@runtime_checkable
+class JointProvider(DepthProvider, Protocol):
+    """A depth provider whose network gives normals in the same pass (``joint-normals``)."""
+
+    def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]: ...
+
+
+@runtime_checkable
+class NormalsProvider(Protocol):
+    """Predicts normals of a view; ``depth`` is given when the spec says ``needs-depth``."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior: ...
+
+
+@runtime_checkable
+class FeatureProvider(Protocol):
+    """Detects and describes sparse features of a view."""
+
+    def extract(self, view: View) -> Features: ...
+
+
+@runtime_checkable
+class Matcher(Protocol):
+    """Matches two views; features are given when the spec says ``sparse``."""
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches: ...
+
+
+@runtime_checkable
+class RetrievalProvider(Protocol):
+    """Describes a view by one (d,) float32 vector; similarity is the dot product."""
+
+    def describe(self, view: View) -> Float32: ...
+
+
+@runtime_checkable
+class MaskProvider(Protocol):
+    """Returns (H, W) bool on the view's grid, True where the pixel may be used."""
+
+    def mask(self, view: View) -> Bool: ...
+
+
+PROTOCOLS: dict[Kind, type] = {
+    "depth": DepthProvider,
+    "normals": NormalsProvider,
+    "features": FeatureProvider,
+    "matcher": Matcher,
+    "retrieval": RetrievalProvider,
+    "mask": MaskProvider,
+}
+"""The protocol of each kind (a wrapper returns a provider of the kind it wraps)."""
+
+
+@dataclass(frozen=True)
+class WeightsFile:
+    """A weights file that a provider loads by default, for ``mpsfm models``.
+
+    ``uri``: see :mod:`mpsfm_core.weights`. ``sha256``: hex digest, or None where the publisher
+    gives none (it is then recorded at first use). ``license``: SPDX id or a short text.
+    """
+
+    uri: str
+    sha256: str | None = None
+    license: str = "unknown"
+
+
+@dataclass(frozen=True)
+class ProviderSpec:
+    """How a plugin announces one provider, without importing it.
+
+    ``kind``, ``name``: unique together; ``name`` is what a configuration's ``use:`` says.
+    ``factory``: ``"package.module:Class"``, imported on first use. ``options``: an
+    :class:`Options` subclass or ``"package.module:Class"``, None when there are none.
+    ``capabilities``: from :data:`CAPABILITIES`. ``requires``: import names that must be
+    installed, checked without importing; ``install_hint`` says how to get them.
+    ``code_license``, ``weights_license``: SPDX ids or short texts. ``weights``: the default
+    files. ``calibration``: declared uncertainty of a depth or normals provider.
+    """
+
+    kind: Kind
+    name: str
+    factory: str
+    options: type[Options] | str | None = None
+    capabilities: frozenset[Capability] = frozenset()
+    summary: str = ""
+    requires: tuple[str, ...] = ()
+    install_hint: str = ""
+    code_license: str = "unknown"
+    weights_license: str = "none"
+    weights: tuple[WeightsFile, ...] = ()
+    calibration: DepthCalibration | NormalCalibration | None = None
+    api_version: int = API_VERSION
+    tags: tuple[str, ...] = field(default=())
+    """Feature families for matchers and features (``"xfeat"``); a sparse matcher works with
+    features that share a tag, or with all when it has none."""
+
+
+hookspec = pluggy.HookspecMarker("mpsfm")
+hookimpl = pluggy.HookimplMarker("mpsfm")
+
+
+class Hooks:
+    """The pluggy hooks. All but :meth:`mpsfm_providers` are optional events."""
+
+    @hookspec
+    def mpsfm_providers(self) -> Sequence[ProviderSpec]:  # type: ignore[empty-body]
+        """The providers of this plugin."""
+
+    @hookspec
+    def mpsfm_filter_pairs(self, pairs: Sequence[tuple[str, str]]) -> Sequence[tuple[str, str]]:  # type: ignore[empty-body]
+        """Which of the candidate pairs (image names) to match; the filters' results intersect."""
+
+    @hookspec(firstresult=True)
+    def mpsfm_calibration(
+        self, kind: str, provider: str, options: BaseModel | None
+    ) -> DepthCalibration | NormalCalibration | None:
+        """Calibration of a prior for these options; None leaves it to the spec's default."""
+
+    @hookspec
+    def mpsfm_stage_started(self, stage: str, total: int | None) -> None:
+        """A stage of the pipeline begins, with this many steps if known."""
+
+    @hookspec
+    def mpsfm_stage_progress(self, stage: str, done: int, total: int) -> None:
+        """Steps done so far."""
+
+    @hookspec
+    def mpsfm_stage_finished(self, stage: str, seconds: float) -> None:
+        """A stage ended."""
+
+    @hookspec
+    def mpsfm_image_registered(self, name: str, registered: int, total: int) -> None:
+        """The mapper accepted an image."""
+
+    @hookspec
+    def mpsfm_image_rejected(self, name: str, reason: str) -> None:
+        """The mapper tried an image and rejected it."""

@@ -1,0 +1,1 @@
+"""Writes reconstructions in the formats other tools read, and the report."""

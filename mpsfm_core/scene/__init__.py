@@ -1,0 +1,1 @@
+"""The state of a reconstruction and its finished form."""

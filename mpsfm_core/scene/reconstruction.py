@@ -1,0 +1,79 @@
+"""The finished reconstruction, as the mapper hands it to the results room."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from mpsfm_core.data import DepthPrior, Float64, Int64, PinholeCamera
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredImage:
+    """One posed image.
+
+    ``index``: position in :attr:`mpsfm_core.data.MappingProblem.images`. ``camera``: undistorted
+    intrinsics, refined if that was asked for. ``rotation`` (3, 3), ``translation`` (3,) float64:
+    ``cam_from_world``. ``point_ids``: (n,) int64, for each keypoint of the problem's image its
+    row in :attr:`Reconstruction.points` or -1. ``depth``: refined depth in world units with its
+    variance, on the grid of the prior. ``scale``: world units per unit of the prior.
+    """
+
+    index: int
+    name: str
+    camera: PinholeCamera
+    rotation: Float64
+    translation: Float64
+    point_ids: Int64
+    depth: DepthPrior
+    scale: float
+
+
+@dataclass(frozen=True)
+class MetricScale:
+    """World units to metres, from the per-image scales of metric priors.
+
+    ``metres_per_unit``: the factor already applied when ``trusted``. ``spread``: robust relative
+    standard deviation (1.4826 MAD) of the per-image estimates.
+    """
+
+    metres_per_unit: float
+    spread: float
+    num_images: int
+    trusted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """Posed images and points.
+
+    ``points``: (p, 3) float64. ``errors_px``: (p,) float64, mean reprojection error of each point.
+    ``metric``: None when the priors are not metric; the coordinates are metres when trusted.
+    """
+
+    images: tuple[RegisteredImage, ...]
+    points: Float64
+    errors_px: Float64
+    metric: MetricScale | None = None
+
+
+@dataclass(frozen=True)
+class MappingReport:
+    """What happened, for people and for summary.json.
+
+    ``image_reasons``: image name -> why it is not registered. ``pair_reasons``: "a b" -> why the
+    pair could not start a reconstruction. ``seconds``: step -> time. ``counts``: step -> calls.
+    """
+
+    image_reasons: Mapping[str, str] = field(default_factory=dict)
+    pair_reasons: Mapping[str, str] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class MappingResult:
+    """``reconstructions``: disconnected components, largest first; empty when none was possible."""
+
+    reconstructions: tuple[Reconstruction, ...]
+    report: MappingReport
