@@ -1,0 +1,80 @@
+"""Robust losses, in Ceres' convention.
+
+A loss takes the squared residual ``s`` and its scale (the residual at which it starts to bend, in
+the residual's unit) and returns ``(rho(s), rho'(s))``. An objective is ``sum(rho(s)) / 2`` and
+``rho'`` is the weight of the residual in iteratively re-weighted least squares. Each function
+works on numpy arrays and, inside of numba kernels, on scalars; :func:`evaluate` selects one by
+its :class:`Loss`.
+"""
+# mypy: allow-untyped-decorators
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from enum import IntEnum
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+
+class Loss(IntEnum):
+    """The losses of the method: reprojection is soft-L1, depth Cauchy, the dense prior truncated
+    (paper, appendix B); trivial is plain least squares."""
+
+    TRIVIAL = 0
+    SOFT_L1 = 1
+    CAUCHY = 2
+    TRUNCATED = 3
+
+
+@register_jitable
+def trivial(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
+    """``rho = s``: the quadratic loss; the scale is ignored."""
+    return s, 0.0 * s + 1.0
+
+
+@register_jitable
+def soft_l1(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
+    """``rho = 2 a^2 (sqrt(1 + s / a^2) - 1)``: linear in the residual beyond the scale a."""
+    root = np.sqrt(1.0 + s / (scale * scale))
+    return 2.0 * scale * scale * (root - 1.0), 1.0 / root
+
+
+@register_jitable
+def cauchy(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
+    """``rho = a^2 log(1 + s / a^2)``: the influence of large residuals vanishes."""
+    ratio = s / (scale * scale)
+    return scale * scale * np.log1p(ratio), 1.0 / (1.0 + ratio)
+
+
+@register_jitable
+def truncated(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
+    """``rho = min(s, a^2)``: residuals beyond the scale have no influence at all."""
+    return np.minimum(s, scale * scale), (s < scale * scale) * 1.0
+
+
+LOSSES: Mapping[Loss, Callable[[NDArray[Any], float], tuple[Any, Any]]] = MappingProxyType(
+    {
+        Loss.TRIVIAL: trivial,
+        Loss.SOFT_L1: soft_l1,
+        Loss.CAUCHY: cauchy,
+        Loss.TRUNCATED: truncated,
+    }
+)
+"""The functions by name, for numpy arrays; kernels use :func:`evaluate`."""
+
+
+@njit(cache=True, error_model="numpy")
+def evaluate(loss: int, s: float, scale: float) -> Any:
+    """``(rho, rho')`` of one squared residual; ``loss`` is a :class:`Loss` as an int."""
+    if loss == 1:
+        return soft_l1(s, scale)
+    if loss == 2:
+        return cauchy(s, scale)
+    if loss == 3:
+        return truncated(s, scale)
+    return trivial(s, scale)
