@@ -1,0 +1,80 @@
+"""Trajectory errors after a similarity transform."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mpsfm_core.evaluation.alignment import trajectory_errors, umeyama
+from mpsfm_core.evaluation.pose_auc import Pose
+from mpsfm_core.geometry import camera_center
+
+
+def poses_at(centers: np.ndarray, rotations: np.ndarray) -> dict[str, Pose]:
+    return {
+        str(i): (rotation, -rotation @ center)
+        for i, (center, rotation) in enumerate(zip(centers, rotations, strict=True))
+    }
+
+
+def test_umeyama_finds_an_exact_similarity_even_for_a_plane() -> None:
+    rng = np.random.default_rng(0)
+    for flat in (1.0, 0.0):
+        points = rng.normal(size=(20, 3)) * [1.0, 1.0, flat]
+        rotation = Rotation.random(rng=rng).as_matrix()
+        target = 2.5 * points @ rotation.T + [1.0, -2.0, 3.0]
+        found = umeyama(points, target)
+        assert found.scale == pytest.approx(2.5)
+        np.testing.assert_allclose(found.rotation, rotation, atol=1e-12)
+        np.testing.assert_allclose(found.apply(points), target, atol=1e-12)
+
+
+def test_umeyama_is_the_least_squares_optimum_and_never_a_reflection() -> None:
+    rng = np.random.default_rng(1)
+    a = rng.normal(size=(12, 3))
+    b = a * [1.0, 1.0, -1.0] + 0.1 * rng.normal(size=(12, 3))
+    found = umeyama(a, b)
+    assert np.linalg.det(found.rotation) == pytest.approx(1)
+    best = ((found.apply(a) - b) ** 2).sum()
+    for _ in range(200):
+        turn = Rotation.from_rotvec(0.05 * rng.normal(size=3)).as_matrix() @ found.rotation
+        scale = found.scale * (1 + 0.05 * rng.normal())
+        moved = scale * a @ turn.T
+        assert ((moved - moved.mean(0) - b + b.mean(0)) ** 2).sum() >= best
+
+
+def test_errors_are_in_the_unit_of_the_truth() -> None:
+    rng = np.random.default_rng(2)
+    centers = rng.normal(size=(8, 3))
+    rotations = Rotation.random(8, rng=rng).as_matrix()
+    truth = poses_at(centers, rotations)
+    frame = Rotation.random(rng=rng).as_matrix()
+    estimated = poses_at(0.1 * centers @ frame + 5.0, rotations @ frame)
+    turned = Rotation.from_euler("x", 3, degrees=True).as_matrix() @ estimated["4"][0]
+    estimated["4"] = (turned, -turned @ camera_center(*estimated["4"]))
+    errors = trajectory_errors(estimated, truth)
+    assert errors is not None
+    assert errors.ate_rmse == pytest.approx(0, abs=1e-9)
+    assert errors.truth_from_estimate.scale == pytest.approx(10)
+    # One of eight orientations is off by 3 degrees: the mean takes an eighth of it.
+    assert errors.rotations_deg[4] == pytest.approx(3 * 7 / 8, abs=0.01)
+    assert np.delete(errors.rotations_deg, 4) == pytest.approx([3 / 8] * 7, abs=0.01)
+
+
+def test_a_displaced_camera_shows_in_the_ate() -> None:
+    angles = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
+    centers = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    truth = poses_at(centers, np.broadcast_to(np.eye(3), (1000, 3, 3)))
+    centers[10] += [0, 0, 0.5]
+    estimated = poses_at(centers, np.broadcast_to(np.eye(3), (1000, 3, 3)))
+    errors = trajectory_errors(estimated, truth)
+    assert errors is not None
+    assert errors.centers[10] == pytest.approx(0.5, abs=0.005)
+    assert errors.ate_rmse == pytest.approx(0.5 / np.sqrt(1000), rel=0.01)
+
+
+def test_two_images_or_coinciding_centres_cannot_be_aligned() -> None:
+    truth = poses_at(np.eye(3), np.stack([np.eye(3)] * 3))
+    assert trajectory_errors({name: truth[name] for name in ("0", "1")}, truth) is None
+    assert trajectory_errors(poses_at(np.zeros((3, 3)), np.stack([np.eye(3)] * 3)), truth) is None
