@@ -164,9 +164,11 @@ class WeightStore:
         _discard(part)
 
     def _cached_path(self, uri: str) -> Path:
-        name = urllib.parse.unquote(uri.split("?")[0].rstrip("/").rsplit("/", 1)[-1])
-        folder = hashlib.sha256(uri.encode()).hexdigest()[:16]
-        return self.cache_dir / folder / re.sub(r"[^\w.-]", "_", name)
+        """Files of one remote folder share a folder here: ONNX looks for its data beside it."""
+        address, _, query = uri.partition("?")
+        parent, _, name = address.rpartition("/")
+        folder = hashlib.sha256(f"{parent}?{query}".encode()).hexdigest()[:16]
+        return self.cache_dir / folder / re.sub(r"[^\w.-]", "_", urllib.parse.unquote(name))
 
     def _is_trusted(self, uri: str, path: Path, expected: str | None) -> bool:
         """The file is there, was verified, and has not been touched since."""
