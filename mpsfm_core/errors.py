@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class MpsfmError(Exception):
     """Base of every error raised on purpose; ``exit_code`` is what the command line returns."""
@@ -53,7 +56,20 @@ class ProviderOutputError(MpsfmError):
         self.rule = rule
 
 
+class ProviderRunError(MpsfmError):
+    """A provider failed on an image; the message names both, the cause is chained."""
+
+
 class ReconstructionError(MpsfmError):
     """The input is fine, but no reconstruction was possible; reasons are in summary.json."""
 
     exit_code = 3
+
+
+def did_you_mean(name: str, candidates: Iterable[str]) -> str:
+    """What to append to "unknown NAME": the nearest candidate, or all when none is near."""
+    known = sorted(set(candidates))
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    if near:
+        return f"; did you mean {near[0]!r}?"
+    return f"; valid are: {', '.join(known)}" if known else ""

@@ -142,6 +142,13 @@ PROTOCOLS: dict[Kind, type] = {
 """The protocol of each kind (a wrapper returns a provider of the kind it wraps)."""
 
 
+CAPABILITY_METHODS: dict[Capability, str] = {
+    "joint-normals": "predict_joint",
+    "estimates-focal": "estimate_focal",
+}
+"""The further method that a provider with the capability must have."""
+
+
 @dataclass(frozen=True)
 class WeightsFile:
     """A weights file that a provider loads by default, for ``mpsfm models``.
@@ -160,7 +167,8 @@ class ProviderSpec:
     """How a plugin announces one provider, without importing it.
 
     ``kind``, ``name``: unique together; ``name`` is what a configuration's ``use:`` says.
-    ``factory``: ``"package.module:Class"``, imported on first use. ``options``: an
+    ``factory``: ``"package.module:Class"``, imported on first use; a plugin always gives this
+    form, a callable is for providers registered in the same process. ``options``: an
     :class:`Options` subclass or ``"package.module:Class"``, None when there are none.
     ``capabilities``: from :data:`CAPABILITIES`. ``requires``: import names that must be
     installed, checked without importing; ``install_hint`` says how to get them.
@@ -170,7 +178,7 @@ class ProviderSpec:
 
     kind: Kind
     name: str
-    factory: str
+    factory: str | Callable[..., object]
     options: type[Options] | str | None = None
     capabilities: frozenset[Capability] = frozenset()
     summary: str = ""
