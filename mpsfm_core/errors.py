@@ -60,6 +60,10 @@ class ProviderRunError(MpsfmError):
     """A provider failed on an image; the message names both, the cause is chained."""
 
 
+class OutputError(MpsfmError):
+    """Results cannot be written: the disk is full or fails. Earlier results are unchanged."""
+
+
 class ReconstructionError(MpsfmError):
     """The input is fine, but no reconstruction was possible; reasons are in summary.json."""
 
