@@ -1,0 +1,116 @@
+"""LightGlue for ALIKED and DISK, and LighterGlue for XFeat, as sparse matchers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from kornia.feature import LightGlue
+
+from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
+from mpsfm_core.errors import ProviderError
+from mpsfm_kornia.options import LightGlueOptions
+from mpsfm_kornia.runtime import fill, inference, load_weights, use_threads
+
+# Every key that shapes the network is named: kornia's defaults are a class attribute, which
+# other packages are known to overwrite.
+_LIGHTGLUE = {"input_dim": 128, "descriptor_dim": 256, "n_layers": 9, "num_heads": 4}
+_LIGHTERGLUE = {"input_dim": 64, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1}
+_FIXED = {
+    "name": "lightglue",
+    "add_scale_ori": False,
+    "add_laf": False,
+    "scale_coef": 1.0,
+    "flash": True,
+    "mp": False,
+    "weights": None,
+}
+
+
+class LightGlueMatcher:
+    """LightGlue with the architecture it has for 128-dimensional ALIKED and DISK features."""
+
+    architecture: dict[str, int] = _LIGHTGLUE
+
+    def __init__(self, options: LightGlueOptions, context: ProviderContext) -> None:
+        use_threads(context)
+        self._device = context.device
+        self._network = LightGlue(
+            None,
+            **self.architecture,
+            **_FIXED,
+            depth_confidence=options.depth_confidence,
+            width_confidence=options.width_confidence,
+            filter_threshold=options.filter_threshold,
+        )
+        state = load_weights(context, options.weights, options.sha256)
+        fill(self._network, _renamed(state), options.weights)
+        self._network.to(self._device)
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """Mutual matches with their confidence.
+
+        Raises:
+            ProviderError: the descriptors are not of the family this network was trained for.
+        """
+        if features_a is None or features_b is None:
+            raise ProviderError("LightGlue matches features: choose a features provider")
+        if not len(features_a) or not len(features_b):
+            return _matches(np.empty((0, 2)), np.empty(0))
+        data = {
+            "image0": self._input(view_a, features_a),
+            "image1": self._input(view_b, features_b),
+        }
+        with inference():
+            found = self._network(data)
+        return _matches(found["matches"][0].cpu().numpy(), found["scores"][0].cpu().numpy())
+
+    def _input(self, view: View, features: Features) -> dict[str, torch.Tensor]:
+        dimension = features.descriptors.shape[1]
+        if dimension != self.architecture["input_dim"]:
+            raise ProviderError(
+                f"descriptors of {view.name!r} have {dimension} dimensions, this matcher wants "
+                f"{self.architecture['input_dim']}: choose the matcher made for these features"
+            )
+        arrays = {
+            "keypoints": features.keypoints,
+            "descriptors": features.descriptors,
+            "image_size": np.array(view.camera.size),
+        }
+        return {
+            key: torch.tensor(value, dtype=torch.float32, device=self._device)[None]
+            for key, value in arrays.items()
+        }
+
+
+class LighterGlueMatcher(LightGlueMatcher):
+    """LighterGlue with the architecture it has for 64-dimensional XFeat features."""
+
+    architecture = _LIGHTERGLUE
+
+
+def _matches(indices: Any, scores: Any) -> PairMatches:
+    return PairMatches(
+        sparse=SparseMatches(indices.astype(np.int64), np.clip(scores, 0, 1).astype(np.float32))
+    )
+
+
+def _renamed(state: dict[str, Any]) -> dict[str, Any]:
+    """Published names as kornia's: without the trainer's prefix, layers under ``transformers``."""
+    renamed = {}
+    for name, tensor in state.items():
+        if name.startswith("extractor."):
+            continue
+        block, _, rest = name.removeprefix("matcher.").partition(".")
+        if block in ("self_attn", "cross_attn"):
+            layer, _, rest = rest.partition(".")
+            block, rest = f"transformers.{layer}.{block}", rest
+        renamed[f"{block}.{rest}" if rest else block] = tensor
+    return renamed

@@ -1,0 +1,74 @@
+"""LoFTR as a dense matcher."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import torch
+from kornia.feature import LoFTR
+from kornia.feature.loftr.loftr import default_cfg
+
+from mpsfm_core import DenseMatches, Features, PairMatches, ProviderContext, View
+from mpsfm_kornia.options import LoftrOptions
+from mpsfm_kornia.runtime import Grid, fill, inference, load_weights, usable, use_threads
+
+_MULTIPLE = 8
+"""The coarse level has one cell every 8 pixels."""
+_STD_NETWORK_PX = 0.5
+"""Localisation noise in network pixels (reference: half that of sparse keypoints)."""
+_LUMA = (0.299, 0.587, 0.114)
+"""ITU-R BT.601, as in the training's image reader."""
+
+
+class LoftrMatcher:
+    """LoFTR with the architecture of its published weights.
+
+    Its keypoints already are in the frame of its training data, COLMAP's (kornia documents that
+    the published weights put a pixel's centre at +0.5), so nothing is added to them.
+    """
+
+    def __init__(self, options: LoftrOptions, context: ProviderContext) -> None:
+        use_threads(context)
+        self._device = context.device
+        self._longest = options.resize
+        config = copy.deepcopy(default_cfg)
+        config["match_coarse"]["thr"] = options.match_threshold
+        config["coarse"]["temp_bug_fix"] = options.corrected_encoding
+        self._network = LoFTR(pretrained=None, config=config)
+        state = load_weights(context, options.weights, options.sha256)
+        fill(self._network, state.get("state_dict", state), options.weights)
+        self._network.to(self._device)
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """Matches of cells of the first view with sub-pixel positions in the second."""
+        grids = [Grid.fit(view, self._longest, _MULTIPLE) for view in (view_a, view_b)]
+        images = [
+            self._gray(grid, view) for grid, view in zip(grids, (view_a, view_b), strict=True)
+        ]
+        with inference():
+            found = self._network({"image0": images[0], "image1": images[1]})
+        points = [
+            grid.to_view(found[key].double().cpu().numpy())
+            for grid, key in zip(grids, ("keypoints0", "keypoints1"), strict=True)
+        ]
+        scores = np.clip(found["confidence"].float().cpu().numpy(), 0, 1)
+        keep = usable(view_a, points[0]) & usable(view_b, points[1])
+        return PairMatches(
+            dense=DenseMatches(
+                points[0][keep],
+                points[1][keep],
+                scores[keep],
+                std_px=max(1.0, _STD_NETWORK_PX * max(grid.pixel_size for grid in grids)),
+            )
+        )
+
+    def _gray(self, grid: Grid, view: View) -> torch.Tensor:
+        image = grid.image(view, self._device)
+        return (image * image.new_tensor(_LUMA)[:, None, None]).sum(1, keepdim=True)

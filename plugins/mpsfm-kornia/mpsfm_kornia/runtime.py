@@ -1,0 +1,95 @@
+"""What the networks share: device and threads, weights, and the network's pixel grid."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from mpsfm_core import ProviderContext, View
+from mpsfm_core.data import Bool, Float64
+from mpsfm_core.errors import WeightsError
+from mpsfm_core.geometry import inside, resize_map, sample_nearest, scale_pixels
+from mpsfm_core.weights import load_torch_state
+from mpsfm_kornia.options import KNOWN_HASHES
+
+_SMALLEST_SIDE = 32
+"""The networks shrink their input by up to 32."""
+
+
+def use_threads(context: ProviderContext) -> None:
+    """Give torch the context's threads. This setting is torch's, for the whole process."""
+    torch.set_num_threads(context.threads)
+
+
+@contextmanager
+def inference() -> Iterator[None]:
+    """No gradients, and the same result for the same input."""
+    with (
+        torch.inference_mode(),
+        torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True),
+    ):
+        yield
+
+
+def load_weights(context: ProviderContext, uri: str, sha256: str | None) -> dict[str, Any]:
+    """The state dictionary of a weights file, its hash checked where one is known."""
+    return load_torch_state(context.resolve_weights(uri, sha256 or KNOWN_HASHES.get(uri)))
+
+
+def fill(module: torch.nn.Module, state: dict[str, Any], uri: str) -> None:
+    """Load all learned values of a network and switch it to evaluation.
+
+    Raises:
+        WeightsError: the file lacks some of them, or has them in other shapes.
+    """
+    try:
+        mismatch = module.load_state_dict(state, strict=False)
+    except RuntimeError as error:  # shapes
+        raise WeightsError(f"{uri} is for another network: {error}") from error
+    learned = {name for name, _ in module.named_parameters()}
+    learned |= {name for name, _ in module.named_buffers() if "running_" in name}
+    if missing := sorted(learned & set(mismatch.missing_keys)):
+        raise WeightsError(f"{uri} is for another network: it lacks {', '.join(missing[:3])}")
+    module.eval()
+
+
+def usable(view: View, xy: Float64) -> Bool:
+    """Which pixels (n, 2) lie in the view and in its mask."""
+    ok = inside(xy, view.camera.size)
+    return ok if view.mask is None else ok & sample_nearest(view.mask, xy)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The image size at which a network runs, beside the size of the view."""
+
+    view: tuple[int, int]
+    network: tuple[int, int]
+
+    @classmethod
+    def fit(cls, view: View, longest: int | None, multiple: int = 1) -> Grid:
+        """At most ``longest`` pixels long, sides rounded down to a multiple, never enlarged
+        (except to the networks' smallest side)."""
+        scale = min(1.0, (longest or np.inf) / max(view.camera.size))
+        sides = (round(side * scale) // multiple * multiple for side in view.camera.size)
+        width, height = (max(side, _SMALLEST_SIDE) for side in sides)
+        return cls(view.camera.size, (width, height))
+
+    def image(self, view: View, device: str) -> torch.Tensor:
+        """The resized image, (1, 3, h, w) float32, RGB in [0, 1]."""
+        resized = resize_map(view.image, *self.network) / np.float32(255)
+        return torch.from_numpy(resized).permute(2, 0, 1)[None].contiguous().to(device)
+
+    def to_view(self, xy: Float64) -> Float64:
+        """Pixels of the network's image (centre of the first at 0.5) as pixels of the view."""
+        return scale_pixels(xy, self.network, self.view)
+
+    @property
+    def pixel_size(self) -> float:
+        """Longer side of a network pixel, in pixels of the view."""
+        return max(v / n for v, n in zip(self.view, self.network, strict=True))
