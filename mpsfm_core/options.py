@@ -45,6 +45,8 @@ class SettingProblem:
 
     path: SettingPath
     text: str
+    missing: bool = False
+    """Whether a required setting is absent."""
 
     def __str__(self) -> str:
         return f"{dotted(self.path)}: {self.text}" if self.path else self.text
@@ -73,7 +75,9 @@ def parse_settings(
         return model.model_validate(dict(values))
     except ValidationError as error:
         problems = tuple(
-            SettingProblem((*path, *_keys(details)), _explain(model, details))
+            SettingProblem(
+                (*path, *_keys(details)), _explain(model, details), details["type"] == "missing"
+            )
             for details in error.errors(include_url=False)
         )
         raise SettingsError(problems) from error

@@ -1,0 +1,352 @@
+"""The configuration of a run: YAML files and ``--set`` into one checked :class:`Config`.
+
+A file may say ``extends:`` with the name of a shipped configuration or a path relative to itself.
+Mappings are merged key by key, everything else is replaced; a block whose ``use:`` changes loses
+the rest that its parent said of it, as another provider has other options.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
+from mpsfm_core.errors import ConfigError, ProviderError, did_you_mean
+from mpsfm_core.extraction.options import ExtractionOptions, PairOptions, VerificationOptions
+from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.options import (
+    Backend,
+    Options,
+    SettingPath,
+    SettingProblem,
+    SettingsError,
+    parse_settings,
+)
+from mpsfm_core.providers import Kind
+from mpsfm_core.registry import Registry
+from mpsfm_core.results.options import ResultOptions
+from mpsfm_core.yaml_text import line_of, parse_yaml, write_yaml
+
+
+class RuntimeOptions(Options):
+    """Where and how a run computes; nothing here changes what it computes but the seed."""
+
+    workers: int | None = Field(None, ge=1)
+    """Worker processes of the extraction, null for one a core."""
+    threads: int = Field(1, ge=1)
+    """Threads that each worker's provider may use."""
+    seed: int = Field(0, ge=0)
+    """Seed of everything random."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where providers compute; ``auto`` takes a GPU when there is one."""
+    cache_dir: Path | None = None
+    """Folder of weights and extraction results, null for the platform's cache folder."""
+    offline: bool = False
+    """Never download; a missing weights file is an error."""
+
+
+class Config(Options):
+    """Everything a run needs to know besides its images and output folder."""
+
+    description: str = ""
+    """One line for ``mpsfm config list``; not inherited."""
+    inputs: InputOptions = Field(default_factory=InputOptions)
+    pairs: PairOptions = Field(default_factory=PairOptions)
+    features: Backend | None = None
+    matcher: Backend | None = None
+    """Sparse matcher, needs ``features``."""
+    dense_matcher: Backend | None = None
+    """Detector-free matcher, instead of the sparse one or beside it."""
+    retrieval: Backend | None = None
+    depth: Backend
+    normals: Backend
+    masks: tuple[Backend, ...] = ()
+    """A pixel is used when all masks allow it."""
+    verification: VerificationOptions = Field(default_factory=VerificationOptions)
+    extraction: ExtractionOptions = Field(default_factory=ExtractionOptions)
+    mapping: MapperOptions = Field(default_factory=MapperOptions)
+    results: ResultOptions = Field(default_factory=ResultOptions)
+    runtime: RuntimeOptions = Field(default_factory=RuntimeOptions)
+
+    def backends(self) -> Iterator[tuple[SettingPath, Kind, Backend]]:
+        """Every chosen provider: its path in the configuration, kind and block."""
+        for name, kind in _BLOCKS.items():
+            backend = getattr(self, name)
+            if backend is not None:
+                yield (name,), kind, backend
+        for index, backend in enumerate(self.masks):
+            yield ("masks", index), "mask", backend
+
+    def to_yaml(self) -> str:
+        """The configuration with all defaults; loading it gives the same configuration."""
+        return write_yaml(self.model_dump(mode="json"))
+
+
+_BLOCKS: dict[str, Kind] = {
+    "features": "features",
+    "matcher": "matcher",
+    "dense_matcher": "matcher",
+    "retrieval": "retrieval",
+    "depth": "depth",
+    "normals": "normals",
+}
+_CALIBRATIONS: dict[str, type[Options]] = {"depth": DepthCalibration, "normals": NormalCalibration}
+
+
+def shipped_configs() -> dict[str, Path]:
+    """The configurations that come with the package: name -> file, sorted by name."""
+    package = Path(__file__).parent
+    # Installed from a wheel they lie in the package, in a source tree beside it.
+    folder = next(f for f in (package / "configs", package.parent / "configs") if f.is_dir())
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def load_config(
+    name_or_path: str | Path,
+    overrides: Sequence[str] = (),
+    registry: Registry | None = None,
+    *,
+    complete: bool = True,
+) -> Config:
+    """Read, merge and check a configuration.
+
+    ``name_or_path``: a shipped name, or a YAML file (anything with a slash or ending in .yaml or
+    .yml). ``overrides``: texts ``a.b=value`` with a YAML value, applied last; list entries by
+    index. ``registry``: default ``Registry.discover()``; every backend's name and options are
+    checked against it, and the returned options have all defaults filled in. ``complete=False``
+    lets required options of backends be absent, to look at a configuration.
+
+    Raises :class:`~mpsfm_core.errors.ConfigError` with file, line, YAML path and, for unknown
+    keys and names, the nearest valid one.
+    """
+    layers = _read_chain(_find(str(name_or_path), Path()))
+    # A change of provider drops the block's options, so it goes before the overrides that set them.
+    layers += [_parse_override(o) for o in sorted(overrides, key=lambda o: ".use=" not in o)]
+    try:
+        config = parse_settings(Config, _merge_all(layers))
+        return _check(config, registry or Registry.discover(), layers, complete)
+    except SettingsError as error:
+        raise ConfigError("; ".join(_located(layers, p) for p in error.problems)) from error
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """What one file or one ``--set`` says; ``text`` is the file's, ``folder`` where it lies."""
+
+    source: str
+    data: Mapping[str, Any]
+    text: str = ""
+    folder: Path = Path()
+
+    def says(self, path: SettingPath) -> bool:
+        """Whether there is an entry at ``path``."""
+        node: Any = self.data
+        for part in path:
+            if isinstance(node, list) and isinstance(part, int) and part < len(node):
+                node = node[part]
+            elif isinstance(node, Mapping) and str(part) in node:
+                node = node[str(part)]
+            else:
+                return False
+        return True
+
+    def place(self, path: SettingPath) -> str:
+        """``FILE:LINE`` of an entry, or the override's text."""
+        line = line_of(self.text, path) if self.text else None
+        return f"{self.source}:{line}" if line else self.source
+
+
+def _find(name: str, folder: Path) -> Path:
+    if "/" in name or "\\" in name or name.endswith((".yaml", ".yml")):
+        path = folder / Path(name).expanduser()
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such configuration file")
+        return path
+    shipped = shipped_configs()
+    if name not in shipped:
+        raise ConfigError(
+            f"no configuration {name!r}{did_you_mean(name, shipped)} (a file ends in .yaml)"
+        )
+    return shipped[name]
+
+
+def _read_chain(path: Path, children: tuple[Path, ...] = ()) -> list[_Layer]:
+    """The file's layers, the one that extends nothing first."""
+    path = path.resolve()
+    chain = (*children, path)
+    if path in children:
+        raise ConfigError("extends goes in a circle: " + " -> ".join(map(str, chain)))
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    data = parse_yaml(text, str(path)) or {}
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: must be a mapping, is a {type(data).__name__}")
+    parent = data.pop("extends", None)
+    if children:
+        data.pop("description", None)
+    layer = _Layer(str(path), data, text, path.parent)
+    if parent is None:
+        return [layer]
+    if not isinstance(parent, str):
+        raise ConfigError(f"{path}: extends: must be a name or a path, is {parent!r}")
+    try:
+        found = _find(parent, path.parent)
+    except ConfigError as error:
+        raise ConfigError(f"{layer.place(('extends',))}: extends: {error}") from error
+    return [*_read_chain(found, chain), layer]
+
+
+def _parse_override(text: str) -> _Layer:
+    key, equals, value = text.partition("=")
+    parts = key.strip().split(".")
+    source = f"--set {text}"
+    if not (equals and all(parts)):
+        raise ConfigError(f"{source}: must look like a.b=value")
+    data: Any = parse_yaml(value, source)
+    for part in reversed(parts):
+        data = {part: data}
+    return _Layer(source, data)
+
+
+def _merge_all(layers: Sequence[_Layer]) -> dict[str, Any]:
+    merged: dict[str, Any] = {}
+    for layer in layers:
+        try:
+            merged = _merge(merged, layer.data)
+        except IndexError as error:
+            raise ConfigError(f"{layer.source}: {error}") from error
+    return merged
+
+
+def _merge(base: Any, change: Any) -> Any:
+    if not isinstance(change, Mapping):
+        return change
+    indices = bool(change) and all(isinstance(k, str) and k.isdigit() for k in change)
+    if indices and (base is None or isinstance(base, list)):
+        return _merge_items(base or [], change)
+    if not isinstance(base, Mapping) or change.get("use", base.get("use")) != base.get("use"):
+        base = {}
+    return {**base, **{key: _merge(base.get(key), value) for key, value in change.items()}}
+
+
+def _merge_items(base: list[Any], change: Mapping[str, Any]) -> list[Any]:
+    """``--set masks.0.use=...``: replace an entry of a list, or append the next one."""
+    items = list(base)
+    for key, value in change.items():
+        index = int(key)
+        if index > len(items):
+            raise IndexError(f"entry {index} of a list that has {len(items)}")
+        items[index : index + 1] = [_merge(items[index] if index < len(items) else None, value)]
+    return items
+
+
+def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complete: bool) -> Config:
+    """The configuration with the options of every backend checked and filled in."""
+    problems: list[SettingProblem] = []
+    blocks: dict[str, Any] = {"masks": list(config.masks)}
+    for path, kind, backend in config.backends():
+        try:
+            checked = _check_backend(path, kind, backend, registry, layers, complete)
+        except SettingsError as error:
+            problems += error.problems
+            continue
+        if path[0] == "masks":
+            blocks["masks"][path[1]] = checked
+        else:
+            blocks[str(path[0])] = checked
+    if not problems:
+        problems += _combination_problems(config, registry)
+    if problems:
+        raise SettingsError(tuple(problems))
+    return config.model_copy(update={**blocks, "masks": tuple(blocks["masks"])})
+
+
+def _check_backend(
+    path: SettingPath,
+    kind: Kind,
+    backend: Backend,
+    registry: Registry,
+    layers: Sequence[_Layer],
+    complete: bool,
+) -> Backend:
+    try:
+        options = registry.validate_options(kind, backend.use, backend.options, (*path, "options"))
+        filled = options.model_dump(mode="json") if options else {}
+    except ProviderError as error:
+        raise SettingsError((SettingProblem((*path, "use"), str(error)),)) from error
+    except SettingsError as error:
+        if complete or not all(problem.missing for problem in error.problems):
+            raise
+        filled = backend.options
+    wrap = tuple(
+        _check_backend((*path, "wrap", index), "wrapper", wrapper, registry, layers, complete)
+        for index, wrapper in enumerate(backend.wrap)
+    )
+    for index, wrapper in enumerate(wrap):
+        if f"wraps-{kind}" not in registry.spec("wrapper", wrapper.use).capabilities:
+            text = f"{wrapper.use!r} does not wrap {kind} providers"
+            raise SettingsError((SettingProblem((*path, "wrap", index, "use"), text),))
+    calibration = _calibration(path, kind, backend, layers)
+    return backend.model_copy(update={"options": filled, "wrap": wrap, "calibration": calibration})
+
+
+def _calibration(
+    path: SettingPath, kind: Kind, backend: Backend, layers: Sequence[_Layer]
+) -> dict[str, Any] | None:
+    """The calibration's values, read from its file if it names one."""
+    values, path = backend.calibration, (*path, "calibration")
+    if values is None:
+        return None
+    if kind not in _CALIBRATIONS:
+        raise SettingsError((SettingProblem(path, f"a {kind} provider has no uncertainty"),))
+    if isinstance(values, str):
+        folder = next(layer.folder for layer in reversed(layers) if layer.says(path))
+        file = folder / Path(values).expanduser()
+        try:
+            values = parse_yaml(file.read_text(encoding="utf-8"), str(file))
+        except (OSError, UnicodeDecodeError) as error:
+            text = f"calibration file {str(file)!r} cannot be read: {error}"
+            raise SettingsError((SettingProblem(path, text),)) from error
+        if not isinstance(values, dict):
+            raise SettingsError((SettingProblem(path, f"{file} does not hold a mapping"),))
+    return parse_settings(_CALIBRATIONS[kind], values, path).model_dump(mode="json")
+
+
+def _combination_problems(config: Config, registry: Registry) -> list[SettingProblem]:
+    """What does not fit together although each block is right by itself."""
+    if config.matcher is None and config.dense_matcher is None:
+        return [SettingProblem(("matcher",), "a matcher or a dense_matcher is needed")]
+    problems = []
+    for name, capability in (("matcher", "sparse"), ("dense_matcher", "dense")):
+        backend: Backend | None = getattr(config, name)
+        if backend and capability not in registry.spec("matcher", backend.use).capabilities:
+            text = f"{backend.use!r} is not a {capability} matcher"
+            problems.append(SettingProblem((name, "use"), text))
+    if config.matcher is None:
+        return problems
+    if config.features is None:
+        text = f"is needed by the sparse matcher {config.matcher.use!r}"
+        return [*problems, SettingProblem(("features",), text)]
+    accepted = set(registry.spec("matcher", config.matcher.use).tags)
+    if accepted and not accepted & set(registry.spec("features", config.features.use).tags):
+        text = f"{config.matcher.use!r} matches {', '.join(sorted(accepted))} features"
+        text += f", not {config.features.use!r}"
+        problems.append(SettingProblem(("matcher", "use"), text))
+    return problems
+
+
+def _located(layers: Sequence[_Layer], problem: SettingProblem) -> str:
+    """The problem with the place that caused it: the last layer that says most of its path."""
+    for length in range(len(problem.path), 0, -1):
+        path = problem.path[:length]
+        for layer in reversed(layers):
+            if layer.says(path):
+                return f"{layer.place(path)}: {problem}"
+    return f"{layers[-1].source}: {problem}"
