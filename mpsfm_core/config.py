@@ -106,6 +106,12 @@ def shipped_configs() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
+def describe_shipped() -> dict[str, str]:
+    """The shipped configurations with their descriptions."""
+    read = {name: _read_chain(path)[-1].data for name, path in shipped_configs().items()}
+    return {name: str(data.get("description", "")) for name, data in read.items()}
+
+
 def load_config(
     name_or_path: str | Path,
     overrides: Sequence[str] = (),

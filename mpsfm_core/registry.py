@@ -49,11 +49,12 @@ DEFAULT_TIMEOUT_S = 10.0
 """A light plugin module loads in milliseconds; a cold network disk may take seconds."""
 
 FIRST_PARTY: Mapping[tuple[Kind, str], str] = {
-    ("features", "xfeat"): "mpsfm-kornia",
-    ("features", "aliked"): "mpsfm-kornia",
-    ("features", "disk"): "mpsfm-kornia",
-    ("matcher", "lightglue"): "mpsfm-kornia",
-    ("matcher", "lighterglue"): "mpsfm-kornia",
+    ("features", "xfeat"): "mpsfm-kornia[weights]",
+    ("features", "aliked"): "mpsfm-kornia[weights]",
+    ("features", "disk"): "mpsfm-kornia[weights]",
+    ("matcher", "lightglue-aliked"): "mpsfm-kornia[weights]",
+    ("matcher", "lightglue-disk"): "mpsfm-kornia[weights]",
+    ("matcher", "lighterglue"): "mpsfm-kornia[weights]",
     ("matcher", "loftr"): "mpsfm-kornia",
     ("depth", "onnx"): "mpsfm-onnx",
     ("normals", "onnx"): "mpsfm-onnx",
@@ -110,6 +111,7 @@ class Registry:
         self._entries: list[_Entry] = []
         self._plugins: list[ProviderStatus] = []
         self._manager = new_manager()
+        self._muted: set[tuple[str, str]] = set()
 
     @classmethod
     def discover(cls, timeout_s: float | None = None) -> Registry:
@@ -121,7 +123,7 @@ class Registry:
         registry = cls()
         if importlib.util.find_spec("mpsfm_core.builtin.plugin"):
             builtin = importlib.import_module("mpsfm_core.builtin.plugin")
-            registry.register(builtin, name="builtin", distribution=CORE, version=_core_version())
+            registry.register(builtin, name="builtin", distribution=CORE, version=core_version())
         if timeout_s is None:
             timeout_s = float(os.environ.get(TIMEOUT_VARIABLE, DEFAULT_TIMEOUT_S))
         for plugin in installed_plugins(timeout_s):
@@ -258,18 +260,21 @@ class Registry:
     def call_hook(self, name: str, **arguments: Any) -> list[Any]:
         """Call a hook of every plugin and return what they answer, None left out.
 
-        A plugin that raises is skipped with a logged warning: an installed viewer, logger or
-        filter that is broken must not end somebody's run.
+        A plugin that raises is skipped with a logged warning and not called for this hook again:
+        an installed viewer, logger or filter that is broken must not end somebody's run.
         """
         answers = []
         for implementation in reversed(getattr(self.hook, name).get_hookimpls()):
+            if (implementation.plugin_name, name) in self._muted:
+                continue
             given = {key: arguments[key] for key in implementation.argnames}
             try:
                 answer = implementation.function(**given)
-            except Exception:
-                _log.warning(
-                    "plugin %r failed in %s", implementation.plugin_name, name, exc_info=True
-                )
+            except Exception as error:
+                self._muted.add((implementation.plugin_name, name))
+                text = f"plugin {implementation.plugin_name!r} failed in {name} and is left out"
+                _log.warning("%s: %s: %s", text, type(error).__name__, error)
+                _log.debug("%s", text, exc_info=True)
                 continue
             if answer is not None:
                 answers.append(answer)
@@ -318,7 +323,7 @@ class Registry:
     def _unknown(self, kind: Kind, name: str) -> str:
         home = FIRST_PARTY.get((kind, name))
         if home:
-            return f"{kind} provider {name!r} comes with a plugin: pip install {home}"
+            return f"{kind} provider {name!r} comes with a plugin: pip install '{home}'"
         known = self.names(kind)
         text = f"no {kind} provider {name!r}{did_you_mean(name, known)}"
         others = [e.spec.kind for e in self._entries if e.spec.name == name]
@@ -406,8 +411,9 @@ def _require_methods(entry: _Entry, provider: object, names: Sequence[str]) -> N
             raise ProviderError(f"{entry.label} gives a {kind} without the method {name}()")
 
 
-def _core_version() -> str:
+def core_version() -> str:
+    """Version of the installed core, ``"source"`` in a tree that was never installed."""
     try:
         return metadata.version(CORE)
-    except metadata.PackageNotFoundError:  # run from a source tree that was never installed
+    except metadata.PackageNotFoundError:
         return "source"

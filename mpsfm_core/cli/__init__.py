@@ -1,0 +1,57 @@
+"""The command ``mpsfm``: thin commands over the front door.
+
+One module a command or command group, added to :func:`build_app`. A module imports what its
+command needs inside of the command's function, so that every command starts as fast as it can.
+Commands raise; :class:`~mpsfm_core.cli.errors.GuardedGroup` turns what they raise into one line
+on stderr and an exit code.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Annotated
+
+import typer
+
+from mpsfm_core.cli import config, plugins
+from mpsfm_core.cli.errors import GuardedGroup
+
+
+def main() -> None:
+    """Entry point of the ``mpsfm`` command."""
+    build_app()(prog_name="mpsfm")
+
+
+def build_app() -> typer.Typer:
+    """The command line with all its commands."""
+    app = typer.Typer(
+        cls=GuardedGroup,
+        callback=_options,
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_show_locals=False,  # they would print whole images
+    )
+    app.add_typer(plugins.app, name="plugins")
+    app.add_typer(config.app, name="config")
+    return app
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from mpsfm_core.registry import core_version
+
+        typer.echo(core_version())
+        raise typer.Exit
+
+
+def _options(
+    debug: Annotated[
+        bool, typer.Option("--debug", envvar="MPSFM_DEBUG", help="Show tracebacks and debug logs.")
+    ] = False,
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="And exit.")
+    ] = False,
+) -> None:
+    """Structure-from-Motion with depth and normal priors from plugins."""
+    logging.basicConfig(format="mpsfm: %(levelname)s: %(message)s", level=logging.WARNING)
+    logging.getLogger("mpsfm_core").setLevel(logging.DEBUG if debug else logging.WARNING)

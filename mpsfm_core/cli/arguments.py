@@ -1,0 +1,18 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from typing import Annotated, TypeAlias
+
+import typer
+
+ConfigName: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        "--config", metavar="NAME_OR_FILE", help="A shipped configuration or a YAML file."
+    ),
+]
+Overrides: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, e.g. runtime.workers=2."),
+]
