@@ -1,0 +1,96 @@
+"""Resizing and padding: what a network sees, and where its output lies in the view."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpsfm_onnx.canvas import Canvas
+from mpsfm_onnx.description import FixedSize, ImageInput, SideSize
+
+from mpsfm_core.geometry import pixel_centers, scale_pixels
+
+RULES = [
+    FixedSize(mode="fixed", width=224, height=224),
+    FixedSize(mode="fixed", width=1064, height=616, fit="pad"),
+    FixedSize(mode="fixed", width=97, height=131, fit="pad"),
+    SideSize(mode="longest", side=518, multiple_of=14),
+    SideSize(mode="shortest", side=140, multiple_of=14, fit="pad"),
+    SideSize(mode="longest", side=999, multiple_of=32, enlarge=False, fit="pad"),
+]
+VIEWS = [(640, 480), (333, 517), (101, 20), (1, 1)]
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("stride", [1, 4, 7])
+def test_cut_output_covers_the_view_exactly(rule, view, stride):
+    """A network that outputs each cell's own position gives the view's positions back."""
+    canvas = Canvas.plan(rule, view)
+    cells = tuple(max(1, side // stride) for side in canvas.size)
+    positions = scale_pixels(pixel_centers(*cells), cells, canvas.size)  # canvas pixels
+    cut = canvas.cut(positions.astype(np.float32))
+    size = cut.shape[1], cut.shape[0]
+    expected = scale_pixels(pixel_centers(*size), size, canvas.image) + canvas.offset
+    # the outer half of the border's cells takes their value
+    expected = expected.clip(positions.min(axis=(0, 1)), positions.max(axis=(0, 1)))
+    np.testing.assert_allclose(cut, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_plan_keeps_the_aspect_ratio_when_padding(rule):
+    canvas = Canvas.plan(rule, (640, 480))
+    assert all(o >= 0 for o in canvas.offset)
+    assert all(o + i <= s for o, i, s in zip(canvas.offset, canvas.image, canvas.size, strict=True))
+    if rule.fit == "pad":
+        assert canvas.image[0] / canvas.image[1] == pytest.approx(640 / 480, rel=0.01)
+    if isinstance(rule, SideSize):
+        assert not any(side % rule.multiple_of for side in canvas.size)
+        if not rule.enlarge:
+            assert canvas.image == (640, 480)
+
+
+def test_painted_image_is_padded_centred_and_normalised():
+    rule = ImageInput(
+        scale=1 / 255,
+        mean=(0.1, 0.2, 0.3),
+        std=(0.5, 0.25, 2.0),
+        pad_value=(51.0, 102.0, 153.0),
+        size=FixedSize(mode="fixed", width=40, height=30, fit="pad"),
+    )
+    image = np.full((10, 20, 3), (255, 0, 127), dtype=np.uint8)
+    canvas = Canvas.plan(rule.size, (20, 10))
+    assert (canvas.image, canvas.offset) == ((40, 20), (0, 5))
+    tensor = canvas.paint(image, rule)
+    assert tensor.shape == (1, 3, 30, 40) and tensor.dtype == np.float32
+    inside = [(1 - 0.1) / 0.5, (0 - 0.2) / 0.25, (127 / 255 - 0.3) / 2]
+    outside = [(0.2 - 0.1) / 0.5, (0.4 - 0.2) / 0.25, (0.6 - 0.3) / 2]
+    for channel in range(3):
+        np.testing.assert_allclose(tensor[0, channel, 5:25], inside[channel], rtol=1e-5)
+        np.testing.assert_allclose(tensor[0, channel, :5], outside[channel], rtol=1e-5)
+        np.testing.assert_allclose(tensor[0, channel, 25:], outside[channel], rtol=1e-5)
+
+
+def test_other_layout_channel_order_and_type():
+    rule = ImageInput(
+        layout="NHWC",
+        channels="BGR",
+        dtype="uint8",
+        size=FixedSize(mode="fixed", width=3, height=2),
+    )
+    image = np.full((2, 3, 3), (10, 20, 30), dtype=np.uint8)
+    tensor = Canvas.plan(rule.size, (3, 2)).paint(image, rule)
+    assert tensor.shape == (1, 2, 3, 3) and tensor.dtype == np.uint8
+    assert tensor[0, 0, 0].tolist() == [30, 20, 10]
+
+
+@pytest.mark.parametrize("interpolation", ["area", "linear"])
+def test_resizing_does_not_move_the_image(interpolation):
+    """An edge at x = 80.0 of 200 stays there, whatever the canvas."""
+    image = np.zeros((60, 200, 3), dtype=np.uint8)
+    image[:, 80:] = 200
+    for width, height in ((200, 60), (100, 60), (150, 45), (310, 90)):
+        size = FixedSize(mode="fixed", width=width, height=height)
+        rule = ImageInput(interpolation=interpolation, size=size)
+        row = Canvas.plan(size, (200, 60)).paint(image, rule)[0, 0, 3]
+        dark = (1 - row / 200).sum() * 200 / width
+        assert dark == pytest.approx(80, abs=0.1 if interpolation == "area" else 0.35)

@@ -1,0 +1,88 @@
+"""Formulas, each against an independent computation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpsfm_onnx.decode import decode_depth, decode_normals, expected_angle, planes
+from mpsfm_onnx.description import ConfidenceOutput, DepthOutput, NormalsOutput
+from scipy.integrate import quad
+
+
+def depth_rule(**fields):
+    return DepthOutput(name="d", metric=True, **fields)
+
+
+@pytest.mark.parametrize("kappa", [0.0, 0.01, 0.5, 2.0, 17.0, 300.0])
+def test_expected_angle_is_the_mean_of_the_density(kappa):
+    def density(angle):
+        normaliser = 2 * np.pi * (1 + np.exp(-kappa * np.pi)) / (kappa**2 + 1)
+        return np.exp(-kappa * angle) / normaliser * 2 * np.pi * np.sin(angle)
+
+    peak = [1 / max(kappa, 1)]
+    total, _ = quad(density, 0, np.pi, points=peak)
+    mean, _ = quad(lambda a: a * density(a), 0, np.pi, points=peak)
+    assert total == pytest.approx(1, rel=1e-7)
+    assert expected_angle(np.array(kappa)) == pytest.approx(mean, rel=1e-7)
+
+
+def test_cautious_side_of_the_squared_angle():
+    """The density's variance along one tangent direction is 3/4 of it for large kappa."""
+    kappa = 60.0
+    density = [lambda a, p=p: a**p * np.exp(-kappa * a) * np.sin(a) for p in (0, 2)]
+    norm, second = (quad(f, 0, np.pi, points=[1 / kappa])[0] for f in density)
+    per_direction = second / norm / 2
+    assert per_direction / expected_angle(np.array(kappa)) ** 2 == pytest.approx(0.75, rel=0.01)
+
+
+def test_disparity_and_log_depth():
+    value = np.array([[0.5, 2.0, -1.0, 0.0]], dtype=np.float32)
+    disparity = decode_depth(value, depth_rule(output="disparity", scale=2.0, shift=1.0), 1.0)
+    assert disparity.valid.tolist() == [[True, True, False, True]]
+    np.testing.assert_allclose(disparity.depth[0, [0, 1, 3]], [1 / 2, 1 / 5, 1.0])
+    log = decode_depth(value, depth_rule(output="log-depth"), 1.0)
+    np.testing.assert_allclose(log.depth[0], np.exp(value[0]), rtol=1e-6)
+
+
+def test_valid_range_is_that_of_the_network_not_of_the_camera():
+    rule = depth_rule(canonical_focal=1000.0, valid_max=200.0, valid_min=0.5)
+    prior = decode_depth(np.array([[0.4, 100.0, 199.0, 201.0, np.nan]]), rule, 0.5)
+    assert prior.valid.tolist() == [[False, True, True, False, False]]
+    np.testing.assert_allclose(prior.depth[0, 1:3], [50.0, 99.5])
+
+
+@pytest.mark.parametrize(
+    ("output", "tensor", "std"),
+    [
+        ("confidence", 0.9, 0.2),
+        ("confidence", 1.5, 2e-4),
+        ("std", 0.3, 0.3),
+        ("variance", 0.09, 0.3),
+    ],
+)
+def test_uncertainty_scales_with_the_canonical_correction(output, tensor, std):
+    confidence = np.full((1, 1), tensor, dtype=np.float32)
+    rule = ConfidenceOutput(name="c", output=output)
+    for ratio in (1.0, 0.25, 3.0):
+        prior = decode_depth(np.full((1, 1), 2.0), depth_rule(), ratio, confidence, rule)
+        assert np.sqrt(prior.variance[0, 0]) == pytest.approx(std * ratio, rel=1e-5)
+
+
+def test_normals_are_turned_into_our_frame_and_normalised():
+    value = np.array([[[1.0, 2.0, 2.0], [0.0, 0.0, -1.0]]], dtype=np.float32)
+    prior = decode_normals(value, NormalsOutput(name="n", axes=(-1, -1, -1)))
+    np.testing.assert_allclose(prior.normals[0, 0], [-1 / 3, -2 / 3, -2 / 3], rtol=1e-6)
+    assert prior.valid.tolist() == [[True, False]]
+    assert prior.variance is None
+
+
+@pytest.mark.parametrize("layout", ["NCHW", "NHWC"])
+def test_planes_of_every_rank(layout):
+    grid = np.arange(6, dtype=np.float32).reshape(2, 3)
+    stacked = np.stack([grid, grid + 10, grid + 20], axis=0 if layout == "NCHW" else -1)
+    for tensor in (grid, grid[None], planes(grid, layout)[..., 0][None]):
+        np.testing.assert_array_equal(planes(tensor, layout), grid[..., None])
+    for tensor in (stacked, stacked[None]):
+        found = planes(tensor, layout)
+        assert found.shape == (2, 3, 3)
+        np.testing.assert_array_equal(found[..., 2], grid + 20)
