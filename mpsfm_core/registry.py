@@ -26,7 +26,7 @@ from mpsfm_core.discovery import (
     new_manager,
     spec_fault,
 )
-from mpsfm_core.errors import MpsfmError, ProviderError, did_you_mean
+from mpsfm_core.errors import InputError, MpsfmError, ProviderError, did_you_mean
 from mpsfm_core.options import Backend, Options, SettingPath, parse_settings
 from mpsfm_core.providers import (
     CAPABILITY_METHODS,
@@ -124,9 +124,7 @@ class Registry:
         if importlib.util.find_spec("mpsfm_core.builtin.plugin"):
             builtin = importlib.import_module("mpsfm_core.builtin.plugin")
             registry.register(builtin, name="builtin", distribution=CORE, version=core_version())
-        if timeout_s is None:
-            timeout_s = float(os.environ.get(TIMEOUT_VARIABLE, DEFAULT_TIMEOUT_S))
-        for plugin in installed_plugins(timeout_s):
+        for plugin in installed_plugins(_default_timeout() if timeout_s is None else timeout_s):
             registry._add(plugin)
         return registry
 
@@ -409,6 +407,14 @@ def _require_methods(entry: _Entry, provider: object, names: Sequence[str]) -> N
         if not callable(getattr(provider, name, None)):
             kind = type(provider).__name__
             raise ProviderError(f"{entry.label} gives a {kind} without the method {name}()")
+
+
+def _default_timeout() -> float:
+    value = os.environ.get(TIMEOUT_VARIABLE, "")
+    try:
+        return float(value) if value else DEFAULT_TIMEOUT_S
+    except ValueError as error:
+        raise InputError(f"{TIMEOUT_VARIABLE}={value!r} is not a number of seconds") from error
 
 
 def core_version() -> str:
