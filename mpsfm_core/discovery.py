@@ -59,7 +59,8 @@ def new_manager() -> pluggy.PluginManager:
 
 def installed_plugins(timeout_s: float) -> Iterator[Plugin]:
     """Load every entry point of the group ``mpsfm.plugins``, in the order of their names."""
-    for entry in sorted(_entry_points(), key=lambda e: (_distribution(e)[0], e.name)):
+    entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
+    for entry in sorted(entries, key=lambda e: (_distribution(e)[0], e.name)):
         name, version = _distribution(entry)
         yield _load(entry, name, version, timeout_s)
 
@@ -103,28 +104,6 @@ def spec_fault(spec: ProviderSpec) -> tuple[str, str]:
         hint = spec.install_hint or f"pip install {' '.join(missing)}"
         return f"needs {', '.join(missing)}, not installed", hint
     return "", ""
-
-
-def _entry_points() -> list[metadata.EntryPoint]:
-    try:
-        return list(metadata.entry_points(group=ENTRY_POINT_GROUP))
-    except Exception:
-        # One unreadable entry_points.txt anywhere makes the call above fail as a whole.
-        return list(_readable_entry_points())
-
-
-def _readable_entry_points() -> Iterator[metadata.EntryPoint]:
-    seen = set()
-    for distribution in metadata.distributions():
-        try:
-            name = distribution.metadata["Name"]
-            found = distribution.entry_points.select(group=ENTRY_POINT_GROUP)
-        except Exception as error:
-            _log.warning("skipping an installed distribution with broken metadata: %s", error)
-            continue
-        if name not in seen:
-            seen.add(name)
-            yield from found
 
 
 def _distribution(entry: metadata.EntryPoint) -> tuple[str, str]:

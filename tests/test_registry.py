@@ -178,10 +178,9 @@ class TestDiscovery:
         with pytest.raises(InputError, match="MPSFM_PLUGIN_TIMEOUT_S='soon'"):
             Registry.discover()
 
-    def test_damaged_metadata_of_a_stranger(self, install_plugin: InstallPlugin) -> None:
-        install_plugin("stranger", "", entry_points="[console_scripts]\nno equals sign here\n")
-        install_plugin("mpsfm-tiny", HEALTHY.format(name="tiny"))
-        assert only(Registry.discover(), "mpsfm-tiny").available
+    def test_an_entry_point_that_is_no_reference(self, install_plugin: InstallPlugin) -> None:
+        install_plugin("mpsfm-odd", "", entry_points="[mpsfm.plugins]\nodd = not a module!\n")
+        assert not only(Registry.discover(), "mpsfm-odd").available
 
     def test_one_module_under_two_entry_points(self, install_plugin: InstallPlugin) -> None:
         module = "mpsfm_twice_plugin"
