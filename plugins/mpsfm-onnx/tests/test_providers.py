@@ -198,7 +198,7 @@ def test_fastdepth_on_real_photos(shared_data, make_view, context):
     provider = OnnxDepth(OnnxOptions(model=str(model)), context)
     scene = shared_data / "data" / "hololens_room"
     errors, close, scales = [], [], []
-    for path in sorted((scene / "images").iterdir())[::12]:
+    for path in sorted((scene / "images").iterdir())[::6]:
         image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
         view = make_view(image.shape[1], image.shape[0], image=image)
         truth = cv2.imread(str(scene / "gt_depth" / f"{path.stem}.png"), cv2.IMREAD_UNCHANGED)
@@ -209,7 +209,7 @@ def test_fastdepth_on_real_photos(shared_data, make_view, context):
         ratio /= scales[-1]
         errors.append(np.abs(ratio - 1).mean())
         close.append((np.maximum(ratio, 1 / ratio) < 1.25).mean())
-    assert len(errors) > 8
+    assert len(errors) == 21
     assert 0.75 < np.median(scales) < 1.1  # metres, by and large; measured 0.89
     assert np.mean(errors) < 0.21
     assert np.mean(close) > 0.66
