@@ -1,0 +1,31 @@
+"""Refined depth maps as files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mpsfm_core.scene.reconstruction import Reconstruction
+
+
+def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
+    """Write ``folder/NAME.npz`` for each registered image, NAME with its own extension.
+
+    Arrays: ``depth`` (h, w) float32, z in the units of the model; ``variance`` (h, w) float32,
+    those units squared; ``valid`` (h, w) bool; ``camera`` (4,) float64, fx, fy, cx, cy on this
+    grid (COLMAP pixels, undistorted); ``cam_from_world`` (3, 4) float64.
+    """
+    for image in reconstruction.images:
+        height, width = image.depth.shape
+        path = folder / f"{image.name}.npz"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        assert image.depth.variance is not None  # of a refined map always
+        np.savez_compressed(
+            path,
+            depth=image.depth.depth,
+            variance=image.depth.variance,
+            valid=image.depth.valid,
+            camera=image.camera.resized(width, height).params,
+            cam_from_world=np.column_stack([image.rotation, image.translation]),
+        )

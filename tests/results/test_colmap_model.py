@@ -1,0 +1,107 @@
+"""The COLMAP model that pycolmap reads back."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from mpsfm_core.results import colmap_model
+from mpsfm_core.results.colmap_model import build_model, pinhole, point_colors, write_model
+
+DISTORTED = pycolmap.Camera(
+    model="OPENCV", width=200, height=150, params=[150, 151, 100, 75, 0.1, -0.05, 0.001, -0.002]
+)
+
+
+def keypoints_of(solved):
+    return [solved.problem.images[image.index].keypoints for image in solved.best.images]
+
+
+@pytest.fixture
+def model(solved) -> pycolmap.Reconstruction:
+    cameras = [pinhole(image.camera) for image in solved.best.images]
+    colors = point_colors(solved.best, keypoints_of(solved), solved.views.__getitem__)
+    return build_model(solved.best, cameras, keypoints_of(solved), colors)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_the_model_holds_what_the_reconstruction_holds(solved, model, tmp_path, text) -> None:
+    write_model(tmp_path, model, text=text)
+    read = pycolmap.Reconstruction(str(tmp_path))
+    assert read.num_reg_images() == 3
+    assert read.num_cameras() == 1
+    # 40 points in three images; the five that only one image sees are left out.
+    assert read.num_points3D() == 40
+    assert read.compute_num_observations() == 120
+    for image in solved.best.images:
+        stored = read.find_image_with_name(image.name)
+        np.testing.assert_allclose(
+            stored.cam_from_world().matrix()[:, :3], image.rotation, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            [point.xy for point in stored.points2D],
+            solved.problem.images[image.index].keypoints,
+            atol=1e-9,
+        )
+        for row, point in enumerate(stored.points2D):
+            assert point.has_point3D() == (row < 40)
+    # The poses, points, camera and keypoints belong together.
+    assert read.compute_mean_reprojection_error() < 1e-6
+
+
+def test_reprojection_errors_are_those_of_the_models_own_camera(solved) -> None:
+    xy = []
+    for image, keypoints in zip(solved.best.images, keypoints_of(solved), strict=True):
+        local = solved.best.points @ image.rotation.T + image.translation
+        seen = image.point_ids >= 0
+        exact = DISTORTED.img_from_cam(local[image.point_ids[seen]])
+        padded = np.vstack([exact, [[0, 0]]])
+        xy.append(np.where(seen[:, None], padded, keypoints) + np.array([3.0, 4.0]))
+    colors = np.zeros((len(solved.best.points), 3), np.uint8)
+    model = build_model(solved.best, [DISTORTED] * 3, xy, colors)
+    assert next(iter(model.cameras.values())).model_name == "OPENCV"
+    assert [point.error for point in model.points3D.values()] == pytest.approx([5.0] * 40)
+
+
+def test_different_cameras_stay_apart(solved) -> None:
+    cameras = [pinhole(image.camera) for image in solved.best.images]
+    cameras[1] = DISTORTED
+    colors = np.zeros((len(solved.best.points), 3), np.uint8)
+    model = build_model(solved.best, cameras, keypoints_of(solved), colors)
+    by_name = {image.name: image.camera_id for image in model.images.values()}
+    assert by_name["images/0.png"] == by_name["images/2.png"] != by_name["images/1.png"]
+
+
+def test_points_have_the_colour_of_the_photos(solved, model) -> None:
+    expected = point_colors(solved.best, keypoints_of(solved), solved.views.__getitem__)
+    stored = {tuple(point.xyz): point.color for point in model.points3D.values()}
+    for xyz, color in zip(solved.best.points[:40], expected[:40], strict=True):
+        np.testing.assert_array_equal(stored[tuple(xyz)], color)
+    image, view = solved.best.images[1], solved.views["images/1.png"]
+    # A point that one image sees has just that pixel's colour.
+    x, y = solved.problem.images[1].keypoints[41]
+    np.testing.assert_array_equal(expected[image.point_ids[41]], view.image[int(y), int(x)])
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_the_room_that_is_tried_is_enough(model, tmp_path: Path, text: bool, monkeypatch) -> None:
+    sizes = []
+    monkeypatch.setattr(colmap_model, "_try_room", lambda path, size: sizes.append(size))
+    write_model(tmp_path, model, text=text)
+    written = sum(path.stat().st_size for path in tmp_path.iterdir())
+    assert written <= sizes[0] <= 20 * written
+
+
+def test_a_disk_without_room_is_noticed_and_left_clean(model, tmp_path: Path) -> None:
+    _, limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limit))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write_model(tmp_path, model)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    assert list(tmp_path.iterdir()) == []
