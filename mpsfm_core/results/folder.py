@@ -27,23 +27,25 @@ def replacing(output: Path, entries: tuple[str, ...]) -> Iterator[Path]:
     """
     created = _make(output)
     try:
-        with _explained(output), tempfile.TemporaryDirectory(prefix=".mpsfm-", dir=output) as own:
-            fresh, old = Path(own, "new"), Path(own, "old")
+        with _scratch(output) as own:
+            fresh, old = own / "new", own / "old"
             fresh.mkdir()
             old.mkdir()
             yield fresh
             _swap(output, entries, fresh, old)
     except BaseException:
-        for folder in created:
-            with suppress(OSError):
-                folder.rmdir()
+        _remove_empty(created)
         raise
 
 
 def check_writable(output: Path) -> None:
-    """Raise :class:`InputError` now if :func:`replacing` would later, and leave nothing behind."""
-    with replacing(output, ()):
-        pass
+    """Raise :class:`InputError` now if :func:`replacing` would later; leaves nothing behind."""
+    created = _make(output)
+    try:
+        with _scratch(output):
+            pass
+    finally:
+        _remove_empty(created)
 
 
 def _swap(output: Path, entries: tuple[str, ...], fresh: Path, old: Path) -> None:
@@ -71,10 +73,18 @@ def _make(output: Path) -> list[Path]:
     return missing
 
 
+def _remove_empty(folders: list[Path]) -> None:
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
+
+
 @contextmanager
-def _explained(output: Path) -> Iterator[None]:
+def _scratch(output: Path) -> Iterator[Path]:
+    """A temporary folder below ``output``, on the same disk; errors of the disk are explained."""
     try:
-        yield
+        with tempfile.TemporaryDirectory(prefix=".mpsfm-", dir=output) as own:
+            yield Path(own)
     except OSError as error:
         if error.errno in _FULL:
             raise OutputError(
