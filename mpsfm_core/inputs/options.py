@@ -2,8 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from pydantic import Field
+
 from mpsfm_core.options import Options
 
 
 class InputOptions(Options):
     """How photos become views."""
+
+    max_image_size: int | None = Field(None, ge=32)
+    """Longer side in pixels to which larger images are reduced, null keeps their size (the paper's
+    evaluation; the published command reduces to 1200)."""
+    masks: Path | None = None
+    """Folder of masks of the original images, ``NAME.png`` or the name with ``.png`` for its own
+    extension; black pixels are not used (COLMAP's convention)."""
+    default_focal_ratio: float = Field(1.2, gt=0)
+    """Focal length over the longer side when nothing is known (COLMAP:
+    default_focal_length_factor)."""
+    blank_pixels: float = Field(0.0, ge=0, le=1)
+    """Undistortion: 0 keeps only the area that is seen everywhere, 1 keeps every original pixel
+    with empty (masked) corners (COLMAP's option and default)."""

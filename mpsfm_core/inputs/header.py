@@ -1,0 +1,138 @@
+"""Size, orientation and focal length from an image file's first bytes, without decoding it."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+_EXIF_SIGNATURE = b"Exif\x00\x00"
+_JPEG_SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD9)))
+_TYPE_FORMATS = {1: "B", 3: "H", 4: "I", 5: "II", 9: "i", 10: "ii"}
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
+_DIAGONAL_35MM = math.hypot(36.0, 24.0)
+_MAX_ASPECT_DIFFERENCE = 0.02
+"""Pixel rounding of a resized photo stays far below; a crop to another format far above."""
+
+_ORIENTATION, _EXIF_IFD = 0x0112, 0x8769
+_FOCAL_MM, _FOCAL_35MM = 0x920A, 0xA405
+_PIXELS_X, _PIXELS_Y = 0xA002, 0xA003
+_PLANE_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file says of its image.
+
+    ``size``: stored (width, height) before rotation, None where only decoding tells.
+    ``orientation``: EXIF's 1 to 8. ``tags``: numeric EXIF tags by number.
+    """
+
+    size: tuple[int, int] | None
+    orientation: int
+    tags: dict[int, float]
+
+    def focal_px(self, width: int, height: int) -> float | None:
+        """Focal length in pixels of the image at this (stored) size, None when EXIF has none.
+
+        The 35 mm equivalent is that of the diagonal (CIPA DCG-001); else focal length times
+        the resolution of the focal plane. None as well for an image that was cropped since.
+        """
+        recorded = self.tags.get(_PIXELS_X, 0.0), self.tags.get(_PIXELS_Y, 0.0)
+        if min(recorded) > 0:
+            ratio = (max(recorded) / min(recorded)) / (max(width, height) / min(width, height))
+            if abs(math.log(ratio)) > _MAX_ASPECT_DIFFERENCE:
+                return None
+        equivalent = self.tags.get(_FOCAL_35MM, 0.0)
+        if equivalent > 0:
+            return equivalent / _DIAGONAL_35MM * math.hypot(width, height)
+        focal_mm = self.tags.get(_FOCAL_MM, 0.0)
+        resolution = self.tags.get(_PLANE_RESOLUTION, 0.0)
+        unit_mm = _MM_PER_UNIT.get(int(self.tags.get(_PLANE_UNIT, 2)), 0.0)
+        if min(focal_mm, resolution, unit_mm) <= 0:
+            return None
+        reduction = max(width, height) / max(recorded) if max(recorded) > 0 else 1.0
+        return focal_mm * resolution / unit_mm * reduction
+
+
+def read_header(data: bytes) -> Header:
+    """Header of an encoded image; what is damaged or unknown is left out."""
+    size: tuple[int, int] | None = None
+    block: bytes | None = None
+    if data[:2] == b"\xff\xd8":
+        for marker, payload in _jpeg_segments(data):
+            if marker in _JPEG_SOF and len(payload) >= 5:
+                rows, columns = struct.unpack(">HH", payload[1:5])
+                size = (columns, rows)
+            elif marker == 0xE1 and payload.startswith(_EXIF_SIGNATURE):
+                block = block or payload[len(_EXIF_SIGNATURE) :]
+    elif data[:8] == b"\x89PNG\r\n\x1a\n":
+        size = struct.unpack(">II", data[16:24]) if len(data) >= 24 else None
+        block = next((c for name, c in _chunks(data, 8, ">") if name == b"eXIf"), None)
+    elif data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        block = next((c for name, c in _chunks(data, 12, "<") if name == b"EXIF"), None)
+        block = block.removeprefix(_EXIF_SIGNATURE) if block else None
+    elif data[:4] in (b"II*\x00", b"MM\x00*"):
+        # The decoder turns TIFFs upright itself, so that their stored size says nothing.
+        return Header(None, 1, _read_tags(data))
+    tags = _read_tags(block) if block else {}
+    orientation = int(tags.get(_ORIENTATION, 1))
+    return Header(size, orientation if 1 <= orientation <= 8 else 1, tags)
+
+
+def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Marker and payload of each segment before the pixels."""
+    position = 2
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker == 0xDA:
+            return
+        if marker == 0xFF or marker in _JPEG_WITHOUT_LENGTH:
+            position += 1 if marker == 0xFF else 2
+            continue
+        (length,) = struct.unpack_from(">H", data, position + 2)
+        yield marker, data[position + 4 : position + 2 + length]
+        position += 2 + length
+
+
+def _chunks(data: bytes, position: int, order: str) -> Iterator[tuple[bytes, bytes]]:
+    """Chunks of a PNG (big-endian, length first, CRC behind) or RIFF (name first, padded)."""
+    png = order == ">"
+    while position + 8 <= len(data):
+        first, second = data[position : position + 4], data[position + 4 : position + 8]
+        name, raw_length = (second, first) if png else (first, second)
+        (length,) = struct.unpack(order + "I", raw_length)
+        yield name, data[position + 8 : position + 8 + length]
+        position += 8 + length + (4 if png else length % 2)
+
+
+def _read_tags(block: bytes) -> dict[int, float]:
+    """Numeric tags of the first directory and the EXIF directory of a TIFF structure."""
+    order = {b"II": "<", b"MM": ">"}.get(block[:2])
+    if order is None or len(block) < 8:
+        return {}
+    tags = _read_directory(block, order, struct.unpack_from(order + "I", block, 4)[0])
+    if _EXIF_IFD in tags:
+        tags |= _read_directory(block, order, int(tags[_EXIF_IFD]))
+    return tags
+
+
+def _read_directory(block: bytes, order: str, offset: int) -> dict[int, float]:
+    tags = {}
+    try:
+        (count,) = struct.unpack_from(order + "H", block, offset)
+        for entry in range(offset + 2, offset + 2 + 12 * count, 12):
+            tag, kind, number = struct.unpack_from(order + "HHI", block, entry)
+            layout = _TYPE_FORMATS.get(kind)
+            if layout is None or number != 1:
+                continue
+            place = entry + 8
+            if struct.calcsize(order + layout) > 4:
+                (place,) = struct.unpack_from(order + "I", block, place)
+            values = struct.unpack_from(order + layout, block, place)
+            tags[tag] = values[0] / values[1] if len(values) == 2 and values[1] else values[0]
+    except struct.error:
+        pass  # the directory is cut off: what was read so far stands
+    return tags

@@ -1,0 +1,376 @@
+"""The images of a run: found, checked, given cameras, and loaded as views when needed."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import Bool, Float64, PinholeCamera, UInt8, View
+from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.inputs.header import Header, read_header
+from mpsfm_core.inputs.intrinsics import read_intrinsics
+from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.inputs.pixels import EXTENSIONS, decode_rgb, read_bytes, read_mask
+from mpsfm_core.inputs.undistortion import (
+    Warp,
+    is_pinhole,
+    pinhole_camera,
+    resized_camera,
+    to_original,
+)
+
+_log = logging.getLogger(__name__)
+
+FocalSource = Literal["intrinsics", "exif", "default"]
+
+_CACHED_BYTES = 512 << 20
+"""Decoded views that are kept: the matcher asks for each image many times."""
+_CACHED_WARPS = 2
+"""A warp has 8 bytes a pixel, and neighbouring images mostly share a camera."""
+_READERS = 4
+"""Threads that read and hash files."""
+_MENTIONED = 5
+
+
+@dataclass(frozen=True, eq=False)
+class SourceImage:
+    """One photo.
+
+    ``name``: path below the images folder, forward slashes. ``camera``: the original camera, for
+    the upright image; ``camera_id`` is the number in the intrinsics file, or counts distinct
+    cameras. ``pinhole``: the camera of the undistorted (maybe reduced) view. ``focal_known``:
+    False when the focal length is the default guess. ``digest``: SHA-256 of the file.
+    """
+
+    name: str
+    path: Path
+    camera: pycolmap.Camera
+    pinhole: PinholeCamera
+    focal_known: bool
+    focal_source: FocalSource
+    digest: str
+
+    def original_pixels(self, xy: Float64) -> Float64:
+        """Pixels (n, 2) of the undistorted view as pixels of the upright original image."""
+        return to_original(self.pinhole, self.camera, xy)
+
+    @property
+    def original_size(self) -> tuple[int, int]:
+        """(width, height) of the upright original image."""
+        return self.camera.width, self.camera.height
+
+
+class ImageSet:
+    """Images of a run in a fixed order, with their views on demand.
+
+    At most about 512 MB of decoded views are kept. Methods may be called from several threads.
+    """
+
+    def __init__(self, images: Sequence[SourceImage], options: InputOptions) -> None:
+        self.images = tuple(images)
+        self._options = options
+        self._lock = threading.Lock()
+        self._views: OrderedDict[int, View] = OrderedDict()
+        self._warps: OrderedDict[str, Warp] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __iter__(self) -> Iterator[SourceImage]:
+        return iter(self.images)
+
+    def __getitem__(self, index: int) -> SourceImage:
+        return self.images[index]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the images in order."""
+        return [image.name for image in self.images]
+
+    def view(self, index: int) -> View:
+        """The undistorted view of an image, decoded now or recently.
+
+        Raises :class:`InputError` when the file (or its mask) is unreadable or has changed.
+        """
+        with self._lock:
+            if index in self._views:
+                self._views.move_to_end(index)
+                return self._views[index]
+        view = self._load(self.images[index])
+        with self._lock:
+            self._views[index] = view
+            while len(self._views) > 1 and sum(map(_bytes, self._views.values())) > _CACHED_BYTES:
+                self._views.popitem(last=False)
+        return view
+
+    def pixel_key(self, index: int) -> str:
+        """Names the content of a view: equal keys mean equal pixels and mask.
+
+        Made of the file's hash and all that undistortion and reduction depend on; intrinsics of
+        an image that needs no undistortion do not enter.
+        """
+        image = self.images[index]
+        parts = [image.digest, str(image.pinhole.size)]
+        if not is_pinhole(image.camera):
+            parts += [_camera_key(image.camera), str(image.pinhole.params.tolist())]
+        mask = self._mask_path(image)
+        if mask is not None:
+            parts.append(hashlib.sha256(read_bytes(mask)).hexdigest())
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+    def _load(self, image: SourceImage) -> View:
+        data = read_bytes(image.path)
+        pixels = decode_rgb(data, read_header(data), image.path)
+        if (pixels.shape[1], pixels.shape[0]) != image.original_size:
+            raise InputError(f"image {image.path} has changed its size during the run")
+        mask = self._user_mask(image)
+        if is_pinhole(image.camera):
+            pixels = _resize(pixels, image.pinhole.size)
+            mask = None if mask is None else _resize_mask(mask, image.pinhole.size)
+            return View(image.name, pixels, image.pinhole, mask)
+        size = _reduced_size(image.original_size, self._options.max_image_size)
+        warp = self._warp(resized_camera(image.camera, size), image.pinhole)
+        pixels = warp.image(_resize(pixels, size))
+        if mask is not None:
+            mask = warp.mask(_resize_mask(mask, size))
+        elif not warp.valid.all():
+            mask = warp.valid
+        return View(image.name, pixels, image.pinhole, mask)
+
+    def _warp(self, camera: pycolmap.Camera, pinhole: PinholeCamera) -> Warp:
+        key = _camera_key(camera)
+        with self._lock:
+            if key not in self._warps:
+                self._warps[key] = Warp(camera, pinhole)
+                if len(self._warps) > _CACHED_WARPS:
+                    self._warps.popitem(last=False)
+            self._warps.move_to_end(key)
+            return self._warps[key]
+
+    def _mask_path(self, image: SourceImage) -> Path | None:
+        folder = self._options.masks
+        if folder is None:
+            return None
+        exact = folder / f"{image.name}.png"
+        candidates = [exact, (folder / image.name).with_suffix(".png")]
+        return next((path for path in candidates if path.is_file()), None)
+
+    def _user_mask(self, image: SourceImage) -> Bool | None:
+        path = self._mask_path(image)
+        if path is None:
+            return None
+        mask = read_mask(path)
+        if (mask.shape[1], mask.shape[0]) != image.original_size:
+            raise InputError(
+                f"mask {path} has {mask.shape[1]}x{mask.shape[0]} pixels, its image "
+                f"{image.name!r} has {image.camera.width}x{image.camera.height}"
+            )
+        return mask
+
+
+def load_images(
+    folder: Path,
+    intrinsics: Path | None = None,
+    image_list: Path | None = None,
+    options: InputOptions | None = None,
+) -> ImageSet:
+    """Find the images of a folder (and its subfolders) and their cameras; decodes no pixels yet.
+
+    Args:
+        folder: images, in any of the formats of :data:`mpsfm_core.inputs.pixels.EXTENSIONS`.
+        intrinsics: ``intrinsics.yaml`` or a COLMAP model (folder or ``cameras.txt``), for the
+            images upright (after EXIF rotation). Without it focal lengths come from EXIF, else
+            from ``options.default_focal_ratio`` with a warning.
+        image_list: text file with one name a line (``#`` starts a comment); its order is kept.
+        options: see :class:`InputOptions`.
+
+    Raises:
+        InputError: no or only one image, unreadable files, names of the list that do not exist
+            or come twice, intrinsics that do not fit. The message names the file.
+    """
+    options = options or InputOptions()
+    if options.masks is not None and not options.masks.is_dir():
+        raise InputError(f"masks folder {options.masks} does not exist")
+    names = _find(folder)
+    if image_list is not None:
+        names = _listed(image_list, names, folder)
+    if len(names) < 2:
+        found = f"only one image, {names[0]!r}" if names else "no images"
+        source = image_list or folder
+        raise InputError(f"{source} has {found}: a reconstruction needs two or more")
+    known = read_intrinsics(intrinsics) if intrinsics is not None else None
+    with ThreadPoolExecutor(_READERS) as pool:
+        files = list(pool.map(lambda name: _probe(folder / name), names))
+    _raise_unreadable(files)
+    guesses = _CameraGuesses(options)
+    images = []
+    for name, file in zip(names, files, strict=True):
+        focal: FocalSource = "intrinsics"
+        if known is not None:
+            camera = known.camera(name, file.size)
+        else:
+            camera, focal = guesses.camera(file)
+        images.append(_source_image(name, folder / name, file, camera, focal, options))
+    _warn_of_default(images, options)
+    return ImageSet(images, options)
+
+
+@dataclass(frozen=True)
+class _File:
+    """A probed image file: upright size, header and hash; or why it is unreadable."""
+
+    size: tuple[int, int]
+    header: Header
+    digest: str
+    fault: str = ""
+
+
+class _CameraGuesses:
+    """Cameras from EXIF, else the default; equal ones share an id."""
+
+    def __init__(self, options: InputOptions) -> None:
+        self._options = options
+        self._ids: dict[tuple[tuple[int, int], float], int] = {}
+
+    def camera(self, file: _File) -> tuple[pycolmap.Camera, FocalSource]:
+        """A SIMPLE_PINHOLE camera with the principal point in the centre."""
+        width, height = file.size
+        source: FocalSource = "exif"
+        focal = file.header.focal_px(width, height)
+        if focal is None:
+            source, focal = "default", self._options.default_focal_ratio * max(file.size)
+        number = self._ids.setdefault((file.size, focal), len(self._ids) + 1)
+        params = [focal, width / 2, height / 2]
+        camera = pycolmap.Camera(
+            model="SIMPLE_PINHOLE", width=width, height=height, params=params, camera_id=number
+        )
+        return camera, source
+
+
+def _source_image(
+    name: str,
+    path: Path,
+    file: _File,
+    camera: pycolmap.Camera,
+    focal: FocalSource,
+    options: InputOptions,
+) -> SourceImage:
+    size = _reduced_size(file.size, options.max_image_size)
+    reduced = camera if size == file.size else resized_camera(camera, size)
+    pinhole = pinhole_camera(reduced, options.blank_pixels)
+    return SourceImage(name, path, camera, pinhole, focal != "default", focal, file.digest)
+
+
+def _find(folder: Path) -> list[str]:
+    """Names of all images below the folder, in natural order; hidden files are left out."""
+    if not folder.is_dir():
+        raise InputError(f"images folder {folder} does not exist")
+    found = []
+    for path in folder.rglob("*"):
+        relative = path.relative_to(folder)
+        hidden = any(part.startswith(".") for part in relative.parts)
+        if path.suffix.lower() in EXTENSIONS and not hidden and path.is_file():
+            found.append(relative.as_posix())
+    return sorted(found, key=_natural)
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Sorts ``img2`` before ``img10``: names of a sequence are in the order they were taken."""
+    parts = re.split(r"(\d+)", name)
+    return [(1, int(p), p) if p.isdecimal() else (0, 0, p) for p in parts]
+
+
+def _listed(image_list: Path, names: list[str], folder: Path) -> list[str]:
+    try:
+        lines = image_list.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"image list {image_list} cannot be read: {error}") from error
+    listed = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    available, seen = set(names), set()
+    for name in listed:
+        if name in seen:
+            raise InputError(f"{image_list}: image {name!r} is listed twice")
+        if name not in available:
+            near = did_you_mean(name, names) if len(names) <= 1000 else ""
+            raise InputError(f"{image_list}: there is no image {name!r} in {folder}{near}")
+        seen.add(name)
+    return listed
+
+
+def _probe(path: Path) -> _File:
+    try:
+        data = read_bytes(path)
+        header = read_header(data)
+        size = header.size
+        if size is None or min(size) == 0:
+            pixels = decode_rgb(data, header, path)
+            size = pixels.shape[1], pixels.shape[0]
+        elif header.orientation >= 5:
+            size = size[1], size[0]
+    except InputError as error:
+        return _File((0, 0), Header(None, 1, {}), "", str(error))
+    return _File(size, header, hashlib.sha256(data).hexdigest())
+
+
+def _raise_unreadable(files: Sequence[_File]) -> None:
+    faults = [file.fault for file in files if file.fault]
+    if faults:
+        rest = len(faults) - _MENTIONED
+        more = f"; and {rest} more" if rest > 0 else ""
+        raise InputError("; ".join(faults[:_MENTIONED]) + more)
+
+
+def _warn_of_default(images: Sequence[SourceImage], options: InputOptions) -> None:
+    guessed = [image.name for image in images if image.focal_source == "default"]
+    if guessed:
+        _log.warning(
+            "%d of %d images (%s%s) have no known focal length: assuming %g times the longer "
+            "side; give intrinsics for a better result",
+            len(guessed),
+            len(images),
+            ", ".join(guessed[:_MENTIONED]),
+            ", ..." if len(guessed) > _MENTIONED else "",
+            options.default_focal_ratio,
+        )
+
+
+def _reduced_size(size: tuple[int, int], limit: int | None) -> tuple[int, int]:
+    if limit is None or max(size) <= limit:
+        return size
+    factor = limit / max(size)
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+
+
+def _resize(image: UInt8, size: tuple[int, int]) -> UInt8:
+    if (image.shape[1], image.shape[0]) == size:
+        return image
+    resized: UInt8 = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return resized
+
+
+def _resize_mask(mask: Bool, size: tuple[int, int]) -> Bool:
+    if (mask.shape[1], mask.shape[0]) == size:
+        return mask
+    resized = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)
+    allowed: Bool = resized > 0
+    return allowed
+
+
+def _camera_key(camera: pycolmap.Camera) -> str:
+    return f"{camera.model_name} {camera.width} {camera.height} {camera.params.tolist()}"
+
+
+def _bytes(view: View) -> int:
+    return view.image.nbytes + (0 if view.mask is None else view.mask.nbytes)

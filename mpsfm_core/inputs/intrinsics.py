@@ -1,0 +1,261 @@
+"""Cameras from a file: ``intrinsics.yaml`` or a COLMAP model.
+
+``intrinsics.yaml`` numbers its cameras::
+
+    1:
+      model: OPENCV            # any camera model of COLMAP; default PINHOLE (SIMPLE_PINHOLE for 3)
+      params: [600, 600, 320, 240, 0.1, 0, 0, 0]
+      width: 640               # optional, checked against the images
+      height: 480
+      images: all              # or a list of names; "all" means those that no list names
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+import yaml
+
+from mpsfm_core.errors import InputError, did_you_mean
+
+_DEFAULT_MODELS = {3: "SIMPLE_PINHOLE", 4: "PINHOLE"}
+_KEYS = ("model", "params", "width", "height", "images")
+_MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = 0.1, 10.0
+"""Focal length over the longer side (COLMAP: min/max_focal_length_ratio)."""
+_CENTRAL = (0.8, 1.25)
+"""Principal points of real cameras lie nearer to the image's centre than these ratios."""
+_SAME_SCALE = 0.1
+
+
+@dataclass(frozen=True)
+class CameraEntry:
+    """One camera of an intrinsics file.
+
+    ``size`` is None when the file does not give it. ``images``: names, or None for all that no
+    other camera names.
+    """
+
+    camera_id: int
+    model: str
+    params: tuple[float, ...]
+    size: tuple[int, int] | None
+    images: frozenset[str] | None
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """All cameras of an intrinsics file."""
+
+    source: Path
+    entries: tuple[CameraEntry, ...]
+
+    def camera(self, name: str, size: tuple[int, int]) -> pycolmap.Camera:
+        """The camera of an image of (width, height) pixels.
+
+        Raises :class:`InputError` when the file has none for it, or when it is for images of
+        another size.
+        """
+        entry = self._entry(name)
+        width, height = entry.size or size
+        camera = pycolmap.Camera(
+            model=entry.model,
+            width=width,
+            height=height,
+            params=list(entry.params),
+            camera_id=entry.camera_id,
+        )
+        fault = _fault(camera, entry, size)
+        if fault:
+            raise InputError(
+                f"{self.source}, camera {entry.camera_id}, image {name!r} "
+                f"({size[0]}x{size[1]} pixels): {fault}"
+            )
+        return camera
+
+    def _entry(self, name: str) -> CameraEntry:
+        for entry in self.entries:
+            if entry.images is not None and name in entry.images:
+                return entry
+        for entry in self.entries:
+            if entry.images is None:
+                return entry
+        listed = [image for entry in self.entries for image in entry.images or ()]
+        raise InputError(
+            f"{self.source} has no camera for image {name!r}{did_you_mean(name, listed)}; "
+            f"add it, or say 'images: all' for one camera"
+        )
+
+
+def read_intrinsics(path: Path) -> Intrinsics:
+    """Read ``intrinsics.yaml``, a COLMAP model folder, or its ``cameras.txt``.
+
+    Raises :class:`InputError` that names the file, the camera and what is wrong.
+    """
+    try:
+        if path.is_dir():
+            text = path / "cameras.txt"
+            entries = _from_text(text) if text.is_file() else _from_model(path)
+        elif path.suffix == ".txt":
+            entries = _from_text(path)
+        else:
+            entries = _from_yaml(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"intrinsics {path} cannot be read: {error}") from error
+    _check_lists(path, entries)
+    return Intrinsics(path, entries)
+
+
+def _from_yaml(path: Path) -> tuple[CameraEntry, ...]:
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise InputError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(data, Mapping) or not data:
+        raise InputError(f"{path}: expected numbered cameras, see the format in the documentation")
+    return tuple(_yaml_entry(path, key, value) for key, value in data.items())
+
+
+def _yaml_entry(path: Path, key: object, value: object) -> CameraEntry:
+    where = f"{path}, camera {key}"
+    if not isinstance(key, int) or isinstance(key, bool):
+        raise InputError(f"{where}: cameras are numbered (1:, 2:, ...)")
+    if not isinstance(value, Mapping):
+        raise InputError(f"{where}: expected a mapping with 'params' and 'images'")
+    for name in value:
+        if name not in _KEYS:
+            raise InputError(f"{where}: unknown key {name!r}{did_you_mean(str(name), _KEYS)}")
+    params: Any = value.get("params")
+    if not _is_list_of(params, (int, float)):
+        raise InputError(f"{where}: 'params' must be a list of numbers")
+    size: Any = (value.get("width"), value.get("height"))
+    if size == (None, None):
+        size = None
+    elif not _is_list_of(size, int):
+        raise InputError(f"{where}: 'width' and 'height' must both be whole numbers, or absent")
+    images: Any = value.get("images", "all")
+    if images != "all" and not _is_list_of(images, str):
+        raise InputError(f"{where}: 'images' must be 'all' or a list of names")
+    model = value.get("model") or _DEFAULT_MODELS.get(len(params))
+    return _entry(where, key, model, params, size, None if images == "all" else images)
+
+
+def _from_text(path: Path) -> tuple[CameraEntry, ...]:
+    """COLMAP's ``cameras.txt``, with the image names of the ``images.txt`` beside it."""
+    names: dict[int, list[str]] = {}
+    listing = path.with_name("images.txt")
+    if listing.is_file():
+        for line in _lines(listing)[::2]:
+            fields = line.split(maxsplit=9)
+            if len(fields) != 10:
+                raise InputError(f"{listing}: {line!r} is no image line of a COLMAP model")
+            names.setdefault(int(fields[8]), []).append(fields[9])
+    cameras = [line.split() for line in _lines(path) if line]
+    entries = []
+    for fields in cameras:
+        where = f"{path}, camera {fields[0]}"
+        try:
+            number, size = int(fields[0]), (int(fields[2]), int(fields[3]))
+            params = [float(value) for value in fields[4:]]
+        except (ValueError, IndexError) as error:
+            raise InputError(f"{where}: expected ID MODEL WIDTH HEIGHT PARAMS") from error
+        images = names.get(number, []) if names or len(cameras) > 1 else None
+        entries.append(_entry(where, number, fields[1], params, size, images))
+    return tuple(entries)
+
+
+def _lines(path: Path) -> list[str]:
+    lines = (line.strip() for line in path.read_text(encoding="utf-8").splitlines())
+    return [line for line in lines if not line.startswith("#")]
+
+
+def _from_model(path: Path) -> tuple[CameraEntry, ...]:
+    try:
+        model = pycolmap.Reconstruction(path)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"{path} is no COLMAP model: {error}") from error
+    names: dict[int, list[str]] = {}
+    for image in model.images.values():
+        names.setdefault(image.camera_id, []).append(image.name)
+    return tuple(
+        _entry(
+            f"{path}, camera {number}",
+            number,
+            camera.model_name,
+            list(camera.params),
+            (camera.width, camera.height),
+            names.get(number, []),
+        )
+        for number, camera in model.cameras.items()
+    )
+
+
+def _entry(
+    where: str,
+    number: int,
+    model: object,
+    params: Sequence[float],
+    size: tuple[int, int] | None,
+    names: Iterable[str] | None,
+) -> CameraEntry:
+    known = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    if model is None:
+        raise InputError(f"{where}: {len(params)} params need a 'model', one of {', '.join(known)}")
+    if model not in known:
+        raise InputError(f"{where}: unknown model {model!r}{did_you_mean(str(model), known)}")
+    camera = pycolmap.Camera(model=model, width=1, height=1, params=list(params))
+    if not camera.verify_params():
+        raise InputError(
+            f"{where}: {model} has the parameters {camera.params_info}, got {len(params)} values"
+        )
+    images = None if names is None else frozenset(names)
+    return CameraEntry(number, str(model), tuple(float(p) for p in params), size, images)
+
+
+def _check_lists(path: Path, entries: Sequence[CameraEntry]) -> None:
+    if sum(entry.images is None for entry in entries) > 1:
+        raise InputError(f"{path}: only one camera can be for 'all' images")
+    owners: dict[str, int] = {}
+    for entry in entries:
+        for name in entry.images or ():
+            if name in owners:
+                raise InputError(
+                    f"{path}: image {name!r} has two cameras, {owners[name]} and {entry.camera_id}"
+                )
+            owners[name] = entry.camera_id
+
+
+def _fault(camera: pycolmap.Camera, entry: CameraEntry, size: tuple[int, int]) -> str | None:
+    """Why the camera cannot belong to an image of this size, and what to do."""
+    if entry.size is not None and entry.size != size:
+        return (
+            f"the intrinsics are for {entry.size[0]}x{entry.size[1]} pixels; give those of the "
+            f"image as it is seen upright, or the images they were made for"
+        )
+    if not camera.is_perspective:
+        return f"{entry.model} images cannot be undistorted to a perspective view"
+    center = camera.principal_point_x, camera.principal_point_y
+    ratio = [2 * c / s for c, s in zip(center, size, strict=True)]
+    wanted = "give fx, fy, cx, cy in pixels of this image"
+    if not all(0 < r < 2 for r in ratio):
+        return f"the principal point ({center[0]:g}, {center[1]:g}) lies outside; {wanted}"
+    off_center = [not _CENTRAL[0] < r < _CENTRAL[1] for r in ratio]
+    if entry.size is None and all(off_center) and abs(ratio[0] / ratio[1] - 1) < _SAME_SCALE:
+        return (
+            f"the principal point ({center[0]:g}, {center[1]:g}) belongs to an image of about "
+            f"{2 * center[0]:.0f}x{2 * center[1]:.0f} pixels; {wanted} (or add width and height "
+            f"if it really is so far from the centre)"
+        )
+    focal_ratio = camera.mean_focal_length() / max(size)
+    if not _MIN_FOCAL_RATIO < focal_ratio < _MAX_FOCAL_RATIO:
+        return f"a focal length of {focal_ratio:.3g} times the longer side is not plausible"
+    return None
+
+
+def _is_list_of(value: object, kinds: type | tuple[type, ...]) -> bool:
+    return isinstance(value, (list, tuple)) and all(
+        isinstance(v, kinds) and not isinstance(v, bool) for v in value
+    )

@@ -1,0 +1,80 @@
+"""Pixels of an image file: upright, RGB, 8 bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mpsfm_core.data import Bool, UInt8
+from mpsfm_core.errors import InputError
+from mpsfm_core.inputs.header import Header, read_header
+
+EXTENSIONS = frozenset(
+    (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".webp", ".bmp", ".jp2", ".ppm", ".pgm")
+)
+"""File names that count as images; the content may be any of these formats."""
+
+
+def read_bytes(path: Path) -> bytes:
+    """The file's content; raises :class:`InputError` when it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"image {path} cannot be read: {error.strerror or error}") from error
+
+
+def decode_rgb(data: bytes, header: Header, path: Path) -> UInt8:
+    """(H, W, 3) uint8 RGB with the EXIF orientation applied.
+
+    16-bit values are scaled by 1/257, floats in [0, 1] by 255; grayscale is repeated, alpha
+    dropped. Raises :class:`InputError` when the file is no image or damaged.
+    """
+    pixels = _decode(data, path)
+    if pixels.ndim == 2:
+        rgb = cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB)
+    elif pixels.shape[2] == 2:
+        rgb = cv2.cvtColor(np.ascontiguousarray(pixels[..., 0]), cv2.COLOR_GRAY2RGB)
+    else:
+        rgb = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_BGR2RGB)
+    if rgb.dtype == np.uint16:
+        rgb = np.round(rgb / np.float32(257.0))
+    elif rgb.dtype != np.uint8:
+        rgb = np.round(np.clip(np.nan_to_num(rgb), 0, 1) * 255.0)
+    return orient(rgb.astype(np.uint8), header.orientation)
+
+
+def read_mask(path: Path) -> Bool:
+    """(H, W) bool from a mask image, upright: False where it is black."""
+    data = read_bytes(path)
+    rgb = decode_rgb(data, read_header(data), path)
+    return np.asarray(rgb.any(axis=2))
+
+
+def orient(image: UInt8, orientation: int) -> UInt8:
+    """The stored image turned upright; ``orientation`` is EXIF's (1: already upright)."""
+    if orientation >= 5:
+        image = np.swapaxes(image, 0, 1)
+    if orientation in (3, 4, 7, 8):
+        image = image[::-1]
+    if orientation in (2, 3, 6, 7):
+        image = image[:, ::-1]
+    return np.ascontiguousarray(image)
+
+
+def _decode(data: bytes, path: Path) -> NDArray[Any]:
+    if not data:
+        raise InputError(f"image {path} is empty")
+    try:
+        # Unchanged: OpenCV's own rotation and depth conversion differ between formats.
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise InputError(f"image {path} cannot be decoded: {error.err}") from error
+    if pixels is None:
+        raise InputError(
+            f"image {path} cannot be decoded: it is damaged or no image; replace or remove it"
+        )
+    return np.asarray(pixels)

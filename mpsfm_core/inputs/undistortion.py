@@ -1,0 +1,87 @@
+"""From the original camera to the pinhole camera of the whole pipeline, and back."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera, UInt8
+from mpsfm_core.geometry import inside, pixel_centers, rays, scale_pixels
+
+_ROWS = 256
+"""Rows of a warp that are computed at once: bounds the memory for large images."""
+
+
+def is_pinhole(camera: pycolmap.Camera) -> bool:
+    """Whether pixels of the camera are those of a pinhole camera already."""
+    return bool(camera.is_perspective_pinhole and camera.is_undistorted())
+
+
+def resized_camera(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:
+    """The same camera for an image resized to (width, height)."""
+    resized = pycolmap.Camera(camera.todict())
+    resized.rescale(*size)
+    return resized
+
+
+def pinhole_camera(camera: pycolmap.Camera, blank_pixels: float) -> PinholeCamera:
+    """The undistorted camera: COLMAP's choice of field of view, or the camera itself."""
+    if not is_pinhole(camera):
+        options = pycolmap.UndistortCameraOptions()
+        options.blank_pixels = blank_pixels
+        camera = pycolmap.undistort_camera(options, camera)
+    return PinholeCamera(
+        camera.width,
+        camera.height,
+        float(camera.focal_length_x if _has_two_focals(camera) else camera.focal_length),
+        float(camera.focal_length_y if _has_two_focals(camera) else camera.focal_length),
+        float(camera.principal_point_x),
+        float(camera.principal_point_y),
+    )
+
+
+def to_original(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64) -> Float64:
+    """Pixels (n, 2) of the undistorted view as pixels of the original camera."""
+    if is_pinhole(camera):
+        return scale_pixels(xy, pinhole.size, (camera.width, camera.height))
+    original: Float64 = camera.img_from_cam(rays(pinhole, xy))
+    return original
+
+
+class Warp:
+    """Resampling from a distorted image to its pinhole view; made once for each camera.
+
+    ``valid``: (h, w) bool, False where the view looks past the border of the original image.
+    """
+
+    def __init__(self, camera: pycolmap.Camera, pinhole: PinholeCamera) -> None:
+        centers = pixel_centers(pinhole.width, pinhole.height)
+        source = np.empty((*centers.shape[:2], 2), dtype=np.float32)
+        for start in range(0, pinhole.height, _ROWS):
+            block = centers[start : start + _ROWS]
+            xy = to_original(pinhole, camera, block.reshape(-1, 2))
+            source[start : start + _ROWS] = xy.reshape(block.shape)
+        self.valid: Bool = inside(source.astype(np.float64), (camera.width, camera.height))
+        self._source: Float32 = source - np.float32(0.5)
+
+    def image(self, image: UInt8) -> UInt8:
+        """The undistorted image, bilinear, black where nothing was seen."""
+        warped = cv2.remap(
+            image, self._source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        warped[~self.valid] = 0
+        result: UInt8 = warped
+        return result
+
+    def mask(self, mask: Bool) -> Bool:
+        """A mask of the original image on the view, nearest pixel, False where nothing was seen."""
+        warped = cv2.remap(
+            mask.astype(np.uint8), self._source, None, cv2.INTER_NEAREST, borderValue=0
+        )
+        result: Bool = (warped > 0) & self.valid
+        return result
+
+
+def _has_two_focals(camera: pycolmap.Camera) -> bool:
+    return len(camera.focal_length_idxs()) == 2
