@@ -1,8 +1,128 @@
-"""Every setting of the mapper, with its source."""
+"""Every setting of the mapper, with its source.
+
+"Reference" is the published system's default, "COLMAP" that of COLMAP 3.12's incremental mapper.
+Angles of the reference's initialisation were tuned with a formula that over-estimates angles; the
+values here are for true angles (chosen by ``benchmarks/ablation.py``).
+"""
 
 from __future__ import annotations
 
+from typing import Literal
+
+from pydantic import Field
+
+from mpsfm_core.optimize.bundle_adjustment import BundleOptions
+from mpsfm_core.optimize.depth_integration import IntegrationOptions
 from mpsfm_core.options import Options
+
+
+class InitializationOptions(Options):
+    """Choice of the first pair."""
+
+    max_pairs: int = Field(50, ge=1)
+    """How many pairs are tried, best first."""
+    min_inliers: int = Field(30, ge=3)
+    """PnP inliers a first pair needs (reference: abs_pose_min_num_inliers)."""
+    high_parallax_deg: float = Field(1.5, gt=0)
+    """A point triangulated with at least this angle counts for the essential matrix's pose."""
+    max_error_px: float = Field(4.0, gt=0)
+    """Essential matrix inlier threshold (COLMAP)."""
+
+
+class RegistrationOptions(Options):
+    """Absolute pose of the next image."""
+
+    next_view: Literal["match-scores", "inlier-matches", "visible-points"] = "match-scores"
+    """Rank by summed match scores, number of verified matches (both with the best registered
+    image), or number of 3D points seen (paper, next view selection; default: the paper's)."""
+    min_inliers: int = Field(30, ge=3)
+    """Reference and COLMAP: abs_pose_min_num_inliers."""
+    min_inlier_share: float = Field(0.7, ge=0, le=1)
+    """Share of the 2D-3D matches that must be inliers. Ours: on rendered_kitchen 96 % of the right
+    pairs pass, 30 % of the wrong ones."""
+    max_error_px: float = Field(12.0, gt=0)
+    """Reference and COLMAP: abs_pose_max_error."""
+    min_inlier_ratio: float = Field(0.25, gt=0, le=1)
+    """Reference and COLMAP: used for RANSAC's number of trials."""
+    lifting: bool = True
+    """Use depth-lifted single-view points (paper section 3.2); off for ablation."""
+    min_point_angle_deg: float = Field(1.0, ge=0)
+    """Points of smaller angle are replaced by lifts (reference: robust_triangles)."""
+    num_neighbors: int = Field(4, ge=0)
+    """Images beside the reference image whose points are used (reference: bundle of 5)."""
+    max_relaxations: int = Field(6, ge=0)
+    """Failure ladder: min_inliers and min_inlier_share are divided by 1.2 this many times
+    (reference)."""
+
+
+class TriangulationOptions(Options):
+    """Tracks and their points."""
+
+    min_angle_deg: float = Field(1.5, ge=0)
+    """Points of smaller angle are lifted from depth (reference: hard_angle; COLMAP: 1.5)."""
+    max_angle_error_deg: float = Field(2.0, gt=0)
+    """For a new image, before refinement (COLMAP: create/continue_max_angle_error)."""
+    max_error_px: float = Field(4.0, gt=0)
+    """For refined images: complete, merge, filter (COLMAP; times the keypoints' std)."""
+
+
+class RefinementOptions(Options):
+    """Alternation of depth integration and bundle adjustment (paper section 3.3)."""
+
+    integrate: bool = True
+    """Refine depth maps; off: the scaled priors are used."""
+    depth_regularization: bool = True
+    """C_reg in bundle adjustment; off for ablation."""
+    measure_depth_noise: bool = True
+    """Weigh depth by how well views agree (:mod:`mpsfm_core.mapping.depth_noise`); off: by the
+    declared variance alone."""
+    rescale: bool = True
+    """Estimate the scales of all priors anew in global refinement (reference: regular_resc)."""
+    local_images: int = Field(5, ge=2)
+    """Images of a local bundle, the new one included (reference; COLMAP: 6)."""
+    local_iterations: int = Field(2, ge=0)
+    """Reference and COLMAP: ba_local_max_refinements."""
+    local_max_change: float = Field(0.001, ge=0)
+    """Reference and COLMAP: ba_local_max_refinement_change."""
+    global_iterations: int = Field(5, ge=1)
+    """Reference and COLMAP: ba_global_max_refinements."""
+    global_max_change: float = Field(0.0005, ge=0)
+    """Reference and COLMAP: ba_global_max_refinement_change."""
+    global_growth: float = Field(0.3, gt=0)
+    """Refine globally when images or points grew by this share (reference; COLMAP: 0.1)."""
+    max_depth_ratio: float = Field(1.5, gt=1)
+    """Depth observations off by more than this factor are ignored (reference: scale_filter)."""
+    final_robust: bool = True
+    """End with a global refinement of sharper depth loss (paper, robust reconstruction)."""
+    final_depth_scale: float = Field(0.125, gt=0)
+    """Multiplies the depth loss scale then (reference: final_robustification)."""
+    anchor_min_angle_deg: float = Field(2.0, ge=0)
+    """Points of at least this angle anchor the integration (reference: robust_triangles)."""
+    bundle: BundleOptions = BundleOptions()
+    integration: IntegrationOptions = IntegrationOptions()
+
+
+class ConsistencyOptions(Options):
+    """Dense depth consistency check (paper section 3.4)."""
+
+    enabled: bool = True
+    check_at_end: bool = True
+    """Also check every image once at the end (paper)."""
+    max_violations: float = Field(0.15, gt=0)
+    """Share of violating pixels that rejects an image (reference: depth_cons_thresh)."""
+    max_violations_initial: float = Field(0.09, gt=0)
+    """The same for the first pair (reference: init_depth_cons_thresh)."""
+    max_deviation: float = Field(2.7, gt=0)
+    """Standard deviations in front of the seen surface that make a violation (paper gamma; the
+    reference's 0.6 x 15 / 3.33 in terms of the calibrated std)."""
+    min_pixels: int = Field(100, ge=1)
+    """Comparisons below this number say nothing (ours)."""
+    num_failures: int = Field(5, ge=1)
+    """Rejections before the threshold is relaxed (reference: dc_num_frames)."""
+    relaxation: float = Field(1.3, gt=1)
+    """Factor of a relaxation (reference)."""
+    max_relaxations: int = Field(4, ge=0)
+    """After these the check is skipped until the next success (reference)."""
 
 
 class MapperOptions(Options):
@@ -10,3 +130,12 @@ class MapperOptions(Options):
 
     seed: int = 0
     """Seed of every random choice (RANSAC)."""
+    min_model_size: int = Field(2, ge=2)
+    """Smallest component that is kept."""
+    max_components: int = Field(10, ge=1)
+    """Largest number of disconnected components."""
+    initialization: InitializationOptions = InitializationOptions()
+    registration: RegistrationOptions = RegistrationOptions()
+    triangulation: TriangulationOptions = TriangulationOptions()
+    refinement: RefinementOptions = RefinementOptions()
+    consistency: ConsistencyOptions = ConsistencyOptions()

@@ -1,0 +1,93 @@
+"""How good the depth priors are in this scene, measured from how well views agree.
+
+A prior declares a variance per pixel. Whether that is too large or too small, and how much the
+errors of neighbouring pixels have in common, shows when matched keypoints of two posed views are
+compared: the depth of one, carried into the other, against the other's own. Bundle adjustment
+takes observations as independent; a hundred observations with one common error must not count a
+hundred times.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mpsfm_core.data import Float64, Int64
+from mpsfm_core.scene.scene import Scene
+
+CELLS = 4
+"""Residuals are compared in a grid of this many cells per side (ours)."""
+MIN_RESIDUALS = 50
+"""Fewer say too little: the declaration stands (ours)."""
+MULTIPLIER_RANGE = (0.1, 10.0)
+"""Bounds of the multiplier (ours): a declaration is not off by more without being broken."""
+
+
+class DepthNoise(NamedTuple):
+    """``multiplier`` of the declared std, and ``design_effect``: by how much the variance of a
+    mean of residuals exceeds that of independent ones (Kish, Survey Sampling, 1965)."""
+
+    multiplier: float = 1.0
+    design_effect: float = 1.0
+
+    @property
+    def std_factor(self) -> float:
+        """Factor of the declared std that makes observations count as if independent."""
+        return self.multiplier * float(np.sqrt(self.design_effect))
+
+
+def measure_depth_noise(scene: Scene) -> DepthNoise:
+    """Compare the scaled priors of all pairs of registered views at their common points."""
+    residuals, groups = _cross_view_residuals(scene)
+    if len(residuals) < MIN_RESIDUALS:
+        return DepthNoise()
+    spread = 1.4826 * float(np.median(np.abs(residuals)))
+    multiplier = float(np.clip(spread, *MULTIPLIER_RANGE))
+    clipped = np.clip(residuals / max(spread, 1e-12), -3, 3)
+    return DepthNoise(multiplier, _design_effect(clipped, groups))
+
+
+def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
+    """Whitened log differences (m,) and the group of each: a cell of one view beside another."""
+    graph, tracks, maps = scene.graph, scene.tracks, scene.maps
+    point = tracks.point_of[graph.source]
+    same = (point >= 0) & (point == tracks.point_of[graph.target])
+    source, target = graph.source[same], graph.target[same]
+    active = np.array([m.active for m in maps])[graph.image_of]
+    prior = np.concatenate([m.prior_at_keypoints() * m.scale for m in maps])
+    known = np.concatenate([m.keypoint_valid for m in maps]) & active & (prior > 0)
+    both = known[source] & known[target]
+    source, target = source[both], target[both]
+    a, b = graph.image_of[source], graph.image_of[target]
+    camera_points = scene.rays(source) * prior[source, None]
+    world = np.einsum("nji,nj->ni", scene.rotations[a], camera_points - scene.translations[a])
+    carried = np.einsum("nj,nj->n", scene.rotations[b, 2], world) + scene.translations[b, 2]
+    centers = scene.centers()
+    origin = np.einsum("nj,nj->n", scene.rotations[b, 2], centers[a]) + scene.translations[b, 2]
+    front = carried > 1e-9
+    source, target, carried, origin = source[front], target[front], carried[front], origin[front]
+    log_std = np.concatenate([m.keypoint_log_std for m in maps])
+    gain = (carried - origin) / carried
+    variance = (gain * log_std[source]) ** 2 + log_std[target] ** 2
+    residuals = np.log(carried / prior[target]) / np.sqrt(np.maximum(variance, 1e-12))
+    size = np.array([image.camera.size for image in scene.problem.images])
+    place = np.floor(CELLS * scene.keypoints[source] / size[graph.image_of[source]])
+    row, column = np.clip(place, 0, CELLS - 1).astype(np.int64).T
+    pair = graph.image_of[source] * scene.num_images + graph.image_of[target]
+    return residuals, (pair * CELLS + row) * CELLS + column
+
+
+def _design_effect(values: Float64, groups: Int64) -> float:
+    """``1 + (mean group size - 1) * intraclass correlation`` by analysis of variance, >= 1."""
+    _, group, sizes = np.unique(groups, return_inverse=True, return_counts=True)
+    count, total = len(sizes), len(values)
+    if count < 2 or total <= count:
+        return 1.0
+    means = np.bincount(group, values) / sizes
+    between = float((sizes * means**2).sum()) / count
+    within = float(((values - means[group]) ** 2).sum()) / (total - count)
+    typical = (total - float((sizes**2).sum()) / total) / (count - 1)
+    correlation = (between - within) / max(between + (typical - 1) * within, 1e-12)
+    weighted_size = float((sizes**2).sum()) / total
+    return 1.0 + max(weighted_size - 1, 0.0) * float(np.clip(correlation, 0, 1))

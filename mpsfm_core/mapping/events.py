@@ -1,0 +1,23 @@
+"""What the mapper tells the outside while it works."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class MappingEvents(Protocol):
+    """Receives progress; the pipeline forwards it to plugins and progress bars."""
+
+    def image_registered(self, name: str, registered: int, total: int) -> None: ...
+
+    def image_rejected(self, name: str, reason: str) -> None: ...
+
+
+class Silent:
+    """Nobody listens."""
+
+    def image_registered(self, name: str, registered: int, total: int) -> None:
+        """Nothing."""
+
+    def image_rejected(self, name: str, reason: str) -> None:
+        """Nothing."""

@@ -1,0 +1,265 @@
+"""The incremental loop: first pair, next images, refinement, checks (paper, system overview)."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
+from mpsfm_core.mapping.depth_consistency import check_image
+from mpsfm_core.mapping.events import MappingEvents, Silent
+from mpsfm_core.mapping.failure_ladder import FailureLadder
+from mpsfm_core.mapping.filtering import filter_points, lost_images
+from mpsfm_core.mapping.finishing import finished
+from mpsfm_core.mapping.initialization import initial_pose, rank_initial_pairs
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.refinement import Refiner
+from mpsfm_core.mapping.registration import find_pose
+from mpsfm_core.mapping.triangulation import triangulate_image
+from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
+from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
+from mpsfm_core.scene.scene import Scene
+
+
+def reconstruct(
+    problem: MappingProblem,
+    options: MapperOptions | None = None,
+    events: MappingEvents | None = None,
+) -> MappingResult:
+    """Pose as many images as can be posed confidently, with points and refined depth.
+
+    Disconnected groups of images become reconstructions of their own, the largest first. The
+    result is the same bit for bit for the same problem, options and machine.
+    """
+    mapper = Mapper(problem, options or MapperOptions(), events or Silent())
+    components = list(mapper.components())
+    components.sort(key=lambda component: -len(component.images))
+    if components:
+        for component in components:
+            for image in component.images:
+                mapper.image_reasons.pop(image.name, None)
+    return MappingResult(
+        tuple(components),
+        MappingReport(
+            mapper.image_reasons, mapper.pair_reasons, dict(mapper.seconds), dict(mapper.counts)
+        ),
+    )
+
+
+class Mapper:
+    """State of one run; :meth:`components` is the loop."""
+
+    def __init__(
+        self, problem: MappingProblem, options: MapperOptions, events: MappingEvents
+    ) -> None:
+        self.problem = problem
+        self.options = options
+        self.events = events
+        self.image_reasons = {
+            image.name: "no verified match with a registered image" for image in problem.images
+        }
+        self.pair_reasons: dict[str, str] = {}
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.counts: dict[str, int] = defaultdict(int)
+
+    def components(self) -> Iterator[Reconstruction]:
+        """Reconstruct one group of images after the other."""
+        available = np.ones(len(self.problem.images), dtype=np.bool_)
+        for _ in range(self.options.max_components):
+            self._begin()
+            if not self._initialize(available):
+                return
+            while self._register_next(available):
+                if self._grown():
+                    self._refine_globally()
+            self._finish()
+            available &= ~self.scene.registered
+            if self.scene.registered.sum() >= self.options.min_model_size:
+                yield finished(self.scene)
+
+    def _begin(self) -> None:
+        self.scene = Scene(self.problem)
+        self.scores = pair_score_matrix(self.scene, self.options.registration.next_view)
+        self.refiner = Refiner(self.scene, self.options, self.scores)
+        self.ladder = FailureLadder(self.options.registration, self.options.consistency)
+        self._last_size = (0, 0)
+
+    def _initialize(self, available: Bool) -> bool:
+        """Find the first pair among the available images and refine it."""
+        pairs = [
+            pair
+            for pair in rank_initial_pairs(self.scene)
+            if available[pair.image_a] and available[pair.image_b]
+        ]
+        for pair in pairs[: self.options.initialization.max_pairs]:
+            with self._timed("initialization"):
+                reason = self._try_pair(pair)
+            if reason is None:
+                self._accept(pair.image_a)
+                self._accept(pair.image_b)
+                self._refine_globally()
+                return True
+            names = [self.problem.images[i].name for i in (pair.image_a, pair.image_b)]
+            self.pair_reasons[" ".join(names)] = reason
+            self._begin()
+        return False
+
+    def _try_pair(self, pair: VerifiedPair) -> str | None:
+        """Start with a pair; None, or why it cannot be the first."""
+        pose = initial_pose(self.scene, pair, self.options)
+        if isinstance(pose, str):
+            return pose
+        a, b = pair.image_a, pair.image_b
+        self.scene.register(a, np.eye(3), np.zeros(3))
+        self.scene.maps[a].set_scale(1.0)
+        self.scene.register(b, pose.rotation, pose.translation)
+        triangulate_image(self.scene, b, self.options.triangulation)
+        self.refiner.estimate_scale(b, [])
+        self.refiner.adjust([a, b])
+        filter_points(self.scene, self.options.triangulation)
+        if lost_images(self.scene):
+            return "too few points are left after refinement"
+        self.refiner.estimate_scale(a, [])
+        self.refiner.estimate_scale(b, [])
+        self.refiner.integrate([a, b])
+        self.refiner.adjust([a, b])
+        filter_points(self.scene, self.options.triangulation)
+        if lost_images(self.scene):
+            return "too few points are left after refinement"
+        limit = self.options.consistency.max_violations_initial
+        return self._contradiction(b, [a], limit if self.options.consistency.enabled else None)
+
+    def _register_next(self, available: Bool) -> bool:
+        """Register one more image, relaxing step by step; False when none can be."""
+        options = self.options.registration
+        while True:
+            ranked = rank_next_images(self.scene, self.scores, available, options)
+            for image, reference in ranked:
+                snapshot = self.scene.snapshot()
+                reason = self._try_image(image, reference)
+                if reason is None:
+                    self.ladder.reset()
+                    self._accept(image)
+                    return True
+                self.scene.restore(snapshot)
+                self.refiner.forget(image)
+                self._reject(image, reason)
+                if self.ladder.enough_failures:
+                    break
+            if not ranked or not self.ladder.relax():
+                return False
+
+    def _try_image(self, image: int, reference: int) -> str | None:
+        """Pose an image, grow and refine its surroundings; None, or why it is rejected."""
+        scene, options = self.scene, self.options
+        with self._timed("registration"):
+            neighbors = options.registration.num_neighbors
+            references = local_bundle(scene, reference, neighbors, self.scores)
+            pose = find_pose(scene, image, references, options.registration, options.seed)
+            if pose is None:
+                return "PnP found no pose"
+            if pose.num_inliers < self.ladder.min_inliers:
+                return f"PnP found {pose.num_inliers} inliers, {self.ladder.min_inliers} needed"
+            if pose.inlier_share < self.ladder.min_inlier_share:
+                return f"only {pose.inlier_share:.0%} of the matches agree with the PnP pose"
+            scene.register(image, pose.rotation, pose.translation)
+            triangulate_image(scene, image, options.triangulation)
+        with self._timed("local refinement"):
+            bundle = local_bundle(
+                scene, image, options.refinement.local_images - 1, self.scores
+            )
+            self.refiner.estimate_scale(image, bundle[1:])
+            self.refiner.adjust([image], local=True)
+            filter_points(scene, options.triangulation)
+            if image in lost_images(scene):
+                return "too few points are left after refinement"
+            self.refiner.estimate_scale(image, bundle[1:])
+            self.refiner.integrate([image])
+        reason = self._contradiction(image, bundle[1:], self.ladder.max_violations)
+        if reason:
+            self.ladder.check_failures += 1
+            return reason
+        with self._timed("local refinement"):
+            self.refiner.refine_locally(image)
+        lost = lost_images(scene)
+        if image in lost:
+            return "too few points are left after refinement"
+        self._drop(lost, "lost its points when another image was refined")
+        return None
+
+    def _contradiction(self, image: int, neighbors: list[int], limit: float | None) -> str | None:
+        """Why the depth of an image contradicts its neighbours', if it does."""
+        if limit is None or not neighbors:
+            return None
+        with self._timed("depth check"):
+            check = check_image(self.scene, image, neighbors, self.options.consistency)
+        if check.score <= limit:
+            return None
+        return f"{check.score:.0%} of the compared pixels contradict its neighbours' depth"
+
+    def _grown(self) -> bool:
+        """Whether images or points grew so much that everything should be refined."""
+        images, points = int(self.scene.registered.sum()), len(self.scene.tracks)
+        growth = 1 + self.options.refinement.global_growth
+        return images > growth * self._last_size[0] or points > growth * self._last_size[1]
+
+    def _refine_globally(self, *, final: bool = False) -> None:
+        with self._timed("global refinement"):
+            self.refiner.refine_globally(final=final)
+            self.scene.tracks.compact()
+        self._last_size = int(self.scene.registered.sum()), len(self.scene.tracks)
+        self._drop(lost_images(self.scene), "lost its points in global refinement")
+
+    def _finish(self) -> None:
+        """Last refinements, and the depth check once more for every image."""
+        self._refine_globally()
+        consistency = self.options.consistency
+        if consistency.enabled and consistency.check_at_end:
+            self._check_all()
+        if self.options.refinement.final_robust:
+            self._refine_globally(final=True)
+
+    def _check_all(self) -> None:
+        """Deregister the image that contradicts its neighbours most until none does."""
+        neighbors = self.options.registration.num_neighbors
+        while self.scene.registered.sum() > 2:
+            worst, reason = 0.0, ""
+            for image in map(int, self.scene.registered_images()):
+                bundle = local_bundle(self.scene, image, neighbors, self.scores)
+                with self._timed("depth check"):
+                    score = check_image(self.scene, image, bundle[1:], self.options.consistency)
+                if score.score > worst:
+                    worst, suspect = score.score, image
+            if worst <= self.options.consistency.max_violations:
+                return
+            reason = f"at the end {worst:.0%} of the pixels contradict its neighbours' depth"
+            self._drop([suspect], reason)
+
+    def _accept(self, image: int) -> None:
+        registered, total = int(self.scene.registered.sum()), len(self.problem.images)
+        self.events.image_registered(self.problem.images[image].name, registered, total)
+
+    def _reject(self, image: int, reason: str) -> None:
+        name = self.problem.images[image].name
+        self.image_reasons[name] = reason
+        self.events.image_rejected(name, reason)
+
+    def _drop(self, images: list[int], reason: str) -> None:
+        """Take images out that were registered before; the run goes on."""
+        for image in images:
+            self.scene.deregister(image)
+            self.refiner.forget(image)
+            self._reject(image, reason)
+
+    @contextmanager
+    def _timed(self, step: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[step] += time.perf_counter() - start
+            self.counts[step] += 1

@@ -1,0 +1,247 @@
+"""Local and global refinement: depth integration and bundle adjustment in turn (section 3.3)."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.mapping.depth_noise import DepthNoise, measure_depth_noise
+from mpsfm_core.mapping.filtering import filter_points
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.triangulation import complete_and_merge, lift_low_parallax
+from mpsfm_core.mapping.view_selection import local_bundle
+from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
+from mpsfm_core.optimize.covariance import depth_variance_of_points, point_covariances
+from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
+from mpsfm_core.scene.scene import Scene
+
+LOCAL_MAX_TRACK_LENGTH = 15
+"""Longer tracks stay fixed in local bundle adjustment (COLMAP, reference)."""
+MIN_SCALE_POINTS = 20
+"""Fewer well triangulated points do not change a scale again (ours)."""
+
+
+class Refiner:
+    """Refines a scene; remembers the integrators and how well depth and points agree.
+
+    ``noise``: how good the priors are in this scene; refreshed by global refinement.
+    """
+
+    def __init__(self, scene: Scene, options: MapperOptions, scores: Float64) -> None:
+        self.scene = scene
+        self.options = options.refinement
+        self.triangulation = options.triangulation
+        self.scores = scores
+        self.noise = DepthNoise()
+        self._integrators: dict[int, DepthIntegrator] = {}
+
+    def estimate_scale(self, image: int, others: list[int]) -> None:
+        """Scale an image's prior so that it agrees with its points (paper eq. 1).
+
+        Points whose scale is far from that of the ``others`` are ignored if the prior is metric;
+        if none is left, the image takes their mean.
+        """
+        scene = self.scene
+        depth_map = scene.maps[image]
+        keypoints, z = self._observed_depth(image)
+        rows = keypoints - scene.graph.offsets[image]
+        valid = depth_map.keypoint_valid[rows] & (z > 0)
+        log_scales = np.log(z[valid] / depth_map.prior_at_keypoints(rows)[valid])
+        if depth_map.prior.metric and others:
+            mean = float(np.mean([np.log(scene.maps[other].scale) for other in others]))
+            near = np.abs(log_scales - mean) < np.log(self.options.max_depth_ratio)
+            log_scales = log_scales[near] if near.any() else np.array([mean])
+        if len(log_scales):
+            depth_map.set_scale(float(np.exp(np.median(log_scales))))
+
+    def rescale(self, images: list[int]) -> None:
+        """Estimate all scales anew from points that rays determine; their mean stays."""
+        scene, tracks = self.scene, self.scene.tracks
+        stable = scene.track_angles_deg() >= self.options.anchor_min_angle_deg
+        log_scales = np.array([np.log(scene.maps[image].scale) for image in images])
+        updated = log_scales.copy()
+        for position, image in enumerate(images):
+            depth_map = scene.maps[image]
+            keypoints, z = self._observed_depth(image)
+            rows = keypoints - scene.graph.offsets[image]
+            prior = depth_map.prior_at_keypoints(rows)
+            good = depth_map.keypoint_valid[rows] & (z > 0) & (prior > 0)
+            good &= stable[tracks.point_of[keypoints]]
+            good[good] &= self._near(z[good] / (depth_map.scale * prior[good]))
+            if good.sum() >= MIN_SCALE_POINTS:
+                updated[position] = np.median(np.log(z[good] / prior[good]))
+        updated += log_scales.mean() - updated.mean()
+        for image, log_scale in zip(images, updated, strict=True):
+            scene.maps[image].set_scale(float(np.exp(log_scale)))
+
+    def integrate(self, images: list[int]) -> None:
+        """Refine the depth maps of some images against the current points."""
+        if not self.options.integrate:
+            return
+        covariances = self._covariances()
+        with ThreadPoolExecutor(max_workers=2) as pool:
+            list(pool.map(lambda image: self._integrate(image, *covariances), images))
+
+    def adjust(
+        self,
+        variable: list[int],
+        *,
+        points_only: bool = False,
+        local: bool = False,
+        depth_scale: float = 1.0,
+    ) -> None:
+        """Bundle-adjust the poses of some images and the points they see.
+
+        ``points_only``: poses stay, and depth counts quadratically (reference). ``local``: long
+        tracks stay too. ``depth_scale`` multiplies the scale of the depth loss.
+        """
+        scene, tracks = self.scene, self.scene.tracks
+        observations = tracks.observations()
+        image_of = scene.graph.image_of[observations]
+        seen = np.zeros(len(tracks.xyz), dtype=np.bool_)
+        seen[tracks.point_of[observations[np.isin(image_of, variable)]]] = True
+        observations = observations[seen[tracks.point_of[observations]]]
+        if not len(observations):
+            return
+        images, image_rows = np.unique(scene.graph.image_of[observations], return_inverse=True)
+        points, point_rows = np.unique(tracks.point_of[observations], return_inverse=True)
+        moving = np.isin(images, variable) & (not points_only)
+        if moving.all():
+            moving[0] = False
+        long_track = np.bincount(point_rows) >= LOCAL_MAX_TRACK_LENGTH
+        log_depth, log_std = self._depth_observations(observations)
+        options = self.options.bundle
+        scale = options.depth_scale * depth_scale / np.sqrt(self.noise.design_effect)
+        result = adjust_bundle(
+            BundleProblem(
+                rotations=scene.rotations[images],
+                translations=scene.translations[images],
+                intrinsics=scene.intrinsics[images],
+                camera_of_image=np.arange(len(images)),
+                points=tracks.xyz[points],
+                obs_image=image_rows,
+                obs_point=point_rows,
+                obs_xy=scene.keypoints[observations],
+                obs_std_px=scene.keypoint_std_px[images][image_rows],
+                obs_log_depth=log_depth if self.options.depth_regularization else None,
+                obs_std_log_depth=log_std * self.noise.std_factor,
+                variable_pose=moving,
+                variable_point=~long_track if local else None,
+            ),
+            options.model_copy(update={"depth_scale": scale}),
+        )
+        scene.rotations[images] = result.rotations
+        scene.translations[images] = result.translations
+        tracks.xyz[points] = result.points
+
+    def refine_locally(self, image: int) -> None:
+        """Refine an image and its neighbours until little changes."""
+        options = self.options
+        complete_and_merge(self.scene, self.triangulation, create=False)
+        for _ in range(options.local_iterations):
+            bundle = local_bundle(self.scene, image, options.local_images - 1, self.scores)
+            self.integrate([image])
+            self.adjust(bundle, local=True)
+            changed = filter_points(self.scene, self.triangulation)
+            changed += complete_and_merge(self.scene, self.triangulation, create=False)
+            if changed < options.local_max_change * max(self._num_observations(), 1):
+                break
+
+    def refine_globally(self, *, final: bool = False) -> None:
+        """Refine everything until little changes; ``final`` sharpens the depth loss."""
+        options = self.options
+        images = [int(i) for i in self.scene.registered_images()]
+        complete_and_merge(self.scene, self.triangulation, create=True)
+        lift_low_parallax(self.scene, self.triangulation)
+        for _ in range(options.global_iterations):
+            if options.rescale:
+                self.rescale(images)
+            self.integrate(images)
+            if options.measure_depth_noise:
+                self.noise = measure_depth_noise(self.scene)
+            self.adjust(images, depth_scale=options.final_depth_scale if final else 1.0)
+            changed = filter_points(self.scene, self.triangulation)
+            changed += complete_and_merge(self.scene, self.triangulation, create=False)
+            if changed < options.global_max_change * max(self._num_observations(), 1):
+                break
+
+    def forget(self, image: int) -> None:
+        """Drop what is remembered of an image that left the scene."""
+        self._integrators.pop(image, None)
+
+    def _integrate(self, image: int, covariances: Float64, angles: Float64) -> None:
+        scene, tracks = self.scene, self.scene.tracks
+        depth_map = scene.maps[image]
+        keypoints, z = self._observed_depth(image)
+        points = tracks.point_of[keypoints]
+        rows = keypoints - scene.graph.offsets[image]
+        rotation = np.broadcast_to(scene.rotations[image], (len(points), 3, 3))
+        variance = depth_variance_of_points(covariances[points], rotation)
+        ratio = z / np.maximum(depth_map.scale * depth_map.prior_at_keypoints(rows), 1e-12)
+        good = (angles[points] >= self.options.anchor_min_angle_deg) & (z > 0)
+        good &= np.isfinite(variance) & (variance > 0)
+        good &= ~depth_map.keypoint_valid[rows] | self._near(ratio)
+        integrator = self._integrators.get(image)
+        if integrator is None:
+            integrator = self._integrators[image] = DepthIntegrator(
+                depth_map.prior, depth_map.normals, depth_map.camera, self.options.integration
+            )
+        anchors = Anchors(depth_map.keypoints[rows][good], z[good], variance[good])
+        result = integrator.refine(anchors, scale=depth_map.scale, initial=depth_map.refined)
+        depth_map.set_refined(result.depth)
+
+    def _observed_depth(self, image: int) -> tuple[Int64, Float64]:
+        """Keypoints of an image that observe points, and the points' depth in the image."""
+        scene, tracks = self.scene, self.scene.tracks
+        of_image = scene.graph.keypoints_of(image)
+        keypoints = of_image.start + np.flatnonzero(tracks.point_of[of_image] >= 0)
+        points = tracks.xyz[tracks.point_of[keypoints]]
+        z = points @ scene.rotations[image][2] + scene.translations[image, 2]
+        return keypoints, z
+
+    def _depth_observations(self, observations: Int64) -> tuple[Float64, Float64]:
+        """Log depth of the maps at observations (NaN where not to be used) and its std."""
+        scene, tracks = self.scene, self.scene.tracks
+        _, z = scene.project(observations, tracks.xyz[tracks.point_of[observations]])
+        log_depth = np.full(len(observations), np.nan)
+        log_std = np.ones(len(observations))
+        images = scene.graph.image_of[observations]
+        for image in np.unique(images):
+            mine = np.flatnonzero(images == image)
+            rows = observations[mine] - scene.graph.offsets[image]
+            depth = scene.maps[image].at_keypoints(rows)
+            usable = scene.maps[image].keypoint_valid[rows] & (depth > 0) & (z[mine] > 0)
+            usable[usable] &= self._near(z[mine][usable] / depth[usable])
+            log_depth[mine[usable]] = np.log(depth[usable])
+            log_std[mine[usable]] = scene.maps[image].keypoint_log_std[rows][usable]
+        return log_depth, np.maximum(log_std, 1e-6)
+
+    def _near(self, ratio: Float64) -> Bool:
+        limit = self.options.max_depth_ratio
+        near: Bool = (ratio > 1 / limit) & (ratio < limit)
+        return near
+
+    def _covariances(self) -> tuple[Float64, Float64]:
+        """Covariance (p, 3, 3) of each point by reprojection alone, and its angle (p,)."""
+        scene, tracks = self.scene, self.scene.tracks
+        observations = tracks.observations()
+        images = scene.graph.image_of[observations]
+        covariances = point_covariances(
+            BundleProblem(
+                rotations=scene.rotations,
+                translations=scene.translations,
+                intrinsics=scene.intrinsics,
+                camera_of_image=np.arange(scene.num_images),
+                points=tracks.xyz,
+                obs_image=images,
+                obs_point=tracks.point_of[observations],
+                obs_xy=scene.keypoints[observations],
+                obs_std_px=scene.keypoint_std_px[images],
+            )
+        )
+        return covariances, scene.track_angles_deg()
+
+    def _num_observations(self) -> int:
+        return int((self.scene.tracks.point_of >= 0).sum())

@@ -1,0 +1,90 @@
+"""The depth of one image: its prior, its scale in the world, and its refined form."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage
+from mpsfm_core.geometry import sample_bilinear, scale_pixels
+
+
+class DepthMap:
+    """Prior depth of an image and what the reconstruction has made of it.
+
+    The prior is ``scale`` times itself in world units. Once refined, ``refined`` holds the map
+    in world units; until then the scaled prior stands for it.
+
+    Attributes:
+        camera: intrinsics of the map's grid.
+        keypoints: (n, 2) float64, the image's keypoints in pixels of the grid.
+        keypoint_valid: (n,) bool, the prior is valid around the keypoint.
+        active: whether the scale has been set, so that the depth means something in the world.
+        keypoint_log_std: (n,) float64, std of the prior's log depth at the keypoints.
+    """
+
+    def __init__(self, image: MappingImage) -> None:
+        self.prior: DepthPrior = image.depth
+        self.normals = image.normals
+        rows, columns = image.depth.shape
+        self.camera = image.camera.resized(columns, rows)
+        self.keypoints: Float64 = scale_pixels(
+            image.keypoints, image.camera.size, self.camera.size
+        )
+        variance = image.depth.variance
+        assert variance is not None  # MappingImage checks it
+        self.log_std: Float32 = np.where(
+            image.depth.valid, np.sqrt(variance) / np.maximum(image.depth.depth, 1e-12), 0
+        ).astype(np.float32)
+        self._prior_at, self.keypoint_valid = self._sample(image.depth.depth)
+        self.keypoint_log_std: Float64 = self._sample(self.log_std)[0]
+        self.scale = 1.0
+        self.active = False
+        self.refined: Float32 | None = None
+        self._refined_at: Float64 | None = None
+
+    @property
+    def valid(self) -> Bool:
+        """(h, w) bool, where the prior is valid."""
+        return self.prior.valid
+
+    @property
+    def depth(self) -> Float32:
+        """(h, w) float32, the best depth known, world units."""
+        if self.refined is not None:
+            return self.refined
+        return self.prior.depth * np.float32(self.scale)
+
+    @property
+    def variance(self) -> Float32:
+        """(h, w) float32, variance of :attr:`depth` by the prior's declaration, world units^2."""
+        variance: Float32 = (self.log_std * self.depth) ** 2
+        return variance
+
+    def prior_at_keypoints(self, rows: Int64 | slice = slice(None)) -> Float64:
+        """Unscaled prior depth at keypoints; meaningful where :attr:`keypoint_valid`."""
+        return self._prior_at[rows]
+
+    def at_keypoints(self, rows: Int64 | slice = slice(None)) -> Float64:
+        """Best depth at keypoints, world units; meaningful where :attr:`keypoint_valid`."""
+        if self._refined_at is None:
+            return self._prior_at[rows] * self.scale
+        return self._refined_at[rows]
+
+    def set_scale(self, scale: float) -> None:
+        """Change the prior's scale; a refined map is scaled along."""
+        if self.refined is not None:
+            self.set_refined(self.refined * np.float32(scale / self.scale))
+        self.scale, self.active = scale, True
+
+    def set_refined(self, depth: Float32) -> None:
+        """Store a refined map, world units."""
+        self.refined = depth
+        self._refined_at = self._sample(depth)[0]
+
+    def reset(self) -> None:
+        """Forget scale and refinement."""
+        self.scale, self.active = 1.0, False
+        self.refined, self._refined_at = None, None
+
+    def _sample(self, values: Float32) -> tuple[Float64, Bool]:
+        return sample_bilinear(values, self.prior.valid, self.keypoints)

@@ -1,0 +1,54 @@
+"""The correspondence graph: verified matches between the keypoints of all images."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mpsfm_core.data import Float64, Int64, MappingProblem
+
+
+class CorrespondenceGraph:
+    """Keypoints of all images numbered through, and the matches between them.
+
+    Keypoint ``k`` of image ``i`` has the global number ``offsets[i] + k``. Each match stands in
+    the edge list twice, once from each end; edges are sorted by their source, so the edges of an
+    image are one slice.
+
+    Attributes:
+        offsets: (n + 1,) int64, first global keypoint of each image.
+        source, target: (e,) int64, global keypoints.
+        pair: (e,) int64, row of the match's pair in the problem.
+        pair_scores: (p,) float64, summed match scores of each pair.
+    """
+
+    def __init__(self, problem: MappingProblem) -> None:
+        counts = [problem.num_keypoints(i) for i in range(len(problem.images))]
+        self.offsets: Int64 = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        self.num_images = len(problem.images)
+        self.image_of: Int64 = np.repeat(np.arange(self.num_images), counts)
+        source, target, pair_row = [], [], []
+        for row, pair in enumerate(problem.pairs):
+            a = pair.matches[:, 0] + self.offsets[pair.image_a]
+            b = pair.matches[:, 1] + self.offsets[pair.image_b]
+            source += [a, b]
+            target += [b, a]
+            pair_row.append(np.full(2 * len(pair), row))
+        empty = np.zeros(0, dtype=np.int64)
+        self.source: Int64 = np.concatenate([empty, *source])
+        self.target: Int64 = np.concatenate([empty, *target])
+        self.pair: Int64 = np.concatenate([empty, *pair_row])
+        order = np.lexsort((self.target, self.source))
+        self.source, self.target = self.source[order], self.target[order]
+        self.pair = self.pair[order]
+        self._first_edge = np.searchsorted(self.source, self.offsets)
+        self.pair_scores: Float64 = np.array(
+            [pair.scores.sum(dtype=np.float64) for pair in problem.pairs]
+        )
+
+    def edges_of(self, image: int) -> slice:
+        """The edges that start in an image."""
+        return slice(int(self._first_edge[image]), int(self._first_edge[image + 1]))
+
+    def keypoints_of(self, image: int) -> slice:
+        """The global keypoints of an image."""
+        return slice(int(self.offsets[image]), int(self.offsets[image + 1]))

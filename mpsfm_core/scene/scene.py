@@ -1,0 +1,155 @@
+"""The state of a reconstruction in progress: poses, points with tracks, depth maps."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mpsfm_core.data import Bool, Float32, Float64, Int64, MappingProblem
+from mpsfm_core.geometry import camera_center
+from mpsfm_core.scene.depth_map import DepthMap
+from mpsfm_core.scene.graph import CorrespondenceGraph
+from mpsfm_core.scene.kernels import max_triangulation_angles
+from mpsfm_core.scene.tracks import Tracks
+
+
+class Snapshot(NamedTuple):
+    """A copy of everything in a :class:`Scene` that changes; opaque to others."""
+
+    rotations: Float64
+    translations: Float64
+    intrinsics: Float64
+    registered: Bool
+    xyz: Float64
+    point_of: Int64
+    maps: list[tuple[float, bool, Float32 | None]]
+
+
+class Scene:
+    """Everything the mapper changes.
+
+    Attributes:
+        rotations: (n, 3, 3), translations: (n, 3) float64, ``cam_from_world`` of each image.
+        registered: (n,) bool.
+        intrinsics: (n, 4) float64, fx, fy, cx, cy of each image.
+        keypoints: (k, 2) float64, of all images, numbered as in :attr:`graph`.
+        maps: the depth map of each image.
+    """
+
+    def __init__(self, problem: MappingProblem) -> None:
+        self.problem = problem
+        self.graph = CorrespondenceGraph(problem)
+        count = len(problem.images)
+        self.keypoints: Float64 = np.concatenate(
+            [np.zeros((0, 2)), *(image.keypoints for image in problem.images)]
+        )
+        self.keypoint_std_px: Float64 = np.array([i.keypoint_std_px for i in problem.images])
+        self.intrinsics: Float64 = np.array([image.camera.params for image in problem.images])
+        self.maps = [DepthMap(image) for image in problem.images]
+        self.rotations: Float64 = np.tile(np.eye(3), (count, 1, 1))
+        self.translations: Float64 = np.zeros((count, 3))
+        self.registered: Bool = np.zeros(count, dtype=np.bool_)
+        self.tracks = Tracks(len(self.keypoints))
+
+    @property
+    def num_images(self) -> int:
+        """Number of images, registered or not."""
+        return len(self.registered)
+
+    def registered_images(self) -> Int64:
+        """Registered images in ascending order."""
+        return np.flatnonzero(self.registered)
+
+    def register(self, image: int, rotation: Float64, translation: Float64) -> None:
+        """Give an image a pose."""
+        self.rotations[image], self.translations[image] = rotation, translation
+        self.registered[image] = True
+
+    def deregister(self, image: int) -> None:
+        """Take an image out, with its observations and the points only it kept alive."""
+        self.registered[image] = False
+        self.maps[image].reset()
+        keypoints = self.graph.keypoints_of(image)
+        self.tracks.remove_observations(np.arange(keypoints.start, keypoints.stop))
+
+    def centers(self) -> Float64:
+        """(n, 3) camera centres in the world."""
+        return camera_center(self.rotations, self.translations)
+
+    def rays(self, keypoints: Int64) -> Float64:
+        """Rays with z = 1 through keypoints (m,) in their camera frames, (m, 3)."""
+        fx, fy, cx, cy = self.intrinsics[self.graph.image_of[keypoints]].T
+        xy = self.keypoints[keypoints]
+        return np.stack([(xy[:, 0] - cx) / fx, (xy[:, 1] - cy) / fy, np.ones(len(xy))], axis=1)
+
+    def lift(self, keypoints: Int64) -> tuple[Float64, Bool]:
+        """World points (m, 3) of keypoints at the best depth of their image, and where valid."""
+        images = self.graph.image_of[keypoints]
+        depth = np.zeros(len(keypoints))
+        valid = np.zeros(len(keypoints), dtype=np.bool_)
+        for image in map(int, np.unique(images)):
+            if not self.maps[image].active:
+                continue
+            of_image = images == image
+            rows = keypoints[of_image] - self.graph.offsets[image]
+            depth[of_image] = self.maps[image].at_keypoints(rows)
+            valid[of_image] = self.maps[image].keypoint_valid[rows]
+        camera_points = self.rays(keypoints) * depth[:, None]
+        rotations, translations = self.rotations[images], self.translations[images]
+        world = np.einsum("nji,nj->ni", rotations, camera_points - translations)
+        return world, valid & (depth > 0)
+
+    def project(self, keypoints: Int64, points: Float64) -> tuple[Float64, Float64]:
+        """Reproject world points (m, 3) into the images of keypoints (m,).
+
+        Returns:
+            ``(errors_px, depth)``, both (m,) float64; the error is inf behind the camera.
+        """
+        images = self.graph.image_of[keypoints]
+        camera = np.einsum("nij,nj->ni", self.rotations[images], points)
+        camera += self.translations[images]
+        fx, fy, cx, cy = self.intrinsics[images].T
+        front = camera[:, 2] > 1e-9
+        z = np.where(front, camera[:, 2], 1.0)
+        dx = fx * camera[:, 0] / z + cx - self.keypoints[keypoints, 0]
+        dy = fy * camera[:, 1] / z + cy - self.keypoints[keypoints, 1]
+        return np.where(front, np.hypot(dx, dy), np.inf), camera[:, 2]
+
+    def track_angles_deg(self) -> Float64:
+        """(p,) largest triangulation angle of each point of the tracks, degrees."""
+        observations = self.tracks.observations()
+        centers = self.centers()[self.graph.image_of[observations]]
+        angles: Float64 = max_triangulation_angles(
+            self.tracks.xyz, self.tracks.point_of[observations], centers
+        )
+        return angles
+
+    def snapshot(self) -> Snapshot:
+        """What :meth:`restore` needs to undo everything that happens from now on."""
+        maps = [(m.scale, m.active, m.refined) for m in self.maps]
+        return Snapshot(
+            self.rotations.copy(),
+            self.translations.copy(),
+            self.intrinsics.copy(),
+            self.registered.copy(),
+            self.tracks.xyz.copy(),
+            self.tracks.point_of.copy(),
+            maps,
+        )
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Return to an earlier state."""
+        self.rotations = snapshot.rotations.copy()
+        self.translations = snapshot.translations.copy()
+        self.intrinsics = snapshot.intrinsics.copy()
+        self.registered = snapshot.registered.copy()
+        self.tracks.xyz = snapshot.xyz.copy()
+        self.tracks.point_of = snapshot.point_of.copy()
+        for depth_map, (scale, active, refined) in zip(self.maps, snapshot.maps, strict=True):
+            if depth_map.refined is not refined or depth_map.scale != scale:
+                depth_map.reset()
+                if active:
+                    depth_map.set_scale(scale)
+                if refined is not None:
+                    depth_map.set_refined(refined)
