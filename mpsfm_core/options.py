@@ -19,7 +19,9 @@ from mpsfm_core.errors import ConfigError, did_you_mean
 class Options(BaseModel):
     """Immutable settings; unknown keys are errors; each field has a default and its source."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", protected_namespaces=(), ser_json_inf_nan="constants"
+    )
 
 
 class Backend(Options):
