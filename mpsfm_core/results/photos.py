@@ -1,0 +1,66 @@
+"""From the mapper's undistorted views back to the photos of the user."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import Float64, MappingProblem, View
+from mpsfm_core.inputs.images import ImageSet, SourceImage
+from mpsfm_core.inputs.undistortion import is_pinhole
+from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
+
+
+class Photos:
+    """The photos of the images of a problem, found by name."""
+
+    def __init__(self, images: ImageSet, problem: MappingProblem) -> None:
+        self._images = images
+        self._problem = problem
+        self._rows = {name: row for row, name in enumerate(images.names)}
+
+    def source(self, image: RegisteredImage) -> SourceImage:
+        """The photo of a registered image."""
+        return self._images[self._rows[image.name]]
+
+    def view(self, name: str) -> View:
+        """The undistorted view."""
+        return self._images.view(self._rows[name])
+
+    def keypoints(self, reconstruction: Reconstruction) -> list[Float64]:
+        """For each registered image its keypoints (n, 2), pixels of the view."""
+        return [self._problem.images[image.index].keypoints for image in reconstruction.images]
+
+    def original_keypoints(self, reconstruction: Reconstruction) -> list[Float64]:
+        """For each registered image its keypoints (n, 2), pixels of the upright photo."""
+        return [
+            self.source(image).original_pixels(xy)
+            for image, xy in zip(reconstruction.images, self.keypoints(reconstruction), strict=True)
+        ]
+
+    def original_camera(self, image: RegisteredImage) -> pycolmap.Camera:
+        """The camera of the upright photo, with the focal length that the mapper refined.
+
+        Focal lengths are refined when they were a guess, and guessed cameras have no distortion,
+        so that scaling the focal length is exact.
+        """
+        source = self.source(image)
+        camera = pycolmap.Camera(source.camera.todict())
+        params = np.array(camera.params)
+        params[list(camera.focal_length_idxs())] *= image.camera.fx / source.pinhole.fx
+        camera.params = params
+        return camera
+
+    def any_distorted(self, reconstruction: Reconstruction) -> bool:
+        """Whether a photo of the reconstruction is not a pinhole image."""
+        return any(not is_pinhole(self.source(image).camera) for image in reconstruction.images)
+
+    def write_view(self, image: RegisteredImage, path: Path) -> None:
+        """Write the undistorted view in the photo's own format."""
+        bgr = cv2.cvtColor(self.view(image.name).image, cv2.COLOR_RGB2BGR)
+        _, data = cv2.imencode(path.suffix, bgr)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data.tobytes())

@@ -1,0 +1,90 @@
+"""What came out of a run, as plain data for ``summary.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.inputs.images import ImageSet
+from mpsfm_core.scene.reconstruction import MappingResult, MetricScale, Reconstruction
+
+
+def describe_images(images: ImageSet, mapping: MappingResult) -> dict[str, Any]:
+    """Who is registered, who is not and why, and where the focal lengths came from."""
+    component = {
+        image.name: number
+        for number, reconstruction in enumerate(mapping.reconstructions)
+        for image in reconstruction.images
+    }
+    unregistered = {}
+    for name in images.names:
+        if name not in component:
+            unregistered[name] = mapping.report.image_reasons.get(name, "no reason recorded")
+        elif component[name] > 0:
+            unregistered[name] = f"not connected to the others; in components/{component[name]}"
+    return {
+        "total": len(images),
+        "registered": [name for name in images.names if component.get(name) == 0],
+        "unregistered": unregistered,
+        "focal_length_from": {image.name: image.focal_source for image in images},
+    }
+
+
+def describe_pairs(problem: MappingProblem, mapping: MappingResult) -> dict[str, Any]:
+    """The verified pairs, and why pairs that were tried could not start a reconstruction."""
+    return {
+        "verified": len(problem.pairs),
+        "matches": sum(len(pair) for pair in problem.pairs),
+        "cannot_start": dict(mapping.report.pair_reasons),
+    }
+
+
+def describe_reconstructions(
+    mapping: MappingResult, models: Sequence[pycolmap.Reconstruction]
+) -> list[dict[str, Any]]:
+    """Sizes and errors of each reconstruction, in the order of ``components/``, first ``sparse``.
+
+    ``models``: the COLMAP model of each. ``mean_reprojection_error_px`` is over its points, in
+    pixels of the original photos; ``lifted_points`` are those that no model has, as only one
+    image sees them.
+    """
+    return [
+        _describe(reconstruction, model)
+        for reconstruction, model in zip(mapping.reconstructions, models, strict=True)
+    ]
+
+
+def _describe(reconstruction: Reconstruction, model: pycolmap.Reconstruction) -> dict[str, Any]:
+    relative_std = [
+        np.sqrt(image.depth.variance[image.depth.valid]) / image.depth.depth[image.depth.valid]
+        for image in reconstruction.images
+        if image.depth.variance is not None
+    ]
+    return {
+        "images": len(reconstruction.images),
+        "points": model.num_points3D(),
+        "observations": model.compute_num_observations(),
+        "mean_track_length": model.compute_mean_track_length() if model.num_points3D() else 0.0,
+        "mean_reprojection_error_px": _mean_error(model),
+        "lifted_points": len(reconstruction.points) - model.num_points3D(),
+        "median_relative_depth_std": _median(relative_std),
+        "metric_scale": _metric(reconstruction.metric),
+    }
+
+
+def _mean_error(model: pycolmap.Reconstruction) -> float | None:
+    return float(model.compute_mean_reprojection_error()) if model.num_points3D() else None
+
+
+def _median(values: Sequence[np.ndarray[Any, Any]]) -> float | None:
+    pooled = np.concatenate(values) if values else np.zeros(0)
+    return float(np.median(pooled)) if len(pooled) else None
+
+
+def _metric(metric: MetricScale | None) -> dict[str, Any] | None:
+    return None if metric is None else asdict(metric)

@@ -1,0 +1,139 @@
+"""Writes everything a run leaves behind, as a whole or not at all.
+
+::
+
+    OUTPUT/sparse/          COLMAP model of the original photos (binary)
+           sparse_text/     the same as text, if asked for
+           components/N/    models of further, disconnected groups of images, largest first
+           undistorted/     images/ and sparse/ for tools that want pinhole cameras; only written
+                            when a photo is distorted
+           points.ply       all points of the first model, those that one image sees as well
+           dense.ply        the refined depth maps, fused
+           depth/NAME.npz   refined depth, variance and camera of each registered image
+           transforms.json  for nerfstudio, if asked for
+           summary.json     what was used, what came out, and why not more
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from mpsfm_core.data import UInt8
+from mpsfm_core.results.colmap_model import build_model, pinhole, point_colors, write_model
+from mpsfm_core.results.dense_cloud import fuse_depth_maps
+from mpsfm_core.results.depth_maps import write_depth_maps
+from mpsfm_core.results.folder import replacing
+from mpsfm_core.results.nerfstudio import can_hold, write_transforms
+from mpsfm_core.results.options import ResultOptions
+from mpsfm_core.results.photos import Photos
+from mpsfm_core.results.ply import write_ply
+from mpsfm_core.scene.reconstruction import Reconstruction
+
+SUMMARY = "summary.json"
+ENTRIES = (
+    "sparse",
+    "sparse_text",
+    "components",
+    "undistorted",
+    "points.ply",
+    "dense.ply",
+    "depth",
+    "transforms.json",
+    SUMMARY,
+)
+"""What belongs to us in an output folder."""
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """A reconstruction ready to be written.
+
+    ``colors``: (p, 3) uint8, RGB of each point. ``model``: COLMAP model of the original photos.
+    """
+
+    reconstruction: Reconstruction
+    colors: UInt8
+    model: pycolmap.Reconstruction
+
+    @classmethod
+    def of(cls, reconstruction: Reconstruction, photos: Photos) -> Component:
+        """Colour the points and build the model."""
+        colors = point_colors(reconstruction, photos.keypoints(reconstruction), photos.view)
+        cameras = [photos.original_camera(image) for image in reconstruction.images]
+        keypoints = photos.original_keypoints(reconstruction)
+        model = build_model(reconstruction, cameras, keypoints, colors)
+        return cls(reconstruction, colors, model)
+
+    def undistorted(self, photos: Photos) -> pycolmap.Reconstruction:
+        """The model of the undistorted views."""
+        cameras = [pinhole(image.camera) for image in self.reconstruction.images]
+        keypoints = photos.keypoints(self.reconstruction)
+        return build_model(self.reconstruction, cameras, keypoints, self.colors)
+
+
+def write_results(
+    output: Path,
+    components: Sequence[Component],
+    photos: Photos,
+    options: ResultOptions,
+    summary: Mapping[str, Any],
+    seed: int = 0,
+) -> None:
+    """Write a successful run.
+
+    ``components``: one at least, largest first. ``summary``: plain data. ``seed``: of the choice
+    of pixels for ``dense.ply``. Raises what :func:`mpsfm_core.results.folder.replacing` raises.
+    """
+    best, rest = components[0], components[1:]
+    with replacing(output, ENTRIES) as folder:
+        write_model(folder / "sparse", best.model)
+        if options.text_model:
+            write_model(folder / "sparse_text", best.model, text=True)
+        for number, component in enumerate(rest, start=1):
+            write_model(folder / "components" / str(number), component.model)
+        write_ply(folder / "points.ply", best.reconstruction.points, best.colors)
+        if options.dense_cloud:
+            dense = fuse_depth_maps(best.reconstruction, photos.view, options, seed)
+            write_ply(folder / "dense.ply", *dense)
+        if options.depth_maps:
+            write_depth_maps(folder / "depth", best.reconstruction)
+        if photos.any_distorted(best.reconstruction):
+            _write_undistorted(folder / "undistorted", best, photos)
+        if options.nerfstudio:
+            _write_nerfstudio(folder / "transforms.json", output, best, photos)
+        _write_json(folder / SUMMARY, summary)
+
+
+def write_failure(output: Path, summary: Mapping[str, Any]) -> None:
+    """Write the summary of a run without reconstruction; earlier results stay where they are."""
+    with replacing(output, (SUMMARY,)) as folder:
+        _write_json(folder / SUMMARY, summary)
+
+
+def _write_undistorted(folder: Path, component: Component, photos: Photos) -> None:
+    write_model(folder / "sparse", component.undistorted(photos))
+    for image in component.reconstruction.images:
+        photos.write_view(image, folder / "images" / image.name)
+
+
+def _write_nerfstudio(path: Path, output: Path, component: Component, photos: Photos) -> None:
+    """The photos themselves where the format has their cameras, else the undistorted views."""
+    images = component.reconstruction.images
+    if all(can_hold(camera) for camera in component.model.cameras.values()):
+        model = component.model
+        files = {image.name: os.path.relpath(photos.source(image).path, output) for image in images}
+    else:
+        model = component.undistorted(photos)
+        files = {image.name: f"undistorted/images/{image.name}" for image in images}
+    write_transforms(path, model, files)
+
+
+def _write_json(path: Path, data: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")

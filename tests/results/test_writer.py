@@ -1,0 +1,211 @@
+"""A whole output folder, read back with pycolmap."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.geometry import project, transform
+from mpsfm_core.inputs.images import ImageSet, SourceImage
+from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.inputs.undistortion import pinhole_camera
+from mpsfm_core.results.options import ResultOptions
+from mpsfm_core.results.photos import Photos
+from mpsfm_core.results.summary import (
+    describe_images,
+    describe_pairs,
+    describe_reconstructions,
+)
+from mpsfm_core.results.writer import Component, write_failure, write_results
+from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction
+
+PINHOLE = pycolmap.Camera(
+    model="PINHOLE", width=160, height=120, params=[140, 141, 80.5, 59], camera_id=1
+)
+DISTORTED = pycolmap.Camera(
+    model="OPENCV",
+    width=160,
+    height=120,
+    params=[140, 141, 80, 60, 0.08, -0.03, 0.001, -0.002],
+    camera_id=1,
+)
+
+
+def photos_of(solved, folder: Path, camera: pycolmap.Camera, known: bool = True) -> ImageSet:
+    sources = []
+    for name, view in solved.views.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), cv2.cvtColor(view.image, cv2.COLOR_RGB2BGR))
+        pinhole = pinhole_camera(camera, 0.0)
+        sources.append(SourceImage(name, path, camera, pinhole, known, "intrinsics", "0"))
+    return ImageSet(sources, InputOptions())
+
+
+def seen_through(solved, images: ImageSet) -> tuple[MappingProblem, Reconstruction]:
+    """The problem and reconstruction with the pinhole cameras of the image set."""
+    pinhole = images[0].pinhole
+    registered, problem_images = [], list(solved.problem.images)
+    for image in solved.best.images:
+        seen = image.point_ids >= 0
+        local = transform(image.rotation, image.translation, solved.best.points)
+        keypoints = solved.problem.images[image.index].keypoints.copy()
+        keypoints[seen] = project(pinhole, local[image.point_ids[seen]])
+        registered.append(replace(image, camera=pinhole))
+        problem_images[image.index] = replace(
+            problem_images[image.index], camera=pinhole, keypoints=keypoints
+        )
+    problem = MappingProblem(tuple(problem_images), solved.problem.pairs)
+    return problem, replace(solved.best, images=tuple(registered))
+
+
+def write(solved, tmp_path: Path, camera: pycolmap.Camera, options: ResultOptions) -> Path:
+    images = photos_of(solved, tmp_path / "photos", camera)
+    problem, reconstruction = seen_through(solved, images)
+    photos = Photos(images, problem)
+    component = Component.of(reconstruction, photos)
+    write_results(tmp_path / "out", [component], photos, options, {"status": "success"})
+    return tmp_path / "out"
+
+
+def test_the_default_output_is_what_the_contract_says(solved, tmp_path: Path) -> None:
+    output = write(solved, tmp_path, PINHOLE, ResultOptions())
+    assert sorted(path.name for path in output.iterdir()) == [
+        "dense.ply",
+        "depth",
+        "points.ply",
+        "sparse",
+        "summary.json",
+    ]
+    assert json.loads((output / "summary.json").read_text()) == {"status": "success"}
+    model = pycolmap.Reconstruction(str(output / "sparse"))
+    assert model.compute_mean_reprojection_error() < 1e-6
+    assert {image.name for image in model.images.values()} == {
+        image.name for image in solved.best.images
+    }
+    cloud = pycolmap.Reconstruction()
+    cloud.import_PLY(str(output / "points.ply"))
+    assert cloud.num_points3D() == len(solved.best.points)
+    assert len(list((output / "depth").rglob("*.npz"))) == 3
+
+
+def test_a_distorted_camera_gives_the_original_and_an_undistorted_model(
+    solved, tmp_path: Path
+) -> None:
+    output = write(solved, tmp_path, DISTORTED, ResultOptions())
+    original = pycolmap.Reconstruction(str(output / "sparse"))
+    (camera,) = original.cameras.values()
+    assert camera.model_name == "OPENCV"
+    assert camera.params.tolist() == DISTORTED.params.tolist()
+    # The points, poses and keypoints fit together through the distorted camera.
+    assert original.compute_mean_reprojection_error() < 1e-6
+    undistorted = pycolmap.Reconstruction(str(output / "undistorted" / "sparse"))
+    (camera,) = undistorted.cameras.values()
+    assert camera.model_name == "PINHOLE"
+    assert undistorted.compute_mean_reprojection_error() < 1e-6
+    for image in undistorted.images.values():
+        picture = cv2.imread(str(output / "undistorted" / "images" / image.name))
+        assert picture.shape == (camera.height, camera.width, 3)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV"])
+def test_transforms_project_points_where_the_photos_show_them(
+    solved, tmp_path: Path, model: str
+) -> None:
+    params = [*DISTORTED.params] + [0.0] * (4 if model == "FULL_OPENCV" else 0)
+    camera = pycolmap.Camera(model=model, width=160, height=120, params=params, camera_id=1)
+    output = write(solved, tmp_path, camera, ResultOptions(nerfstudio=True))
+    # The format has no FULL_OPENCV: there the undistorted views stand in.
+    folder = "sparse" if model == "OPENCV" else "undistorted/sparse"
+    reference = pycolmap.Reconstruction(str(output / folder))
+    frames = json.loads((output / "transforms.json").read_text())["frames"]
+    assert len(frames) == 3
+    for frame, image in zip(
+        frames, sorted(reference.images.values(), key=lambda image: image.name), strict=True
+    ):
+        assert (output / frame["file_path"]).resolve().is_file()
+        distortion = [frame.get(key, 0.0) for key in ("k1", "k2", "p1", "p2")]
+        matrix = np.array(
+            [[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]]
+        )
+        cam_from_world = np.linalg.inv(np.array(frame["transform_matrix"]))
+        cam_from_world[1:3] *= -1
+        for point in image.get_observation_points2D()[:5]:
+            xyz = reference.points3D[point.point3D_id].xyz
+            local = cam_from_world[:3, :3] @ xyz + cam_from_world[:3, 3]
+            xy, _ = cv2.projectPoints(
+                local[None], np.zeros(3), np.zeros(3), matrix, np.array(distortion)
+            )
+            np.testing.assert_allclose(xy.ravel(), point.xy, atol=1e-5)
+
+
+def test_a_refined_focal_length_reaches_the_photos_camera(solved, tmp_path: Path) -> None:
+    images = photos_of(solved, tmp_path, PINHOLE, known=False)
+    problem, reconstruction = seen_through(solved, images)
+    refined = replace(images[0].pinhole, fx=140 * 1.1, fy=141 * 1.1)
+    reconstruction = replace(
+        reconstruction,
+        images=tuple(replace(image, camera=refined) for image in reconstruction.images),
+    )
+    model = Component.of(reconstruction, Photos(images, problem)).model
+    (camera,) = model.cameras.values()
+    np.testing.assert_allclose(camera.params, [154, 155.1, 80.5, 59])
+
+
+def test_everything_that_can_be_left_out_is(solved, tmp_path: Path) -> None:
+    options = ResultOptions(depth_maps=False, dense_cloud=False, text_model=True)
+    output = write(solved, tmp_path, PINHOLE, options)
+    names = sorted(path.name for path in output.iterdir())
+    assert names == ["points.ply", "sparse", "sparse_text", "summary.json"]
+    assert pycolmap.Reconstruction(str(output / "sparse_text")).num_points3D() == 40
+
+
+def test_further_components_are_models_of_their_own(solved, tmp_path: Path) -> None:
+    images = photos_of(solved, tmp_path / "photos", PINHOLE)
+    problem, reconstruction = seen_through(solved, images)
+    photos = Photos(images, problem)
+    first = replace(reconstruction, images=reconstruction.images[:2])
+    second = replace(reconstruction, images=reconstruction.images[1:])
+    components = [Component.of(part, photos) for part in (first, second)]
+    write_results(tmp_path / "out", components, photos, ResultOptions(), {})
+    main = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse"))
+    other = pycolmap.Reconstruction(str(tmp_path / "out" / "components" / "1"))
+    assert {image.name for image in main.images.values()} == {"images/0.png", "images/1.png"}
+    assert {image.name for image in other.images.values()} == {"images/1.png", "images/2.png"}
+
+
+def test_a_failed_run_leaves_its_summary_and_the_earlier_model(solved, tmp_path: Path) -> None:
+    output = write(solved, tmp_path, PINHOLE, ResultOptions())
+    before = (output / "sparse" / "points3D.bin").read_bytes()
+    write_failure(output, {"status": "failed"})
+    assert json.loads((output / "summary.json").read_text()) == {"status": "failed"}
+    assert (output / "sparse" / "points3D.bin").read_bytes() == before
+
+
+def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path) -> None:
+    images = photos_of(solved, tmp_path, PINHOLE)
+    problem, reconstruction = seen_through(solved, images)
+    model = Component.of(reconstruction, Photos(images, problem)).model
+    mapping = MappingResult((reconstruction,), solved.result.report)
+    described = describe_images(images, mapping)
+    assert described["total"] == 4
+    assert described["registered"] == ["images/0.png", "images/1.png", "images/2.png"]
+    assert described["unregistered"] == {"images/3.png": "too few matches"}
+    assert describe_pairs(problem, mapping)["cannot_start"] == {
+        "images/0.png images/3.png": "no parallax"
+    }
+    (numbers,) = describe_reconstructions(mapping, [model])
+    assert (numbers["images"], numbers["points"], numbers["observations"]) == (3, 40, 120)
+    assert numbers["lifted_points"] == 5
+    assert numbers["mean_track_length"] == 3
+    assert numbers["mean_reprojection_error_px"] == pytest.approx(0, abs=1e-6)
+    assert 0.001 < numbers["median_relative_depth_std"] < 0.1
+    assert numbers["metric_scale"]["trusted"] is True
+    json.dumps([described, numbers], allow_nan=False)
