@@ -1,0 +1,38 @@
+"""Matches between real and rendered photos, against known cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+FAMILIES = {"xfeat": "lighterglue", "aliked": "lightglue-aliked", "disk": "lightglue-disk"}
+
+
+@pytest.mark.parametrize(
+    ("family", "matches", "median_px"),
+    [
+        ("xfeat", 550, 0.8),  # measured: 703 matches, 0.63 px
+        pytest.param("aliked", 1000, 0.4, marks=pytest.mark.slow),  # 1338, 0.19 px
+        pytest.param("disk", 900, 0.6, marks=pytest.mark.slow),
+    ],
+)
+def test_fountain(make, load_pair, family, matches, median_px):
+    pair = load_pair("fountain", "0003.jpg", "0005.jpg")
+    found, xy = match(make, pair, family)
+    assert len(found) > matches
+    assert np.median(pair.epipolar_distance(*xy)) < median_px
+
+
+@pytest.mark.parametrize("family", ["xfeat", pytest.param("aliked", marks=pytest.mark.slow)])
+def test_rendered_kitchen(make, load_pair, family):
+    pair = load_pair("rendered_kitchen", "view_014.jpg", "view_021.jpg")
+    found, xy = match(make, pair, family)
+    assert len(found) > 100
+    assert np.median(pair.epipolar_distance(*xy)) < 1
+
+
+def match(make, pair, family):
+    detector, matcher = make("features", family), make("matcher", FAMILIES[family])
+    a, b = detector.extract(pair.view_a), detector.extract(pair.view_b)
+    found = matcher.match(pair.view_a, pair.view_b, a, b).sparse
+    return found, (a.keypoints[found.indices[:, 0]], b.keypoints[found.indices[:, 1]])
