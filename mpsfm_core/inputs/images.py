@@ -292,12 +292,20 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
     return [(1, int(p), p) if p.isdecimal() else (0, 0, p) for p in parts]
 
 
-def _listed(image_list: Path, names: list[str], folder: Path) -> list[str]:
+def read_image_list(path: Path) -> list[str]:
+    """The names in a text file with one name a line; ``#`` starts a comment line.
+
+    Raises :class:`InputError` when the file cannot be read.
+    """
     try:
-        lines = image_list.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"image list {image_list} cannot be read: {error}") from error
-    listed = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+        raise InputError(f"image list {path} cannot be read: {error}") from error
+    return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def _listed(image_list: Path, names: list[str], folder: Path) -> list[str]:
+    listed = read_image_list(image_list)
     available, seen = set(names), set()
     for name in listed:
         if name in seen:

@@ -1,0 +1,53 @@
+"""``mpsfm evaluate``: how far a model is from the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def evaluate(
+    model: Annotated[Path, typer.Argument(help="COLMAP model, or an output folder of ours.")],
+    truth: Annotated[Path, typer.Argument(metavar="GT", help="COLMAP model with true poses.")],
+    images: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,C", help="Only these images; extensions may be left out."),
+    ] = None,
+    image_list: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The same, one name a line.")
+    ] = None,
+    convention: Annotated[
+        str, typer.Option(metavar="NAME", help="Of the pose AUC: paper, colmap or vggt.")
+    ] = "paper",
+) -> None:
+    """Print pose AUC at 1, 5 and 20 degrees, trajectory error and registered share as JSON.
+
+    Images are matched by name. Images of GT that MODEL lacks count as unregistered.
+    """
+    import json
+
+    from mpsfm_core.evaluation import CONVENTIONS, evaluate, read_poses
+
+    if convention not in CONVENTIONS:
+        from mpsfm_core.errors import InputError, did_you_mean
+
+        raise InputError(f"no convention {convention!r}{did_you_mean(convention, CONVENTIONS)}")
+    names = _names(images, image_list)
+    report = evaluate(read_poses(model), read_poses(truth), names, CONVENTIONS[convention])
+    typer.echo(json.dumps(report, indent=2))
+
+
+def _names(images: str | None, image_list: Path | None) -> list[str] | None:
+    from mpsfm_core.errors import InputError
+
+    if images is not None and image_list is not None:
+        raise InputError("--images and --image-list exclude each other")
+    if images is not None:
+        return [name.strip() for name in images.split(",") if name.strip()]
+    if image_list is None:
+        return None
+    from mpsfm_core.inputs.images import read_image_list
+
+    return read_image_list(image_list)
