@@ -255,7 +255,7 @@ class Registry:
         """The hooks of all plugins, unguarded; :meth:`call_hook` is the guarded call."""
         return self._manager.hook
 
-    def call_hook(self, name: str, **arguments: Any) -> list[Any]:
+    def call_hook(self, name: str, /, **arguments: Any) -> list[Any]:
         """Call a hook of every plugin and return what they answer, None left out.
 
         A plugin that raises is skipped with a logged warning and not called for this hook again:
