@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli import config, evaluate, plugins
+from mpsfm_core.cli import config, demo, evaluate, plugins, reconstruct
 from mpsfm_core.cli.errors import GuardedGroup
 
 
@@ -31,6 +31,8 @@ def build_app() -> typer.Typer:
         add_completion=False,
         pretty_exceptions_show_locals=False,  # they would print whole images
     )
+    app.command("reconstruct")(reconstruct.reconstruct)
+    app.command("demo")(demo.demo)
     app.command("evaluate")(evaluate.evaluate)
     app.add_typer(plugins.app, name="plugins")
     app.add_typer(config.app, name="config")

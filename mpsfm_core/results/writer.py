@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -83,13 +83,14 @@ def write_results(
     components: Sequence[Component],
     photos: Photos,
     options: ResultOptions,
-    summary: Mapping[str, Any],
+    summarize: Callable[[], Mapping[str, Any]],
     seed: int = 0,
 ) -> None:
     """Write a successful run.
 
-    ``components``: one at least, largest first. ``summary``: plain data. ``seed``: of the choice
-    of pixels for ``dense.ply``. Raises what :func:`mpsfm_core.results.folder.replacing` raises.
+    ``components``: one at least, largest first. ``summarize``: gives the plain data of the
+    summary, called when all else is written. ``seed``: of the choice of pixels for ``dense.ply``.
+    Raises what :func:`mpsfm_core.results.folder.replacing` raises.
     """
     best, rest = components[0], components[1:]
     with replacing(output, ENTRIES) as folder:
@@ -108,7 +109,7 @@ def write_results(
             _write_undistorted(folder / "undistorted", best, photos)
         if options.nerfstudio:
             _write_nerfstudio(folder / "transforms.json", output, best, photos)
-        _write_json(folder / SUMMARY, summary)
+        _write_json(folder / SUMMARY, summarize())
 
 
 def write_failure(output: Path, summary: Mapping[str, Any]) -> None:

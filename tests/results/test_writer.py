@@ -71,7 +71,7 @@ def write(solved, tmp_path: Path, camera: pycolmap.Camera, options: ResultOption
     problem, reconstruction = seen_through(solved, images)
     photos = Photos(images, problem)
     component = Component.of(reconstruction, photos)
-    write_results(tmp_path / "out", [component], photos, options, {"status": "success"})
+    write_results(tmp_path / "out", [component], photos, options, lambda: {"status": "success"})
     return tmp_path / "out"
 
 
@@ -174,7 +174,7 @@ def test_further_components_are_models_of_their_own(solved, tmp_path: Path) -> N
     first = replace(reconstruction, images=reconstruction.images[:2])
     second = replace(reconstruction, images=reconstruction.images[1:])
     components = [Component.of(part, photos) for part in (first, second)]
-    write_results(tmp_path / "out", components, photos, ResultOptions(), {})
+    write_results(tmp_path / "out", components, photos, ResultOptions(), dict)
     main = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse"))
     other = pycolmap.Reconstruction(str(tmp_path / "out" / "components" / "1"))
     assert {image.name for image in main.images.values()} == {"images/0.png", "images/1.png"}

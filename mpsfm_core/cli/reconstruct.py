@@ -1,0 +1,78 @@
+"""``mpsfm reconstruct``: the main command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mpsfm_core.cli.arguments import ConfigName, Overrides, Quiet
+
+if TYPE_CHECKING:
+    from mpsfm_core.pipeline import ReconstructionResult
+
+
+def reconstruct(
+    images: Annotated[Path, typer.Argument(help="Folder of photos.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Is written.")],
+    config: ConfigName = "default",
+    intrinsics: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="intrinsics.yaml or a COLMAP model; else EXIF."),
+    ] = None,
+    image_list: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Use these images only, one name a line.")
+    ] = None,
+    overrides: Overrides = None,
+    quiet: Quiet = False,
+) -> None:
+    """Reconstruct a folder of photos.
+
+    Writes a COLMAP model (DIR/sparse), point clouds (DIR/points.ply, DIR/dense.ply), refined
+    depth (DIR/depth) and DIR/summary.json. Exits with 0 on success, 2 on wrong input, 3 when no
+    reconstruction was possible; the summary then has the reasons.
+    """
+    run(images, output, config, intrinsics, image_list, overrides or [], quiet)
+
+
+def run(
+    images: Path,
+    output: Path,
+    config: str,
+    intrinsics: Path | None,
+    image_list: Path | None,
+    overrides: list[str],
+    quiet: bool,
+) -> ReconstructionResult:
+    """Reconstruct with progress bars and print what came out; both unless ``quiet``."""
+    from mpsfm_core.cli.progress import showing_progress
+    from mpsfm_core.pipeline import reconstruct
+    from mpsfm_core.registry import Registry
+
+    registry = Registry.discover()
+    with showing_progress(registry, quiet):
+        result = reconstruct(
+            images,
+            output,
+            config,
+            intrinsics=intrinsics,
+            image_list=image_list,
+            overrides=overrides,
+            registry=registry,
+        )
+    if not quiet:
+        _print_outcome(result, output)
+    return result
+
+
+def _print_outcome(result: ReconstructionResult, output: Path) -> None:
+    images, best = result.summary["images"], result.summary["reconstructions"][0]
+    typer.echo(
+        f"{best['images']} of {images['total']} images, {best['points']} points, mean "
+        f"reprojection error {best['mean_reprojection_error_px'] or 0:.2f} px"
+    )
+    for name, reason in images["unregistered"].items():
+        typer.echo(f"  not registered: {name}: {reason}")
+    seconds = sum(stage["seconds"] for stage in result.summary["stages"].values())
+    typer.echo(f"written to {output} in {seconds:.0f} s")

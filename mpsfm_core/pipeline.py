@@ -1,0 +1,186 @@
+"""From a folder of photos to results: the only place that knows all rooms."""
+
+from __future__ import annotations
+
+import platform
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+from threadpoolctl import threadpool_limits
+
+from mpsfm_core.config import Config, load_config
+from mpsfm_core.errors import ReconstructionError
+from mpsfm_core.extraction.runner import Extraction, extract
+from mpsfm_core.inputs.images import ImageSet, load_images
+from mpsfm_core.mapping import mapper
+from mpsfm_core.options import dotted
+from mpsfm_core.registry import Registry, core_version
+from mpsfm_core.results.folder import check_writable
+from mpsfm_core.results.photos import Photos
+from mpsfm_core.results.summary import describe_images, describe_pairs, describe_reconstructions
+from mpsfm_core.results.writer import SUMMARY, Component, write_failure, write_results
+from mpsfm_core.scene.reconstruction import MappingResult
+from mpsfm_core.stages import Stages
+
+PathLike = str | Path
+
+
+@dataclass(frozen=True, eq=False)
+class ReconstructionResult:
+    """What :func:`reconstruct` returns.
+
+    ``model``: COLMAP model of the original photos. ``further_models``: of images that are not
+    connected to those of ``model``, largest first. ``mapping``: poses, points and refined depth
+    as arrays. ``summary``: what ``summary.json`` says. ``output``: the folder that was written.
+    """
+
+    model: pycolmap.Reconstruction
+    further_models: tuple[pycolmap.Reconstruction, ...]
+    mapping: MappingResult
+    summary: dict[str, Any]
+    output: Path | None
+
+
+def reconstruct(
+    images: PathLike,
+    output: PathLike | None = None,
+    config: PathLike | Config = "default",
+    *,
+    intrinsics: PathLike | None = None,
+    image_list: PathLike | None = None,
+    overrides: Sequence[str] = (),
+    registry: Registry | None = None,
+) -> ReconstructionResult:
+    """Reconstruct a folder of photos.
+
+    Args:
+        images: folder of photos, subfolders included.
+        output: folder to write (see :mod:`mpsfm_core.results.writer`), nothing is written if None.
+        config: name of a shipped configuration, a YAML file, or a loaded one.
+        intrinsics: ``intrinsics.yaml`` or a COLMAP model; else EXIF, else a default focal length.
+        image_list: text file with one image name a line.
+        overrides: settings such as ``"runtime.workers=2"``; not with a loaded configuration.
+        registry: the providers to choose from, by default those of all installed plugins.
+
+    Raises:
+        InputError: images, intrinsics, configuration, weights or output folder are wrong.
+        ReconstructionError: no reconstruction was possible; ``summary.json`` has the reasons.
+        MpsfmError: a provider failed or broke its contract, or the disk is full.
+    """
+    registry = registry or Registry.discover()
+    if not isinstance(config, Config):
+        config = load_config(config, overrides, registry)
+    elif overrides:
+        raise TypeError("overrides go into load_config(), this configuration is loaded already")
+    run = _Run(config, registry, None if output is None else Path(output))
+    with threadpool_limits(config.runtime.workers):
+        return run(Path(images), _path(intrinsics), _path(image_list))
+
+
+class _Run:
+    """One reconstruction: the rooms in their order."""
+
+    def __init__(self, config: Config, registry: Registry, output: Path | None) -> None:
+        self._config = config
+        self._registry = registry
+        self._output = output
+        self._stages = Stages(registry)
+
+    def __call__(
+        self, folder: Path, intrinsics: Path | None, image_list: Path | None
+    ) -> ReconstructionResult:
+        config, stage = self._config, self._stages.stage
+        if self._output is not None:
+            check_writable(self._output)
+        with stage("inputs"):
+            images = load_images(folder, intrinsics, image_list, config.inputs)
+        with stage("extraction"):
+            extraction = extract(images, config, self._registry, self._stages)
+        with stage("mapping"):
+            mapping = mapper.reconstruct(extraction.problem, config.mapping, self._stages)
+        if not mapping.reconstructions:
+            self._give_up(images, extraction, mapping)
+        summary: dict[str, Any] = {}
+        with stage("results"):
+            photos = Photos(images, extraction.problem)
+            components = [Component.of(part, photos) for part in mapping.reconstructions]
+            models = tuple(component.model for component in components)
+
+            def summarize() -> dict[str, Any]:
+                summary.update(self._summary("success", images, extraction, mapping, models))
+                return summary
+
+            if self._output is None:
+                summarize()
+            else:
+                seed = config.runtime.seed
+                write_results(self._output, components, photos, config.results, summarize, seed)
+        return ReconstructionResult(models[0], models[1:], mapping, summary, self._output)
+
+    def _give_up(self, images: ImageSet, extraction: Extraction, mapping: MappingResult) -> None:
+        """Leave the reasons in the summary and raise."""
+        summary = self._summary("failed", images, extraction, mapping, ())
+        where = ""
+        if self._output is not None:
+            write_failure(self._output, summary)
+            where = f"; the reasons per image and pair are in {self._output / SUMMARY}"
+        pairs = summary["pairs"]["verified"]
+        counted = Counter(summary["images"]["unregistered"].values()).most_common(1)
+        raise ReconstructionError(
+            f"no reconstruction was possible from {len(images)} images with {pairs} verified "
+            f"pairs (most often: {counted[0][0]}){where}"
+        )
+
+    def _summary(
+        self,
+        status: str,
+        images: ImageSet,
+        extraction: Extraction,
+        mapping: MappingResult,
+        models: Sequence[pycolmap.Reconstruction],
+    ) -> dict[str, Any]:
+        return {
+            "status": status,
+            "images": describe_images(images, mapping),
+            "pairs": describe_pairs(extraction.problem, mapping),
+            "reconstructions": describe_reconstructions(mapping, models),
+            "extraction": extraction.report,
+            "stages": {name: asdict(record) for name, record in self._stages.report().items()},
+            "mapping_steps": {
+                name: {"seconds": seconds, "calls": mapping.report.counts.get(name)}
+                for name, seconds in mapping.report.seconds.items()
+            },
+            "providers": self._providers(),
+            "config": self._config.model_dump(mode="json"),
+            "versions": {
+                "mpsfm-core": core_version(),
+                "pycolmap": pycolmap.__version__,
+                "python": platform.python_version(),
+            },
+        }
+
+    def _providers(self) -> list[dict[str, Any]]:
+        """What predicted what, under which licences."""
+        described = []
+        for path, kind, backend in self._config.backends():
+            spec = self._registry.spec(kind, backend.use)
+            described.append(
+                {
+                    "block": dotted(path),
+                    "kind": kind,
+                    "name": spec.name,
+                    "from": self._registry.version(kind, backend.use),
+                    "code_license": spec.code_license,
+                    "weights_license": spec.weights_license,
+                    "wrappers": [wrapper.use for wrapper in backend.wrap],
+                }
+            )
+        return described
+
+
+def _path(value: PathLike | None) -> Path | None:
+    return None if value is None else Path(value)
