@@ -57,6 +57,7 @@ Capability = Literal[
     "wraps-normals",  # wrapper for normals providers
     "intrinsics-aware",  # the output depends on the focal length
     "estimates-focal",  # depth provider that also has estimate_focal()
+    "uncached",  # reads its output from files: nothing is kept, and a changed file is seen
 ]
 CAPABILITIES: tuple[Capability, ...] = get_args(Capability)
 
