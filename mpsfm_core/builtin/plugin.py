@@ -1,0 +1,100 @@
+"""What the core brings along: providers that need no weights. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from mpsfm_core.builtin.options import (
+    DepthFileOptions,
+    FromDepthOptions,
+    MaskFileOptions,
+    MutualNearestOptions,
+    NormalFileOptions,
+    SiftOptions,
+)
+from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers import ProviderSpec, hookimpl
+
+_LICENSE = "Apache-2.0"
+
+
+@hookimpl
+def mpsfm_providers() -> list[ProviderSpec]:
+    """SIFT, mutual nearest neighbours, priors from files, normals from depth."""
+    return [*_matching(), *_depth(), *_normals(), *_masks()]
+
+
+def _matching() -> list[ProviderSpec]:
+    return [
+        ProviderSpec(
+            kind="features",
+            name="sift",
+            factory="mpsfm_core.builtin.sift:Sift",
+            options=SiftOptions,
+            summary="RootSIFT of COLMAP on the CPU",
+            code_license=_LICENSE,
+            tags=("sift",),
+        ),
+        ProviderSpec(
+            kind="matcher",
+            name="mutual-nearest",
+            factory="mpsfm_core.builtin.mutual_nearest:MutualNearest",
+            options=MutualNearestOptions,
+            capabilities=frozenset({"sparse"}),
+            summary="mutual nearest descriptors with ratio test, for any features",
+            code_license=_LICENSE,
+        ),
+    ]
+
+
+def _depth() -> list[ProviderSpec]:
+    return [
+        ProviderSpec(
+            kind="depth",
+            name="files",
+            factory="mpsfm_core.builtin.files:DepthFiles",
+            options=DepthFileOptions,
+            capabilities=frozenset({"uncached"}),
+            summary="depth maps of a sensor or any network, read from files",
+            code_license=_LICENSE,
+            # The files' uncertainty is declared with them: nothing is added to it.
+            calibration=DepthCalibration(std_scale=1.0, relative_std=0.0, std_floor=0.0),
+        ),
+    ]
+
+
+def _normals() -> list[ProviderSpec]:
+    return [
+        ProviderSpec(
+            kind="normals",
+            name="files",
+            factory="mpsfm_core.builtin.files:NormalFiles",
+            options=NormalFileOptions,
+            capabilities=frozenset({"uncached"}),
+            summary="normal maps read from files",
+            code_license=_LICENSE,
+            calibration=NormalCalibration(std_scale=1.0, std_floor_deg=0.0),
+        ),
+        ProviderSpec(
+            kind="normals",
+            name="from-depth",
+            factory="mpsfm_core.builtin.from_depth:FromDepth",
+            options=FromDepthOptions,
+            capabilities=frozenset({"needs-depth", "variance", "intrinsics-aware"}),
+            summary="normals of planes fitted to the depth prior",
+            code_license=_LICENSE,
+            calibration=NormalCalibration(std_scale=1.0, std_floor_deg=1.0),
+        ),
+    ]
+
+
+def _masks() -> list[ProviderSpec]:
+    return [
+        ProviderSpec(
+            kind="mask",
+            name="files",
+            factory="mpsfm_core.builtin.files:MaskFiles",
+            options=MaskFileOptions,
+            capabilities=frozenset({"uncached"}),
+            summary="masks read from image files",
+            code_license=_LICENSE,
+        ),
+    ]
