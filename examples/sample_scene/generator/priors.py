@@ -1,0 +1,100 @@
+"""Depth and normal priors with the errors of a monocular network, and honest variances.
+
+All errors are drawn from a seeded generator; variances are declared from what the errors were drawn
+with and from the local spread that a blurred edge has, never from the errors themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .cameras import Truth
+
+Float64 = NDArray[np.float64]
+
+FIELD_SCALES = ((0.7, 0.2), (0.55, 0.07), (0.45, 0.025))
+"""(weight, correlation length as a share of the map's width); squared weights sum to 1."""
+
+
+@dataclass(frozen=True)
+class PriorErrors:
+    """How wrong the priors are. Standard deviations; blur in pixels of the prior's grid."""
+
+    std_scale: float = 0.05
+    std_depth: float = 0.05
+    std_normal_deg: float = 3.0
+    amplitude_spread: float = 0.35
+    declared_spread: float = 0.15
+    blur_px: float = 1.3
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A degraded map, its variance (m^2, or rad^2 a tangent axis) and where it holds."""
+
+    values: Float64
+    variance: Float64
+    valid: NDArray[np.bool_]
+
+
+def degrade_depth(truth: Truth, errors: PriorErrors, rng: np.random.Generator) -> Prior:
+    """Blurred edges, one wrong scale, and a smooth multiplicative error whose size varies."""
+    valid = truth.depth > 0
+    shape = truth.depth.shape
+    mean = _blur(truth.depth, valid, errors.blur_px)
+    spread = np.maximum(_blur(truth.depth**2, valid, errors.blur_px) - mean**2, 0)
+    std_relative = errors.std_depth * np.exp(errors.amplitude_spread * _field(rng, shape))
+    scale = np.exp(rng.normal(0, errors.std_scale))
+    depth = scale * mean * np.exp(std_relative * _field(rng, shape))
+    variance = depth**2 * (errors.std_scale**2 + std_relative**2) + scale**2 * spread
+    return Prior(depth, variance * _misjudged(errors, rng, shape), valid)
+
+
+def degrade_normals(
+    truth: Truth, rays: Float64, errors: PriorErrors, rng: np.random.Generator
+) -> Prior:
+    """Blurred edges and a smooth tilt about both tangent axes whose size varies.
+
+    ``rays``: (h, w, 3) directions of the pixels; a normal turned away from its ray is invalid.
+    """
+    valid = truth.depth > 0
+    shape = truth.depth.shape
+    blurred = np.dstack([_blur(n, valid, errors.blur_px) for n in np.moveaxis(truth.normals, 2, 0)])
+    length = np.linalg.norm(blurred, axis=2)
+    mean = blurred / np.maximum(length, 1e-9)[..., None]
+    std_tilt = np.radians(errors.std_normal_deg)
+    std_tilt = std_tilt * np.exp(errors.amplitude_spread * _field(rng, shape))
+    tilt = np.dstack([std_tilt * _field(rng, shape) for _ in range(3)])
+    tilt -= (tilt * mean).sum(2, keepdims=True) * mean
+    normals = (mean + tilt) / np.linalg.norm(mean + tilt, axis=2, keepdims=True).clip(1e-9)
+    variance = std_tilt**2 + (1 - length**2).clip(0) / 2
+    faces_camera = (normals * rays).sum(2) < 0
+    return Prior(normals, variance * _misjudged(errors, rng, shape), valid & faces_camera)
+
+
+def _misjudged(errors: PriorErrors, rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
+    """Factor by which a network's own idea of its variance is off."""
+    return np.exp(2 * errors.declared_spread * _field(rng, shape))
+
+
+def _field(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
+    """A Gaussian random field of zero mean and unit variance with several correlation lengths."""
+    total = np.zeros(shape)
+    for weight, share in FIELD_SCALES:
+        sigma = share * shape[1]
+        margin = int(3 * sigma)
+        noise = rng.normal(size=(shape[0] + 2 * margin, shape[1] + 2 * margin))
+        smooth = cv2.GaussianBlur(noise, (0, 0), sigma)[margin:-margin, margin:-margin]
+        total += weight * 2 * np.sqrt(np.pi) * sigma * smooth
+    return total
+
+
+def _blur(values: Float64, valid: NDArray[np.bool_], sigma: float) -> Float64:
+    """Gaussian blur of the valid pixels alone; 0 elsewhere."""
+    weight = cv2.GaussianBlur(valid.astype(float), (0, 0), sigma)
+    mean = cv2.GaussianBlur(np.where(valid, values, 0), (0, 0), sigma) / weight.clip(1e-9)
+    return np.where(valid, mean, 0)
