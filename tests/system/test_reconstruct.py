@@ -1,0 +1,163 @@
+"""``mpsfm reconstruct`` and the Python front door, from photos to files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+import mpsfm_core
+from mpsfm_core.errors import ReconstructionError
+from mpsfm_core.evaluation import evaluate, read_poses, reconstruction_poses
+
+
+@pytest.fixture(scope="module")
+def output(photo_scene, mpsfm, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("results") / "out"
+    ended = mpsfm(*photo_scene.arguments, "--output", folder)
+    assert ended.code == 0, ended.err
+    assert "5 of 5 images" in ended.out
+    return folder
+
+
+def test_the_contract_of_the_output_folder(output: Path) -> None:
+    names = {path.name for path in output.iterdir()}
+    assert names == {"sparse", "points.ply", "dense.ply", "depth", "summary.json"}
+    assert {path.name for path in (output / "depth").iterdir()} == {
+        f"{number}.png.npz" for number in range(5)
+    }
+
+
+def test_poses_and_depth_are_right(output: Path, photo_scene) -> None:
+    report = evaluate(read_poses(output), read_poses(photo_scene.truth))
+    assert report["registered"] == 5
+    assert report["auc"]["1"] > 80
+    # Exact metric depth: the model is in metres.
+    assert report["trajectory"]["scale"] == pytest.approx(1, abs=0.02)
+    for number in range(5):
+        with np.load(output / "depth" / f"{number}.png.npz") as refined:
+            depth, valid = refined["depth"], refined["valid"]
+        with np.load(photo_scene.folder / "depth" / f"{number}.npz") as exact:
+            truth = cv2.resize(exact["depth"], depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        error = np.abs(depth[valid] / truth[valid] - 1)
+        assert np.median(error) < 0.02
+
+
+def test_the_model_opens_and_names_the_photos(output: Path) -> None:
+    model = pycolmap.Reconstruction(str(output / "sparse"))
+    assert sorted(image.name for image in model.images.values()) == [f"{i}.png" for i in range(5)]
+    assert model.num_points3D() > 100
+    assert model.compute_mean_reprojection_error() < 2
+
+
+def test_the_summary_says_what_was_used_and_what_came_out(output: Path) -> None:
+    summary = json.loads((output / "summary.json").read_text())
+    assert summary["status"] == "success"
+    assert summary["images"]["unregistered"] == {}
+    assert summary["config"]["features"]["use"] == "sift"
+    assert {provider["kind"] for provider in summary["providers"]} == {
+        "features",
+        "matcher",
+        "depth",
+        "normals",
+    }
+    assert set(summary["stages"]) == {"inputs", "extraction", "mapping", "results"}
+    for stage in summary["stages"].values():
+        assert stage["seconds"] > 0
+        assert stage["peak_memory_mb"] > 10
+    (best,) = summary["reconstructions"]
+    assert best["images"] == 5
+
+
+def test_python_gives_the_same_poses_without_writing(
+    output: Path, photo_scene, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MPSFM_CACHE", str(cache))
+    result = mpsfm_core.reconstruct(
+        photo_scene.images,
+        config=photo_scene.config,
+        intrinsics=photo_scene.intrinsics,
+        overrides=["runtime.seed=0"],
+    )
+    assert result.output is None
+    assert result.summary["status"] == "success"
+    assert len(result.mapping.reconstructions[0].images) == 5
+    written = read_poses(output)
+    for name, (rotation, translation) in reconstruction_poses(result.model).items():
+        np.testing.assert_allclose(rotation, written[name][0], atol=1e-9)
+        np.testing.assert_allclose(translation, written[name][1], atol=1e-9)
+
+
+def test_an_image_list_chooses_and_quiet_is_quiet(photo_scene, mpsfm, tmp_path: Path) -> None:
+    listed = tmp_path / "list.txt"
+    listed.write_text("1.png\n2.png\n3.png\n")
+    output = tmp_path / "out"
+    ended = mpsfm(*photo_scene.arguments, "--output", output, "--image-list", listed, "--quiet")
+    assert (ended.code, ended.out, ended.err) == (0, "", "")
+    model = pycolmap.Reconstruction(str(output / "sparse"))
+    assert {image.name for image in model.images.values()} == {"1.png", "2.png", "3.png"}
+
+
+def test_a_setting_reaches_the_run(photo_scene, mpsfm, tmp_path: Path) -> None:
+    ended = mpsfm(
+        *photo_scene.arguments, "--output", tmp_path / "out", "--set", "results.dense_cloud=false"
+    )
+    assert ended.code == 0, ended.err
+    assert not (tmp_path / "out" / "dense.ply").exists()
+
+
+@pytest.fixture(scope="module")
+def unrelated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three photos of noise, with depth files: nothing matches."""
+    folder = tmp_path_factory.mktemp("noise")
+    (folder / "images").mkdir()
+    rng = np.random.default_rng(0)
+    for number in range(3):
+        noise = rng.integers(0, 256, (240, 320, 3)).astype(np.uint8)
+        cv2.imwrite(str(folder / "images" / f"{number}.png"), noise)
+        np.savez(folder / f"{number}.npz", depth=np.full((60, 80), 2.0, np.float32))
+    return folder
+
+
+def test_nothing_to_reconstruct_exits_with_3_and_gives_reasons(
+    photo_scene, unrelated: Path, mpsfm, tmp_path: Path
+) -> None:
+    output = tmp_path / "out"
+    (output / "sparse").mkdir(parents=True)
+    (output / "sparse" / "images.bin").write_text("earlier")
+    ended = mpsfm(
+        "reconstruct",
+        unrelated / "images",
+        "--config",
+        photo_scene.config,
+        "--set",
+        f"depth.options.directory={unrelated}",
+        "--output",
+        output,
+        "--quiet",
+    )
+    assert ended.code == 3, ended.err
+    assert "no reconstruction was possible from 3 images" in ended.err
+    assert "summary.json" in ended.err
+    summary = json.loads((output / "summary.json").read_text())
+    assert summary["status"] == "failed"
+    assert set(summary["images"]["unregistered"]) == {"0.png", "1.png", "2.png"}
+    assert all(summary["images"]["unregistered"].values())
+    assert set(summary["pairs"]["rejected"]) == {"0.png 1.png", "0.png 2.png", "1.png 2.png"}
+    assert (output / "sparse" / "images.bin").read_text() == "earlier"
+
+
+def test_python_raises_when_nothing_can_be_reconstructed(
+    photo_scene, unrelated: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MPSFM_CACHE", str(cache))
+    with pytest.raises(ReconstructionError, match="from 3 images with 0 verified pairs"):
+        mpsfm_core.reconstruct(
+            unrelated / "images",
+            config=photo_scene.config,
+            overrides=[f"depth.options.directory={unrelated}"],
+        )
