@@ -43,8 +43,8 @@ lint: $(INSTALLED) ## Run ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(INSTALLED) ## Run the benchmarks
-	$(BIN)/python -m benchmarks
+bench: $(INSTALLED) ## Run the benchmarks, or those that BENCH names
+	$(BIN)/python -m benchmarks $(BENCH)
 
 clean: ## Remove the environment and the demo's output
 	rm -rf $(VENV) demo-output
