@@ -150,8 +150,8 @@ class WeightStore:
             state = "is damaged in" if path.is_file() else "is not in"
             raise WeightsError(
                 f"{uri} {state} the cache {self.cache_dir} and downloads are switched off "
-                f"({' or '.join(OFFLINE_VARIABLES)}): run 'mpsfm models fetch' with network, "
-                f"or name a local file instead"
+                f"(runtime.offline or ${' or $'.join(OFFLINE_VARIABLES)}): run 'mpsfm models "
+                f"fetch' with network, or name a local file instead"
             )
         part = path.with_name(path.name + ".part")
         _download(uri, part, expected, self._progress)

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli import config, demo, evaluate, plugins, reconstruct
+from mpsfm_core.cli import config, demo, evaluate, models, plugins, reconstruct
 from mpsfm_core.cli.errors import GuardedGroup
 
 
@@ -36,6 +36,7 @@ def build_app() -> typer.Typer:
     app.command("evaluate")(evaluate.evaluate)
     app.add_typer(plugins.app, name="plugins")
     app.add_typer(config.app, name="config")
+    app.add_typer(models.app, name="models")
     return app
 
 

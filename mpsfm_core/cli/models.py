@@ -1,0 +1,166 @@
+"""``mpsfm models``: the weights of networks, on this machine and elsewhere."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeAlias
+
+import typer
+
+if TYPE_CHECKING:
+    from mpsfm_core.providers import WeightsFile
+    from mpsfm_core.weights import Progress
+
+app = typer.Typer(no_args_is_help=True, help="Weights: list, download, check.")
+
+Targets: TypeAlias = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="NAME_OR_URI...", help="Providers (xfeat, matcher/loftr) or URIs of weights files."
+    ),
+]
+CacheDir: TypeAlias = Annotated[
+    Path | None,
+    typer.Option("--cache", metavar="DIR", help="Instead of $MPSFM_CACHE or the user's cache."),
+]
+
+
+@app.command("list")
+def list_models(
+    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+    cache: CacheDir = None,
+) -> None:
+    """List the default weights of all providers, and whether they are on this machine."""
+    from mpsfm_core.cli.tables import print_table
+    from mpsfm_core.weights import WeightStore
+
+    store = WeightStore(cache)
+    files = [(provider, file, store.locate(file.uri)) for provider, file in _known()]
+    if as_json:
+        lines = [
+            {"provider": provider, **asdict(file), "path": path and str(path)}
+            for provider, file, path in files
+        ]
+        typer.echo(json.dumps(lines, indent=2))
+        return
+    rows = [
+        (provider, file.license, _state(file.uri, path), str(path or file.uri))
+        for provider, file, path in files
+    ]
+    print_table(("provider", "licence", "state", "file"), rows)
+
+
+@app.command()
+def fetch(
+    targets: Targets,
+    sha256: Annotated[
+        str | None, typer.Option("--sha256", help="Expected hash, for a single URI.")
+    ] = None,
+    cache: CacheDir = None,
+) -> None:
+    """Download weights that are missing, check them, and print where they are."""
+    from mpsfm_core.weights import WeightStore
+
+    with _progress_bars() as progress:
+        store = WeightStore(cache, progress=progress)
+        paths = [store.resolve(file.uri, sha256 or file.sha256) for file in _select(targets)]
+    for path in paths:
+        typer.echo(path)
+
+
+@app.command()
+def verify(
+    targets: Annotated[list[str] | None, typer.Argument(metavar="[NAME_OR_URI...]")] = None,
+    cache: CacheDir = None,
+) -> None:
+    """Hash weights and compare; without arguments, all default weights on this machine."""
+    from mpsfm_core.weights import WeightStore
+
+    store = WeightStore(cache)
+    if targets:
+        chosen = _select(targets)
+    else:
+        chosen = [file for _, file in _known() if store.locate(file.uri)]
+    for file in chosen:
+        typer.echo(f"{store.verify(file.uri, file.sha256)}  {file.uri}")
+
+
+@app.command()
+def path(targets: Targets, cache: CacheDir = None) -> None:
+    """Print where weights are on this machine; fails if they are not."""
+    from mpsfm_core.errors import WeightsError
+    from mpsfm_core.weights import WeightStore
+
+    store = WeightStore(cache)
+    for file in _select(targets):
+        found = store.locate(file.uri)
+        if found is None:
+            raise WeightsError(f"{file.uri} is not on this machine; 'mpsfm models fetch' gets it")
+        typer.echo(found)
+
+
+def _known() -> Iterator[tuple[str, WeightsFile]]:
+    """Kind and name of each usable provider with each of its default weights files."""
+    from mpsfm_core.registry import Registry
+
+    registry = Registry.discover()
+    for status in registry.status():
+        if status.available and status.kind != "plugin":
+            for file in registry.spec(status.kind, status.name).weights:
+                yield f"{status.kind}/{status.name}", file
+
+
+def _select(targets: list[str]) -> list[WeightsFile]:
+    """The weights files that names and URIs stand for, each once."""
+    from mpsfm_core.errors import InputError, did_you_mean
+    from mpsfm_core.providers import WeightsFile
+
+    known = [(provider.split("/")[1], provider, file) for provider, file in _known()]
+    chosen: dict[str, WeightsFile] = {}
+    for target in targets:
+        found = [file for name, provider, file in known if target in (name, provider, file.uri)]
+        if not found and not _is_uri(target):
+            raise InputError(
+                f"no provider {target!r} with weights"
+                f"{did_you_mean(target, [name for name, _, _ in known])}; "
+                f"'mpsfm models list' shows all"
+            )
+        chosen |= {file.uri: file for file in found or [WeightsFile(target)]}
+    return list(chosen.values())
+
+
+def _is_uri(target: str) -> bool:
+    return ":" in target or Path(target).suffix != "" or Path(target).exists()
+
+
+def _state(uri: str, path: Path | None) -> str:
+    if path:
+        return "here"
+    return "to be fetched" if "://" in uri else "its package is not installed"
+
+
+@contextmanager
+def _progress_bars() -> Iterator[Progress]:
+    """A bar on stderr for each file that is downloaded."""
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn())
+    bars = Progress(*columns, TransferSpeedColumn(), console=Console(stderr=True))
+    tasks = {}
+
+    def show(name: str, done: int, total: int | None) -> None:
+        if name not in tasks:
+            bars.start()
+            tasks[name] = bars.add_task(name)
+        bars.update(tasks[name], completed=done, total=total)
+
+    try:
+        yield show
+    finally:
+        if tasks:
+            bars.stop()
