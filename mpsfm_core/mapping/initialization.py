@@ -64,7 +64,7 @@ def _pose_from_lift(
     )
     if pose is None:
         return None
-    return InitialPose(pose.rotation, pose.translation, "lifted depth", pose.num_inliers)
+    return InitialPose(pose[0], pose[1], "lifted depth", int(pose[2].sum()))
 
 
 def _pose_from_rays(

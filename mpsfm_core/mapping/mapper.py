@@ -161,11 +161,12 @@ class Mapper:
             references = local_bundle(scene, reference, neighbors, self.scores)
             pose = find_pose(scene, image, references, options.registration, options.seed)
             if pose is None:
-                return "PnP found no pose"
+                return "neither PnP nor an essential matrix gives a pose"
             if pose.num_inliers < self.ladder.min_inliers:
-                return f"PnP found {pose.num_inliers} inliers, {self.ladder.min_inliers} needed"
+                needed = self.ladder.min_inliers
+                return f"{pose.num_inliers} matches support its pose, {needed} are needed"
             if pose.inlier_share < self.ladder.min_inlier_share:
-                return f"only {pose.inlier_share:.0%} of the matches agree with the PnP pose"
+                return f"only {pose.inlier_share:.0%} of the matches support its pose"
             scene.register(image, pose.rotation, pose.translation)
             triangulate_image(scene, image, options.triangulation)
         with self._timed("local refinement"):

@@ -42,6 +42,11 @@ class RegistrationOptions(Options):
     pairs pass, 30 % of the wrong ones."""
     max_error_px: float = Field(12.0, gt=0)
     """Reference and COLMAP: abs_pose_max_error."""
+    max_support_error_px: float = Field(4.0, gt=0)
+    """Distance of a supporting keypoint to the segment its match projects to (COLMAP: two-view
+    max_error)."""
+    depth_deviations: float = Field(2.0, ge=0)
+    """Half length of that segment in standard deviations of log depth (ours)."""
     min_inlier_ratio: float = Field(0.25, gt=0, le=1)
     """Reference and COLMAP: used for RANSAC's number of trials."""
     lifting: bool = True

@@ -189,8 +189,9 @@ class Refiner:
                 depth_map.prior, depth_map.normals, depth_map.camera, self.options.integration
             )
         anchors = Anchors(depth_map.keypoints[rows][good], z[good], variance[good])
-        result = integrator.refine(anchors, scale=depth_map.scale, initial=depth_map.refined)
-        depth_map.set_refined(result.depth)
+        depth_map.set_refined(
+            integrator.refine(anchors, scale=depth_map.scale, start=depth_map.refined)
+        )
 
     def _observed_depth(self, image: int) -> tuple[Int64, Float64]:
         """Keypoints of an image that observe points, and the points' depth in the image."""

@@ -201,7 +201,7 @@ def midpoints(center_a: Float64, ray_a: Float64, center_b: Float64, ray_b: Float
 def _fits(
     scene: Scene, source: Int64, target: Int64, points: Float64, max_error_px: float
 ) -> Bool:
-    fits = np.isfinite(points).all(axis=1)
+    fits: Bool = np.asarray(np.isfinite(points).all(axis=1))
     for keypoints in (source, target):
         with np.errstate(invalid="ignore"):
             errors, _ = scene.project(keypoints, points)

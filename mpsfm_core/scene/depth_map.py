@@ -6,13 +6,13 @@ import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage
 from mpsfm_core.geometry import sample_bilinear, scale_pixels
+from mpsfm_core.optimize.depth_integration import RefinedDepth
 
 
 class DepthMap:
     """Prior depth of an image and what the reconstruction has made of it.
 
-    The prior is ``scale`` times itself in world units. Once refined, ``refined`` holds the map
-    in world units; until then the scaled prior stands for it.
+    The prior is ``scale`` times itself in world units. Once refined, ``refined`` stands for it.
 
     Attributes:
         camera: intrinsics of the map's grid.
@@ -39,8 +39,8 @@ class DepthMap:
         self.keypoint_log_std: Float64 = self._sample(self.log_std)[0]
         self.scale = 1.0
         self.active = False
-        self.refined: Float32 | None = None
-        self._refined_at: Float64 | None = None
+        self.refined: RefinedDepth | None = None
+        self._use_prior()
 
     @property
     def valid(self) -> Bool:
@@ -50,9 +50,8 @@ class DepthMap:
     @property
     def depth(self) -> Float32:
         """(h, w) float32, the best depth known, world units."""
-        if self.refined is not None:
-            return self.refined
-        return self.prior.depth * np.float32(self.scale)
+        depth: Float32 = self._best * np.float32(self._factor)
+        return depth
 
     @property
     def variance(self) -> Float32:
@@ -66,25 +65,27 @@ class DepthMap:
 
     def at_keypoints(self, rows: Int64 | slice = slice(None)) -> Float64:
         """Best depth at keypoints, world units; meaningful where :attr:`keypoint_valid`."""
-        if self._refined_at is None:
-            return self._prior_at[rows] * self.scale
-        return self._refined_at[rows]
+        return self._best_at[rows] * self._factor
 
     def set_scale(self, scale: float) -> None:
         """Change the prior's scale; a refined map is scaled along."""
-        if self.refined is not None:
-            self.set_refined(self.refined * np.float32(scale / self.scale))
         self.scale, self.active = scale, True
+        self._factor = scale / self.refined.scale if self.refined else scale
 
-    def set_refined(self, depth: Float32) -> None:
-        """Store a refined map, world units."""
-        self.refined = depth
-        self._refined_at = self._sample(depth)[0]
+    def set_refined(self, refined: RefinedDepth) -> None:
+        """Let a refined map stand for the prior."""
+        self.refined = refined
+        self._best = refined.depth
+        self._best_at = self._sample(self._best)[0]
+        self.set_scale(refined.scale)
 
     def reset(self) -> None:
         """Forget scale and refinement."""
-        self.scale, self.active = 1.0, False
-        self.refined, self._refined_at = None, None
+        self.scale, self.active, self.refined = 1.0, False, None
+        self._use_prior()
+
+    def _use_prior(self) -> None:
+        self._best, self._best_at, self._factor = self.prior.depth, self._prior_at, 1.0
 
     def _sample(self, values: Float32) -> tuple[Float64, Bool]:
         return sample_bilinear(values, self.prior.valid, self.keypoints)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Float32, Float64, Int64, MappingProblem
+from mpsfm_core.data import Bool, Float64, Int64, MappingProblem
 from mpsfm_core.geometry import camera_center
+from mpsfm_core.optimize.depth_integration import RefinedDepth
 from mpsfm_core.scene.depth_map import DepthMap
 from mpsfm_core.scene.graph import CorrespondenceGraph
 from mpsfm_core.scene.kernels import max_triangulation_angles
@@ -23,7 +25,7 @@ class Snapshot(NamedTuple):
     registered: Bool
     xyz: Float64
     point_of: Int64
-    maps: list[tuple[float, bool, Float32 | None]]
+    maps: Sequence[tuple[float, bool, RefinedDepth | None]]
 
 
 class Scene:
@@ -149,7 +151,7 @@ class Scene:
         for depth_map, (scale, active, refined) in zip(self.maps, snapshot.maps, strict=True):
             if depth_map.refined is not refined or depth_map.scale != scale:
                 depth_map.reset()
-                if active:
-                    depth_map.set_scale(scale)
                 if refined is not None:
                     depth_map.set_refined(refined)
+                if active:
+                    depth_map.set_scale(scale)
