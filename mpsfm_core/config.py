@@ -125,7 +125,7 @@ def load_config(
     .yml). ``overrides``: texts ``a.b=value`` with a YAML value, applied last; list entries by
     index. ``registry``: default ``Registry.discover()``; every backend's name and options are
     checked against it, and the returned options have all defaults filled in. ``complete=False``
-    lets required options of backends be absent, to look at a configuration.
+    lets required options of backends be absent (they are null), to look at a configuration.
 
     Raises :class:`~mpsfm_core.errors.ConfigError` with file, line, YAML path and, for unknown
     keys and names, the nearest valid one.
@@ -290,7 +290,7 @@ def _check_backend(
     except SettingsError as error:
         if complete or not all(problem.missing for problem in error.problems):
             raise
-        filled = backend.options
+        filled = registry.default_options(kind, backend.use) | backend.options
     wrap = tuple(
         _check_backend((*path, "wrap", index), "wrapper", wrapper, registry, layers, complete)
         for index, wrapper in enumerate(backend.wrap)

@@ -8,7 +8,6 @@ and hands it on. Finding and listing providers imports no plugin's heavy modules
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import logging
 import os
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ from typing import Any, Literal
 
 import pluggy
 
+from mpsfm_core.builtin import plugin as builtin
 from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.discovery import (
     Plugin,
@@ -121,9 +121,7 @@ class Registry:
         limit for each plugin, by default ``$MPSFM_PLUGIN_TIMEOUT_S`` or 10 s.
         """
         registry = cls()
-        if importlib.util.find_spec("mpsfm_core.builtin.plugin"):
-            builtin = importlib.import_module("mpsfm_core.builtin.plugin")
-            registry.register(builtin, name="builtin", distribution=CORE, version=core_version())
+        registry.register(builtin, name="builtin", distribution=CORE, version=core_version())
         for plugin in installed_plugins(_default_timeout() if timeout_s is None else timeout_s):
             registry._add(plugin)
         return registry
@@ -199,11 +197,13 @@ class Registry:
         Raises :class:`~mpsfm_core.options.SettingsError` with the path (below ``path``) and the
         nearest key for each wrong setting.
         """
-        entry = self._entry(kind, name)
-        model = entry.spec.options
-        if isinstance(model, str):
-            model = _load_reference(entry, model)
+        model = self._options_model(kind, name)
         return parse_settings(model or _NoOptions, values or {}, path) if model or values else None
+
+    def default_options(self, kind: Kind, name: str) -> dict[str, Any]:
+        """The provider's options as plain values, None for those that the user has to give."""
+        model = self._options_model(kind, name) or _NoOptions
+        return dict.fromkeys(model.model_fields) | model.model_construct().model_dump(mode="json")
 
     def calibration(self, kind: Kind, backend: Backend) -> Calibration:
         """The uncertainty model of a depth or normals backend.
@@ -332,6 +332,11 @@ class Registry:
             text += "; plugins that did not load: "
             text += ", ".join(f"{p.distribution} ({p.reason})" for p in broken)
         return f"{text}; 'mpsfm plugins list' shows all"
+
+    def _options_model(self, kind: Kind, name: str) -> type[Options] | None:
+        entry = self._entry(kind, name)
+        model: type[Options] | str | None = entry.spec.options
+        return _load_reference(entry, model) if isinstance(model, str) else model
 
     def _construct(
         self,

@@ -249,7 +249,11 @@ class TestResult:
 
     def test_incomplete_configurations_can_be_looked_at(self, load: Load) -> None:
         text = "extends: fast-cpu\ndepth: {use: files, options: {scale: 2}}\n"
-        assert load(text, complete=False).depth.options == {"scale": 2}
+        assert load(text, complete=False).depth.options == {
+            "directory": None,
+            "scale": 2,
+            "weights": {},
+        }
         with pytest.raises(ConfigError, match="unknown key"):
             load(text, "depth.options.scael=3", complete=False)
 
