@@ -143,6 +143,8 @@ class Registry:
             loaded = inspect_plugin(plugin, name, distribution, version)
         except Exception as error:
             raise ProviderError(f"plugin {name!r}: {type(error).__name__}: {error}") from error
+        if self._manager.is_registered(plugin) or self._manager.has_plugin(_label(loaded)):
+            raise ProviderError(f"plugin {name!r} is registered already")
         self._add(loaded)
 
     def add(
@@ -285,7 +287,7 @@ class Registry:
         if plugin.module is not None and self._manager.is_registered(plugin.module):
             fault, hint = "is a second entry point of a plugin that is already loaded", ""
         elif plugin.module is not None:
-            self._manager.register(plugin.module, f"{plugin.distribution}: {plugin.name}")
+            self._manager.register(plugin.module, _label(plugin))
             for spec in plugin.specs:
                 if isinstance(spec, ProviderSpec):
                     self._entries.append(_Entry(spec, *origin, *spec_fault(spec)))
@@ -361,6 +363,10 @@ class Registry:
 
 class _NoOptions(Options):
     """For a provider that has no options: refuses every key."""
+
+
+def _label(plugin: Plugin) -> str:
+    return f"{plugin.distribution}: {plugin.name}"
 
 
 def _key(entry: _Entry) -> tuple[str, str]:

@@ -311,6 +311,16 @@ class TestSpecifications:
         with pytest.raises(ProviderError, match="without any mpsfm hook"):
             Registry().register(object())
 
+    def test_a_plugin_of_this_process_registers_once(self) -> None:
+        class Listener:
+            @hookimpl
+            def mpsfm_stage_started(self, stage: str) -> None: ...
+
+        registry = Registry()
+        registry.register(Listener(), name="viewer")
+        with pytest.raises(ProviderError, match="'viewer' is registered already"):
+            registry.register(Listener(), name="viewer")
+
 
 class TestOptions:
     def test_defaults_are_filled_in(self) -> None:
