@@ -210,21 +210,24 @@ class Registry:
     def calibration(self, kind: Kind, backend: Backend) -> Calibration:
         """The uncertainty model of a depth or normals backend.
 
-        In this order: what the configuration says (``backend.calibration``, values only: a file
-        was read when the configuration was loaded), the first plugin's ``mpsfm_calibration``
-        hook that knows these options, what the outermost wrapper or else the provider declares,
-        the class's defaults.
+        What the configuration says (``backend.calibration``, values only: a file was read when the
+        configuration was loaded) goes first. Else the outermost wrapper and then the provider are
+        asked: its plugin's ``mpsfm_calibration`` hook, then its specification. Else the class's
+        defaults.
         """
         model: type[Calibration] = DepthCalibration if kind == "depth" else NormalCalibration
         if isinstance(backend.calibration, Mapping):
             return parse_settings(model, backend.calibration, ("calibration",))
-        options = self.validate_options(kind, backend.use, backend.options)
-        answers = self.call_hook(
-            "mpsfm_calibration", kind=kind, provider=backend.use, options=options
-        )
-        specs = [self.spec("wrapper", w.use) for w in reversed(backend.wrap)]
-        declared = [spec.calibration for spec in (*specs, self.spec(kind, backend.use))]
-        return next((c for c in (*answers, *declared) if isinstance(c, model)), model())
+        wrappers: list[tuple[Kind, Backend]] = [("wrapper", w) for w in reversed(backend.wrap)]
+        for chosen, block in (*wrappers, (kind, backend)):
+            options = self.validate_options(chosen, block.use, block.options)
+            answers = self.call_hook(
+                "mpsfm_calibration", kind=chosen, provider=block.use, options=options
+            )
+            for answer in (*answers, self.spec(chosen, block.use).calibration):
+                if isinstance(answer, model):
+                    return answer
+        return model()
 
     def create(
         self,

@@ -433,13 +433,14 @@ class TestHooks:
         assert caplog.text.count("window closed") == 1
         assert "viewer" in caplog.text
 
-    def test_calibration_prefers_config_then_hook_then_specs(self) -> None:
+    def test_calibration_prefers_config_then_wrapper_then_hook_then_spec(self) -> None:
         declared = DepthCalibration(relative_std=0.1)
 
         class Knows:
             @hookimpl
-            def mpsfm_calibration(self, kind: str, options: FlatOptions) -> DepthCalibration | None:
-                return DepthCalibration(relative_std=0.2) if options.depth == 2 else None
+            def mpsfm_calibration(self, kind: str, options: Any) -> DepthCalibration | None:
+                known = kind == "depth" and options.depth == 2
+                return DepthCalibration(relative_std=0.2) if known else None
 
         registry = Registry()
         registry.add(dataclasses.replace(FLAT, calibration=declared))
@@ -455,6 +456,7 @@ class TestHooks:
         assert relative_std() == 0.1
         assert relative_std(wrap=(Backend(use="doubling"),)) == 0.3
         assert relative_std(options={"depth": 2}) == 0.2
+        assert relative_std(options={"depth": 2}, wrap=(Backend(use="doubling"),)) == 0.3
         assert relative_std(options={"depth": 2}, calibration={"relative_std": 0.5}) == 0.5
 
     def test_calibration_of_normals_has_a_default(self) -> None:
