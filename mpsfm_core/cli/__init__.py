@@ -9,6 +9,7 @@ on stderr and an exit code.
 from __future__ import annotations
 
 import logging
+import os
 from typing import Annotated
 
 import typer
@@ -59,3 +60,5 @@ def _options(
     """Structure-from-Motion with depth and normal priors from plugins."""
     logging.basicConfig(format="mpsfm: %(levelname)s: %(message)s", level=logging.WARNING)
     logging.getLogger("mpsfm_core").setLevel(logging.DEBUG if debug else logging.WARNING)
+    if not debug:
+        os.environ.setdefault("GLOG_minloglevel", "1")  # COLMAP logs what it creates
