@@ -1,0 +1,324 @@
+"""The energy of depth integration and its quadratic majoriser around a map.
+
+Over the log depth z of all pixels (paper appendix B; the logarithm makes perspective linear):
+
+    energy = sum over pixels and both axes of  w_n / var_r * soft_min(r_+^2, r_-^2, limit)
+           + sum over pixels of                w_d * geman_mcclure((z - log d)^2 / var_log_d)
+           + sum over sparse points of         cauchy((z - log D)^2 / var_log_D)
+
+r_+ and r_- are the one-sided residuals of bilateral normal integration (Cao et al., ECCV 2022),
+
+    r_+ = s (z[p + e] - z[p]) + n,    s = f (n . ray),    n = n_x or n_y,
+
+var_r = var_n |e - ray n / (n . ray)|^2 is the exact propagation of an isotropic normal variance,
+and with sharpness k
+
+    soft_min(a, b, limit) = -log((exp(-k a) + exp(-k b) + exp(-k limit)) / (2 + exp(-k limit))) / k
+
+says that the surface continues to one side, to the other, or to none. Its derivatives are the
+sigmoid weights of the published method, which never had an energy of its own. All three losses are
+concave in the squared residuals, so that re-weighted least squares majorises this energy: a step
+that lowers the quadratic, however inexact, cannot raise the energy.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from mpsfm_core.data import Bool, Float32, Float64, Int64, NormalPrior, PinholeCamera
+
+_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+
+_MISSING = 1e30  # squared residual of a side that does not exist
+_SQRT_3 = 1.7320508075688772
+
+# Floors that keep the weights of absurdly confident input finite: 0.06 deg and 0.1 % of depth.
+_MIN_NORMAL_VARIANCE = 1e-6
+MIN_LOG_VARIANCE = 1e-6
+# Normals seen under more than 89.9 deg say nothing about the slope of depth.
+_MIN_FACING = 2e-3
+
+
+class Losses(NamedTuple):
+    """Scales of the robust losses: `sharpness` and `normal_limit` of the soft minimum (squared
+    residual), `prior_limit` and `point_scale` in standard deviations."""
+
+    sharpness: float
+    normal_limit: float
+    prior_limit: float
+    point_scale: float
+
+
+class NormalTerms(NamedTuple):
+    """Normal residuals, framed (2, h + 2, w + 2): first along x, then along y.
+
+    `slope` s, `normal` n, `weight` w_n / var_r (float32, zero without a normal); `link` (bool):
+    the pixel and the next one along the axis may be linked.
+    """
+
+    slope: Float32
+    normal: Float32
+    weight: Float32
+    link: Bool
+
+
+class PriorTerms(NamedTuple):
+    """Depth prior: log depth float64 (h, w), 1 / var_log_d float32 (h, w), and w_d."""
+
+    log_depth: Float64
+    precision: Float32
+    weight: float
+
+
+class PointTerms(NamedTuple):
+    """Sparse points, (n,): pixel, log depth and 1 / var_log_D."""
+
+    rows: Int64
+    columns: Int64
+    log_depth: Float64
+    precision: Float64
+
+
+class EnergyTerms(NamedTuple):
+    """Everything the energy of one image is made of."""
+
+    normals: NormalTerms
+    prior: PriorTerms
+    points: PointTerms
+    losses: Losses
+
+
+class Majoriser(NamedTuple):
+    """energy + 2 gradient . step + step' A step, with A as in `multigrid`; maps are (h, w)."""
+
+    energy: float
+    gradient: Float64  # half the gradient of the energy
+    east: Float32
+    south: Float32
+    mass: Float32
+
+
+def normal_terms(
+    normals: NormalPrior, camera: PinholeCamera, active: Bool, weight: float
+) -> NormalTerms:
+    """Residuals of a normal map (with variance) between active pixels (h, w)."""
+    shape = (2, active.shape[0] + 2, active.shape[1] + 2)
+    link = np.zeros(shape, np.bool_)
+    link[0, 1:-1, 1:-2] = active[:, :-1] & active[:, 1:]
+    link[1, 1:-2, 1:-1] = active[:-1] & active[1:]
+    terms = NormalTerms(*(np.zeros(shape, np.float32) for _ in range(3)), link)
+    usable = normals.valid & active
+    _fill_normal_terms(normals.normals, normals.variance, usable, camera.params, weight, terms)
+    return terms
+
+
+def majorise(z: Float64, terms: EnergyTerms) -> Majoriser:
+    """Energy of a map of log depth (h, w), and the quadratic that touches it there."""
+    framed = np.zeros((z.shape[0] + 2, z.shape[1] + 2))
+    framed[1:-1, 1:-1] = z
+    gradient = np.zeros_like(framed)
+    east, south = np.zeros((2, *framed.shape), np.float32)
+    inner = (slice(1, -1), slice(1, -1))
+    losses = terms.losses
+    energy = _add_normals(framed, terms.normals, 0, losses, east, gradient)
+    energy += _add_normals(framed, terms.normals, 1, losses, south, gradient)
+    mass = np.empty(z.shape, np.float32)
+    energy += _add_prior(z, terms.prior, losses.prior_limit, mass, gradient[inner])
+    energy += _add_points(z, terms.points, losses.point_scale, mass, gradient[inner])
+    return Majoriser(energy, gradient[inner], east[inner], south[inner], mass)
+
+
+@_kernel
+def _fill_normal_terms(
+    normals: Float32,
+    variance: Float32,
+    usable: Bool,
+    camera: Float64,
+    weight: float,
+    terms: NormalTerms,
+) -> None:
+    fx, fy, cx, cy = camera
+    for i in range(usable.shape[0]):
+        y = (i + 0.5 - cy) / fy
+        for j in range(usable.shape[1]):
+            x = (j + 0.5 - cx) / fx
+            nx, ny = normals[i, j, 0], normals[i, j, 1]
+            facing = nx * x + ny * y + normals[i, j, 2]
+            if not usable[i, j] or facing > -_MIN_FACING:
+                continue
+            r, c = i + 1, j + 1
+            scaled = weight / max(variance[i, j], _MIN_NORMAL_VARIANCE)
+            a, b = nx / facing, ny / facing
+            ray = x * x + y * y + 1.0
+            terms.slope[0, r, c], terms.slope[1, r, c] = fx * facing, fy * facing
+            terms.normal[0, r, c], terms.normal[1, r, c] = nx, ny
+            if terms.link[0, r, c] or terms.link[0, r, c - 1]:
+                terms.weight[0, r, c] = scaled / (1.0 - 2.0 * a * x + a * a * ray)
+            if terms.link[1, r, c] or terms.link[1, r - 1, c]:
+                terms.weight[1, r, c] = scaled / (1.0 - 2.0 * b * y + b * b * ray)
+
+
+@_kernel
+def _add_normals(
+    z: Float64,
+    terms: NormalTerms,
+    axis: int,
+    losses: Losses,
+    coupling: Float32,
+    gradient: Float64,
+) -> float:
+    """Energy of the residuals along one axis; adds to the couplings and to half the gradient.
+
+    All maps are framed and contiguous: the next pixel of the axis is `stride` further in memory.
+    """
+    height, width = z.shape
+    stride = 1 if axis == 0 else width
+    z, coupling, gradient = z.ravel(), coupling.ravel(), gradient.ravel()
+    slope, normal = terms.slope[axis].ravel(), terms.normal[axis].ravel()
+    weight, link = terms.weight[axis].ravel(), terms.link[axis].ravel()
+    coupling_ahead, coupling_behind = np.empty(width), np.empty(width)
+    force_ahead, force_behind = np.empty(width), np.empty(width)
+    energy = 0.0
+    for i in range(1, height - 1):
+        first = i * width + 1
+        energy += _link_row(
+            z[first - stride :],
+            z[first:],
+            z[first + stride :],
+            link[first - stride :],
+            link[first:],
+            slope[first:],
+            normal[first:],
+            weight[first : first + width - 2],
+            losses,
+            coupling_ahead,
+            coupling_behind,
+            force_ahead,
+            force_behind,
+        )
+        for j in range(width - 2):
+            coupling[first + j] += coupling_ahead[j]
+            gradient[first + j] += force_behind[j] - force_ahead[j]
+        for j in range(width - 2):
+            coupling[first - stride + j] += coupling_behind[j]
+            gradient[first - stride + j] -= force_behind[j]
+        for j in range(width - 2):
+            gradient[first + stride + j] += force_ahead[j]
+    return energy
+
+
+@_kernel
+def _link_row(
+    z_behind: Float64,
+    z: Float64,
+    z_ahead: Float64,
+    link_behind: Bool,
+    link_ahead: Bool,
+    slope: Float32,
+    normal: Float32,
+    weight: Float32,
+    losses: Losses,
+    coupling_ahead: Float64,
+    coupling_behind: Float64,
+    force_ahead: Float64,
+    force_behind: Float64,
+) -> float:
+    """Energy of a row of pixels (as many as weights), and coupling and half the force to both sides.
+
+    Where one side is missing, the choice is between the other one and the limit.
+    """
+    k, limit = losses.sharpness, losses.normal_limit
+    two_sides, one_side = np.log(2.0 + np.exp(-k * limit)), np.log(1.0 + np.exp(-k * limit))
+    energy = 0.0
+    for j in range(weight.size):
+        s, n, w = slope[j], normal[j], weight[j]
+        ahead, behind = s * (z_ahead[j] - z[j]) + n, s * (z[j] - z_behind[j]) + n
+        a = ahead * ahead if link_ahead[j] else _MISSING
+        b = behind * behind if link_behind[j] else _MISSING
+
+        # Exponentials relative to the smallest of a, b and the limit, which has 1.
+        low, high = min(a, b), max(a, b)
+        of_gap = _exp(-k * abs(limit - low))
+        of_low, of_limit = (1.0, of_gap) if low < limit else (of_gap, 1.0)
+        of_high = of_low * _exp(-k * (high - low))
+        total = of_low + of_high + of_limit
+        full = two_sides if link_ahead[j] and link_behind[j] else one_side
+        energy += w * (min(low, limit) + (full - _log(total)) / k)
+
+        share_ahead = w * s * (of_low if a < b else of_high) / total
+        share_behind = w * s * (of_high if a < b else of_low) / total
+        coupling_ahead[j], coupling_behind[j] = share_ahead * s, share_behind * s
+        force_ahead[j], force_behind[j] = share_ahead * ahead, share_behind * behind
+    return energy
+
+
+@_kernel
+def _exp(x: float) -> float:
+    """exp(x) for x <= 0 to 1e-14, and exp(-60) below; unlike a library call, it vectorises."""
+    scaled = max(x, -60.0) * 1.4426950408889634
+    whole = np.floor(scaled + 0.5)
+    f = (scaled - whole) * 0.6931471805599453
+    p = 1.0 + f * (1 / 11)
+    p = 1.0 + f * p * (1 / 10)
+    p = 1.0 + f * p * (1 / 9)
+    p = 1.0 + f * p * (1 / 8)
+    p = 1.0 + f * p * (1 / 7)
+    p = 1.0 + f * p * (1 / 6)
+    p = 1.0 + f * p * (1 / 5)
+    p = 1.0 + f * p * (1 / 4)
+    p = 1.0 + f * p * (1 / 3)
+    p = 1.0 + f * p * (1 / 2)
+    p = 1.0 + f * p
+    return p * np.int64((np.int64(whole) + 1023) << 52).view(np.float64)
+
+
+@_kernel
+def _log(x: float) -> float:
+    """log(x) for x in [1, 3] to 1e-11, by the series of the area hyperbolic tangent at sqrt(3)."""
+    u = (x - _SQRT_3) / (x + _SQRT_3)
+    q = u * u
+    p = 1 / 13 + q * (1 / 15)
+    p = 1 / 11 + q * p
+    p = 1 / 9 + q * p
+    p = 1 / 7 + q * p
+    p = 1 / 5 + q * p
+    p = 1 / 3 + q * p
+    return 0.5493061443340548 + 2.0 * u * (1.0 + q * p)
+
+
+@_kernel
+def _add_prior(
+    z: Float64, prior: PriorTerms, limit: float, mass: Float32, gradient: Float64
+) -> float:
+    """Geman-McClure loss, a smooth truncated L2, of the depth prior; sets the mass."""
+    energy = 0.0
+    for i in range(z.shape[0]):
+        for j in range(z.shape[1]):
+            offset, precision = z[i, j] - prior.log_depth[i, j], prior.precision[i, j]
+            square = precision * offset * offset
+            kept = limit * limit / (limit * limit + square)
+            energy += prior.weight * square * kept
+            slope = prior.weight * precision * kept * kept
+            mass[i, j] = slope
+            gradient[i, j] += slope * offset
+    return energy
+
+
+@_kernel
+def _add_points(
+    z: Float64, points: PointTerms, scale: float, mass: Float32, gradient: Float64
+) -> float:
+    """Cauchy loss of the sparse points; adds to the mass."""
+    energy = 0.0
+    for k in range(points.rows.size):
+        i, j = points.rows[k], points.columns[k]
+        offset = z[i, j] - points.log_depth[k]
+        ratio = points.precision[k] * offset * offset / (scale * scale)
+        energy += scale * scale * np.log1p(ratio)
+        slope = points.precision[k] / (1.0 + ratio)
+        mass[i, j] += slope
+        gradient[i, j] += slope * offset
+    return energy
