@@ -5,8 +5,8 @@ Constructors check shape, dtype and range and raise :class:`~mpsfm_core.errors.D
 are stored as read-only views, so nobody can change what somebody else holds.
 
 Conventions: camera x right, y down, z forward; depth is z; normals are unit, in the camera frame,
-and face the camera (``n_z < 0``); pixels are COLMAP's (centre of the first pixel is (0.5, 0.5));
-uncertainty is a variance.
+and face the camera (``n . ray < 0`` for the ray through their pixel); pixels are COLMAP's (centre
+of the first pixel is (0.5, 0.5)); uncertainty is a variance.
 """
 
 from __future__ import annotations
@@ -71,9 +71,7 @@ class PinholeCamera:
     def resized(self, width: int, height: int) -> PinholeCamera:
         """The same camera on a grid of another size (exact in the (0.5, 0.5) convention)."""
         sx, sy = width / self.width, height / self.height
-        return PinholeCamera(
-            width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
-        )
+        return PinholeCamera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +151,10 @@ class DepthPrior:
 class NormalPrior:
     """A surface normal map with its uncertainty on a grid of any size that covers the view.
 
-    ``normals``: (h, w, 3) float32, unit, camera frame, facing the camera (``n_z < 0``) where
-    valid. ``variance``: (h, w) float32, rad^2, the angular variance along each of the two tangent
+    ``normals``: (h, w, 3) float32, unit, camera frame, where valid. They face the camera: their
+    dot product with the ray through the pixel is negative (off the axis ``n_z`` may be positive,
+    as on a floor at the lower border). The constructor knows no camera, so the validator checks
+    that. ``variance``: (h, w) float32, rad^2, the angular variance along each of the two tangent
     directions, > 0 where valid, or None when the network gives none. ``valid``: (h, w) bool.
     """
 
@@ -170,8 +170,6 @@ class NormalPrior:
         length = np.linalg.norm(self.normals[self.valid], axis=-1)
         if length.size and np.abs(length - 1).max() > UNIT_NORMAL_TOLERANCE:
             raise DataError("normals", "must have unit length where valid")
-        if (self.normals[..., 2][self.valid] >= 0).any():
-            raise DataError("normals", "must face the camera (n_z < 0) where valid")
         if self.variance is not None:
             _array(self, "variance", np.float32, shape)
             _finite(self, "variance")
@@ -183,13 +181,17 @@ class NormalPrior:
         normals: NDArray[Any],
         variance: NDArray[Any] | None = None,
         valid: NDArray[Any] | None = None,
+        *,
+        camera: PinholeCamera | None = None,
     ) -> NormalPrior:
-        """Build from raw arrays: normalises lengths; pixels that are not finite, have no length
-        or do not face the camera become invalid (0)."""
+        """Build from raw arrays: normalises lengths; pixels that are not finite or have no length
+        become invalid (0), and with the view's ``camera`` those that do not face it."""
         raw = np.asarray(normals, dtype=np.float32)
         finite = np.where(np.isfinite(raw).all(axis=-1, keepdims=True), raw, np.float32(0))
         length = np.linalg.norm(finite, axis=-1)
-        usable = (length > 1e-6) & (finite[..., 2] < 0)
+        usable = length > 1e-6
+        if camera is not None:
+            usable &= along_rays(camera, finite) < 0
         if valid is not None:
             usable &= np.asarray(valid, dtype=np.bool_)
         if variance is not None:
@@ -398,6 +400,17 @@ class MappingProblem:
             if pair.image_a in position and pair.image_b in position
         )
         return MappingProblem(tuple(self.images[i] for i in keep), pairs)
+
+
+def along_rays(camera: PinholeCamera, normals: NDArray[Any]) -> Float64:
+    """Dot products (h, w) of a map of vectors (h, w, 3) that covers the camera's view, on a grid
+    of any size, with the unit rays through its pixels: negative where a normal faces the camera."""
+    height, width = normals.shape[:2]
+    grid = camera.resized(width, height)
+    x = (np.arange(width) + 0.5 - grid.cx) / grid.fx
+    y = ((np.arange(height) + 0.5 - grid.cy) / grid.fy)[:, None]
+    along: Float64 = normals[..., 0] * x + normals[..., 1] * y + normals[..., 2]
+    return along / np.sqrt(1 + x**2 + y**2)
 
 
 def _array(owner: object, name: str, dtype: Any, shape: tuple[int | None, ...]) -> None:

@@ -30,6 +30,7 @@ from mpsfm_core.data import (
     PinholeCamera,
     SparseMatches,
     View,
+    along_rays,
 )
 from mpsfm_core.errors import DataError, MpsfmError, ProviderOutputError, ProviderRunError
 from mpsfm_core.providers import (
@@ -45,6 +46,10 @@ from mpsfm_core.providers import (
 
 MAX_MEDIAN_NORMAL_VARIANCE = np.pi**2
 """rad^2; no angle deviates by more than pi, so a larger median is in degrees or no variance."""
+
+FACING_TOLERANCE = 1e-3
+"""Cosine of the angle between ray and normal up to which a normal may look away: rounding, as in
+:data:`~mpsfm_core.data.UNIT_NORMAL_TOLERANCE`."""
 
 
 def run_depth(spec: ProviderSpec, provider: DepthProvider, view: View) -> DepthPrior:
@@ -111,11 +116,12 @@ def validate_depth(spec: ProviderSpec, view: View, output: object) -> DepthPrior
 
 
 def validate_normals(spec: ProviderSpec, view: View, output: object) -> NormalPrior:
-    """Rules: type and values of :class:`NormalPrior`; not empty; with a variance where the spec
-    of a normals provider promises that, and that in rad^2."""
+    """Rules: type and values of :class:`NormalPrior`; not empty; facing the camera; with a
+    variance where the spec of a normals provider promises that, and that in rad^2."""
     with _rules(spec, view.name):
         prior = _checked(output, NormalPrior, "normals")
         _not_empty(prior.shape, "normals")
+        _facing(prior, view.camera)
         if prior.variance is None:
             if spec.kind == "normals":
                 _promised(spec, "variance", "variance")
@@ -236,6 +242,13 @@ def _check_depth(spec: ProviderSpec, output: object, field: str) -> DepthPrior:
     if prior.variance is None:
         _promised(spec, "variance", "variance")
     return prior
+
+
+def _facing(prior: NormalPrior, camera: PinholeCamera) -> None:
+    away = (along_rays(camera, prior.normals) > FACING_TOLERANCE)[prior.valid]
+    if away.any():
+        share = f"{100 * away.mean():.3g} % of the valid pixels"
+        raise DataError("normals", f"must face the camera (n . ray < 0), not so at {share}")
 
 
 def _check_sparse(sparse: SparseMatches, features: tuple[Features, Features] | None) -> None:

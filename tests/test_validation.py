@@ -60,6 +60,13 @@ def normals(variance: float | None = None) -> NormalPrior:
     return NormalPrior(facing, given, np.ones((2, 3), bool))
 
 
+def turned(n_x: float, n_z: float) -> NormalPrior:
+    """Normals (n_x, 0, n_z) at two of six pixels, in the last column; the others face the axis."""
+    values = np.tile(np.array([0, 0, -1], np.float32), (2, 3, 1))
+    values[:, 2] = n_x, 0, n_z
+    return NormalPrior(values, None, np.ones((2, 3), bool))
+
+
 def features(*points: tuple[float, float]) -> Features:
     return Features(np.array(points, float).reshape(-1, 2), np.ones((len(points), 4), np.float32))
 
@@ -119,6 +126,7 @@ def written_to_later() -> DepthPrior:
         (run_normals, (), depth, "normals", "must be a NormalPrior, got DepthPrior"),
         (run_normals, ("variance",), normals, "variance", "declares: 'variance'"),
         (run_normals, (), lambda: normals(25.0), "variance", r"rad\^2, the median is 25"),
+        (run_normals, (), lambda: turned(0, 1), "normals", r"n \. ray < 0.*33.3 % of the valid"),
         (run_features, (), lambda: features((1, 1), (6.5, 1)), "keypoints", r"6x4.*\(6.50, 1.00\)"),
         (run_features, (), lambda: features((np.nan, 1)), "keypoints", "finite"),
         (run_retrieval, (), lambda: [1.0], "descriptor", "numpy array, got list"),
@@ -200,6 +208,15 @@ def test_right_answers_pass_unchanged() -> None:
 
 def _joint() -> tuple[DepthPrior, NormalPrior]:
     return depth(variance=np.ones((2, 3), np.float32)), normals()
+
+
+def test_a_normal_faces_the_camera_along_its_ray() -> None:
+    """The ray of the last column is (0.4, 0, 1): n_z may be positive there, or negative in vain."""
+    assert run_normals(spec("normals"), Provider(lambda: turned(-0.96, 0.28)), VIEW).valid.all()
+    with pytest.raises(ProviderOutputError, match="face the camera"):
+        run_normals(spec("normals"), Provider(lambda: turned(0.96, -0.28)), VIEW)
+    marked = NormalPrior.from_arrays(turned(0.96, -0.28).normals, camera=VIEW.camera)
+    assert marked.valid.tolist() == [[True, True, False]] * 2
 
 
 def test_features_and_depth_are_given_only_when_declared() -> None:

@@ -91,7 +91,7 @@ class NormalFiles:
         variance = _optional(path, arrays, "variance", view)
         if variance is None and self._options.std_deg is not None:
             variance = np.full(usable.shape, np.radians(self._options.std_deg) ** 2)
-        return NormalPrior.from_arrays(normals, variance, usable)
+        return NormalPrior.from_arrays(normals, variance, usable, camera=view.camera)
 
 
 class MaskFiles:

@@ -63,6 +63,7 @@ class FromDepth:
             -fit.plane / np.sqrt(squared_length)[..., None],
             np.clip((tilt + fit.variance) / squared_length, *_VARIANCE_RANGE),
             fit.solved,
+            camera=view.camera,
         )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core import DepthPrior, NormalPrior
+from mpsfm_core import DepthPrior, NormalPrior, PinholeCamera
 from mpsfm_core.data import Float32, Float64
 from mpsfm_onnx.description import (
     ConfidenceOutput,
@@ -72,11 +72,15 @@ def _depth_std(depth: Float64, tensor: Float64, rule: ConfidenceOutput) -> Float
 
 
 def decode_normals(
-    value: Float32, rule: NormalsOutput, kappa: Float32 | None = None
+    value: Float32, rule: NormalsOutput, camera: PinholeCamera, kappa: Float32 | None = None
 ) -> NormalPrior:
-    """Normals and their angular variance from (h, w, 3 or more) and the (h, w) concentration."""
+    """Normals and their angular variance from (h, w, 3 or more) and the (h, w) concentration.
+
+    Pixels whose normal does not face the ``camera`` of the view are invalid.
+    """
     variance = None if kappa is None else expected_angle(kappa.astype(np.float64)) ** 2
-    return NormalPrior.from_arrays(value[..., :3] * np.float32(rule.axes), variance)
+    normals = value[..., :3] * np.array(rule.axes, dtype=np.float32)
+    return NormalPrior.from_arrays(normals, variance, camera=camera)
 
 
 def expected_angle(kappa: Float64) -> Float64:

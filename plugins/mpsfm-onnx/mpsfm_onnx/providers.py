@@ -44,7 +44,7 @@ class OnnxNormals:
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         """Normals on the network's own grid; ``depth`` is not used."""
         tensors, _ = self._network.run(view)
-        return normals_of(tensors, self._network.description, self._rule)
+        return normals_of(tensors, self._network.description, self._rule, view)
 
 
 class OnnxJoint(OnnxDepth):
@@ -57,17 +57,17 @@ class OnnxJoint(OnnxDepth):
     def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
         """Both priors on the network's own grid."""
         tensors, canvas = self._network.run(view)
-        normals = normals_of(tensors, self._network.description, self._normals_rule)
+        normals = normals_of(tensors, self._network.description, self._normals_rule, view)
         return self._depth(view, tensors, canvas), normals
 
 
 def normals_of(
-    tensors: dict[str, Float32], description: Description, rule: NormalsOutput
+    tensors: dict[str, Float32], description: Description, rule: NormalsOutput, view: View
 ) -> NormalPrior:
-    """The normals among a network's output tensors."""
+    """The normals of a view among a network's output tensors."""
     concentration = description.outputs.kappa
     kappa = tensors[concentration.name][..., concentration.channel] if concentration else None
-    return decode_normals(tensors[rule.name], rule, kappa)
+    return decode_normals(tensors[rule.name], rule, view.camera, kappa)
 
 
 def _depth_rule(description: Description) -> DepthOutput:

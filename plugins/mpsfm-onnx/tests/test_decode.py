@@ -8,6 +8,8 @@ from mpsfm_onnx.decode import decode_depth, decode_normals, expected_angle, plan
 from mpsfm_onnx.description import ConfidenceOutput, DepthOutput, NormalsOutput
 from scipy.integrate import quad
 
+from mpsfm_core import PinholeCamera
+
 
 def depth_rule(**fields):
     return DepthOutput(name="d", metric=True, **fields)
@@ -70,7 +72,8 @@ def test_uncertainty_scales_with_the_canonical_correction(output, tensor, std):
 
 def test_normals_are_turned_into_our_frame_and_normalised():
     value = np.array([[[1.0, 2.0, 2.0], [0.0, 0.0, -1.0]]], dtype=np.float32)
-    prior = decode_normals(value, NormalsOutput(name="n", axes=(-1, -1, -1)))
+    camera = PinholeCamera(2, 1, 4.0, 4.0, 1.0, 0.5)
+    prior = decode_normals(value, NormalsOutput(name="n", axes=(-1, -1, -1)), camera)
     np.testing.assert_allclose(prior.normals[0, 0], [-1 / 3, -2 / 3, -2 / 3], rtol=1e-6)
     assert prior.valid.tolist() == [[True, False]]
     assert prior.variance is None
