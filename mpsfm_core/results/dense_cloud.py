@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.geometry import (
@@ -65,11 +66,13 @@ def _variance(image: RegisteredImage) -> Float32:
 
 def _neighbors(reconstruction: Reconstruction) -> list[Int64]:
     """For each image the rows of those that share most points with it."""
-    count = len(reconstruction.images)
-    sees = np.zeros((count, len(reconstruction.points)), dtype=np.float32)
-    for row, image in enumerate(reconstruction.images):
-        sees[row, image.point_ids[image.point_ids >= 0]] = 1
-    shared = sees @ sees.T
+    seen = [image.point_ids[image.point_ids >= 0] for image in reconstruction.images]
+    starts = np.cumsum([0, *map(len, seen)])
+    sees = csr_array(
+        (np.ones(starts[-1], np.int32), np.concatenate(seen), starts),
+        shape=(len(seen), len(reconstruction.points)),
+    )
+    shared = (sees @ sees.T).toarray()
     np.fill_diagonal(shared, 0)
     order = np.argsort(-shared, axis=1, kind="stable")[:, :_NEIGHBORS]
     return [row[shared[i, row] > 0] for i, row in enumerate(order)]
