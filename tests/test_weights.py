@@ -299,7 +299,7 @@ def test_hub_file(tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatc
         ("ftp://example.org/model.onnx", "unknown scheme"),
         ("package:numpy", "package:NAME/PATH"),
         ("package:numpy/../secret", "package:NAME/PATH"),
-        ("package:not_there_at_all/x.pt", "pip install not-there-at-all"),
+        ("package:not_there_at_all/x.pt", "pip install --no-deps not-there-at-all"),
         ("package:numpy/x.pt", "does not exist"),
         ("nowhere/model.onnx", "does not exist"),
     ],

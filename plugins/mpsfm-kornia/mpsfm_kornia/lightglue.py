@@ -37,7 +37,7 @@ class LightGlueMatcher:
         use_threads(context)
         self._device = context.device
         self._network = LightGlue(
-            None,
+            None,  # type: ignore[arg-type]  # documented: no weights of a family
             **self.architecture,
             **_FIXED,
             depth_confidence=options.depth_confidence,

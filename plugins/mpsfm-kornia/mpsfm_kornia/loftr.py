@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ class LoftrMatcher:
         use_threads(context)
         self._device = context.device
         self._longest = options.resize
-        config = copy.deepcopy(default_cfg)
+        config: Any = copy.deepcopy(default_cfg)
         config["match_coarse"]["thr"] = options.match_threshold
         config["coarse"]["temp_bug_fix"] = options.corrected_encoding
         self._network = LoFTR(pretrained=None, config=config)

