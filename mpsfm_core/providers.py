@@ -214,7 +214,10 @@ class Hooks:
     def mpsfm_calibration(
         self, kind: str, provider: str, options: BaseModel | None
     ) -> DepthCalibration | NormalCalibration | None:
-        """Calibration of a prior for these options; None leaves it to the spec's default."""
+        """Calibration of a prior for these options; None leaves it to the spec's default.
+
+        ``kind`` is depth or normals, or ``wrapper`` for a wrapper around such a provider.
+        """
 
     @hookspec
     def mpsfm_stage_started(self, stage: str, total: int | None) -> None:
