@@ -1,6 +1,10 @@
-"""Settings of the extraction room."""
+"""Settings of the extraction room; "reference" is the published system's default."""
 
 from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
 
 from mpsfm_core.options import Options
 
@@ -8,10 +12,59 @@ from mpsfm_core.options import Options
 class PairOptions(Options):
     """Which pairs of images are matched."""
 
+    mode: Literal["exhaustive", "sequential", "retrieval"] = "exhaustive"
+    """``exhaustive``: all. ``sequential``: neighbours in the order of the images. ``retrieval``:
+    the most similar by the retrieval provider (reference)."""
+    overlap: int = Field(2, ge=1)
+    """Sequential: how many of the following images (reference: noverlap)."""
+    quadratic: bool = False
+    """Sequential: the 1st, 2nd, 4th, 8th ... following image instead (reference: off)."""
+    top_k: int = Field(20, ge=1)
+    """Retrieval: how many for each image (reference: nquery)."""
+    min_similarity: float = 0.0
+    """Retrieval: smallest dot product (reference)."""
+
 
 class VerificationOptions(Options):
     """Two-view geometric verification of matches."""
 
+    max_error_px: float = Field(4.0, gt=0)
+    """Inlier threshold for keypoints of std 1 px; it grows with their std (reference, COLMAP)."""
+    min_inliers: int = Field(15, ge=5)
+    """Pairs with fewer are dropped (reference, COLMAP)."""
+    min_inlier_ratio: float = Field(0.1, ge=0, lt=1)
+    """Share of inliers the number of RANSAC trials is made for (reference)."""
+    max_chance: float = Field(1e-8, ge=0, le=1)
+    """Probability that one given epipolar geometry has the inliers by chance, above which the
+    pair is dropped; RANSAC tries thousands of geometries. 1 switches it off. (Ours: 250 random
+    matches have 23 to 30 inliers, so that ``min_inliers`` alone lets them pass.)"""
+    max_trials: int = Field(20_000, ge=1)
+    """RANSAC (reference)."""
+    confidence: float = Field(0.999, gt=0, lt=1)
+    """RANSAC (COLMAP)."""
+    min_e_f_ratio: float = Field(0.95, ge=0)
+    """Inliers of the essential over those of the fundamental matrix, for a calibrated pair
+    (reference, COLMAP)."""
+    max_h_ratio: float = Field(0.8, ge=0)
+    """Inliers of a homography over those of the epipolar model, above which the pair is planar or
+    panoramic (reference, COLMAP)."""
+
 
 class ExtractionOptions(Options):
-    """Grid of the prior maps and the like."""
+    """Grid of the prior maps, and how dense matches become keypoints."""
+
+    integration_size: int = Field(387, ge=16)
+    """Longer side of the maps that the mapper refines (reference: normscale)."""
+    edge_ratio: float | None = Field(1.015, gt=1)
+    """Normals next to a larger ratio of neighbouring depths are not trusted; null trusts all
+    (reference: continuity)."""
+    dense_snap_px: float = Field(2.0, ge=0)
+    """A dense match this near to keypoints in both images matches them, if there is no sparse
+    matcher (reference: RoMa)."""
+    dense_sparse_px: float = Field(6.0, ge=0)
+    """Dense matches nearer to a keypoint of the same image are left out (reference:
+    sparse_nms_radius)."""
+    dense_nms_px: float = Field(8.0, ge=0)
+    """Of dense matches nearer to each other only the most certain is kept (reference)."""
+    dense_min_score: float = Field(0.1, ge=0, le=1)
+    """Less certain dense matches are left out (reference: RoMa)."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
-import threading
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -23,6 +21,7 @@ from mpsfm_core.inputs.header import Header, read_header
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.pixels import EXTENSIONS, decode_rgb, read_bytes, read_mask
+from mpsfm_core.inputs.recent import Recent
 from mpsfm_core.inputs.undistortion import (
     Warp,
     is_pinhole,
@@ -81,9 +80,8 @@ class ImageSet:
     def __init__(self, images: Sequence[SourceImage], options: InputOptions) -> None:
         self.images = tuple(images)
         self._options = options
-        self._lock = threading.Lock()
-        self._views: OrderedDict[int, View] = OrderedDict()
-        self._warps: OrderedDict[str, Warp] = OrderedDict()
+        self._views: Recent[int, View] = Recent(_CACHED_BYTES, _bytes)
+        self._warps: Recent[str, Warp] = Recent(_CACHED_WARPS, lambda _: 1)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -104,16 +102,14 @@ class ImageSet:
 
         Raises :class:`InputError` when the file (or its mask) is unreadable or has changed.
         """
-        with self._lock:
-            if index in self._views:
-                self._views.move_to_end(index)
-                return self._views[index]
-        view = self._load(self.images[index])
-        with self._lock:
-            self._views[index] = view
-            while len(self._views) > 1 and sum(map(_bytes, self._views.values())) > _CACHED_BYTES:
-                self._views.popitem(last=False)
-        return view
+        return self._views.get(index, lambda: self._load(self.images[index]))
+
+    def mask(self, index: int) -> Bool | None:
+        """The mask of a view; does not decode the image when there is none."""
+        image = self.images[index]
+        if is_pinhole(image.camera) and self._mask_path(image) is None:
+            return None
+        return self.view(index).mask
 
     def pixel_key(self, index: int) -> str:
         """Names the content of a view: equal keys mean equal pixels and mask.
@@ -141,23 +137,14 @@ class ImageSet:
             mask = None if mask is None else _resize_mask(mask, image.pinhole.size)
             return View(image.name, pixels, image.pinhole, mask)
         size = _reduced_size(image.original_size, self._options.max_image_size)
-        warp = self._warp(resized_camera(image.camera, size), image.pinhole)
+        camera = resized_camera(image.camera, size)
+        warp = self._warps.get(_camera_key(camera), lambda: Warp(camera, image.pinhole))
         pixels = warp.image(_resize(pixels, size))
         if mask is not None:
             mask = warp.mask(_resize_mask(mask, size))
         elif not warp.valid.all():
             mask = warp.valid
         return View(image.name, pixels, image.pinhole, mask)
-
-    def _warp(self, camera: pycolmap.Camera, pinhole: PinholeCamera) -> Warp:
-        key = _camera_key(camera)
-        with self._lock:
-            if key not in self._warps:
-                self._warps[key] = Warp(camera, pinhole)
-                if len(self._warps) > _CACHED_WARPS:
-                    self._warps.popitem(last=False)
-            self._warps.move_to_end(key)
-            return self._warps[key]
 
     def _mask_path(self, image: SourceImage) -> Path | None:
         folder = self._options.masks

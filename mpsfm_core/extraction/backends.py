@@ -1,0 +1,178 @@
+"""The chosen providers while they are in use: what identifies them, and an instance a thread."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from mpsfm_core.config import RuntimeOptions
+from mpsfm_core.options import Backend
+from mpsfm_core.providers import API_VERSION, Capability, Kind, ProviderContext, ProviderSpec
+from mpsfm_core.registry import Registry
+from mpsfm_core.weights import WeightStore, file_sha256, is_remote
+
+T = TypeVar("T")
+
+_MAX_WORKERS = 4
+"""Automatic: every worker has its own copy of a network; more cores become its threads."""
+_LONGEST_URI = 1000
+
+
+@dataclass
+class Usage:
+    """How often a provider was asked, how often the cache answered, and its time in seconds."""
+
+    computed: int = 0
+    cached: int = 0
+    seconds: float = 0.0
+
+
+class ActiveProvider:
+    """A provider chosen in the configuration.
+
+    It is constructed when the first result is computed, once in each thread: a run that finds
+    everything in the cache loads no network.
+    """
+
+    def __init__(
+        self, kind: Kind, backend: Backend, registry: Registry, runtime: RuntimeOptions
+    ) -> None:
+        self.kind = kind
+        self.backend = backend
+        self.spec: ProviderSpec = registry.spec(kind, backend.use)
+        self.usage = Usage()
+        self._registry = registry
+        self._runtime = runtime
+        self._store = WeightStore(runtime.cache_dir, True if runtime.offline else None)
+        self._local = threading.local()
+        self._lock = threading.Lock()
+        self._identity: dict[str, Any] | None = None
+
+    def can(self, capability: Capability) -> bool:
+        """Whether the provider declares a capability."""
+        return capability in self.spec.capabilities
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """All that its output depends on besides its input, as plain data."""
+        with self._lock:
+            if self._identity is None:
+                self._identity = self._identify()
+            return self._identity
+
+    @property
+    def instance(self) -> Any:
+        """The provider, this thread's own."""
+        if not hasattr(self._local, "provider"):
+            with self._lock:  # imports and downloads once, not in every thread at the same time
+                self._local.provider = self._create()
+        return self._local.provider
+
+    @property
+    def workers(self) -> int:
+        """How many threads may use it: one with a GPU."""
+        return 1 if _device(self._runtime, self.spec) == "cuda" else worker_count(self._runtime)
+
+    def timed(self, compute: Callable[[Any], T]) -> T:
+        """Compute with this thread's instance, on the provider's clock."""
+        provider = self.instance
+        started = time.perf_counter()
+        result = compute(provider)
+        seconds = time.perf_counter() - started
+        with self._lock:
+            self.usage.computed += 1
+            self.usage.seconds += seconds
+        return result
+
+    def count_cached(self) -> None:
+        """Note that a result came from the cache."""
+        with self._lock:
+            self.usage.cached += 1
+
+    def _create(self) -> Any:
+        backend = self.backend
+        context = ProviderContext(
+            resolve_weights=self._store.resolve,
+            device=_device(self._runtime, self.spec),
+            threads=thread_count(self._runtime),
+            seed=self._runtime.seed,
+        )
+        return self._registry.create(self.kind, backend.use, backend.options, context, backend.wrap)
+
+    def _identify(self) -> dict[str, Any]:
+        blocks = [(self.kind, self.backend), *(("wrapper", w) for w in self.backend.wrap)]
+        described = []
+        for kind, backend in blocks:
+            spec = self._registry.spec(kind, backend.use)
+            options = self._registry.validate_options(kind, backend.use, backend.options)
+            values = options.model_dump(mode="json") if options else {}
+            described.append(
+                {
+                    "kind": kind,
+                    "name": backend.use,
+                    "version": self._registry.version(kind, backend.use),
+                    "options": values,
+                    "files": self._hashes(spec, values),
+                }
+            )
+        return {"api": API_VERSION, "seed": self._runtime.seed, "providers": described}
+
+    def _hashes(self, spec: ProviderSpec, values: dict[str, Any]) -> dict[str, str]:
+        """SHA-256 of the files that options name, or else of the provider's default weights.
+
+        What has to be downloaded is downloaded first, by constructing the provider.
+        """
+        named = [uri for uri in _texts(values) if is_remote(uri) or self._store.locate(uri)]
+        uris = named or [file.uri for file in spec.weights]
+        if any(is_remote(uri) and self._store.locate(uri) is None for uri in uris):
+            self._local.provider = self._create()
+        found = {uri: self._store.locate(uri) for uri in uris}
+        return {uri: file_sha256(path) for uri, path in found.items() if path is not None}
+
+
+def worker_count(runtime: RuntimeOptions) -> int:
+    """Threads that a stage runs on."""
+    return runtime.workers or min(_MAX_WORKERS, _cores())
+
+
+def thread_count(runtime: RuntimeOptions) -> int:
+    """Threads that one provider may use itself."""
+    if runtime.workers is not None:
+        return runtime.threads
+    return max(runtime.threads, _cores() // worker_count(runtime))
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):  # what a container or job scheduler allows
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _device(runtime: RuntimeOptions, spec: ProviderSpec) -> str:
+    """``cuda`` where it is asked for, or automatically where the provider's library can use it."""
+    if runtime.device != "auto":
+        return runtime.device
+    if "torch" in spec.requires:
+        available = importlib.import_module("torch").cuda.is_available()
+    elif "onnxruntime" in spec.requires:
+        names = importlib.import_module("onnxruntime").get_available_providers()
+        available = "CUDAExecutionProvider" in names
+    else:
+        available = False
+    return "cuda" if available else "cpu"
+
+
+def _texts(values: object) -> Iterator[str]:
+    """All texts in plain data that can be a file's name or URI."""
+    if isinstance(values, dict):
+        values = list(values.values())
+    if isinstance(values, list):
+        for value in values:
+            yield from _texts(value)
+    elif isinstance(values, str) and 0 < len(values) <= _LONGEST_URI and values.isprintable():
+        yield values

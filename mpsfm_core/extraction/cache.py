@@ -1,0 +1,148 @@
+"""Results of providers on disk, found by what they depend on.
+
+An entry's key is the hash of everything that its content depends on, so that nothing is ever out
+of date: a changed option, weights file or image has another key. Entries are written beside their
+place and moved into it when complete; one that is damaged nevertheless is computed again.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+import json
+import logging
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_type_hints
+
+import numpy as np
+import platformdirs
+from numpy.typing import NDArray
+
+from mpsfm_core.errors import DataError, OutputError
+from mpsfm_core.weights import CACHE_VARIABLE
+
+_log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+Arrays = Mapping[str, NDArray[Any]]
+
+FORMAT = 1
+"""Raised when the meaning of entries changes, which makes all old ones unreachable."""
+
+_DAMAGED = (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, DataError)
+
+
+class Cache:
+    """A folder of entries, shared by threads and processes.
+
+    Args:
+        folder: default ``$MPSFM_CACHE`` or the platform's user cache; entries go into
+            ``extraction/`` below it.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        root = folder or os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("mpsfm")
+        self.folder = Path(root).expanduser() / "extraction"
+
+    def load(self, kind: str, key: str, cls: type[T]) -> T | None:
+        """The entry as an object of ``cls``, None when there is none that can be read."""
+        path = self._path(kind, key)
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            _log.warning("cache entry %s cannot be read (%s): computing it again", path, error)
+            return None
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+                return unpack(cls, {name: archive[name] for name in archive.files})
+        except _DAMAGED as error:
+            _log.warning("cache entry %s is damaged (%s): computing it again", path, error)
+            return None
+
+    def store(self, kind: str, key: str, value: object) -> None:
+        """Keep an object; raises :class:`OutputError` when the disk is full or fails."""
+        path = self._path(kind, key)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _write_atomically(path, pack(value))
+        except OSError as error:
+            reason = "the disk is full" if error.errno == errno.ENOSPC else str(error)
+            raise OutputError(
+                f"cannot write to the cache {self.folder}: {reason}; make room or set "
+                f"runtime.cache_dir"
+            ) from error
+
+    def _path(self, kind: str, key: str) -> Path:
+        return self.folder / kind / key[:2] / f"{key}.npz"
+
+
+def content_key(*parts: object) -> str:
+    """SHA-256 of plain data (numbers, texts, lists, dictionaries with text keys)."""
+    text = json.dumps([FORMAT, *parts], sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def digest(value: object) -> str:
+    """SHA-256 of the content of a data object."""
+    found = hashlib.sha256()
+    for name, array in pack(value).items():
+        found.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        found.update(np.ascontiguousarray(array).data)
+    return found.hexdigest()
+
+
+def pack(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
+    """The arrays of a data object by path, without those that are None."""
+    if not is_dataclass(value):
+        return {prefix or "value": np.asarray(value)}
+    arrays: dict[str, NDArray[Any]] = {}
+    for field in fields(value):
+        content = getattr(value, field.name)
+        if content is not None:
+            arrays |= pack(content, f"{prefix}/{field.name}" if prefix else field.name)
+    return arrays
+
+
+def unpack(cls: type[T], arrays: Arrays, prefix: str = "") -> T:
+    """The object of class ``cls`` (a data class, or an array) that :func:`pack` took apart."""
+    if not is_dataclass(cls):
+        return arrays[prefix or "value"]  # type: ignore[return-value]
+    hints = get_type_hints(cls)
+    values: dict[str, Any] = {}
+    for field in fields(cls):
+        path = f"{prefix}/{field.name}" if prefix else field.name
+        nested = _data_class(hints[field.name])
+        if nested and any(name.startswith(path + "/") for name in arrays):
+            values[field.name] = unpack(nested, arrays, path)
+        elif path in arrays:
+            values[field.name] = arrays[path].item() if arrays[path].ndim == 0 else arrays[path]
+        else:
+            values[field.name] = None
+    return cls(**values)
+
+
+def _data_class(hint: object) -> type | None:
+    """The data class that a field's annotation names, alone or ``| None``."""
+    kinds = (hint, *get_args(hint))
+    return next((k for k in kinds if isinstance(k, type) and is_dataclass(k)), None)
+
+
+def _write_atomically(path: Path, arrays: Arrays) -> None:
+    handle, temporary = tempfile.mkstemp(prefix=".", suffix=".tmp", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, **arrays)  # type: ignore[arg-type]
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise

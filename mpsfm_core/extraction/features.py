@@ -1,0 +1,106 @@
+"""Features of the images, and which pairs their likeness suggests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mpsfm_core import validation
+from mpsfm_core.data import Bool, Features
+from mpsfm_core.errors import ConfigError
+from mpsfm_core.extraction import pairs
+from mpsfm_core.extraction.cache import digest
+from mpsfm_core.extraction.pairs import Pair
+from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.geometry import sample_nearest
+from mpsfm_core.inputs.recent import Recent
+from mpsfm_core.options import Backend
+
+_CACHED_BYTES = 512 << 20
+"""Features that are kept while pairs are matched; 8192 SIFT features have 4 MB."""
+
+
+class FeatureTable:
+    """Features of each image without those in masked areas; loaded again when needed."""
+
+    def __init__(self, bench: Workbench, backend: Backend) -> None:
+        self._bench = bench
+        self._provider = bench.provider("features", backend)
+        self._recent: Recent[int, Features] = Recent(_CACHED_BYTES, lambda f: f.descriptors.nbytes)
+
+    def extract(self) -> list[Features]:
+        """Run the stage; returns features without descriptors, to keep memory small."""
+        images = range(len(self._bench.images))
+        return self._bench.each("features", images, self._located, self._provider.workers)
+
+    def __getitem__(self, index: int) -> Features:
+        return self._recent.get(index, lambda: self._load(index))
+
+    def key(self, index: int) -> str:
+        """Names the features of an image."""
+        if self._provider.can("uncached"):
+            return digest(self[index])
+        return self._bench.key(self._provider, self._bench.view_inputs(index, self._provider))
+
+    def _located(self, index: int) -> Features:
+        features = self[index]
+        return Features(
+            features.keypoints,
+            np.empty((len(features), 0), dtype=np.float32),
+            std_px=features.std_px,
+        )
+
+    def _load(self, index: int) -> Features:
+        def compute(instance: Any) -> Features:
+            return validation.run_features(self._provider.spec, instance, self._bench.view(index))
+
+        inputs = self._bench.view_inputs(index, self._provider)
+        features = self._bench.result(self._provider, Features, inputs, compute)
+        mask = self._bench.mask(index)
+        if mask is None:
+            return features
+        return _select(features, sample_nearest(mask, features.keypoints))
+
+
+def choose_pairs(bench: Workbench) -> tuple[list[Pair], int]:
+    """The pairs to match, and how many there were before the filters of plugins."""
+    options, count = bench.config.pairs, len(bench.images)
+    if options.mode == "exhaustive":
+        candidates = pairs.exhaustive(count)
+    elif options.mode == "sequential":
+        candidates = pairs.sequential(count, options)
+    else:
+        candidates = _similar(bench)
+    names = bench.images.names
+    named = [(names[a], names[b]) for a, b in candidates]
+    answers = bench.registry.call_hook("mpsfm_filter_pairs", pairs=named)
+    return pairs.apply_filters(candidates, names, answers), len(candidates)
+
+
+def _similar(bench: Workbench) -> list[Pair]:
+    backend = bench.config.retrieval
+    if backend is None:
+        raise ConfigError("pairs.mode: 'retrieval' needs a provider: set retrieval.use")
+    provider = bench.provider("retrieval", backend)
+
+    def describe(index: int) -> Any:
+        return bench.result(
+            provider,
+            np.ndarray,
+            bench.view_inputs(index, provider),
+            lambda instance: validation.run_retrieval(provider.spec, instance, bench.view(index)),
+        )
+
+    descriptors = bench.each("retrieval", range(len(bench.images)), describe, provider.workers)
+    return pairs.retrieval(descriptors, bench.config.pairs)
+
+
+def _select(features: Features, rows: Bool) -> Features:
+    return Features(
+        features.keypoints[rows],
+        features.descriptors[rows],
+        None if features.scores is None else features.scores[rows],
+        None if features.scales is None else features.scales[rows],
+        features.std_px,
+    )

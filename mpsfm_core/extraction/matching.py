@@ -1,0 +1,222 @@
+"""Matches of image pairs: by features, dense, or both; verified."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core import validation
+from mpsfm_core.data import (
+    DenseMatches,
+    DepthPrior,
+    Features,
+    Float64,
+    PairMatches,
+    SparseMatches,
+    VerifiedPair,
+)
+from mpsfm_core.extraction.backends import ActiveProvider, worker_count
+from mpsfm_core.extraction.cache import content_key, digest
+from mpsfm_core.extraction.dense import PointMatches, sample, snap
+from mpsfm_core.extraction.features import FeatureTable
+from mpsfm_core.extraction.pairs import Pair
+from mpsfm_core.extraction.verification import CALIBRATED, TwoView, verify
+from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.geometry import sample_nearest
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Matches of a pair before verification: rows of the features, then free points.
+
+    ``std_px``: localisation noise of the free points. ``precision``: mean inverse variance of the
+    pair depth of both images, None where the matcher gives none.
+    """
+
+    pair: Pair
+    sparse: SparseMatches
+    points: PointMatches
+    std_px: float
+    precision: tuple[float, float] | None = None
+
+    def __len__(self) -> int:
+        return len(self.sparse) + len(self.points.scores)
+
+
+class PairMatcher:
+    """The chosen matchers on pairs of images."""
+
+    def __init__(self, bench: Workbench, table: FeatureTable | None) -> None:
+        self._bench = bench
+        self._table = table
+        config = bench.config
+        chosen = (config.matcher, config.dense_matcher)
+        self._providers = [bench.provider("matcher", b) for b in chosen if b is not None]
+        self._snaps = config.matcher is None and table is not None
+
+    def match(self, pairs: list[Pair], located: list[Features]) -> list[Candidates]:
+        """Run the stage. ``located``: features of all images, descriptors not needed."""
+        workers = min(provider.workers for provider in self._providers)
+
+        def work(pair: Pair) -> Candidates:
+            return self._candidates(pair, located[pair[0]], located[pair[1]])
+
+        return self._bench.each("matching", pairs, work, workers)
+
+    def pair_depth(self, pair: Pair, side: int) -> DepthPrior:
+        """Depth of one image of a pair (0 or 1) as the matcher saw it."""
+        for provider in self._providers:
+            depth = self._run(provider, pair).depth
+            if depth is not None:
+                return (depth.depth_a, depth.depth_b)[side]
+        raise LookupError(f"no matcher gave depth for pair {pair}")
+
+    def _candidates(self, pair: Pair, a: Features, b: Features) -> Candidates:
+        options = self._bench.config.extraction
+        results = [self._run(provider, pair) for provider in self._providers]
+        no_scores = np.empty(0, dtype=np.float32)
+        sparse = SparseMatches(np.empty((0, 2), dtype=np.int64), no_scores)
+        points, std_px = PointMatches(np.empty((0, 2)), np.empty((0, 2)), no_scores), 1.0
+        for result in results:
+            if result.sparse is not None:
+                sparse = result.sparse
+            if result.dense is None:
+                continue
+            dense = self._allowed(pair, result.dense)
+            if self._snaps:
+                sparse = snap(dense, a.keypoints, b.keypoints, options.dense_snap_px)
+            points = sample(dense, a.keypoints, b.keypoints, options)
+            std_px = dense.std_px
+        return Candidates(pair, sparse, points, std_px, _precision(results))
+
+    def _run(self, provider: ActiveProvider, pair: Pair) -> PairMatches:
+        bench, table = self._bench, self._table
+
+        def compute(instance: Any) -> PairMatches:
+            views = bench.view(pair[0]), bench.view(pair[1])
+            features = None if table is None else (table[pair[0]], table[pair[1]])
+            return validation.run_matcher(provider.spec, instance, views, features)
+
+        inputs: list[object] = [bench.view_inputs(index, provider) for index in pair]
+        if table is not None and provider.can("sparse"):
+            inputs += [table.key(index) for index in pair]
+        return bench.result(provider, PairMatches, inputs, compute)
+
+    def _allowed(self, pair: Pair, dense: DenseMatches) -> DenseMatches:
+        """The matches that no mask forbids."""
+        keep = np.ones(len(dense), dtype=np.bool_)
+        for index, points in zip(pair, (dense.points_a, dense.points_b), strict=True):
+            mask = self._bench.mask(index)
+            if mask is not None:
+                keep &= sample_nearest(mask, points)
+        return DenseMatches(
+            dense.points_a[keep], dense.points_b[keep], dense.scores[keep], dense.std_px
+        )
+
+
+class PairVerifier:
+    """Two-view geometry of candidate matches."""
+
+    def __init__(self, bench: Workbench, located: list[Features]) -> None:
+        self._bench = bench
+        self._located = located
+
+    def verify(self, candidates: list[Candidates]) -> list[TwoView]:
+        """Run the stage."""
+        workers = worker_count(self._bench.config.runtime)
+        return self._bench.each("verification", candidates, self._verify, workers)
+
+    def _verify(self, matches: Candidates) -> TwoView:
+        options, seed = self._bench.config.verification, self._bench.config.runtime.seed
+        a, b = matches.pair
+        rows = matches.sparse.indices
+        xy_a = np.concatenate([self._located[a].keypoints[rows[:, 0]], matches.points.xy_a])
+        xy_b = np.concatenate([self._located[b].keypoints[rows[:, 1]], matches.points.xy_b])
+        std_px = max(
+            max(self._located[a].std_px, self._located[b].std_px) if len(rows) else 0.0,
+            matches.std_px if len(matches.points.scores) else 0.0,
+        )
+        cameras = self._bench.images[a].pinhole, self._bench.images[b].pinhole
+        parts = [
+            options.model_dump(mode="json"),
+            *map(asdict, cameras),
+            std_px,
+            seed,
+            pycolmap.__version__,
+        ]
+        key = content_key(parts, digest(xy_a), digest(xy_b))
+        found = self._bench.cache.load("two-view", key, TwoView)
+        if found is None:
+            found = verify(*cameras, xy_a, xy_b, options, std_px=std_px, seed=seed)
+            self._bench.cache.store("two-view", key, found)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Assembled:
+    """Verified pairs, and the keypoints (n, 2) and their noise of each image they refer to."""
+
+    pairs: tuple[VerifiedPair, ...]
+    keypoints: list[Float64]
+    std_px: list[float]
+
+
+def assemble(
+    candidates: list[Candidates], outcomes: list[TwoView], located: list[Features]
+) -> Assembled:
+    """Number the keypoints: each image's features, then the free points of its verified pairs."""
+    keypoints = [[features.keypoints] for features in located]
+    counts = [len(features) for features in located]
+    noise = [[(len(features), features.std_px)] for features in located]
+    verified = []
+    for matches, outcome in zip(candidates, outcomes, strict=True):
+        if outcome.reason:
+            continue
+        sparse = outcome.inliers[outcome.inliers < len(matches.sparse)]
+        free = outcome.inliers[outcome.inliers >= len(matches.sparse)] - len(matches.sparse)
+        columns = []
+        for side, image in enumerate(matches.pair):
+            points = (matches.points.xy_a, matches.points.xy_b)[side][free]
+            new_rows = counts[image] + np.arange(len(points), dtype=np.int64)
+            columns.append(np.concatenate([matches.sparse.indices[sparse, side], new_rows]))
+            keypoints[image].append(points)
+            counts[image] += len(points)
+            noise[image].append((len(points), matches.std_px))
+        verified.append(
+            VerifiedPair(
+                *matches.pair,
+                np.stack(columns, axis=1),
+                np.concatenate([matches.sparse.scores[sparse], matches.points.scores[free]]),
+                outcome.rotation,
+                outcome.translation,
+                outcome.configuration == CALIBRATED,
+            )
+        )
+    return Assembled(
+        tuple(verified),
+        [np.concatenate(parts) for parts in keypoints],
+        [_typical(parts) for parts in noise],
+    )
+
+
+def _typical(parts: list[tuple[int, float]]) -> float:
+    """Median noise of keypoints that come in groups of (number, std)."""
+    values = np.repeat([std for _, std in parts], [count for count, _ in parts])
+    return float(np.median(values)) if len(values) else 1.0
+
+
+def _precision(results: list[PairMatches]) -> tuple[float, float] | None:
+    for result in results:
+        if result.depth is not None:
+            return _mean_precision(result.depth.depth_a), _mean_precision(result.depth.depth_b)
+    return None
+
+
+def _mean_precision(depth: DepthPrior) -> float:
+    """Mean inverse variance of the valid pixels (reference: how the best pair is chosen)."""
+    if depth.variance is None or not depth.valid.any():
+        return 0.0
+    return float((1.0 / depth.variance[depth.valid].astype(np.float64)).mean())

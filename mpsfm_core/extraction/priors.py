@@ -1,0 +1,101 @@
+"""From the priors as networks or files give them to the maps the mapper works on."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from mpsfm_core.data import Bool, DepthPrior, Float32, NormalPrior
+from mpsfm_core.geometry import resize_map
+
+EDGE_VARIANCE = 1e6
+"""rad^2, of a normal that is not trusted (reference)."""
+_ALL_VALID = 1 - 1e-5
+"""A resized mask is 1 up to float32 rounding where all contributing pixels are valid."""
+
+
+def integration_grid(size: tuple[int, int], longer_side: int) -> tuple[int, int]:
+    """(width, height) of the maps for an image of ``size``: the aspect ratio is kept."""
+    factor = longer_side / max(size)
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+
+
+def resize_depth(prior: DepthPrior, grid: tuple[int, int]) -> DepthPrior:
+    """The prior on another grid (width, height).
+
+    Inverse depth and relative variance are interpolated bilinearly (averaged when shrinking):
+    inverse depth is linear in the image on a plane, so that planes stay planes; errors of
+    neighbours are correlated, so that averaging does not reduce their variance. A pixel is valid
+    when all that contribute are.
+    """
+    if (prior.shape[1], prior.shape[0]) == grid:
+        return prior
+    valid = _resize_valid(prior.valid, grid)
+    safe = np.where(prior.valid, prior.depth, np.float32(1))
+    inverse = resize_map(1.0 / safe, *grid)
+    depth = np.where(valid, 1.0 / np.where(valid, inverse, np.float32(1)), np.float32(0))
+    variance = None
+    if prior.variance is not None:
+        relative = resize_map(np.where(prior.valid, prior.variance / safe**2, 0), *grid)
+        variance = np.where(valid, relative * depth**2, np.float32(0))
+    return DepthPrior(depth, variance, valid, prior.metric)
+
+
+def resize_normals(prior: NormalPrior, grid: tuple[int, int]) -> NormalPrior:
+    """The prior on another grid (width, height): normals are averaged and made unit again, the
+    variance is averaged. A pixel is valid when all that contribute are."""
+    if (prior.shape[1], prior.shape[0]) == grid:
+        return prior
+    valid = _resize_valid(prior.valid, grid)
+    normals = resize_map(prior.normals, *grid)
+    variance = None if prior.variance is None else resize_map(prior.variance, *grid)
+    return NormalPrior.from_arrays(normals, variance, valid)
+
+
+def allow_only(mask: Bool, grid: tuple[int, int]) -> Bool:
+    """A mask (H, W) of the view on the grid of the maps, by the nearest pixel."""
+    resized = cv2.resize(mask.astype(np.uint8), grid, interpolation=cv2.INTER_NEAREST_EXACT)
+    return np.asarray(resized > 0)
+
+
+def restrict_depth(prior: DepthPrior, allowed: Bool) -> DepthPrior:
+    """The prior, valid only where allowed."""
+    return DepthPrior(prior.depth, prior.variance, prior.valid & allowed, prior.metric)
+
+
+def restrict_normals(prior: NormalPrior, allowed: Bool) -> NormalPrior:
+    """The prior, valid only where allowed."""
+    return NormalPrior(prior.normals, prior.variance, prior.valid & allowed)
+
+
+def distrust_edges(normals: NormalPrior, depth: DepthPrior, ratio: float) -> NormalPrior:
+    """Normals with :data:`EDGE_VARIANCE` on both sides of a depth step of more than ``ratio``.
+
+    The variance must be there, and the grids the same. Steps to invalid pixels do not count.
+    """
+    edges = depth_steps(depth, ratio)
+    variance = np.where(edges & normals.valid, np.float32(EDGE_VARIANCE), _variance(normals))
+    return NormalPrior(normals.normals, variance.astype(np.float32), normals.valid)
+
+
+def depth_steps(depth: DepthPrior, ratio: float) -> Bool:
+    """Pixels with a 4-neighbour whose depth differs by more than a factor of ``ratio``."""
+    steps = np.zeros(depth.shape, dtype=np.bool_)
+    log_depth = np.log(np.where(depth.valid, depth.depth, np.float32(1)))
+    for axis in (0, 1):
+        values, valid = np.moveaxis(log_depth, axis, 0), np.moveaxis(depth.valid, axis, 0)
+        step = (np.abs(np.diff(values, axis=0)) > np.log(ratio)) & valid[1:] & valid[:-1]
+        view = np.moveaxis(steps, axis, 0)
+        view[1:] |= step
+        view[:-1] |= step
+    return steps
+
+
+def _resize_valid(valid: Bool, grid: tuple[int, int]) -> Bool:
+    return np.asarray(resize_map(valid, *grid) > _ALL_VALID)
+
+
+def _variance(normals: NormalPrior) -> Float32:
+    if normals.variance is None:
+        raise ValueError("the normals have no variance yet")
+    return normals.variance

@@ -1,0 +1,88 @@
+"""Runs the chosen providers over the images and assembles the mapper's problem.
+
+Order: masks, features, retrieval, matching, verification, depth, normals. Whatever a provider
+returns is validated, then cached; calibration and resizing come after the cache, so that a change
+of them predicts nothing anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from mpsfm_core.config import Config
+from mpsfm_core.data import Features, MappingImage, MappingProblem
+from mpsfm_core.extraction.backends import thread_count
+from mpsfm_core.extraction.events import ExtractionEvents, Silent
+from mpsfm_core.extraction.features import FeatureTable, choose_pairs
+from mpsfm_core.extraction.matching import PairMatcher, PairVerifier, assemble
+from mpsfm_core.extraction.predictions import Predictions
+from mpsfm_core.extraction.report import describe
+from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.inputs.images import ImageSet
+from mpsfm_core.registry import Registry
+
+
+@dataclass(frozen=True, eq=False)
+class Extraction:
+    """The mapper's problem, its images in the order of the image set, and a report.
+
+    ``report`` is plain data for ``summary.json``: pairs tried and dropped with reasons, and what
+    each provider did.
+    """
+
+    problem: MappingProblem
+    report: dict[str, Any]
+
+
+def extract(
+    images: ImageSet,
+    config: Config,
+    registry: Registry,
+    events: ExtractionEvents | None = None,
+) -> Extraction:
+    """Run all providers of a configuration.
+
+    What the cache has is not computed again, so that an interrupted run goes on where it was.
+
+    Raises:
+        InputError: a provider, its weights or its files are missing.
+        ProviderRunError, ProviderOutputError: a provider failed or broke its contract.
+        OutputError: the cache cannot be written.
+    """
+    with threadpool_limits(thread_count(config.runtime), user_api="blas"):
+        return _extract(Workbench(images, config, registry, events or Silent()))
+
+
+def _extract(bench: Workbench) -> Extraction:
+    bench.run_masks()
+    backend = bench.config.features
+    table = None if backend is None else FeatureTable(bench, backend)
+    located = [_NO_FEATURES] * len(bench.images) if table is None else table.extract()
+    pairs, proposed = choose_pairs(bench)
+    matcher = PairMatcher(bench, table)
+    candidates = matcher.match(pairs, located)
+    outcomes = PairVerifier(bench, located).verify(candidates)
+    assembled = assemble(candidates, outcomes, located)
+    priors = Predictions(bench, matcher, candidates).run()
+    problem = MappingProblem(
+        tuple(
+            MappingImage(
+                image.name,
+                image.pinhole,
+                assembled.keypoints[index],
+                *priors[index],
+                keypoint_std_px=assembled.std_px[index],
+                focal_known=image.focal_known,
+            )
+            for index, image in enumerate(bench.images)
+        ),
+        assembled.pairs,
+    )
+    return Extraction(problem, describe(bench, problem, proposed, candidates, outcomes))
+
+
+_NO_FEATURES = Features(np.empty((0, 2)), np.empty((0, 0), dtype=np.float32))
