@@ -66,7 +66,7 @@ def verify(
     )
     inliers = np.asarray(geometry.inlier_matches)[:, 0].astype(np.int64)
     if geometry.config not in _USABLE:
-        name = geometry.config.name.lower()
+        name = _Configuration(geometry.config).name.lower()
         return _dropped(f"{len(inliers)} inliers of {len(xy_a)} matches ({name})", name)
     configuration = _USABLE[geometry.config]
     if len(inliers) < options.min_inliers:
