@@ -109,6 +109,22 @@ def resize_map(values: NDArray[Any], width: int, height: int, *, linear: bool = 
     return resized
 
 
+def log_depth_steps(depth: Float32, valid: Bool) -> Float32:
+    """Largest step of log depth to a 4-neighbour, (h, w) float32, >= 0; e.g. 0.1 for 10 %.
+
+    ``depth``, ``valid``: (h, w). Steps to or from invalid pixels do not count.
+    """
+    steps = np.zeros(depth.shape, dtype=np.float32)
+    log_depth = np.log(np.where(valid, depth, np.float32(1)))
+    for axis in (0, 1):
+        values, ok = np.moveaxis(log_depth, axis, 0), np.moveaxis(valid, axis, 0)
+        step = np.where(ok[1:] & ok[:-1], np.abs(np.diff(values, axis=0)), np.float32(0))
+        along = np.moveaxis(steps, axis, 0)
+        np.maximum(along[1:], step, out=along[1:])
+        np.maximum(along[:-1], step, out=along[:-1])
+    return steps
+
+
 def rotation_angle_deg(rotation: Float64) -> Float64:
     """Angle of rotations (..., 3, 3) in degrees, accurate near 0 and 180."""
     sine = 0.5 * np.linalg.norm(

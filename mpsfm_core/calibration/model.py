@@ -1,16 +1,24 @@
 """The uncertainty model of a prior: what a network says about itself, made trustworthy.
 
 Paper appendix C: the total std is the maximum of the scaled network std, a std proportional to
-depth, and a floor.
+depth, and a floor. To it come what relative networks need, a common shift that leaves one scale
+per image to the mapper, and more variance at depth edges.
 """
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from mpsfm_core.data import DepthPrior, NormalPrior
+from mpsfm_core.geometry import log_depth_steps
 from mpsfm_core.options import Options
+
+_SMALLEST_VARIANCE = 1e-12
+_SMALLEST_SHARE = 0.01
+"""Of its median: what a shift makes smaller than that, or negative, is no depth any more."""
 
 
 class DepthCalibration(Options):
@@ -18,6 +26,9 @@ class DepthCalibration(Options):
 
     ``std_floor`` is in metres and applies to metric priors only. The defaults are those of
     Metric3D v2 giant2 in the reference (its other backends' values stand in their plugins).
+
+    The variance is that of what remains after each image was given its own scale, as the mapper
+    does; an error of the scale of a whole image is not in it.
     """
 
     std_scale: float = Field(3.33, gt=0)
@@ -28,17 +39,44 @@ class DepthCalibration(Options):
     """Smallest std in metres (paper appendix C: 2 cm)."""
     use_network_variance: bool = True
     """False ignores what the network says of itself."""
+    shift: float = 0.0
+    """Added to depth or inverse depth, in medians of it over the map; 0 for metric networks."""
+    shift_space: Literal["depth", "disparity"] = "depth"
+    """What ``shift`` is added to: disparity for networks that predict affine inverse depth."""
+    edge_ratio: float | None = Field(None, gt=1)
+    """A pixel beside a larger ratio of neighbouring depths lies on an edge (reference, for
+    normals: 1.015); null knows no edges."""
+    edge_std_scale: float = Field(1.0, ge=1)
+    """Multiplies the std of pixels on an edge."""
 
     def apply(self, prior: DepthPrior) -> DepthPrior:
-        """The prior with its total variance; every valid pixel has one."""
-        depth = prior.depth.astype(np.float64)
+        """The prior shifted and with its total variance; every valid pixel has one."""
+        shifted = self.shifted(prior)
+        depth = shifted.depth.astype(np.float64)
         std = self.relative_std * depth
         if prior.metric:
             std = np.maximum(std, self.std_floor)
-        if prior.variance is not None and self.use_network_variance:
-            std = np.maximum(std, self.std_scale * np.sqrt(np.maximum(prior.variance, 0)))
-        variance = np.where(prior.valid, np.maximum(std**2, 1e-12), 0.0).astype(np.float32)
-        return DepthPrior(prior.depth, variance, prior.valid, prior.metric)
+        if shifted.variance is not None and self.use_network_variance:
+            std = np.maximum(std, self.std_scale * np.sqrt(np.maximum(shifted.variance, 0)))
+        if self.edge_ratio is not None:
+            edges = log_depth_steps(prior.depth, prior.valid) > np.log(self.edge_ratio)
+            std = np.where(edges, self.edge_std_scale * std, std)
+        variance = np.where(shifted.valid, np.maximum(std**2, _SMALLEST_VARIANCE), 0.0)
+        return DepthPrior(shifted.depth, variance.astype(np.float32), shifted.valid, shifted.metric)
+
+    def shifted(self, prior: DepthPrior) -> DepthPrior:
+        """The prior with :attr:`shift` applied to depth and network variance."""
+        if self.shift == 0 or not prior.valid.any():
+            return prior
+        depth = np.where(prior.valid, prior.depth, np.float32(1)).astype(np.float64)
+        quantity = depth if self.shift_space == "depth" else 1 / depth
+        median = float(np.median(quantity[prior.valid]))
+        moved = quantity + self.shift * median
+        valid = prior.valid & (moved > _SMALLEST_SHARE * median)
+        moved = np.where(valid, moved, 1.0)
+        new, gain = (moved, 1.0) if self.shift_space == "depth" else (1 / moved, quantity / moved)
+        variance = None if prior.variance is None else prior.variance * gain**4
+        return DepthPrior.from_arrays(new, variance, valid, metric=prior.metric)
 
 
 class NormalCalibration(Options):
@@ -62,5 +100,8 @@ class NormalCalibration(Options):
         else:
             std = np.full(prior.shape, np.radians(self.std_default_deg))
         std = np.maximum(std, np.radians(self.std_floor_deg))
-        variance = np.where(prior.valid, np.maximum(std**2, 1e-12), 0.0).astype(np.float32)
-        return NormalPrior(prior.normals, variance, prior.valid)
+        variance = np.where(prior.valid, np.maximum(std**2, _SMALLEST_VARIANCE), 0.0)
+        return NormalPrior(prior.normals, variance.astype(np.float32), prior.valid)
+
+
+Calibration = DepthCalibration | NormalCalibration

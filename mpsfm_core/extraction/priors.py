@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, NormalPrior
-from mpsfm_core.geometry import resize_map
+from mpsfm_core.geometry import log_depth_steps, resize_map
 
 EDGE_VARIANCE = 1e6
 """rad^2, of a normal that is not trusted (reference)."""
@@ -73,22 +73,9 @@ def distrust_edges(normals: NormalPrior, depth: DepthPrior, ratio: float) -> Nor
 
     The variance must be there, and the grids the same. Steps to invalid pixels do not count.
     """
-    edges = depth_steps(depth, ratio)
+    edges = log_depth_steps(depth.depth, depth.valid) > np.log(ratio)
     variance = np.where(edges & normals.valid, np.float32(EDGE_VARIANCE), _variance(normals))
     return NormalPrior(normals.normals, variance.astype(np.float32), normals.valid)
-
-
-def depth_steps(depth: DepthPrior, ratio: float) -> Bool:
-    """Pixels with a 4-neighbour whose depth differs by more than a factor of ``ratio``."""
-    steps = np.zeros(depth.shape, dtype=np.bool_)
-    log_depth = np.log(np.where(depth.valid, depth.depth, np.float32(1)))
-    for axis in (0, 1):
-        values, valid = np.moveaxis(log_depth, axis, 0), np.moveaxis(depth.valid, axis, 0)
-        step = (np.abs(np.diff(values, axis=0)) > np.log(ratio)) & valid[1:] & valid[:-1]
-        view = np.moveaxis(steps, axis, 0)
-        view[1:] |= step
-        view[:-1] |= step
-    return steps
 
 
 def _resize_valid(valid: Bool, grid: tuple[int, int]) -> Bool:
