@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 
 class MpsfmError(Exception):
@@ -65,9 +66,16 @@ class OutputError(MpsfmError):
 
 
 class ReconstructionError(MpsfmError):
-    """The input is fine, but no reconstruction was possible; reasons are in summary.json."""
+    """The input is fine, but no reconstruction was possible.
+
+    ``summary``: what ``summary.json`` says, with the reasons for each image and pair.
+    """
 
     exit_code = 3
+
+    def __init__(self, message: str, summary: Mapping[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.summary = dict(summary or {})
 
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str:

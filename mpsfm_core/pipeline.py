@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -128,11 +127,11 @@ class _Run:
         if self._output is not None:
             write_failure(self._output, summary)
             where = f"; the reasons per image and pair are in {self._output / SUMMARY}"
-        pairs = summary["pairs"]["verified"]
-        counted = Counter(summary["images"]["unregistered"].values()).most_common(1)
+        pairs = summary["pairs"]
         raise ReconstructionError(
-            f"no reconstruction was possible from {len(images)} images with {pairs} verified "
-            f"pairs (most often: {counted[0][0]}){where}"
+            f"no reconstruction was possible from {len(images)} images: {pairs['verified']} of "
+            f"{pairs['matched']} matched pairs could be verified{where}",
+            summary,
         )
 
     def _summary(
@@ -145,16 +144,15 @@ class _Run:
     ) -> dict[str, Any]:
         return {
             "status": status,
-            "images": describe_images(images, mapping),
-            "pairs": describe_pairs(extraction.problem, mapping),
+            "images": describe_images(images, extraction.report, mapping),
+            "pairs": describe_pairs(extraction.report, mapping),
             "reconstructions": describe_reconstructions(mapping, models),
-            "extraction": extraction.report,
             "stages": {name: asdict(record) for name, record in self._stages.report().items()},
             "mapping_steps": {
                 name: {"seconds": seconds, "calls": mapping.report.counts.get(name)}
                 for name, seconds in mapping.report.seconds.items()
             },
-            "providers": self._providers(),
+            "providers": self._providers(extraction.report["providers"]),
             "config": self._config.model_dump(mode="json"),
             "versions": {
                 "mpsfm-core": core_version(),
@@ -163,16 +161,16 @@ class _Run:
             },
         }
 
-    def _providers(self) -> list[dict[str, Any]]:
-        """What predicted what, under which licences."""
+    def _providers(self, usage: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """What predicted what, under which licences, how often and how long."""
+        used = {(line["kind"], line["name"]): line for line in usage}
         described = []
         for path, kind, backend in self._config.backends():
             spec = self._registry.spec(kind, backend.use)
             described.append(
                 {
                     "block": dotted(path),
-                    "kind": kind,
-                    "name": spec.name,
+                    **used.get((kind, spec.name), {"kind": kind, "name": spec.name}),
                     "from": self._registry.version(kind, backend.use),
                     "code_license": spec.code_license,
                     "weights_license": spec.weights_license,

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import MappingProblem
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.scene.reconstruction import MappingResult, MetricScale, Reconstruction
 
 
-def describe_images(images: ImageSet, mapping: MappingResult) -> dict[str, Any]:
-    """Who is registered, who is not and why, and where the focal lengths came from."""
+def describe_images(
+    images: ImageSet, extraction: Mapping[str, Any], mapping: MappingResult
+) -> dict[str, Any]:
+    """Who is registered, who is not and why, and what is known of each.
+
+    ``extraction``: the report of the extraction.
+    """
     component = {
         image.name: number
         for number, reconstruction in enumerate(mapping.reconstructions)
@@ -31,16 +35,27 @@ def describe_images(images: ImageSet, mapping: MappingResult) -> dict[str, Any]:
         "total": len(images),
         "registered": [name for name in images.names if component.get(name) == 0],
         "unregistered": unregistered,
-        "focal_length_from": {image.name: image.focal_source for image in images},
+        "details": {
+            image.name: {
+                "focal_length_from": image.focal_source,
+                **extraction["images"][image.name],
+            }
+            for image in images
+        },
     }
 
 
-def describe_pairs(problem: MappingProblem, mapping: MappingResult) -> dict[str, Any]:
-    """The verified pairs, and why pairs that were tried could not start a reconstruction."""
+def describe_pairs(extraction: Mapping[str, Any], mapping: MappingResult) -> dict[str, Any]:
+    """Each matched pair: what was found, why it was dropped or could not be the first one."""
+    described = []
+    for pair in extraction["pairs"]:
+        reason = mapping.report.pair_reasons.get(" ".join(pair["images"]))
+        described.append(pair if reason is None else {**pair, "cannot_start": reason})
     return {
-        "verified": len(problem.pairs),
-        "matches": sum(len(pair) for pair in problem.pairs),
-        "cannot_start": dict(mapping.report.pair_reasons),
+        "proposed": extraction["pairs_proposed"],
+        "matched": extraction["pairs_matched"],
+        "verified": extraction["pairs_verified"],
+        "all": described,
     }
 
 

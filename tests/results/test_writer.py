@@ -194,13 +194,21 @@ def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path)
     problem, reconstruction = seen_through(solved, images)
     model = Component.of(reconstruction, Photos(images, problem)).model
     mapping = MappingResult((reconstruction,), solved.result.report)
-    described = describe_images(images, mapping)
+    extraction = {
+        "images": {name: {"keypoints": 46} for name in images.names},
+        "pairs": [{"images": ["images/0.png", "images/3.png"], "matches": 20, "inliers": 15}],
+        "pairs_proposed": 6,
+        "pairs_matched": 1,
+        "pairs_verified": 1,
+    }
+    described = describe_images(images, extraction, mapping)
     assert described["total"] == 4
     assert described["registered"] == ["images/0.png", "images/1.png", "images/2.png"]
     assert described["unregistered"] == {"images/3.png": "too few matches"}
-    assert describe_pairs(problem, mapping)["cannot_start"] == {
-        "images/0.png images/3.png": "no parallax"
-    }
+    details = described["details"]["images/0.png"]
+    assert details == {"focal_length_from": "intrinsics", "keypoints": 46}
+    (pair,) = describe_pairs(extraction, mapping)["all"]
+    assert pair == {**extraction["pairs"][0], "cannot_start": "no parallax"}
     (numbers,) = describe_reconstructions(mapping, [model])
     assert (numbers["images"], numbers["points"], numbers["observations"]) == (3, 40, 120)
     assert numbers["lifted_points"] == 5

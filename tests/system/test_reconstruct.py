@@ -147,7 +147,8 @@ def test_nothing_to_reconstruct_exits_with_3_and_gives_reasons(
     assert summary["status"] == "failed"
     assert set(summary["images"]["unregistered"]) == {"0.png", "1.png", "2.png"}
     assert all(summary["images"]["unregistered"].values())
-    assert set(summary["pairs"]["rejected"]) == {"0.png 1.png", "0.png 2.png", "1.png 2.png"}
+    assert summary["pairs"]["matched"] == 3
+    assert all(pair["dropped"] for pair in summary["pairs"]["all"])
     assert (output / "sparse" / "images.bin").read_text() == "earlier"
 
 
@@ -155,9 +156,10 @@ def test_python_raises_when_nothing_can_be_reconstructed(
     photo_scene, unrelated: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MPSFM_CACHE", str(cache))
-    with pytest.raises(ReconstructionError, match="from 3 images with 0 verified pairs"):
+    with pytest.raises(ReconstructionError, match="0 of 3 matched pairs") as raised:
         mpsfm_core.reconstruct(
             unrelated / "images",
             config=photo_scene.config,
             overrides=[f"depth.options.directory={unrelated}"],
         )
+    assert raised.value.summary["status"] == "failed"
