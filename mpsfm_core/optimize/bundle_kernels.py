@@ -1,0 +1,775 @@
+"""Compiled inner loops of bundle adjustment.
+
+Kernels run on a range of points and write only to what belongs to that range, so that ranges can
+run in threads (the GIL is released) and the result does not depend on how many there are. They
+own no memory: with numba's reference counting they take three times as long, so it is off
+(``_nrt=False``) and the caller passes what they work in.
+
+Observations are sorted by point, then by image. Poses and focal lengths that may move have a
+slot each; camera-side vectors hold 6 numbers for each pose slot (rotation, translation), then
+one for each focal slot. A pose moves as ``R <- exp(w) R, t <- t + dt``, a focal length as
+``f <- f exp(a)``.
+"""
+# mypy: allow-untyped-decorators
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.optimize.losses import evaluate
+
+Int32 = NDArray[np.int32]
+
+MIN_DEPTH = 1e-9
+"""Points at or below this depth do not project (COLMAP: machine epsilon)."""
+MAX_SLOPE = 1e6
+"""Points whose ray is flatter than this do not project; keeps every derivative finite."""
+MIN_DEPTH_RATIO = 0.1
+"""A point's step is shortened until no depth falls below this part of itself (our choice): the
+linearised log depth would otherwise throw a point that is e times too far behind its camera."""
+SHORTER = 0.25
+MIN_LENGTH = 0.01
+"""A step that is still not safe at this part of its length is not taken at all."""
+MAX_OWN_STEPS = 10
+"""After a joint step, each point may take this many of its own, with the cameras fixed. Robust
+losses make points with outliers converge slowly; this takes a third of the iterations and half of
+the time, to a lower cost at the same tolerance (our measurement)."""
+OWN_STEP_DAMPING = 1e-6
+POSE = 6
+
+
+class Observations(NamedTuple):
+    """Observations sorted by point, then image; those of point p are ``start[p]:start[p + 1]``.
+
+    ``weight`` is 1 / std of the pixel, ``depth_weight`` 1 / std of the log depth (0: no depth).
+    """
+
+    start: Int64
+    image: Int32
+    xy: Float64
+    weight: Float64
+    log_depth: Float64
+    depth_weight: Float64
+
+
+class Layout(NamedTuple):
+    """Which parameters move (slot -1: constant), and where pairs of poses are stored:
+    ``pair[i, j]``, ``i <= j``, is the row of pose slots i, j in :attr:`System.blocks`, or -1."""
+
+    camera_of_image: Int32
+    pose_slot: Int32
+    focal_slot: Int32
+    variable_point: Bool
+    pair: Int32
+
+
+class Robust(NamedTuple):
+    """Loss codes and scales, both for whitened residuals."""
+
+    reprojection_loss: int
+    reprojection_scale: float
+    depth_loss: int
+    depth_scale: float
+
+
+class Bundle(NamedTuple):
+    """What does not change during an adjustment."""
+
+    obs: Observations
+    layout: Layout
+    robust: Robust
+
+
+class State(NamedTuple):
+    """What is estimated: cam_from_world (n, 3, 3), (n, 3); intrinsics (k, 4); points (p, 3)."""
+
+    rotations: Float64
+    translations: Float64
+    intrinsics: Float64
+    points: Float64
+
+
+class System(NamedTuple):
+    """The camera-side normal equations of a range of points, or summed over all.
+
+    ``blocks`` (pairs, 6, 6), ``border`` (focals, 6 poses) and ``corner`` (focals, focals) hold
+    the reduced matrix, of a pose with itself only the upper triangle; ``gradient`` and
+    ``diagonal`` (d,) are those before the points are eliminated, ``rhs`` (d,) is what
+    elimination adds to the gradient.
+    """
+
+    blocks: Float64
+    border: Float64
+    corner: Float64
+    gradient: Float64
+    diagonal: Float64
+    rhs: Float64
+
+
+class Scratch(NamedTuple):
+    """Working memory of one range for tracks of up to ``longest`` observations.
+
+    ``y``, ``yf``: (longest, 3, 6) and (longest, 3, 1), coupling of the point with pose slots
+    ``slots`` and focal slots ``focals``. ``before``: (longest, 2), cost and depth. ``block``:
+    (1, 12), laid out as a row of ``eliminated``.
+    """
+
+    slots: Int64
+    focals: Int64
+    y: Float64
+    yf: Float64
+    columns: Float64
+    before: Float64
+    block: Float64
+    vector: Float64
+
+
+class Sight(NamedTuple):
+    """One observation in one state, in the camera frame.
+
+    ``q`` is the rotated point, ``x, y, z`` the camera point; ``g`` is the gradient of the cost
+    with respect to it and ``h`` the Gauss-Newton matrix (``hxy`` is 0). Pose, point and focal
+    length all act by displacing the camera point: by ``w x q + dt``, ``R dX``, ``(x, y, 0) da``.
+    """
+
+    visible: bool
+    cost: float
+    qx: float
+    qy: float
+    qz: float
+    x: float
+    y: float
+    z: float
+    gx: float
+    gy: float
+    gz: float
+    hxx: float
+    hyy: float
+    hxz: float
+    hyz: float
+    hzz: float
+
+
+def make_scratch(longest: int) -> Scratch:
+    """Working memory for tracks of up to ``longest`` observations."""
+    longest = max(longest, 1)
+    return Scratch(
+        slots=np.empty(longest, np.int64),
+        focals=np.empty(longest, np.int64),
+        y=np.empty((longest, 3, POSE)),
+        yf=np.empty((longest, 3, 1)),
+        columns=np.empty((3, POSE)),
+        before=np.empty((longest, 2)),
+        block=np.empty((1, 12)),
+        vector=np.empty(3),
+    )
+
+
+_kernel = njit(
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+    fastmath={"contract"},
+    forceinline=True,
+    _nrt=False,
+)
+
+
+@_kernel
+def sort_by(keys: Int32, previous: Int64, start: Int64, order: Int64) -> None:
+    """Stable counting sort of the rows ``previous`` by ``keys[row]``.
+
+    ``start`` (keys + 2,) comes zeroed and leaves with the first position of each key in
+    ``start[key]``; ``order`` gets the sorted rows.
+    """
+    for row in previous:
+        start[keys[row] + 2] += 1
+    for key in range(2, len(start)):
+        start[key] += start[key - 1]
+    for row in previous:
+        order[start[keys[row] + 1]] = row
+        start[keys[row] + 1] += 1
+
+
+@_kernel
+def number_pairs(obs: Observations, pose_slot: Int32, variable: Bool, pair: Int32) -> int:
+    """Number the pairs of pose slots that share a variable point; returns their count.
+
+    ``pair`` (s, s) comes filled with -1 and is left so below the diagonal.
+    """
+    for p in range(len(obs.start) - 1):
+        if variable[p]:
+            for a in range(obs.start[p], obs.start[p + 1]):
+                row = pose_slot[obs.image[a]]
+                if row >= 0:
+                    for b in range(a + 1, obs.start[p + 1]):
+                        column = pose_slot[obs.image[b]]
+                        if column >= 0:
+                            pair[row, column] = 0
+    count = 0
+    for row in range(len(pair)):
+        for column in range(row, len(pair)):
+            if row == column or pair[row, column] >= 0:
+                pair[row, column] = count
+                count += 1
+    return count
+
+
+@_kernel
+def observe(k: int, p: int, bundle: Bundle, state: State) -> Sight:
+    """See observation ``k`` of point ``p``; cost and derivatives are 0 where it is not visible."""
+    obs, robust = bundle.obs, bundle.robust
+    image = obs.image[k]
+    rotation, points = state.rotations, state.points
+    px, py, pz = points[p, 0], points[p, 1], points[p, 2]
+    qx = rotation[image, 0, 0] * px + rotation[image, 0, 1] * py + rotation[image, 0, 2] * pz
+    qy = rotation[image, 1, 0] * px + rotation[image, 1, 1] * py + rotation[image, 1, 2] * pz
+    qz = rotation[image, 2, 0] * px + rotation[image, 2, 1] * py + rotation[image, 2, 2] * pz
+    x = qx + state.translations[image, 0]
+    y = qy + state.translations[image, 1]
+    z = qz + state.translations[image, 2]
+    if not (z > MIN_DEPTH and z * MAX_SLOPE > abs(x) + abs(y)):
+        return Sight(False, 0.0, qx, qy, qz, x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    inverse = 1.0 / z
+    u, v = x * inverse, y * inverse
+    camera = bundle.layout.camera_of_image[image]
+    fx = state.intrinsics[camera, 0] * obs.weight[k]
+    fy = state.intrinsics[camera, 1] * obs.weight[k]
+    ru = fx * u + (state.intrinsics[camera, 2] - obs.xy[k, 0]) * obs.weight[k]
+    rv = fy * v + (state.intrinsics[camera, 3] - obs.xy[k, 1]) * obs.weight[k]
+    rho, weight = evaluate(robust.reprojection_loss, ru * ru + rv * rv, robust.reprojection_scale)
+    fx *= inverse
+    fy *= inverse
+    gx, gy = weight * fx * ru, weight * fy * rv
+    gz = -gx * u - gy * v
+    hxx, hyy = weight * fx * fx, weight * fy * fy
+    hzz = hxx * u * u + hyy * v * v
+    if obs.depth_weight[k] > 0.0:
+        rd = (np.log(z) - obs.log_depth[k]) * obs.depth_weight[k]
+        depth_rho, weight = evaluate(robust.depth_loss, rd * rd, robust.depth_scale)
+        slope = obs.depth_weight[k] * inverse
+        rho += depth_rho
+        gz += weight * slope * rd
+        hzz += weight * slope * slope
+    return Sight(
+        True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, -hxx * u, -hyy * v, hzz
+    )
+
+
+@_kernel
+def _fill_pose_columns(s: Sight, columns: Float64) -> None:
+    """columns (3, 6) <- h [dx/dw | dx/dt]."""
+    columns[0, 0] = s.hxz * s.qy
+    columns[0, 1] = s.hxx * s.qz - s.hxz * s.qx
+    columns[0, 2] = -s.hxx * s.qy
+    columns[1, 0] = s.hyz * s.qy - s.hyy * s.qz
+    columns[1, 1] = -s.hyz * s.qx
+    columns[1, 2] = s.hyy * s.qx
+    columns[2, 0] = s.hzz * s.qy - s.hyz * s.qz
+    columns[2, 1] = s.hxz * s.qz - s.hzz * s.qx
+    columns[2, 2] = s.hyz * s.qx - s.hxz * s.qy
+    columns[0, 3] = s.hxx
+    columns[1, 3] = columns[0, 4] = 0.0
+    columns[1, 4] = s.hyy
+    columns[2, 3] = columns[0, 5] = s.hxz
+    columns[2, 4] = columns[1, 5] = s.hyz
+    columns[2, 5] = s.hzz
+
+
+@_kernel
+def _add_pose(s: Sight, columns: Float64, slot: int, row: int, system: System) -> None:
+    """Add the pose's gradient, diagonal and the upper triangle of its own block."""
+    blocks, gradient, diagonal = system.blocks, system.gradient, system.diagonal
+    n = POSE * slot
+    gradient[n] += s.qy * s.gz - s.qz * s.gy
+    gradient[n + 1] += s.qz * s.gx - s.qx * s.gz
+    gradient[n + 2] += s.qx * s.gy - s.qy * s.gx
+    gradient[n + 3] += s.gx
+    gradient[n + 4] += s.gy
+    gradient[n + 5] += s.gz
+    diagonal[n] += s.qy * columns[2, 0] - s.qz * columns[1, 0]
+    diagonal[n + 1] += s.qz * columns[0, 1] - s.qx * columns[2, 1]
+    diagonal[n + 2] += s.qx * columns[1, 2] - s.qy * columns[0, 2]
+    diagonal[n + 3] += s.hxx
+    diagonal[n + 4] += s.hyy
+    diagonal[n + 5] += s.hzz
+    for b in range(POSE):
+        c0, c1, c2 = columns[0, b], columns[1, b], columns[2, b]
+        blocks[row, 0, b] += s.qy * c2 - s.qz * c1
+        if b >= 1:
+            blocks[row, 1, b] += s.qz * c0 - s.qx * c2
+        if b >= 2:
+            blocks[row, 2, b] += s.qx * c1 - s.qy * c0
+    blocks[row, 3, 3] += s.hxx
+    blocks[row, 3, 5] += s.hxz
+    blocks[row, 4, 4] += s.hyy
+    blocks[row, 4, 5] += s.hyz
+    blocks[row, 5, 5] += s.hzz
+
+
+@_kernel
+def _add_focal(
+    s: Sight, columns: Float64, focal: int, slot: int, poses: int, system: System
+) -> None:
+    """Add the focal length's gradient, diagonal, own entry and coupling with the pose."""
+    own = s.x * s.x * s.hxx + s.y * s.y * s.hyy
+    system.gradient[POSE * poses + focal] += s.x * s.gx + s.y * s.gy
+    system.diagonal[POSE * poses + focal] += own
+    system.corner[focal, focal] += own
+    if slot >= 0:
+        for a in range(POSE):
+            system.border[focal, POSE * slot + a] += s.x * columns[0, a] + s.y * columns[1, a]
+
+
+@_kernel
+def _add_point(s: Sight, rotation: Float64, image: int, block: Float64, p: int) -> None:
+    """block[p] (12,) += packed lower triangle of R^T h R at 0..5 and R^T g at 6..8."""
+    r = rotation
+    for a in range(3):
+        r0, r1, r2 = r[image, 0, a], r[image, 1, a], r[image, 2, a]
+        block[p, 6 + a] += r0 * s.gx + r1 * s.gy + r2 * s.gz
+        c0 = r0 * s.hxx + r2 * s.hxz
+        c1 = r1 * s.hyy + r2 * s.hyz
+        c2 = r0 * s.hxz + r1 * s.hyz + r2 * s.hzz
+        for b in range(a + 1):
+            block[p, a * (a + 1) // 2 + b] += (
+                c0 * r[image, 0, b] + c1 * r[image, 1, b] + c2 * r[image, 2, b]
+            )
+
+
+@_kernel
+def _add_coupling(
+    columns: Float64, width: int, rotation: Float64, image: int, y: Float64, n: int, fresh: bool
+) -> None:
+    """y[n] (3, width) = (fresh) or += R^T columns."""
+    for c in range(3):
+        r0, r1, r2 = rotation[image, 0, c], rotation[image, 1, c], rotation[image, 2, c]
+        for a in range(width):
+            value = r0 * columns[0, a] + r1 * columns[1, a] + r2 * columns[2, a]
+            y[n, c, a] = value if fresh else y[n, c, a] + value
+
+
+@_kernel
+def _invert_factor(block: Float64, p: int, damping: float) -> bool:
+    """Replace the packed V in block[p, :6] by L^-1, V + damping diag(V) = L L^T, and keep the
+    diagonal of V in block[p, 9:]. False (block unusable) if it is not positive definite."""
+    boost = 1.0 + damping
+    block[p, 9], block[p, 10], block[p, 11] = block[p, 0], block[p, 2], block[p, 5]
+    a = block[p, 0] * boost
+    if not (a > 0.0 and a < np.inf):
+        return False
+    i00 = 1.0 / np.sqrt(a)
+    l10, l20 = block[p, 1] * i00, block[p, 3] * i00
+    b = block[p, 2] * boost - l10 * l10
+    if not (b > 0.0 and b < np.inf):
+        return False
+    i11 = 1.0 / np.sqrt(b)
+    l21 = (block[p, 4] - l20 * l10) * i11
+    c = block[p, 5] * boost - l20 * l20 - l21 * l21
+    if not (c > 0.0 and c < np.inf):
+        return False
+    i22 = 1.0 / np.sqrt(c)
+    i10 = -l10 * i00 * i11
+    block[p, 0], block[p, 1], block[p, 2] = i00, i10, i11
+    block[p, 3] = -(l20 * i00 + l21 * i10) * i22
+    block[p, 4], block[p, 5] = -l21 * i11 * i22, i22
+    return True
+
+
+@_kernel
+def _whiten(block: Float64, p: int, y: Float64, n: int, width: int) -> None:
+    """y[n] (3, width) <- L^-1 y[n]."""
+    i00, i10, i11 = block[p, 0], block[p, 1], block[p, 2]
+    i20, i21, i22 = block[p, 3], block[p, 4], block[p, 5]
+    for a in range(width):
+        y0, y1, y2 = y[n, 0, a], y[n, 1, a], y[n, 2, a]
+        y[n, 0, a] = i00 * y0
+        y[n, 1, a] = i10 * y0 + i11 * y1
+        y[n, 2, a] = i20 * y0 + i21 * y1 + i22 * y2
+
+
+@_kernel
+def _point_step(block: Float64, p: int, g0: float, g1: float, g2: float, step: Float64) -> float:
+    """step (3,) <- -V^-1 g; returns the decrease of cost that the linear model promises."""
+    i00, i10, i11 = block[p, 0], block[p, 1], block[p, 2]
+    i20, i21, i22 = block[p, 3], block[p, 4], block[p, 5]
+    z0 = i00 * g0
+    z1 = i10 * g0 + i11 * g1
+    z2 = i20 * g0 + i21 * g1 + i22 * g2
+    step[0] = -(i00 * z0 + i10 * z1 + i20 * z2)
+    step[1] = -(i11 * z1 + i21 * z2)
+    step[2] = -i22 * z2
+    promised: float = 0.5 * (z0 * z0 + z1 * z1 + z2 * z2)
+    return promised
+
+
+@_kernel
+def _eliminate_from_poses(
+    count: int, z0: float, z1: float, z2: float, pair: Int32, system: System, scratch: Scratch
+) -> None:
+    """Schur complement of a point on its poses: S_ij -= Y_i^T Y_j, rhs_i -= Y_i^T z."""
+    blocks, rhs, slots, y = system.blocks, system.rhs, scratch.slots, scratch.y
+    for a in range(count):
+        own = pair[slots[a], slots[a]]
+        for i in range(POSE):
+            y0, y1, y2 = y[a, 0, i], y[a, 1, i], y[a, 2, i]
+            rhs[POSE * slots[a] + i] -= y0 * z0 + y1 * z1 + y2 * z2
+            for j in range(i, POSE):
+                blocks[own, i, j] -= y0 * y[a, 0, j] + y1 * y[a, 1, j] + y2 * y[a, 2, j]
+        for b in range(a + 1, count):
+            row = pair[slots[a], slots[b]]
+            for i in range(POSE):
+                y0, y1, y2 = y[a, 0, i], y[a, 1, i], y[a, 2, i]
+                for j in range(POSE):
+                    blocks[row, i, j] -= y0 * y[b, 0, j] + y1 * y[b, 1, j] + y2 * y[b, 2, j]
+
+
+@_kernel
+def _eliminate_from_focals(
+    count: int,
+    num_focals: int,
+    z0: float,
+    z1: float,
+    z2: float,
+    poses: int,
+    system: System,
+    scratch: Scratch,
+) -> None:
+    """Schur complement of a point on its focal lengths, against its poses and each other."""
+    focals, yf, slots, y = scratch.focals, scratch.yf, scratch.slots, scratch.y
+    for f in range(num_focals):
+        y0, y1, y2 = yf[f, 0, 0], yf[f, 1, 0], yf[f, 2, 0]
+        system.rhs[POSE * poses + focals[f]] -= y0 * z0 + y1 * z1 + y2 * z2
+        for a in range(count):
+            for i in range(POSE):
+                system.border[focals[f], POSE * slots[a] + i] -= (
+                    y0 * y[a, 0, i] + y1 * y[a, 1, i] + y2 * y[a, 2, i]
+                )
+        for g in range(num_focals):
+            system.corner[focals[f], focals[g]] -= (
+                y0 * yf[g, 0, 0] + y1 * yf[g, 1, 0] + y2 * yf[g, 2, 0]
+            )
+
+
+@_kernel
+def _find_or_add(values: Int64, count: int, value: int) -> int:
+    for index in range(count):
+        if values[index] == value:
+            return index
+    values[count] = value
+    return count
+
+
+@_kernel
+def reduce_points(
+    first: int,
+    last: int,
+    damping: float,
+    bundle: Bundle,
+    state: State,
+    system: System,
+    eliminated: Float64,
+    scratch: Scratch,
+) -> float:
+    """Linearise the points ``first:last``, eliminate them, and return their cost.
+
+    Adds to ``system``, undamped on the camera side. Fills ``eliminated`` (p, 12): packed L^-1 of
+    the damped 3 x 3 block, its gradient, its diagonal; a row is 0, so that the point stays, if
+    the point is constant or its block is not definite (nothing sees it).
+    """
+    obs, layout = bundle.obs, bundle.layout
+    slots, focals, columns = scratch.slots, scratch.focals, scratch.columns
+    poses = len(layout.pair)
+    cost = 0.0
+    for p in range(first, last):
+        count = num_focals = 0
+        for a in range(12):
+            eliminated[p, a] = 0.0
+        for k in range(obs.start[p], obs.start[p + 1]):
+            s = observe(k, p, bundle, state)
+            if not s.visible:
+                continue
+            cost += s.cost
+            image = obs.image[k]
+            slot = layout.pose_slot[image]
+            focal = layout.focal_slot[layout.camera_of_image[image]]
+            _fill_pose_columns(s, columns)
+            if slot >= 0:
+                _add_pose(s, columns, slot, layout.pair[slot, slot], system)
+            if focal >= 0:
+                _add_focal(s, columns, focal, slot, poses, system)
+            if not layout.variable_point[p]:
+                continue
+            _add_point(s, state.rotations, image, eliminated, p)
+            if slot >= 0:
+                # a track may see an image twice; sorted by image, only the last slot can be equal
+                fresh = count == 0 or slots[count - 1] != slot
+                if fresh:
+                    slots[count] = slot
+                    count += 1
+                _add_coupling(columns, POSE, state.rotations, image, scratch.y, count - 1, fresh)
+            if focal >= 0:
+                n = _find_or_add(focals, num_focals, focal)
+                columns[0, 0] = s.x * s.hxx
+                columns[1, 0] = s.y * s.hyy
+                columns[2, 0] = s.x * s.hxz + s.y * s.hyz
+                fresh = n == num_focals
+                _add_coupling(columns, 1, state.rotations, image, scratch.yf, n, fresh)
+                num_focals = max(num_focals, n + 1)
+        if not _invert_factor(eliminated, p, damping):
+            for a in range(12):
+                eliminated[p, a] = 0.0
+            continue
+        g0, g1, g2 = eliminated[p, 6], eliminated[p, 7], eliminated[p, 8]
+        z0 = eliminated[p, 0] * g0
+        z1 = eliminated[p, 1] * g0 + eliminated[p, 2] * g1
+        z2 = eliminated[p, 3] * g0 + eliminated[p, 4] * g1 + eliminated[p, 5] * g2
+        for a in range(count):
+            _whiten(eliminated, p, scratch.y, a, POSE)
+        for f in range(num_focals):
+            _whiten(eliminated, p, scratch.yf, f, 1)
+        _eliminate_from_poses(count, z0, z1, z2, layout.pair, system, scratch)
+        _eliminate_from_focals(count, num_focals, z0, z1, z2, poses, system, scratch)
+    return cost
+
+
+@_kernel
+def _joint_step(
+    p: int,
+    damping: float,
+    delta: Float64,
+    bundle: Bundle,
+    state: State,
+    eliminated: Float64,
+    scratch: Scratch,
+) -> float:
+    """Back-substitute: scratch.vector <- -V^-1 (g + W^T delta), the point's part of the step.
+
+    Fills ``scratch.before`` with each observation's cost (-1 if not visible) and depth, and
+    returns the decrease of cost that the linear model promises.
+    """
+    obs, layout, rotation = bundle.obs, bundle.layout, state.rotations
+    g0, g1, g2 = eliminated[p, 6], eliminated[p, 7], eliminated[p, 8]
+    for k in range(obs.start[p], obs.start[p + 1]):
+        s = observe(k, p, bundle, state)
+        scratch.before[k - obs.start[p], 0] = s.cost if s.visible else -1.0
+        scratch.before[k - obs.start[p], 1] = s.z
+        image = obs.image[k]
+        dx = dy = dz = 0.0
+        if layout.pose_slot[image] >= 0:
+            n = POSE * layout.pose_slot[image]
+            dx = delta[n + 1] * s.qz - delta[n + 2] * s.qy + delta[n + 3]
+            dy = delta[n + 2] * s.qx - delta[n] * s.qz + delta[n + 4]
+            dz = delta[n] * s.qy - delta[n + 1] * s.qx + delta[n + 5]
+        focal = layout.focal_slot[layout.camera_of_image[image]]
+        if focal >= 0:
+            dx += s.x * delta[POSE * len(layout.pair) + focal]
+            dy += s.y * delta[POSE * len(layout.pair) + focal]
+        ux = s.hxx * dx + s.hxz * dz
+        uy = s.hyy * dy + s.hyz * dz
+        uz = s.hxz * dx + s.hyz * dy + s.hzz * dz
+        g0 += rotation[image, 0, 0] * ux + rotation[image, 1, 0] * uy + rotation[image, 2, 0] * uz
+        g1 += rotation[image, 0, 1] * ux + rotation[image, 1, 1] * uy + rotation[image, 2, 1] * uz
+        g2 += rotation[image, 0, 2] * ux + rotation[image, 1, 2] * uy + rotation[image, 2, 2] * uz
+    step = scratch.vector
+    _point_step(eliminated, p, g0, g1, g2, step)
+    promised = 0.0
+    for a in range(3):
+        promised += step[a] * (damping * eliminated[p, 9 + a] * step[a] - eliminated[p, 6 + a])
+    return 0.5 * promised
+
+
+@_kernel
+def _look(p: int, bundle: Bundle, trial: State, scratch: Scratch) -> tuple[float, float, bool]:
+    """Cost of a point after a step, cost before it of what it lost from view, and whether its
+    depths are safe. Fills ``scratch.block`` with the point's own normal equations."""
+    obs, before, block = bundle.obs, scratch.before, scratch.block
+    cost = lost = 0.0
+    safe = True
+    for a in range(12):
+        block[0, a] = 0.0
+    for k in range(obs.start[p], obs.start[p + 1]):
+        s = observe(k, p, bundle, trial)
+        cost += s.cost
+        _add_point(s, trial.rotations, obs.image[k], block, 0)
+        n = k - obs.start[p]
+        if before[n, 0] >= 0.0:
+            safe = safe and s.z > MIN_DEPTH_RATIO * before[n, 1]
+            if not s.visible:
+                lost += before[n, 0]
+    return cost, lost, safe
+
+
+@_kernel
+def step_points(
+    first: int,
+    last: int,
+    damping: float,
+    tolerance: float,
+    delta: Float64,
+    bundle: Bundle,
+    state: State,
+    trial: State,
+    eliminated: Float64,
+    scratch: Scratch,
+) -> tuple[float, float, float]:
+    """Move the points ``first:last`` of ``trial``, whose cameras have moved by ``delta``; then
+    each point by itself, while that promises to lower its cost by the part ``tolerance``.
+
+    Returns ``(cost, lost, promised)``: the cost of what is visible after the step; the cost
+    before it of observations that it loses from view; and the decrease of cost that the linear
+    model promises for the points' part of the joint step.
+    """
+    points, step = trial.points, scratch.vector
+    total = total_lost = promised = 0.0
+    for p in range(first, last):
+        promised += _joint_step(p, damping, delta, bundle, state, eliminated, scratch)
+        for a in range(3):
+            points[p, a] = state.points[p, a] + step[a]
+        cost, lost, safe = _look(p, bundle, trial, scratch)
+        length = 1.0
+        while not safe and length > 0.0:
+            length = length * SHORTER if length > MIN_LENGTH else 0.0
+            for a in range(3):
+                points[p, a] = state.points[p, a] + length * step[a]
+            cost, lost, safe = _look(p, bundle, trial, scratch)
+        for _ in range(MAX_OWN_STEPS if bundle.layout.variable_point[p] else 0):
+            block = scratch.block
+            if not _invert_factor(block, 0, OWN_STEP_DAMPING):
+                break
+            gain = _point_step(block, 0, block[0, 6], block[0, 7], block[0, 8], step)
+            if not gain > tolerance * cost:
+                break
+            x, y, z = points[p, 0], points[p, 1], points[p, 2]
+            for a in range(3):
+                points[p, a] += step[a]
+            own_cost, own_lost, safe = _look(p, bundle, trial, scratch)
+            if not (safe and own_cost < cost and own_lost <= lost):
+                points[p, 0], points[p, 1], points[p, 2] = x, y, z
+                break
+            cost, lost = own_cost, own_lost
+        total += cost
+        total_lost += lost
+    return total, total_lost, promised
+
+
+@_kernel
+def _rotation(x: float, y: float, z: float) -> Any:
+    """Rodrigues' formula, row by row; the series near 0 keeps full precision."""
+    squared = x * x + y * y + z * z
+    angle = np.sqrt(squared)
+    if angle < 1e-4:
+        a = 1.0 - squared / 6.0
+        b = 0.5 - squared / 24.0
+    else:
+        a = np.sin(angle) / angle
+        b = (1.0 - np.cos(angle)) / squared
+    return (
+        (1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y),
+        (b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x),
+        (b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)),
+    )
+
+
+@_kernel
+def move_cameras(delta: Float64, layout: Layout, state: State, trial: State) -> None:
+    """Move the cameras of ``trial``, a copy of those of ``state``, by ``delta``."""
+    for image in range(len(layout.pose_slot)):
+        slot = layout.pose_slot[image]
+        if slot < 0:
+            continue
+        n = POSE * slot
+        turn = _rotation(delta[n], delta[n + 1], delta[n + 2])
+        for a in range(3):
+            trial.translations[image, a] += delta[n + 3 + a]
+            for b in range(3):
+                value = 0.0
+                for c in range(3):
+                    value += turn[a][c] * state.rotations[image, c, b]
+                trial.rotations[image, a, b] = value
+    for camera in range(len(layout.focal_slot)):
+        if layout.focal_slot[camera] >= 0:
+            scale = np.exp(delta[POSE * len(layout.pair) + layout.focal_slot[camera]])
+            trial.intrinsics[camera, 0] *= scale
+            trial.intrinsics[camera, 1] *= scale
+
+
+@_kernel
+def assemble(system: System, boost: Float64, pair: Int32, out: Float64) -> None:
+    """Write the lower triangle of the reduced matrix plus ``boost`` on its diagonal."""
+    poses = len(pair)
+    for i in range(poses):
+        for j in range(i, poses):
+            if pair[i, j] >= 0:
+                for a in range(POSE):
+                    for b in range(a if i == j else 0, POSE):
+                        out[POSE * j + b, POSE * i + a] = system.blocks[pair[i, j], a, b]
+    for f in range(len(system.corner)):
+        for a in range(POSE * poses):
+            out[POSE * poses + f, a] = system.border[f, a]
+        for g in range(f + 1):
+            out[POSE * poses + f, POSE * poses + g] = system.corner[f, g]
+    for a in range(len(boost)):
+        out[a, a] += boost[a]
+
+
+@_kernel
+def multiply(system: System, boost: Float64, pairs: Int64, x: Float64, out: Float64) -> None:
+    """out (d,) <- (reduced matrix + diag(boost)) x; ``pairs`` (n, 2) are the slots of blocks."""
+    for a in range(len(x)):
+        out[a] = boost[a] * x[a]
+    for n in range(len(pairs)):
+        i, j = POSE * pairs[n, 0], POSE * pairs[n, 1]
+        for a in range(POSE):
+            value = 0.0
+            for b in range(a if i == j else 0, POSE):
+                value += system.blocks[n, a, b] * x[j + b]
+            out[i + a] += value
+            for b in range(a + 1 if i == j else 0, POSE):
+                out[j + b] += system.blocks[n, a, b] * x[i + a]
+    poses = system.border.shape[1]
+    for f in range(len(system.corner)):
+        value = 0.0
+        for a in range(poses):
+            value += system.border[f, a] * x[a]
+            out[a] += system.border[f, a] * x[poses + f]
+        for g in range(len(system.corner)):
+            value += system.corner[f, g] * x[poses + g]
+        out[poses + f] += value
+
+
+@_kernel
+def point_covariances(
+    first: int,
+    last: int,
+    damping: float,
+    bundle: Bundle,
+    state: State,
+    scratch: Scratch,
+    out: Float64,
+) -> None:
+    """Inverse of ``V + damping I`` of each of the points ``first:last``, to out (p, 3, 3)."""
+    block = scratch.block
+    for p in range(first, last):
+        for a in range(12):
+            block[0, a] = 0.0
+        block[0, 0] = block[0, 2] = block[0, 5] = damping
+        for k in range(bundle.obs.start[p], bundle.obs.start[p + 1]):
+            s = observe(k, p, bundle, state)
+            _add_point(s, state.rotations, bundle.obs.image[k], block, 0)
+        if not _invert_factor(block, 0, 0.0):
+            # an unobserved direction beside strong ones: the damping drowned in rounding
+            _invert_factor(block, 0, 1e-12)
+        i00, i10, i11 = block[0, 0], block[0, 1], block[0, 2]
+        i20, i21, i22 = block[0, 3], block[0, 4], block[0, 5]
+        out[p, 0, 0] = i00 * i00 + i10 * i10 + i20 * i20
+        out[p, 1, 1] = i11 * i11 + i21 * i21
+        out[p, 2, 2] = i22 * i22
+        out[p, 1, 0] = out[p, 0, 1] = i10 * i11 + i20 * i21
+        out[p, 2, 0] = out[p, 0, 2] = i20 * i22
+        out[p, 2, 1] = out[p, 1, 2] = i21 * i22

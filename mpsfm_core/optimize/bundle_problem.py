@@ -1,0 +1,269 @@
+"""What bundle adjustment is asked: its problem and options, checked and brought into order."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.errors import DataError
+from mpsfm_core.optimize import bundle_kernels as kernels
+from mpsfm_core.optimize.losses import Loss
+from mpsfm_core.options import Options
+
+RANGE_SIZE = 8000
+"""Observations that are worth a thread of their own (our measurement)."""
+MAX_RANGES = 8
+MAX_BUFFER_BYTES = 1 << 30
+"""Fewer ranges when their copies of the reduced system would take more than this."""
+
+Result = TypeVar("Result")
+Range = tuple[int, int, int]
+"""Number of the range, first point, end."""
+
+
+class BundleOptions(Options):
+    """Settings of bundle adjustment. Loss scales are in standard deviations of the residual."""
+
+    reprojection_loss: Loss = Loss.SOFT_L1
+    """Reference: SOFT_L1."""
+    reprojection_scale: float = Field(1.5, gt=0)
+    """Reference: 1.5 x keypoint std with weight 1 / std^2, which is 1.5 on whitened residuals."""
+    depth_loss: Loss = Loss.CAUCHY
+    """Paper and reference: Cauchy; the reference's points-only refinement takes TRIVIAL."""
+    depth_scale: float = Field(2.0, gt=0)
+    """Reference: rob_std 2, times a MAD factor, times 0.125 in the last global adjustment."""
+    function_tolerance: float = Field(1e-6, ge=0)
+    """Stop when a step lowers the cost by at most this part (Ceres, reference: 1e-6)."""
+    max_iterations: int = Field(50, ge=1)
+    """Steps tried, taken or not (Ceres, reference: 50)."""
+    initial_damping: float = Field(1e-4, gt=0)
+    """Inverse of Ceres' initial trust region radius, 1e4."""
+    dense_poses: int = Field(500, ge=0)
+    """Up to this many variable poses the cameras are solved for by a dense Cholesky
+    factorisation, beyond by conjugate gradients (our measurement)."""
+    threads: int | None = Field(None, ge=1)
+    """None: one per processor. The result does not depend on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class BundleProblem:
+    """What to adjust, as arrays; nothing is changed in place.
+
+    ``rotations`` (n, 3, 3), ``translations`` (n, 3): cam_from_world. ``intrinsics`` (k, 4):
+    fx, fy, cx, cy in pixels. ``camera_of_image`` (n,) int: row of ``intrinsics``. ``points``
+    (p, 3): world. Observation j sees point ``obs_point[j]`` in image ``obs_image[j]`` at
+    ``obs_xy[j]`` (m, 2), COLMAP pixels, with standard deviation ``obs_std_px`` ((m,) or one
+    number). ``obs_log_depth`` (m,): log of the depth map there, NaN where it has none (None:
+    nowhere); ``obs_std_log_depth`` ((m,) or one number) its standard deviation, the square root
+    of variance / depth^2.
+
+    ``variable_pose`` (n,), ``variable_point`` (p,), ``variable_focal`` (k,), bool: what moves;
+    None: all poses, all points, no focal length. A focal length keeps its aspect ratio; images
+    with the same camera share it. Gauge: hold a pose constant. Where no depth fixes the scale,
+    ``scale_anchor`` is the index of a variable pose of which one translation coordinate is held
+    too: the one that a change of scale about the first constant pose moves most.
+    """
+
+    rotations: Float64
+    translations: Float64
+    intrinsics: Float64
+    camera_of_image: NDArray[np.integer[Any]]
+    points: Float64
+    obs_image: NDArray[np.integer[Any]]
+    obs_point: NDArray[np.integer[Any]]
+    obs_xy: Float64
+    obs_std_px: Float64 | float = 1.0
+    obs_log_depth: Float64 | None = None
+    obs_std_log_depth: Float64 | float = 1.0
+    variable_pose: Bool | None = None
+    variable_point: Bool | None = None
+    variable_focal: Bool | None = None
+    scale_anchor: int | None = None
+
+
+class Prepared(NamedTuple):
+    """A checked problem as the kernels want it.
+
+    ``pairs`` (b, 2): pose slots of each block of the reduced matrix. ``anchor``: image and axis
+    of the translation coordinate that is held, or None. ``longest``: observations of a point.
+    """
+
+    bundle: kernels.Bundle
+    state: kernels.State
+    pairs: Int64
+    anchor: tuple[int, int] | None
+    ranges: list[Range]
+    longest: int
+
+
+class Run(Protocol):
+    """Calls ``function(*range)`` for each range of points, maybe in threads; returns the results
+    in the order of the ranges."""
+
+    def __call__(self, function: Callable[[int, int, int], Result]) -> list[Result]: ...
+
+
+def prepare(problem: BundleProblem, options: BundleOptions) -> Prepared:
+    """Check the problem, copy what will change, and sort the observations by point.
+
+    Raises:
+        DataError: a shape, an index, a value that is not finite or a std that is not positive.
+    """
+    state = _state(problem)
+    images, points, cameras = (len(a) for a in (state.rotations, state.points, state.intrinsics))
+    obs = _observations(problem, images, points)
+    variable_pose = _mask(problem.variable_pose, "variable_pose", images, True)
+    variable_point = _mask(problem.variable_point, "variable_point", points, True)
+    variable_focal = _mask(problem.variable_focal, "variable_focal", cameras, False)
+    poses = np.count_nonzero(variable_pose)
+    layout = kernels.Layout(
+        _indices(problem.camera_of_image, "camera_of_image", images, cameras),
+        _slots(variable_pose),
+        _slots(variable_focal),
+        variable_point,
+        np.full((poses, poses), -1, dtype=np.int32),
+    )
+    kernels.number_pairs(obs, layout.pose_slot, variable_point, layout.pair)
+    pairs = np.argwhere(layout.pair >= 0)
+    robust = kernels.Robust(
+        int(options.reprojection_loss),
+        options.reprojection_scale,
+        int(options.depth_loss),
+        options.depth_scale,
+    )
+    return Prepared(
+        kernels.Bundle(obs, layout, robust),
+        state,
+        pairs,
+        _scale_gauge(problem.scale_anchor, variable_pose, state),
+        _ranges(obs.start, len(pairs)),
+        int(np.diff(obs.start).max(initial=0)),
+    )
+
+
+@contextmanager
+def workers(ranges: list[Range], threads: int | None) -> Iterator[Run]:
+    """Threads, if there are several ranges and processors, for as long as the context lasts."""
+    count = min(len(ranges), threads or os.cpu_count() or 1)
+    if count < 2:
+
+        def run_here(function: Callable[[int, int, int], Result]) -> list[Result]:
+            return [function(*part) for part in ranges]
+
+        yield run_here
+        return
+    with ThreadPoolExecutor(count) as pool:
+
+        def run(function: Callable[[int, int, int], Result]) -> list[Result]:
+            return list(pool.map(lambda part: function(*part), ranges))
+
+        yield run
+
+
+def _state(problem: BundleProblem) -> kernels.State:
+    count = len(problem.rotations)
+    return kernels.State(
+        _numbers(problem.rotations, "rotations", (count, 3, 3)).copy(),
+        _numbers(problem.translations, "translations", (count, 3)).copy(),
+        _numbers(problem.intrinsics, "intrinsics", (len(problem.intrinsics), 4)).copy(),
+        _numbers(problem.points, "points", (len(problem.points), 3)).copy(),
+    )
+
+
+def _observations(problem: BundleProblem, images: int, points: int) -> kernels.Observations:
+    count = len(problem.obs_image)
+    image = _indices(problem.obs_image, "obs_image", count, images)
+    point = _indices(problem.obs_point, "obs_point", count, points)
+    xy = _numbers(problem.obs_xy, "obs_xy", (count, 2))
+    weight = _inverse_std(problem.obs_std_px, "obs_std_px", count)
+    log_depth = depth_weight = np.zeros(count)
+    if problem.obs_log_depth is not None:
+        given = np.asarray(problem.obs_log_depth, dtype=np.float64)
+        known = ~np.isnan(given)
+        log_depth = _numbers(np.where(known, given, 0.0), "obs_log_depth", (count,))
+        std = np.where(known, problem.obs_std_log_depth, 1.0)
+        depth_weight = np.where(known, _inverse_std(std, "obs_std_log_depth", count), 0.0)
+    start, order = _sorted_by_point(image, point, images, points)
+    return kernels.Observations(
+        start, image[order], xy[order], weight[order], log_depth[order], depth_weight[order]
+    )
+
+
+def _sorted_by_point(
+    image: NDArray[np.int32], point: NDArray[np.int32], images: int, points: int
+) -> tuple[Int64, Int64]:
+    """``(start, order)``: observations by point, then image."""
+    by_image, order = np.empty(len(image), np.int64), np.empty(len(image), np.int64)
+    start = np.zeros(points + 2, np.int64)
+    kernels.sort_by(image, np.arange(len(image)), np.zeros(images + 2, np.int64), by_image)
+    kernels.sort_by(point, by_image, start, order)
+    return start[:-1], order
+
+
+def _numbers(values: ArrayLike, name: str, shape: tuple[int, ...]) -> Float64:
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    if array.shape != shape:
+        raise DataError(name, f"must have shape {shape}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise DataError(name, "must be finite")
+    return array
+
+
+def _inverse_std(std: Float64 | float, name: str, count: int) -> Float64:
+    array = _numbers(np.broadcast_to(std, (count,)) if np.ndim(std) == 0 else std, name, (count,))
+    if not (array > 0).all():
+        raise DataError(name, "must be positive")
+    return 1.0 / array
+
+
+def _indices(values: NDArray[Any], name: str, count: int, limit: int) -> NDArray[np.int32]:
+    array = np.asarray(values)
+    if array.shape != (count,) or array.dtype.kind not in "iu":
+        raise DataError(name, f"must be integers of shape ({count},)")
+    if count and not 0 <= array.min() <= array.max() < limit:
+        raise DataError(name, f"must lie in [0, {limit})")
+    return np.array(array, dtype=np.int32)
+
+
+def _mask(values: Bool | None, name: str, count: int, default: bool) -> Bool:
+    if values is None:
+        return np.full(count, default)
+    array = np.array(values)
+    if array.shape != (count,) or array.dtype != np.bool_:
+        raise DataError(name, f"must be bool of shape ({count},)")
+    return array
+
+
+def _slots(variable: Bool) -> NDArray[np.int32]:
+    return np.where(variable, np.cumsum(variable) - 1, -1).astype(np.int32)
+
+
+def _scale_gauge(
+    anchor: int | None, variable: Bool, state: kernels.State
+) -> tuple[int, int] | None:
+    if anchor is None:
+        return None
+    if not (0 <= anchor < len(variable) and variable[anchor]) or variable.all():
+        raise DataError("scale_anchor", "must be a variable pose beside a constant one")
+    first = int(np.argmin(variable))
+    center = -state.rotations[first].T @ state.translations[first]
+    offset = state.rotations[anchor] @ center + state.translations[anchor]
+    return anchor, int(np.argmax(np.abs(offset)))
+
+
+def _ranges(start: Int64, pairs: int) -> list[Range]:
+    """Ranges of points with about equally many observations; the problem alone decides."""
+    room = MAX_BUFFER_BYTES // (8 * 36 * max(pairs, 1))
+    count = max(1, min(MAX_RANGES, int(start[-1]) // RANGE_SIZE, room))
+    ends = np.searchsorted(start, start[-1] * np.arange(1, count) / count)
+    edges = [0, *ends.tolist(), len(start) - 1]
+    return [(i, edges[i], edges[i + 1]) for i in range(count)]

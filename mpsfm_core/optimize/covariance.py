@@ -1,0 +1,47 @@
+"""Covariances of 3D points, and what they say about depth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mpsfm_core.data import Float64
+from mpsfm_core.optimize import bundle_kernels as kernels
+from mpsfm_core.optimize.bundle_problem import BundleOptions, BundleProblem, prepare, workers
+
+DAMPING = 1e-8
+"""Added to the information of each coordinate, so that it has an inverse (COLMAP's default)."""
+
+
+def point_covariances(problem: BundleProblem, options: BundleOptions | None = None) -> Float64:
+    """Covariance of each point for fixed cameras: (p, 3, 3) float64, world frame, squared units.
+
+    The inverse of the point's block of the normal equations, with the weights of the robust
+    losses, which is what COLMAP's ``estimate_ba_covariance`` gives for points. Observations that
+    do not project count nothing. A direction that nothing observes has variance
+    1 / :data:`DAMPING`. What is variable in the problem does not matter.
+
+    Raises:
+        DataError: as :func:`~mpsfm_core.optimize.bundle_adjustment.adjust_bundle`.
+    """
+    options = options or BundleOptions()
+    p = prepare(problem, options)
+    covariances = np.empty((len(p.state.points), 3, 3))
+    scratch = [kernels.make_scratch(0) for _ in p.ranges]
+    with workers(p.ranges, options.threads) as run:
+        run(
+            lambda n, first, last: kernels.point_covariances(
+                first, last, DAMPING, p.bundle, p.state, scratch[n], covariances
+            )
+        )
+    return covariances
+
+
+def depth_variance_of_points(covariances: Float64, rotations: Float64) -> Float64:
+    """Variance of the depth z of points in a camera: (m,) float64, squared units.
+
+    ``covariances``: (m, 3, 3), world frame. ``rotations``: (m, 3, 3) or (3, 3), of
+    cam_from_world. This is the last diagonal entry of R S R^T (the published code has R^T S R).
+    """
+    axis = rotations[..., 2, :]
+    variance: Float64 = np.einsum("...a,...ab,...b->...", axis, covariances, axis)
+    return variance
