@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -100,6 +99,8 @@ def resize_map(values: NDArray[Any], width: int, height: int, *, linear: bool = 
 
     ``linear``: bilinear, averaging over areas when shrinking; else nearest.
     """
+    import cv2  # here, as plugins and the command line import this module and must start fast
+
     values = np.ascontiguousarray(values, dtype=np.float32)
     if values.shape[:2] == (height, width):
         return values
