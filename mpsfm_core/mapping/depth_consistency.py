@@ -54,9 +54,15 @@ def _compare(
     rotation = scene.rotations[target] @ scene.rotations[source].T
     translation = scene.translations[target] - rotation @ scene.translations[source]
     depth, variance = warp_depth(
-        a.depth, a.variance, a.valid, a.camera.params,
-        rotation, translation, b.camera.params, b.depth.shape,
-    )  # fmt: skip
+        a.depth,
+        a.variance,
+        a.valid,
+        a.camera.params,
+        rotation,
+        translation,
+        b.camera.params,
+        b.depth.shape,
+    )
     seen = np.isfinite(depth) & b.valid
     deviation = (depth[seen] - b.depth[seen]) / np.sqrt(variance[seen] + b.variance[seen])
     violations = deviation < -options.max_deviation

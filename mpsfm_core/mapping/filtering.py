@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from mpsfm_core.mapping.options import TriangulationOptions
 from mpsfm_core.scene.scene import Scene
@@ -25,9 +27,7 @@ def filter_points(scene: Scene, options: TriangulationOptions) -> int:
     removed = tracks.remove_observations(observations[~(errors <= limit)])
     observations = tracks.observations()
     valid = np.concatenate([m.keypoint_valid for m in scene.maps])[observations]
-    supported = np.bincount(
-        tracks.point_of[observations], valid, minlength=len(tracks.xyz)
-    )
+    supported = np.bincount(tracks.point_of[observations], valid, minlength=len(tracks.xyz))
     unstable = (scene.track_angles_deg() < options.min_angle_deg) & (supported == 0)
     removed += int(unstable[tracks.point_of[observations]].sum())
     tracks.delete(unstable)
@@ -39,3 +39,17 @@ def lost_images(scene: Scene) -> list[int]:
     observed = np.flatnonzero(scene.tracks.point_of >= 0)
     counts = np.bincount(scene.graph.image_of[observed], minlength=scene.num_images)
     return [int(i) for i in scene.registered_images() if counts[i] < MIN_IMAGE_POINTS]
+
+
+def disconnected_images(scene: Scene) -> list[int]:
+    """Registered images that share no chain of points with the largest group of images."""
+    observations = scene.tracks.observations()
+    points = scene.tracks.point_of[observations]
+    images = scene.graph.image_of[observations]
+    nodes = scene.num_images + len(scene.tracks.xyz)
+    links = coo_matrix(
+        (np.ones(len(points)), (images, scene.num_images + points)), shape=(nodes, nodes)
+    )
+    group = connected_components(links, directed=False)[1][: scene.num_images]
+    sizes = np.bincount(group[scene.registered])
+    return [int(i) for i in scene.registered_images() if group[i] != sizes.argmax()]

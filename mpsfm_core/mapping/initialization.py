@@ -29,9 +29,7 @@ def rank_initial_pairs(scene: Scene) -> list[VerifiedPair]:
     return sorted(scene.problem.pairs, key=lambda pair: (not pair.calibrated, -len(pair)))
 
 
-def initial_pose(
-    scene: Scene, pair: VerifiedPair, options: MapperOptions
-) -> InitialPose | str:
+def initial_pose(scene: Scene, pair: VerifiedPair, options: MapperOptions) -> InitialPose | str:
     """Pose of a pair, or in words why it has none.
 
     The essential matrix wins if it triangulates more points at a safe angle than PnP on the
@@ -49,9 +47,7 @@ def initial_pose(
     return best
 
 
-def _pose_from_lift(
-    scene: Scene, pair: VerifiedPair, options: MapperOptions
-) -> InitialPose | None:
+def _pose_from_lift(scene: Scene, pair: VerifiedPair, options: MapperOptions) -> InitialPose | None:
     image = scene.problem.images[pair.image_b]
     keypoints_a, keypoints_b = _global_keypoints(scene, pair)
     depth_map = scene.maps[pair.image_a]
@@ -67,9 +63,7 @@ def _pose_from_lift(
     return InitialPose(pose[0], pose[1], "lifted depth", int(pose[2].sum()))
 
 
-def _pose_from_rays(
-    scene: Scene, pair: VerifiedPair, options: MapperOptions
-) -> InitialPose | None:
+def _pose_from_rays(scene: Scene, pair: VerifiedPair, options: MapperOptions) -> InitialPose | None:
     """Pose of the essential matrix, its length chosen such that points agree with the prior."""
     length = np.linalg.norm(pair.translation)
     if not pair.calibrated or length < 1e-12:

@@ -13,12 +13,12 @@ from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
 from mpsfm_core.mapping.depth_consistency import check_image
 from mpsfm_core.mapping.events import MappingEvents, Silent
 from mpsfm_core.mapping.failure_ladder import FailureLadder
-from mpsfm_core.mapping.filtering import filter_points, lost_images
+from mpsfm_core.mapping.filtering import disconnected_images, filter_points, lost_images
 from mpsfm_core.mapping.finishing import finished
 from mpsfm_core.mapping.initialization import initial_pose, rank_initial_pairs
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement import Refiner
-from mpsfm_core.mapping.registration import find_pose
+from mpsfm_core.mapping.registration import AbsolutePose, find_poses
 from mpsfm_core.mapping.triangulation import triangulate_image
 from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
 from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
@@ -139,14 +139,11 @@ class Mapper:
         while True:
             ranked = rank_next_images(self.scene, self.scores, available, options)
             for image, reference in ranked:
-                snapshot = self.scene.snapshot()
                 reason = self._try_image(image, reference)
                 if reason is None:
                     self.ladder.reset()
                     self._accept(image)
                     return True
-                self.scene.restore(snapshot)
-                self.refiner.forget(image)
                 self._reject(image, reason)
                 if self.ladder.enough_failures:
                     break
@@ -154,25 +151,37 @@ class Mapper:
                 return False
 
     def _try_image(self, image: int, reference: int) -> str | None:
-        """Pose an image, grow and refine its surroundings; None, or why it is rejected."""
-        scene, options = self.scene, self.options
+        """Register an image with the first of its possible poses that holds; None, or why not."""
+        scene, options = self.scene, self.options.registration
         with self._timed("registration"):
-            neighbors = options.registration.num_neighbors
-            references = local_bundle(scene, reference, neighbors, self.scores)
-            pose = find_pose(scene, image, references, options.registration, options.seed)
-            if pose is None:
-                return "neither PnP nor an essential matrix gives a pose"
-            if pose.num_inliers < self.ladder.min_inliers:
-                needed = self.ladder.min_inliers
-                return f"{pose.num_inliers} matches support its pose, {needed} are needed"
-            if pose.inlier_share < self.ladder.min_inlier_share:
-                return f"only {pose.inlier_share:.0%} of the matches support its pose"
+            references = local_bundle(scene, reference, options.num_neighbors, self.scores)
+            poses = find_poses(scene, image, references, options, self.options.seed)
+        reason: str | None = "neither PnP nor an essential matrix gives a pose"
+        snapshot = scene.snapshot()
+        for pose in poses:
+            reason = self._lacks_support(pose) or self._try_pose(image, pose)
+            if reason is None:
+                return None
+            scene.restore(snapshot)
+            self.refiner.forget(image)
+        return reason
+
+    def _lacks_support(self, pose: AbsolutePose) -> str | None:
+        """Why too few matches agree with a pose, if so."""
+        needed, share = self.ladder.min_inliers, self.ladder.min_inlier_share
+        if pose.num_inliers < needed:
+            return f"{pose.num_inliers} matches support its pose, {needed} are needed"
+        if pose.inlier_share < share:
+            return f"{pose.inlier_share:.0%} of the matches support its pose, not {share:.0%}"
+        return None
+
+    def _try_pose(self, image: int, pose: AbsolutePose) -> str | None:
+        """Grow and refine the scene around a new pose; None, or why it is rejected."""
+        scene, options = self.scene, self.options
+        with self._timed("local refinement"):
             scene.register(image, pose.rotation, pose.translation)
             triangulate_image(scene, image, options.triangulation)
-        with self._timed("local refinement"):
-            bundle = local_bundle(
-                scene, image, options.refinement.local_images - 1, self.scores
-            )
+            bundle = local_bundle(scene, image, options.refinement.local_images - 1, self.scores)
             self.refiner.estimate_scale(image, bundle[1:])
             self.refiner.adjust([image], local=True)
             filter_points(scene, options.triangulation)
@@ -228,7 +237,7 @@ class Mapper:
         """Deregister the image that contradicts its neighbours most until none does."""
         neighbors = self.options.registration.num_neighbors
         while self.scene.registered.sum() > 2:
-            worst, reason = 0.0, ""
+            worst, suspect = 0.0, -1
             for image in map(int, self.scene.registered_images()):
                 bundle = local_bundle(self.scene, image, neighbors, self.scores)
                 with self._timed("depth check"):
@@ -239,6 +248,8 @@ class Mapper:
                 return
             reason = f"at the end {worst:.0%} of the pixels contradict its neighbours' depth"
             self._drop([suspect], reason)
+            apart = disconnected_images(self.scene)
+            self._drop(apart, "held to the rest only by an image that was dropped at the end")
 
     def _accept(self, image: int) -> None:
         registered, total = int(self.scene.registered.sum()), len(self.problem.images)

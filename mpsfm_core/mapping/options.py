@@ -13,6 +13,7 @@ from pydantic import Field
 
 from mpsfm_core.optimize.bundle_adjustment import BundleOptions
 from mpsfm_core.optimize.depth_integration import IntegrationOptions
+from mpsfm_core.optimize.losses import Loss
 from mpsfm_core.options import Options
 
 
@@ -97,13 +98,16 @@ class RefinementOptions(Options):
     """Refine globally when images or points grew by this share (reference; COLMAP: 0.1)."""
     max_depth_ratio: float = Field(1.5, gt=1)
     """Depth observations off by more than this factor are ignored (reference: scale_filter)."""
-    final_robust: bool = True
-    """End with a global refinement of sharper depth loss (paper, robust reconstruction)."""
+    final_robust: bool = False
+    """End with a global refinement of sharper depth loss (paper, robust reconstruction). Ours:
+    off; once the noise of depth is measured it costs accuracy (``benchmarks/ablation.py``)."""
     final_depth_scale: float = Field(0.125, gt=0)
     """Multiplies the depth loss scale then (reference: final_robustification)."""
     anchor_min_angle_deg: float = Field(2.0, ge=0)
     """Points of at least this angle anchor the integration (reference: robust_triangles)."""
-    bundle: BundleOptions = BundleOptions()
+    bundle: BundleOptions = BundleOptions(reprojection_loss=Loss.CAUCHY, reprojection_scale=0.7)
+    """Ours: learned keypoints have heavier tails than the reference's SOFT_L1 at 1.5 expects
+    (``benchmarks/ablation.py``)."""
     integration: IntegrationOptions = IntegrationOptions()
 
 

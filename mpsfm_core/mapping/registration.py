@@ -123,39 +123,38 @@ def correspondences(
     return Correspondences(source, points, near, far, graph.image_of[target])
 
 
-def find_pose(
+def find_poses(
     scene: Scene, image: int, references: list[int], options: RegistrationOptions, seed: int
-) -> AbsolutePose | None:
-    """The best supported pose of an image from its matches to the reference images, or None."""
+) -> list[AbsolutePose]:
+    """Possible poses of an image from its matches to the reference images, best support first."""
     found = correspondences(scene, image, references, options)
-    best: AbsolutePose | None = None
-    for rotation, translation, source in _hypotheses(scene, image, references, found, options, seed):
+    poses = []
+    for rotation, translation, source in _hypotheses(scene, image, found, options, seed):
         misfit = _misfits(scene, found, rotation, translation, options)
-        references_of = found.references
-        support = np.bincount(references_of, 1 - misfit**2, minlength=scene.num_images)
-        reference = int(support.argmax())
-        if best is None or support[reference] > best.support:
-            inliers = misfit[references_of == reference] < 1
-            best = AbsolutePose(
+        support = np.bincount(found.references, 1 - misfit**2, minlength=scene.num_images)
+        mine = misfit[found.references == support.argmax()] < 1
+        poses.append(
+            AbsolutePose(
                 rotation,
                 translation,
                 source,
-                float(support[reference]),
-                int(inliers.sum()),
-                float(inliers.mean()),
+                float(support.max()),
+                int(mine.sum()),
+                float(mine.mean()),
             )
-    return best
+        )
+    return sorted(poses, key=lambda pose: -pose.support)
 
 
 def _hypotheses(
     scene: Scene,
     image: int,
-    references: list[int],
     found: Correspondences,
     options: RegistrationOptions,
     seed: int,
 ) -> Iterator[tuple[Float64, Float64, str]]:
     """Poses by PnP on all correspondences, and by each reference image's essential matrix."""
+    references = set(found.references.tolist())
     camera = scene.problem.images[image].camera
     xy = scene.keypoints[found.keypoints]
     pose = estimate_absolute_pose(camera, xy, found.points, options, seed)

@@ -198,9 +198,7 @@ def midpoints(center_a: Float64, ray_a: Float64, center_b: Float64, ray_b: Float
     return points
 
 
-def _fits(
-    scene: Scene, source: Int64, target: Int64, points: Float64, max_error_px: float
-) -> Bool:
+def _fits(scene: Scene, source: Int64, target: Int64, points: Float64, max_error_px: float) -> Bool:
     fits: Bool = np.asarray(np.isfinite(points).all(axis=1))
     for keypoints in (source, target):
         with np.errstate(invalid="ignore"):

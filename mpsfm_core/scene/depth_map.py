@@ -27,9 +27,7 @@ class DepthMap:
         self.normals = image.normals
         rows, columns = image.depth.shape
         self.camera = image.camera.resized(columns, rows)
-        self.keypoints: Float64 = scale_pixels(
-            image.keypoints, image.camera.size, self.camera.size
-        )
+        self.keypoints: Float64 = scale_pixels(image.keypoints, image.camera.size, self.camera.size)
         variance = image.depth.variance
         assert variance is not None  # MappingImage checks it
         self.log_std: Float32 = np.where(
