@@ -65,11 +65,10 @@ def test_an_unreadable_file(photo_scene, mpsfm, output: Path, tmp_path: Path) ->
     data = (images / "2.png").read_bytes()
     (images / "2.png").write_bytes(data[: len(data) // 3])
     (images / "9.jpg").write_text("this is no picture")
-    ended = mpsfm("reconstruct", images, "--output", output, "--config", photo_scene.config)
-    check(ended, 2, "9.jpg")
+    arguments = ["reconstruct", images, *photo_scene.arguments[2:], "--output", output]
+    check(mpsfm(*arguments), 2, "9.jpg")
     (images / "9.jpg").unlink()
-    ended = mpsfm("reconstruct", images, "--output", output, "--config", photo_scene.config)
-    check(ended, 2, "2.png")
+    check(mpsfm(*arguments), 2, "2.png")
 
 
 def test_intrinsics_of_another_size(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
