@@ -95,6 +95,7 @@ class Majoriser(NamedTuple):
     """energy + 2 gradient . step + step' A step, with A as in `multigrid`; maps are (h, w)."""
 
     energy: float
+    point_energy: float  # the share of the sparse points
     gradient: Float64  # half the gradient of the energy
     east: Float32
     south: Float32
@@ -127,8 +128,9 @@ def majorise(z: Float64, terms: EnergyTerms) -> Majoriser:
     energy += _add_normals(framed, terms.normals, 1, losses, south, gradient)
     mass = np.empty(z.shape, np.float32)
     energy += _add_prior(z, terms.prior, losses.prior_limit, mass, gradient[inner])
-    energy += _add_points(z, terms.points, losses.point_scale, mass, gradient[inner])
-    return Majoriser(energy, gradient[inner], east[inner], south[inner], mass)
+    of_points = _add_points(z, terms.points, losses.point_scale, mass, gradient[inner])
+    energy += of_points
+    return Majoriser(energy, of_points, gradient[inner], east[inner], south[inner], mass)
 
 
 @_kernel
@@ -226,7 +228,7 @@ def _link_row(
     force_ahead: Float64,
     force_behind: Float64,
 ) -> float:
-    """Energy of a row of pixels (as many as weights), and coupling and half the force to both sides.
+    """Energy of a row of pixels, as many as weights; coupling and half the force to both sides.
 
     Where one side is missing, the choice is between the other one and the limit.
     """
@@ -248,8 +250,9 @@ def _link_row(
         full = two_sides if link_ahead[j] and link_behind[j] else one_side
         energy += w * (min(low, limit) + (full - _log(total)) / k)
 
-        share_ahead = w * s * (of_low if a < b else of_high) / total
-        share_behind = w * s * (of_high if a < b else of_low) / total
+        of_ahead, of_behind = (of_low, of_high) if a < b else (of_high, of_low)
+        share_ahead = w * s * of_ahead / total if link_ahead[j] else 0.0
+        share_behind = w * s * of_behind / total if link_behind[j] else 0.0
         coupling_ahead[j], coupling_behind[j] = share_ahead * s, share_behind * s
         force_ahead[j], force_behind[j] = share_ahead * ahead, share_behind * behind
     return energy
