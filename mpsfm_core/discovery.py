@@ -154,6 +154,8 @@ def _malformed(spec: ProviderSpec) -> str:
     is_model = inspect.isclass(spec.options) and issubclass(spec.options, Options)
     if not (spec.options is None or is_model or _is_reference(spec.options)):
         return "options is neither a subclass of Options nor 'package.module:Class'"
+    if not (spec.contract is None or callable(spec.contract) or _is_reference(spec.contract)):
+        return f"contract {spec.contract!r} does not look like 'package.module:function'"
     for name in ("capabilities", "requires", "tags"):
         values = getattr(spec, name)
         if isinstance(values, str) or not all(isinstance(value, str) for value in values):

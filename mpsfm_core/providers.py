@@ -174,7 +174,9 @@ class ProviderSpec:
     ``capabilities``: from :data:`CAPABILITIES`. ``requires``: import names that must be
     installed, checked without importing; ``install_hint`` says how to get them.
     ``code_license``, ``weights_license``: SPDX ids or short texts. ``weights``: the default
-    files. ``calibration``: declared uncertainty of a depth or normals provider.
+    files. ``calibration``: declared uncertainty of a depth or normals provider. ``contract``:
+    how the contract kit tests it without weights, a function (see
+    :class:`mpsfm_core.testing.Setup`) by reference like ``factory``.
     """
 
     kind: Kind
@@ -193,6 +195,7 @@ class ProviderSpec:
     tags: tuple[str, ...] = field(default=())
     """Feature families for matchers and features (``"xfeat"``); a sparse matcher works with
     features that share a tag, or with all when it has none."""
+    contract: str | Callable[[Path], object] | None = None
 
 
 hookspec = pluggy.HookspecMarker("mpsfm")

@@ -258,6 +258,7 @@ class TestSpecifications:
             ({"factory": "no colon"}, "package.module:Class"),
             ({"factory": None}, "package.module:Class"),
             ({"options": dict}, "subclass of Options"),
+            ({"contract": "no colon"}, "package.module:function"),
             ({"capabilities": frozenset({"metrics"})}, "did you mean 'metric'"),
             ({"capabilities": "metric"}, "capabilities must be"),
             ({"requires": 3}, "not iterable"),
