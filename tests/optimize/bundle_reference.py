@@ -1,0 +1,238 @@
+"""Scenes for bundle adjustment, and Ceres as its oracle (through pycolmap and pyceres)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pyceres
+import pycolmap
+
+from mpsfm_core.data import Float64
+from mpsfm_core.optimize.bundle_adjustment import BundleOptions, BundleProblem
+
+SIZE = (1600, 1200)
+FOCAL = 1300.0
+
+
+def rotation(vector: Float64) -> Float64:
+    """Rotation matrix of a rotation vector."""
+    matrix: Float64 = pycolmap.Rotation3d(np.asarray(vector, dtype=np.float64)).matrix()
+    return matrix
+
+
+def make_problem(images: int, points: int, track: float, seed: int = 0) -> BundleProblem:
+    """Cameras that walk past a slab of points, each seen by neighbouring images.
+
+    Cameras and points are the true ones, the measurements noisy: 1 px with 3 % outliers, 5 % in
+    depth with heavy tails. One camera, the first pose constant. ``track``: mean track length.
+    """
+    rng = np.random.default_rng(seed)
+    length = np.clip(rng.poisson(track - 2, points) + 2, 2, images)
+    first = rng.integers(0, images - length + 1)
+    obs_point = np.repeat(np.arange(points), length)
+    step = np.arange(len(obs_point)) - np.repeat(np.cumsum(length) - length, length)
+    obs_image = first[obs_point] + step
+    centers = np.stack([0.25 * np.arange(images), *rng.normal(0, 0.1, (2, images))], axis=1)
+    rotations = np.stack([rotation(turn) for turn in rng.normal(0, 0.05, (images, 3))])
+    middle = centers[:, 0][np.minimum(first + length // 2, images - 1)]
+    xyz = rng.uniform([-1.5, -1.5, 3.0], [1.5, 1.5, 8.0], (points, 3))
+    xyz[:, 0] += middle
+    translations = -np.einsum("nij,nj->ni", rotations, centers)
+    in_camera = np.einsum("mij,mj->mi", rotations[obs_image], xyz[obs_point])
+    in_camera += translations[obs_image]
+    center = np.array(SIZE) / 2
+    noise = rng.normal(0, 1, (len(obs_point), 2))
+    noise[rng.random(len(noise)) < 0.03] *= 8
+    return BundleProblem(
+        rotations=rotations,
+        translations=translations,
+        intrinsics=np.array([[FOCAL, FOCAL, *center]]),
+        camera_of_image=np.zeros(images, dtype=np.int64),
+        points=xyz,
+        obs_image=obs_image,
+        obs_point=obs_point,
+        obs_xy=FOCAL * in_camera[:, :2] / in_camera[:, 2:] + center + noise,
+        obs_log_depth=np.log(in_camera[:, 2]) + 0.05 * rng.standard_t(4, len(obs_point)),
+        obs_std_log_depth=0.05,
+        variable_pose=np.arange(images) > 0,
+    )
+
+
+def perturb(problem: BundleProblem, seed: int, amount: float = 1.0) -> BundleProblem:
+    """A start: poses (but the first two) and points moved, 2 % of the points grossly."""
+    rng = np.random.default_rng(seed)
+    rotations, translations = problem.rotations.copy(), problem.translations.copy()
+    for i in range(2, len(rotations)):
+        rotations[i] = rotation(rng.normal(0, 0.004 * amount, 3)) @ rotations[i]
+        translations[i] += rng.normal(0, 0.02 * amount, 3)
+    std = np.where(rng.random(len(problem.points)) < 0.02, 0.3, 0.03)[:, None] * amount
+    points = problem.points + std * rng.normal(size=problem.points.shape)
+    return replace(problem, rotations=rotations, translations=translations, points=points)
+
+
+def without_depth(problem: BundleProblem) -> BundleProblem:
+    """The plain problem, in which the second image fixes the scale."""
+    return replace(problem, obs_log_depth=None, scale_anchor=1)
+
+
+def to_pycolmap(problem: BundleProblem) -> pycolmap.Reconstruction:
+    """The same scene as a reconstruction with one camera (ids are indices plus 1)."""
+    rec = pycolmap.Reconstruction()
+    focal, _, *center = problem.intrinsics[0]
+    rec.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            model="SIMPLE_PINHOLE",
+            width=SIZE[0],
+            height=SIZE[1],
+            params=[focal, *center],
+            camera_id=1,
+        )
+    )
+    row = np.empty(len(problem.obs_image), dtype=np.int64)
+    for i in range(len(problem.rotations)):
+        mine = np.flatnonzero(problem.obs_image == i)
+        row[mine] = np.arange(len(mine))
+        image = pycolmap.Image(
+            name=str(i), keypoints=problem.obs_xy[mine], camera_id=1, image_id=i + 1
+        )
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(problem.rotations[i]), problem.translations[i])
+        rec.add_image_with_trivial_frame(image, pose)
+    by_point = np.argsort(problem.obs_point, kind="stable")
+    ends = np.searchsorted(problem.obs_point[by_point], np.arange(len(problem.points) + 1))
+    for p, xyz in enumerate(problem.points):
+        track = pycolmap.Track()
+        for k in by_point[ends[p] : ends[p + 1]]:
+            track.add_element(int(problem.obs_image[k]) + 1, int(row[k]))
+        rec.add_point3D(xyz, track)
+    return rec
+
+
+def ceres_adjuster(
+    rec: pycolmap.Reconstruction,
+    tolerance: float = 1e-6,
+    *,
+    refine_focal: bool = False,
+    fix_scale: bool = True,
+) -> Any:
+    """Pycolmap's adjuster with our defaults: soft-L1 loss, first pose (and scale) constant."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = refine_focal
+    options.refine_extra_params = options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = BundleOptions().reprojection_scale
+    solver = options.ceres.solver_options
+    solver.function_tolerance = tolerance
+    solver.gradient_tolerance = min(1e-4, 1e2 * tolerance)
+    solver.max_num_iterations = 100 if tolerance >= 1e-6 else 1000
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in rec.images:
+        config.add_image(image_id)
+    if fix_scale:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    else:
+        config.set_constant_rig_from_world_pose(rec.images[1].frame_id)
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, rec)
+
+
+class LogDepthCost(pyceres.CostFunction):  # type: ignore[misc]
+    """(log z - log d) / std on a pose (quaternion xyzw, translation) and a point."""
+
+    def __init__(self, log_depth: float, std: float) -> None:
+        super().__init__()
+        self.set_num_residuals(1)
+        self.set_parameter_block_sizes([7, 3])
+        self.log_depth = log_depth
+        self.std = std
+
+    def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
+        """Ceres' callback."""
+        (qx, qy, qz, qw, _, _, tz), (x, y, z) = parameters
+        row = np.array(
+            [2 * (qx * qz - qy * qw), 2 * (qy * qz + qx * qw), 1 - 2 * (qx * qx + qy * qy)]
+        )
+        depth = row @ (x, y, z) + tz
+        residuals[0] = (np.log(depth) - self.log_depth) / self.std if depth > 0 else 0.0
+        scale = 1 / (depth * self.std) if depth > 0 else 0.0
+        if jacobians is not None and jacobians[0] is not None:
+            by_quaternion = [
+                2 * qz * x + 2 * qw * y - 4 * qx * z,
+                -2 * qw * x + 2 * qz * y - 4 * qy * z,
+                2 * qx * x + 2 * qy * y,
+                -2 * qy * x + 2 * qx * y,
+            ]
+            jacobians[0][:] = scale * np.array([*by_quaternion, 0, 0, 1])
+        if jacobians is not None and jacobians[1] is not None:
+            jacobians[1][:] = scale * row
+        return True
+
+
+def solve_with_ceres(
+    problem: BundleProblem, *, refine_focal: bool = False
+) -> tuple[float, float, pycolmap.Reconstruction]:
+    """Initial and final cost of the problem in Ceres, and the reconstruction it leaves.
+
+    All poses but the first and all points are variable, as :func:`make_problem` has it.
+    """
+    rec = to_pycolmap(problem)
+    plain = problem.obs_log_depth is None
+    adjuster = ceres_adjuster(rec, 1e-13, refine_focal=refine_focal, fix_scale=plain)
+    if not plain:
+        ceres = adjuster.problem
+        loss = pyceres.LossFunction({"name": "cauchy", "params": [BundleOptions().depth_scale]})
+        std = np.broadcast_to(problem.obs_std_log_depth, len(problem.obs_log_depth))
+        keep = [loss]
+        for k in np.flatnonzero(np.isfinite(problem.obs_log_depth)):
+            pose = rec.images[int(problem.obs_image[k]) + 1].frame.rig_from_world.params
+            point = rec.points3D[int(problem.obs_point[k]) + 1].xyz
+            keep.append(LogDepthCost(problem.obs_log_depth[k], std[k]))
+            ceres.add_residual_block(keep[-1], loss, [pose, point])
+        # a constant pose becomes variable with the first residual that is added on it
+        ceres.set_parameter_block_constant(rec.images[1].frame.rig_from_world.params)
+    summary = adjuster.solve().ceres_summary
+    return summary.initial_cost, summary.final_cost, rec
+
+
+def whitened_residuals(
+    problem: BundleProblem, points: Float64 | None = None, *, robust: bool = True
+) -> Float64:
+    """(m, 3): reprojection and log-depth residuals in plain numpy, 0 where there is no depth.
+
+    ``robust``: multiplied by the square roots of the default losses' weights at the problem's
+    own points, so that their Jacobian is that of the normal equations.
+    """
+    if robust:
+        fixed = whitened_residuals(problem, robust=False)
+        b = BundleOptions().reprojection_scale ** 2
+        weight = np.ones_like(fixed)
+        weight[:, :2] = (1 + (fixed[:, :2] ** 2).sum(axis=1, keepdims=True) / b) ** -0.25
+        weight[:, 2] = (1 + fixed[:, 2] ** 2 / BundleOptions().depth_scale ** 2) ** -0.5
+        return weight * whitened_residuals(problem, points, robust=False)
+    seen = (problem.points if points is None else points)[problem.obs_point]
+    image = problem.obs_image
+    in_camera = np.einsum("mij,mj->mi", problem.rotations[image], seen)
+    in_camera += problem.translations[image]
+    intrinsics = problem.intrinsics[problem.camera_of_image[image]]
+    xy = intrinsics[:, :2] * in_camera[:, :2] / in_camera[:, 2:] + intrinsics[:, 2:]
+    pixel = (xy - problem.obs_xy) / np.broadcast_to(problem.obs_std_px, len(image))[:, None]
+    depth = np.zeros(len(image))
+    if problem.obs_log_depth is not None:
+        depth = (np.log(in_camera[:, 2]) - problem.obs_log_depth) / problem.obs_std_log_depth
+    return np.column_stack([pixel, np.nan_to_num(depth)])
+
+
+def dense_point_information(problem: BundleProblem) -> Float64:
+    """J^T J (3p, 3p) of all points by central differences, robust weights included."""
+    count = problem.points.size
+    jacobian = np.empty((3 * len(problem.obs_image), count))
+    for n in range(count):
+        change = np.zeros(count)
+        change[n] = 1e-5
+        ahead, behind = (
+            whitened_residuals(problem, problem.points + sign * change.reshape(-1, 3))
+            for sign in (1, -1)
+        )
+        jacobian[:, n] = ((ahead - behind) / 2e-5).ravel()
+    information: Float64 = jacobian.T @ jacobian
+    return information
