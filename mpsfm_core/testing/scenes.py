@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mpsfm_core import geometry
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
 
 # Rays closer than this to a surface's plane or start count as leaving it (metres).
@@ -178,14 +179,7 @@ class AnalyticScene:
         """What is seen through pixels `xy` (n, 2) of a camera."""
         rotation, origin = _split_pose(cam_from_world)
         pixels = np.asarray(xy, np.float64).reshape(-1, 2)
-        rays = np.column_stack(
-            [
-                (pixels[:, 0] - camera.cx) / camera.fx,
-                (pixels[:, 1] - camera.cy) / camera.fy,
-                np.ones(len(pixels)),
-            ]
-        )
-        directions = rays @ rotation
+        directions = geometry.rays(camera, pixels) @ rotation
         depth, normals, surface = self.first_hit(origin, directions)
         valid = np.isfinite(depth)
         depth = np.where(valid, depth, 0.0)
@@ -194,8 +188,7 @@ class AnalyticScene:
 
     def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
         """Depth, normals and colours at every pixel centre."""
-        columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        xy = np.column_stack([columns.ravel(), rows.ravel()])
+        xy = geometry.pixel_centers(camera.width, camera.height)
         seen = self.sample(camera, cam_from_world, xy)
         rgb = self.texture.colors(seen.points, seen.surface, seen.depth / camera.fx)
         rgb[~seen.valid] = 0
@@ -217,10 +210,10 @@ class AnalyticScene:
         """Where the points seen through pixels `xy_a` (n, 2) of view a lie in view b."""
         seen = self.sample(camera_a, a_from_world, xy_a)
         xy_b, depth_b = project(camera_b, b_from_world, seen.points)
-        inside = (xy_b >= 0).all(1) & (xy_b <= (camera_b.width, camera_b.height)).all(1)
         _, origin = _split_pose(b_from_world)
         t, _, _ = self.first_hit(origin, seen.points - origin)
-        visible = seen.valid & (depth_b > 0) & inside & (np.abs(t - 1.0) < 1e-6)
+        visible = seen.valid & (depth_b > 0) & geometry.inside(xy_b, camera_b.size)
+        visible &= np.abs(t - 1.0) < 1e-6
         return Correspondences(np.where(visible[:, None], xy_b, 0.0), seen.points, visible)
 
 
@@ -229,16 +222,8 @@ def project(
 ) -> tuple[Float64, Float64]:
     """Pixels (n, 2) and depths (n,) of world points (n, 3); pixels are 0 where depth <= 0."""
     pose = np.asarray(cam_from_world, np.float64)
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    depth = local[:, 2]
-    safe = np.where(depth > 0, depth, np.inf)
-    xy = np.column_stack(
-        [
-            camera.fx * local[:, 0] / safe + camera.cx,
-            camera.fy * local[:, 1] / safe + camera.cy,
-        ]
-    )
-    return np.where((depth > 0)[:, None], xy, 0.0), depth
+    local = geometry.transform(pose[:3, :3], pose[:3, 3], points)
+    return np.nan_to_num(geometry.project(camera, local), nan=0.0), local[:, 2]
 
 
 def look_at(eye: ArrayLike, target: ArrayLike) -> Float64:
@@ -291,7 +276,7 @@ def arc_poses(
 def _split_pose(cam_from_world: ArrayLike) -> tuple[Float64, Float64]:
     """Rotation (3, 3) and the camera's centre (3,) in the world."""
     pose = np.asarray(cam_from_world, np.float64)
-    return pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+    return pose[:3, :3], geometry.camera_center(pose[:3, :3], pose[:3, 3])
 
 
 def _away_from_zero(values: Float64) -> Float64:
