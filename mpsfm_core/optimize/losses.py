@@ -41,7 +41,7 @@ def trivial(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
 def soft_l1(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
     """``rho = 2 a^2 (sqrt(1 + s / a^2) - 1)``: linear in the residual beyond the scale a."""
     root = np.sqrt(1.0 + s / (scale * scale))
-    return 2.0 * scale * scale * (root - 1.0), 1.0 / root
+    return 2.0 * s / (root + 1.0), 1.0 / root
 
 
 @register_jitable

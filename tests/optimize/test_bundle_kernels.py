@@ -1,0 +1,206 @@
+"""Derivatives and elimination against finite differences and dense linear algebra."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import Float64
+from mpsfm_core.optimize import bundle_kernels as kernels
+from mpsfm_core.optimize.bundle_adjustment import BundleOptions, BundleProblem, _NormalEquations
+from mpsfm_core.optimize.bundle_problem import Prepared, prepare, workers
+from mpsfm_core.optimize.losses import Loss
+from tests.optimize.bundle_reference import make_problem, perturb, rotation
+
+STEP = 1e-6
+
+
+def small_problem() -> BundleProblem:
+    """Everything at once: two cameras with focal lengths to refine, a constant and variable
+    poses and points, a track that sees an image twice, missing depth, a single view."""
+    problem = perturb(make_problem(5, 12, 3), seed=3)
+    # the longest track sees its last image twice
+    point = np.bincount(problem.obs_point).argmax()
+    twice = np.flatnonzero(problem.obs_point == point)[-1]
+    single = np.flatnonzero(problem.obs_point == 0)[1:]
+    keep = np.setdiff1d(np.arange(len(problem.obs_image)), single)
+    keep = np.random.default_rng(0).permutation(np.append(keep, twice))
+    log_depth = problem.obs_log_depth[keep].copy()
+    log_depth[::4] = np.nan
+    rng = np.random.default_rng(1)
+    return replace(
+        problem,
+        intrinsics=np.array([[1300.0, 1200.0, 800.0, 600.0], [900.0, 950.0, 810.0, 590.0]]),
+        camera_of_image=np.array([0, 1, 0, 1, 1]),
+        obs_image=problem.obs_image[keep],
+        obs_point=problem.obs_point[keep],
+        obs_xy=problem.obs_xy[keep] + rng.normal(0, 2, (len(keep), 2)),
+        obs_std_px=rng.uniform(0.5, 2, len(keep)),
+        obs_log_depth=log_depth,
+        obs_std_log_depth=rng.uniform(0.02, 0.1, len(keep)),
+        variable_point=np.arange(12) != 5,
+        variable_focal=np.array([True, True]),
+    )
+
+
+def moved(p: Prepared, delta: Float64, points: Float64) -> kernels.State:
+    """The state moved by a camera-side vector and point displacements (p, 3)."""
+    trial = kernels.State(*(array.copy() for array in p.state))
+    kernels.move_cameras(delta, p.bundle.layout, p.state, trial)
+    trial.points[:] += points
+    return trial
+
+
+def sights(p: Prepared, state: kernels.State) -> list[kernels.Sight]:
+    """All observations, in the kernels' order."""
+    points = np.repeat(np.arange(len(state.points)), np.diff(p.bundle.obs.start))
+    return [kernels.observe(k, point, p.bundle, state) for k, point in enumerate(points)]
+
+
+def residuals(p: Prepared, state: kernels.State) -> Float64:
+    """(3 m,) whitened residuals, computed in plain numpy."""
+    obs, layout = p.bundle.obs, p.bundle.layout
+    points = np.repeat(np.arange(len(state.points)), np.diff(obs.start))
+    camera = np.einsum("mij,mj->mi", state.rotations[obs.image], state.points[points])
+    camera += state.translations[obs.image]
+    k = state.intrinsics[layout.camera_of_image[obs.image]]
+    xy = k[:, :2] * camera[:, :2] / camera[:, 2:] + k[:, 2:]
+    pixel = (xy - obs.xy) * obs.weight[:, None]
+    depth = (np.log(camera[:, 2]) - obs.log_depth) * obs.depth_weight
+    return np.column_stack([pixel, depth]).ravel()
+
+
+def numeric_jacobian(p: Prepared) -> Float64:
+    """Jacobian (3 m, d + 3 v) of the residuals: camera side, then variable points."""
+    size = sum(p.bundle.layout.pair.shape[:1]) * 6 + int(p.bundle.layout.focal_slot.max()) + 1
+    variable = np.flatnonzero(p.bundle.layout.variable_point)
+    columns = []
+    for n in range(size + 3 * len(variable)):
+        delta, points = np.zeros(size), np.zeros_like(p.state.points)
+        if n < size:
+            delta[n] = STEP
+        else:
+            points[variable[(n - size) // 3], (n - size) % 3] = STEP
+        ahead, behind = (residuals(p, moved(p, s * delta, s * points)) for s in (1, -1))
+        columns.append((ahead - behind) / (2 * STEP))
+    return np.column_stack(columns)
+
+
+@pytest.mark.parametrize("depth_loss", Loss)
+@pytest.mark.parametrize("reprojection_loss", Loss)
+def test_gradient_of_every_loss(reprojection_loss: Loss, depth_loss: Loss) -> None:
+    options = BundleOptions(reprojection_loss=reprojection_loss, depth_loss=depth_loss)
+    p = prepare(small_problem(), options)
+    layout = p.bundle.layout
+    with workers(p.ranges, 1) as run:
+        normal = _NormalEquations(p, options, run)
+        normal.linearize(p.state, 0.0)
+    variable = layout.variable_point
+    by_point = np.zeros_like(p.state.points)
+    rows = np.repeat(np.arange(len(by_point)), np.diff(p.bundle.obs.start))
+    for row, image, s in zip(rows, p.bundle.obs.image, sights(p, p.state), strict=True):
+        by_point[row] += p.state.rotations[image].T @ [s.gx, s.gy, s.gz]
+    gradient = np.concatenate([normal.total.gradient, by_point[variable].ravel()])
+
+    def cost(delta: Float64, points: Float64) -> float:
+        return sum(sight.cost for sight in sights(p, moved(p, delta, points)))
+
+    size = len(normal.total.gradient)
+    numeric = np.empty_like(gradient)
+    for n in range(len(gradient)):
+        delta, points = np.zeros(size), np.zeros_like(p.state.points)
+        if n < size:
+            delta[n] = STEP
+        else:
+            points[np.flatnonzero(variable)[(n - size) // 3], (n - size) % 3] = STEP
+        numeric[n] = (cost(delta, points) - cost(-delta, -points)) / (2 * STEP)
+    np.testing.assert_allclose(gradient, numeric, rtol=1e-6, atol=1e-6 * np.abs(numeric).max())
+
+
+@pytest.mark.parametrize("kind", ["reprojection", "depth"])
+def test_one_residual_at_random_poses(kind: str) -> None:
+    """Gradient and Gauss-Newton matrix of the camera point, to 1e-6."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        problem = BundleProblem(
+            rotations=rotation(rng.normal(size=3))[None],
+            translations=rng.normal(size=(1, 3)),
+            intrinsics=np.array([[*rng.uniform(300, 2000, 2), *rng.uniform(100, 900, 2)]]),
+            camera_of_image=np.array([0]),
+            points=np.zeros((1, 3)),
+            obs_image=np.array([0]),
+            obs_point=np.array([0]),
+            obs_xy=rng.uniform(0, 1000, (1, 2)),
+            obs_std_px=1.0 if kind == "reprojection" else 1e9,
+            obs_log_depth=rng.normal(size=1) if kind == "depth" else None,
+            obs_std_log_depth=0.05,
+        )
+        camera_point = rng.uniform([-1, -1, 0.5], [1, 1, 5])
+        world = problem.rotations[0].T @ (camera_point - problem.translations[0])
+        problem = replace(problem, points=world[None])
+        trivial = BundleOptions(reprojection_loss=Loss.TRIVIAL, depth_loss=Loss.TRIVIAL)
+        p = prepare(problem, trivial)
+        jacobian = np.empty((3, 3))
+        for a in range(3):
+            step = np.zeros(3)
+            step[a] = STEP
+            states = [
+                p.state._replace(translations=p.state.translations + s) for s in (step, -step)
+            ]
+            jacobian[:, a] = np.subtract(*(residuals(p, s) for s in states)) / (2 * STEP)
+        (s,) = sights(p, p.state)
+        expected = jacobian.T @ jacobian
+        actual = np.array([[s.hxx, 0, s.hxz], [0, s.hyy, s.hyz], [s.hxz, s.hyz, s.hzz]])
+        np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-6 * expected.max())
+        force = jacobian.T @ residuals(p, p.state)
+        np.testing.assert_allclose([s.gx, s.gy, s.gz], force, atol=1e-6 * np.abs(force).max())
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_step_solves_the_damped_normal_equations(sparse: bool, monkeypatch) -> None:
+    """Elimination, borders, back-substitution and the promised decrease, against dense algebra."""
+    options = BundleOptions(
+        reprojection_loss=Loss.TRIVIAL,
+        depth_loss=Loss.TRIVIAL,
+        dense_poses=0 if sparse else 500,
+    )
+    monkeypatch.setattr("mpsfm_core.optimize.bundle_adjustment.CG_TOLERANCE", 1e-12)
+    damping = 1e-2
+    p = prepare(small_problem(), options)
+    jacobian = numeric_jacobian(p)
+    gradient = jacobian.T @ residuals(p, p.state)
+    matrix = jacobian.T @ jacobian
+    matrix += damping * np.diag(np.diagonal(matrix))
+    expected = np.linalg.solve(matrix, -gradient)
+    with workers(p.ranges, 1) as run:
+        normal = _NormalEquations(p, options, run)
+        cost = normal.linearize(p.state, damping)
+        trial = kernels.State(*(np.empty_like(array) for array in p.state))
+        # a huge tolerance: no point moves by itself after the joint step
+        normal.tolerance = np.inf
+        _, _, promised = normal.step(p.state, trial, damping, cost)
+    assert cost == pytest.approx(0.5 * np.sum(residuals(p, p.state) ** 2), rel=1e-12)
+    size = len(normal.total.gradient)
+    points = np.zeros_like(p.state.points)
+    points[p.bundle.layout.variable_point] = expected[size:].reshape(-1, 3)
+    reference = moved(p, expected[:size], points)
+    for actual, wanted, start in zip(trial, reference, p.state, strict=True):
+        np.testing.assert_allclose(actual - start, wanted - start, rtol=1e-4, atol=1e-7)
+    linear = residuals(p, p.state) + jacobian @ expected
+    decrease = cost - 0.5 * linear @ linear
+    assert promised == pytest.approx(decrease, rel=1e-4)
+
+
+def test_rotation_near_zero_and_beyond_half_a_turn() -> None:
+    for vector in ([0, 0, 0], [1e-9, -1e-7, 1e-8], [9e-5, 0, 0], [1e-3, 2e-3, 0], [3, -2, 1]):
+        turn = np.array(kernels._rotation(*map(float, vector)))
+        np.testing.assert_allclose(turn, rotation(np.array(vector)), atol=1e-15)
+
+
+def test_sorting_is_stable_and_by_point_then_image() -> None:
+    problem = small_problem()
+    obs = prepare(problem, BundleOptions()).bundle.obs
+    order = np.lexsort((np.arange(len(obs.image)), problem.obs_image, problem.obs_point))
+    np.testing.assert_array_equal(obs.image, problem.obs_image[order])
+    np.testing.assert_array_equal(obs.xy, problem.obs_xy[order])
+    np.testing.assert_array_equal(np.diff(obs.start), np.bincount(problem.obs_point))
