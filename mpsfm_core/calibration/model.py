@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from mpsfm_core.data import DepthPrior, NormalPrior
+from mpsfm_core.data import Bool, DepthPrior, Float64, NormalPrior
 from mpsfm_core.geometry import log_depth_steps
 from mpsfm_core.options import Options
 
@@ -69,14 +69,34 @@ class DepthCalibration(Options):
         if self.shift == 0 or not prior.valid.any():
             return prior
         depth = np.where(prior.valid, prior.depth, np.float32(1)).astype(np.float64)
-        quantity = depth if self.shift_space == "depth" else 1 / depth
-        median = float(np.median(quantity[prior.valid]))
+        moved, gain, possible = self.shift_depth(depth, medians(prior))
+        variance = None if prior.variance is None else prior.variance * gain**2
+        return DepthPrior.from_arrays(moved, variance, prior.valid & possible, metric=prior.metric)
+
+    def shift_depth(
+        self, depth: Float64, medians: tuple[float, float]
+    ) -> tuple[Float64, Float64, Bool]:
+        """Apply :attr:`shift` to depth values of a map with the given :func:`medians`.
+
+        Returns:
+            The new depth, the factor of its std, and where there is one; of the shape of
+            ``depth``.
+        """
+        in_depth = self.shift_space == "depth"
+        quantity = depth if in_depth else 1 / depth
+        median = medians[0] if in_depth else medians[1]
         moved = quantity + self.shift * median
-        valid = prior.valid & (moved > _SMALLEST_SHARE * median)
-        moved = np.where(valid, moved, 1.0)
-        new, gain = (moved, 1.0) if self.shift_space == "depth" else (1 / moved, quantity / moved)
-        variance = None if prior.variance is None else prior.variance * gain**4
-        return DepthPrior.from_arrays(new, variance, valid, metric=prior.metric)
+        possible = moved > _SMALLEST_SHARE * median
+        moved = np.where(possible, moved, median)
+        if in_depth:
+            return moved, np.ones_like(moved), possible
+        return 1 / moved, (quantity / moved) ** 2, possible
+
+
+def medians(prior: DepthPrior) -> tuple[float, float]:
+    """Medians of depth and of inverse depth over a map with valid pixels."""
+    depth = prior.depth[prior.valid].astype(np.float64)
+    return float(np.median(depth)), float(np.median(1 / depth))
 
 
 class NormalCalibration(Options):

@@ -1,0 +1,211 @@
+"""Fitting a std of the form ``max_j(theta_j * term_j)`` to errors.
+
+Criterion. An error is normal with the modelled variance plus the truth's, or, with a small
+probability that is fitted too, gross: uniform up to the largest possible error. Maximising this
+likelihood finds the proportions of the terms without being led by outliers. Errors of networks
+are no clean mixture, though, so their common factor is then set by coverage: 68.27 % of the errors
+that are not gross lie within one std. Every image counts the same, however many pixels it has.
+
+The paper chose the factors of appendix C by looking at calibration plots and at the area under
+sensitivity curves; the likelihood rewards both the ranking and the size of the std.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from mpsfm_core.calibration.samples import Residuals
+from mpsfm_core.data import Bool, Float64, Int64
+
+ONE_SIGMA = 0.6827
+"""Share of normal errors within one std."""
+MAX_GROSS = 0.5
+DOMINANT_SHARE = 0.01
+"""A term that is the largest for fewer of the samples is not determined by them (ours)."""
+_RANGE = 1e4
+"""A factor lies within this of what it is as the only one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted std.
+
+    ``names``: of the terms used, ``values``: (m,) their factors. ``edge_ratio``: pixels beside a
+    larger ratio of depths have ``edge_scale`` times the std; None: no edges. ``gross``: share of
+    gross errors. ``shares``: (m,), of how many samples each term is the largest.
+    ``log_density``: (images,), mean of each image.
+    """
+
+    names: tuple[str, ...]
+    values: Float64
+    edge_ratio: float | None
+    edge_scale: float
+    gross: float
+    shares: Float64
+    log_density: Float64
+
+    def value(self, name: str) -> float | None:
+        """Factor of a term, None if it is not used."""
+        return float(self.values[self.names.index(name)]) if name in self.names else None
+
+
+def fit_std(
+    residuals: Residuals, names: Sequence[str] | None = None, edge_ratio: float | None = None
+) -> Fit:
+    """Fit the factors of some terms (all by default) and, if asked, of edges."""
+    problem = _Problem(residuals, tuple(names or residuals.names), edge_ratio)
+    best = min((problem.solve(start) for start in problem.starts()), key=lambda found: found[1])
+    return problem.finish(best[0])
+
+
+def bootstrap(residuals: Residuals, fit: Fit, count: int, rng: np.random.Generator) -> Float64:
+    """The fit repeated on images drawn with replacement: (count, m + 1), factors and edge scale."""
+    problem = _Problem(residuals, fit.names, fit.edge_ratio)
+    start = problem.vector(fit)
+    drawn = np.empty((count, len(fit.names) + 1))
+    for row in drawn:
+        chosen = rng.integers(residuals.images, size=residuals.images)
+        repeats = np.bincount(chosen, minlength=residuals.images)
+        again = problem.reweighted(repeats)
+        found = again.finish(again.solve(start)[0])
+        row[:-1], row[-1] = found.values, found.edge_scale
+    return drawn
+
+
+def weighted_quantile(values: Float64, weights: Float64, share: float) -> float:
+    """The value below which this share of the weight lies."""
+    order = np.argsort(values)
+    cumulated = np.cumsum(weights[order])
+    place = int(np.searchsorted(cumulated, share * cumulated[-1]))
+    return float(values[order[min(place, len(order) - 1)]])
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """All that the likelihood and its gradient are made of, at one parameter vector."""
+
+    largest: Int64
+    variance: Float64
+    total: Float64
+    inlier: Float64
+    log_density: Float64
+
+
+class _Problem:
+    """Parameters: logs of the factors, log of the edge scale if there are edges, logit of the
+    share of gross errors over its maximum."""
+
+    def __init__(
+        self, residuals: Residuals, names: tuple[str, ...], edge_ratio: float | None
+    ) -> None:
+        self._residuals = residuals
+        self._names = names
+        self._edge_ratio = edge_ratio
+        self._terms = residuals.terms[:, [residuals.names.index(name) for name in names]]
+        self._squared = residuals.error**2
+        self._noise = residuals.noise**2
+        self._edges: Bool = (
+            np.zeros(len(residuals), dtype=np.bool_)
+            if edge_ratio is None
+            else residuals.step > np.log(edge_ratio)
+        )
+        self._uniform = 0.5 / residuals.limit
+        self._weights = residuals.weights() / residuals.images
+        self._alone = self._factors_alone()
+
+    def reweighted(self, repeats: Int64) -> _Problem:
+        """The same with each image counted this often."""
+        other = object.__new__(_Problem)
+        other.__dict__.update(self.__dict__)
+        other._weights = self._weights * repeats[self._residuals.image]
+        return other
+
+    def starts(self) -> list[Float64]:
+        """All terms alike, and each term the largest in turn."""
+        count = len(self._names)
+        rest = [0.0] * (self._edge_ratio is not None) + [-2.0]
+        mixes = [np.zeros(count)]
+        if count > 1:
+            mixes += [np.where(np.eye(count, dtype=np.bool_)[j], 0.0, -0.7) for j in range(count)]
+        return [np.concatenate([self._alone + mix, rest]) for mix in mixes]
+
+    def vector(self, fit: Fit) -> Float64:
+        """The parameters of a fit."""
+        edges = [np.log(fit.edge_scale)] * (self._edge_ratio is not None)
+        share = np.clip(fit.gross / MAX_GROSS, 1e-4, 1 - 1e-4)
+        return np.concatenate([np.log(fit.values), edges, [np.log(share / (1 - share))]])
+
+    def solve(self, start: Float64) -> tuple[Float64, float]:
+        """Parameters and negative log likelihood of the maximum near a start."""
+        span = np.log(_RANGE)
+        bounds = [(v - span, v + span) for v in self._alone]
+        bounds += [(0.0, span)] * (self._edge_ratio is not None) + [(-9.0, 9.0)]
+        found = minimize(self._objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
+        return np.asarray(found.x), float(found.fun)
+
+    def finish(self, vector: Float64) -> Fit:
+        """Set the common factor by coverage and describe the result."""
+        state = self._evaluate(vector)
+        count = len(self._names)
+        inside = np.maximum(self._squared - self._noise, 0) / state.variance
+        squared = weighted_quantile(inside, self._weights * state.inlier, ONE_SIGMA)
+        vector = vector.copy()
+        vector[:count] += 0.5 * np.log(max(squared, 1e-12))
+        state = self._evaluate(vector)
+        shares = np.zeros(count)
+        np.add.at(shares, state.largest, self._weights)
+        density = state.log_density * self._residuals.weights()
+        per_image = np.zeros(self._residuals.images)
+        np.add.at(per_image, self._residuals.image, density)
+        return Fit(
+            self._names,
+            np.exp(vector[:count]),
+            self._edge_ratio,
+            float(np.exp(vector[count])) if self._edge_ratio is not None else 1.0,
+            _gross(vector[-1]),
+            shares / shares.sum(),
+            per_image,
+        )
+
+    def _factors_alone(self) -> Float64:
+        """Log of each factor if its term were the only one, by the median error."""
+        spread = 1.4826 * np.median(np.abs(self._residuals.error))
+        values: Float64 = np.log(max(spread, 1e-9) / np.median(self._terms, axis=0))
+        return values
+
+    def _evaluate(self, vector: Float64) -> _State:
+        count = len(self._names)
+        scaled = self._terms * np.exp(vector[:count])
+        largest = scaled.argmax(axis=1)
+        variance = np.take_along_axis(scaled, largest[:, None], axis=1)[:, 0] ** 2
+        if self._edge_ratio is not None:
+            variance = np.where(self._edges, variance * np.exp(2 * vector[count]), variance)
+        total = variance + self._noise
+        gross = _gross(vector[-1])
+        normal = np.exp(-0.5 * self._squared / total) / np.sqrt(2 * np.pi * total)
+        density = (1 - gross) * normal + gross * self._uniform
+        inlier = (1 - gross) * normal / density
+        return _State(largest, variance, total, inlier, np.log(density))
+
+    def _objective(self, vector: Float64) -> tuple[float, Float64]:
+        """Negative mean log density and its gradient."""
+        state, weights, count = self._evaluate(vector), self._weights, len(self._names)
+        # d log density / d log std, through the variance
+        slope = weights * state.inlier * (self._squared / state.total - 1)
+        slope *= state.variance / state.total
+        gradient = np.zeros(len(vector))
+        gradient[:count] = np.bincount(state.largest, weights=slope, minlength=count)
+        if self._edge_ratio is not None:
+            gradient[count] = slope[self._edges].sum()
+        gross = _gross(vector[-1])
+        chance = (1 - state.inlier) / gross - state.inlier / (1 - gross)
+        gradient[-1] = (weights * chance).sum() * gross * (1 - gross / MAX_GROSS)
+        return -float((weights * state.log_density).sum()), -gradient
+
+
+def _gross(logit: float) -> float:
+    return float(MAX_GROSS / (1 + np.exp(-logit)))

@@ -1,0 +1,108 @@
+"""How trustworthy a declared std is: coverage, sensitivity and calibration curves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mpsfm_core.calibration.samples import Residuals
+from mpsfm_core.data import Bool, Float64, Int64
+
+CURVE_POINTS = 50
+BINS = 10
+RANGES = 5
+NORMAL_COVERAGE = (0.6827, 0.9545, 0.9973)
+"""Of normal errors, within 1, 2 and 3 standard deviations."""
+MAD_TO_STD = 1.4826
+
+
+def measure(residuals: Residuals, std: Float64) -> dict[str, Any]:
+    """All metrics of a std (n,), as plain data.
+
+    ``coverage``: share of errors within 1, 2, 3 std. ``z_mad``: 1.4826 times the median of
+    ``|error / std|``, 1 when right. ``nll``: mean negative log density of normal errors. ``ause``:
+    area between the sensitivity curve and that of the true order of errors, as a share of the
+    total RMSE; 0 is a perfect order. ``rmse``: in metres or rad. Then the curves behind them.
+    """
+    total = np.hypot(std, residuals.noise)
+    z = np.abs(residuals.error) / total
+    sensitivity = sensitivity_curve(residuals.magnitude, std * residuals.unit)
+    return {
+        **_summary(residuals.error, total),
+        "nll": float((0.5 * z**2 + np.log(total) + 0.5 * np.log(2 * np.pi)).mean()),
+        "rmse": float(np.sqrt((residuals.magnitude**2).mean())),
+        "ause": float(np.mean(sensitivity["predicted"]) - np.mean(sensitivity["ideal"])),
+        "sensitivity": sensitivity,
+        "calibration_curve": _curve_by_std(residuals.error, total),
+        "by_range": _by_range(residuals, total),
+    }
+
+
+def coverage(z: Float64) -> list[float]:
+    """Share of absolute standardised errors (n,) within 1, 2 and 3."""
+    return [float((z <= limit).mean()) for limit in (1, 2, 3)]
+
+
+def sensitivity_curve(errors: Float64, std: Float64) -> dict[str, list[float]]:
+    """RMSE of the share of samples with the smallest std, and with the smallest errors.
+
+    Paper figure of appendix C (sparsification). ``recall`` in (0, 1]; both curves are divided by
+    the RMSE of all samples.
+    """
+    count = len(errors)
+    ends = np.unique(np.ceil(np.linspace(0, 1, CURVE_POINTS + 1)[1:] * count).astype(np.int64))
+    squared = errors**2
+    total = max(float(np.sqrt(squared.mean())), 1e-12)
+
+    def curve(order: Int64) -> list[float]:
+        means = np.cumsum(squared[order])[ends - 1] / ends
+        return [float(value) for value in np.sqrt(means) / total]
+
+    # Samples of equal std keep a fixed random order, not that of the images they come from.
+    shuffled = np.random.default_rng(0).permutation(count)
+    predicted = shuffled[np.argsort(std[shuffled], kind="stable")]
+    return {
+        "recall": [float(end / count) for end in ends],
+        "predicted": curve(predicted),
+        "ideal": curve(np.argsort(errors)),
+    }
+
+
+def _curve_by_std(error: Float64, total: Float64) -> list[dict[str, float]]:
+    """Expected and actual spread of samples of similar std."""
+    return [
+        {
+            "std": float(np.sqrt((total[rows] ** 2).mean())),
+            "rmse": float(np.sqrt((error[rows] ** 2).mean())),
+            "robust_std": MAD_TO_STD * float(np.median(np.abs(error[rows]))),
+            "samples": int(rows.sum()),
+        }
+        for rows in _quantile_bins(total, BINS)
+    ]
+
+
+def _by_range(residuals: Residuals, total: Float64) -> list[dict[str, Any]]:
+    return [
+        {
+            "from": float(residuals.place[rows].min()),
+            "to": float(residuals.place[rows].max()),
+            "samples": int(rows.sum()),
+            "std": float(np.median(total[rows])),
+            **_summary(residuals.error[rows], total[rows]),
+        }
+        for rows in _quantile_bins(residuals.place, RANGES)
+    ]
+
+
+def _summary(error: Float64, total: Float64) -> dict[str, Any]:
+    z = np.abs(error) / total
+    return {"coverage": coverage(z), "z_mad": MAD_TO_STD * float(np.median(z))}
+
+
+def _quantile_bins(values: Float64, count: int) -> list[Bool]:
+    """Rows of about equally many samples, from small to large; fewer bins for few values."""
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, count + 1)[1:-1]))
+    number = np.searchsorted(edges, values, side="right")
+    rows = [number == bin_ for bin_ in range(len(edges) + 1)]
+    return [r for r in rows if r.any()]
