@@ -18,11 +18,17 @@ from mpsfm_core.mapping.finishing import finished
 from mpsfm_core.mapping.initialization import initial_pose, rank_initial_pairs
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement import Refiner
-from mpsfm_core.mapping.registration import AbsolutePose, find_poses
+from mpsfm_core.mapping.registration import (
+    AbsolutePose,
+    Correspondences,
+    correspondences,
+    find_poses,
+    rate_pose,
+)
 from mpsfm_core.mapping.triangulation import triangulate_image
 from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
 from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
-from mpsfm_core.scene.scene import Scene
+from mpsfm_core.scene.scene import Scene, Snapshot
 
 
 def reconstruct(
@@ -155,9 +161,15 @@ class Mapper:
         scene, options = self.scene, self.options.registration
         with self._timed("registration"):
             references = local_bundle(scene, reference, options.num_neighbors, self.scores)
-            poses = find_poses(scene, image, references, options, self.options.seed)
+            found = correspondences(scene, image, references, options)
+            poses = find_poses(scene, image, found, options, self.options.seed)
+            snapshot = scene.snapshot()
+            poses = [
+                self._polished(image, pose, found, snapshot)
+                for pose in poses[: options.num_polished]
+            ]
+            poses.sort(key=lambda pose: -pose.support)
         reason: str | None = "neither PnP nor an essential matrix gives a pose"
-        snapshot = scene.snapshot()
         for pose in poses:
             reason = self._lacks_support(pose) or self._try_pose(image, pose)
             if reason is None:
@@ -165,6 +177,19 @@ class Mapper:
             scene.restore(snapshot)
             self.refiner.forget(image)
         return reason
+
+    def _polished(
+        self, image: int, pose: AbsolutePose, found: Correspondences, snapshot: Snapshot
+    ) -> AbsolutePose:
+        """A pose after bundle adjustment beside its neighbours, if that finds more support."""
+        scene, options = self.scene, self.options
+        scene.register(image, pose.rotation, pose.translation)
+        triangulate_image(scene, image, options.triangulation)
+        self.refiner.adjust([image], local=True)
+        rotation, translation = scene.rotations[image].copy(), scene.translations[image].copy()
+        scene.restore(snapshot)
+        polished = rate_pose(scene, found, rotation, translation, pose.source, options.registration)
+        return max(pose, polished, key=lambda candidate: candidate.support)
 
     def _lacks_support(self, pose: AbsolutePose) -> str | None:
         """Why too few matches agree with a pose, if so."""

@@ -48,6 +48,8 @@ class RegistrationOptions(Options):
     max_error)."""
     depth_deviations: float = Field(2.0, ge=0)
     """Half length of that segment in standard deviations of log depth (ours)."""
+    num_polished: int = Field(3, ge=1)
+    """Best supported poses that are bundle-adjusted before one is chosen (ours)."""
     min_inlier_ratio: float = Field(0.25, gt=0, le=1)
     """Reference and COLMAP: used for RANSAC's number of trials."""
     lifting: bool = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from mpsfm_core.scene.scene import Scene
 
 LOCAL_MAX_TRACK_LENGTH = 15
 """Longer tracks stay fixed in local bundle adjustment (COLMAP, reference)."""
+NOISE_CHANGE = 1.25
+"""Factor of the measured noise from which on the integration is set up anew (ours)."""
 MIN_SCALE_POINTS = 20
 """Fewer well triangulated points do not change a scale again (ours)."""
 
@@ -35,6 +38,7 @@ class Refiner:
         self.triangulation = options.triangulation
         self.scores = scores
         self.noise = DepthNoise()
+        self._assumed_multiplier = 1.0
         self._integrators: dict[int, DepthIntegrator] = {}
 
     def estimate_scale(self, image: int, others: list[int]) -> None:
@@ -158,9 +162,8 @@ class Refiner:
         for _ in range(options.global_iterations):
             if options.rescale:
                 self.rescale(images)
+            self._measure_noise()
             self.integrate(images)
-            if options.measure_depth_noise:
-                self.noise = measure_depth_noise(self.scene)
             self.adjust(images, depth_scale=options.final_depth_scale if final else 1.0)
             changed = filter_points(self.scene, self.triangulation)
             changed += complete_and_merge(self.scene, self.triangulation, create=False)
@@ -183,15 +186,35 @@ class Refiner:
         good = (angles[points] >= self.options.anchor_min_angle_deg) & (z > 0)
         good &= np.isfinite(variance) & (variance > 0)
         good &= ~depth_map.keypoint_valid[rows] | self._near(ratio)
-        integrator = self._integrators.get(image)
-        if integrator is None:
-            integrator = self._integrators[image] = DepthIntegrator(
-                depth_map.prior, depth_map.normals, depth_map.camera, self.options.integration
-            )
+        integrator = self._integrator(image)
         anchors = Anchors(depth_map.keypoints[rows][good], z[good], variance[good])
         depth_map.set_refined(
             integrator.refine(anchors, scale=depth_map.scale, start=depth_map.refined)
         )
+
+    def _measure_noise(self) -> None:
+        """Measure how good the priors are; integrators that assumed much else are made anew."""
+        if not self.options.measure_depth_noise:
+            return
+        self.noise = measure_depth_noise(self.scene)
+        assumed = self._assumed_multiplier
+        if not 1 / NOISE_CHANGE < self.noise.multiplier / assumed < NOISE_CHANGE:
+            self._assumed_multiplier = self.noise.multiplier
+            self._integrators.clear()
+
+    def _integrator(self, image: int) -> DepthIntegrator:
+        """The integrator of an image; the measured noise scales what its depth prior is worth."""
+        integrator = self._integrators.get(image)
+        if integrator is None:
+            depth_map, options = self.scene.maps[image], self.options.integration
+            worth = options.independent_depths / self._assumed_multiplier**2
+            integrator = self._integrators[image] = DepthIntegrator(
+                depth_map.prior,
+                depth_map.normals,
+                depth_map.camera,
+                replace(options, independent_depths=worth),
+            )
+        return integrator
 
     def _observed_depth(self, image: int) -> tuple[Int64, Float64]:
         """Keypoints of an image that observe points, and the points' depth in the image."""

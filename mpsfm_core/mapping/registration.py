@@ -1,10 +1,11 @@
 """Pose of the next image from triangulated and depth-lifted points (paper section 3.2).
 
-Pose hypotheses come from PnP and, since lifted points of an uncertain depth miss by many pixels
-over a wide baseline, also from the essential matrices of the image's verified pairs with the
-length that depth gives them. The one that most matches support wins. A match supports a pose if
-its keypoint lies near the segment onto which the pose projects the other keypoint's ray between
-the depths that the prior allows.
+Lifted points of an uncertain depth miss by many pixels over a wide baseline, so one PnP is not
+enough. Hypotheses come from PnP on the points of the scene, from PnP the other way round (the new
+image's own lifts seen in a registered image), and from the essential matrices of verified pairs
+with the length that depth gives them. The one that most matches support wins. A match supports a
+pose if its keypoint lies near the segment onto which the other keypoint's ray projects between
+the depths that the prior allows, and if the depth that follows fits the new image's own prior.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ from mpsfm_core.scene.scene import Scene
 
 MIN_CORRESPONDENCES = 4
 """PnP needs three; the fourth chooses among the solutions."""
+PNP_ERROR_FACTORS = (1.0, 4.0)
+"""PnP is tried with the allowed error and with this multiple of it, for lifts that miss widely over
+a wide baseline (ours)."""
 MIN_DEPTH_SHARE = 1e-3
 """Smallest share of its depth that an uncertain depth may shrink to."""
 
@@ -31,12 +35,14 @@ MIN_DEPTH_SHARE = 1e-3
 class Correspondences(NamedTuple):
     """Keypoints of an image and what they see.
 
-    ``keypoints`` (m,): of the image. ``near``, ``far``: (m, 3) world points that bound where the
+    ``keypoints`` (m,): of the image. ``matched`` (m,): their matches in registered images.
+    ``near``, ``far``: (m, 3) world points that bound where the
     point may lie along the ray of the matched keypoint (the same point twice when triangulated);
     ``points`` (m, 3): the best guess. ``references`` (m,): the image the match comes from.
     """
 
     keypoints: Int64
+    matched: Int64
     points: Float64
     near: Float64
     far: Float64
@@ -59,7 +65,12 @@ class AbsolutePose:
 
 
 def estimate_absolute_pose(
-    camera: PinholeCamera, xy: Float64, points: Float64, options: RegistrationOptions, seed: int
+    camera: PinholeCamera,
+    xy: Float64,
+    points: Float64,
+    options: RegistrationOptions,
+    seed: int,
+    error_factor: float = 1.0,
 ) -> tuple[Float64, Float64, Bool] | None:
     """Robust PnP of pixels (m, 2) and world points (m, 3).
 
@@ -68,7 +79,7 @@ def estimate_absolute_pose(
     if len(xy) < MIN_CORRESPONDENCES:
         return None
     ransac = pycolmap.RANSACOptions(
-        max_error=options.max_error_px,
+        max_error=options.max_error_px * error_factor,
         min_inlier_ratio=options.min_inlier_ratio,
         confidence=0.99999,  # COLMAP, reference
         min_num_trials=100,
@@ -120,60 +131,99 @@ def correspondences(
     along = points - centers
     near = centers + along * np.maximum(np.exp(-slack), MIN_DEPTH_SHARE)[:, None]
     far = centers + along * np.exp(slack)[:, None]
-    return Correspondences(source, points, near, far, graph.image_of[target])
+    return Correspondences(source, target, points, near, far, graph.image_of[target])
 
 
 def find_poses(
-    scene: Scene, image: int, references: list[int], options: RegistrationOptions, seed: int
+    scene: Scene, image: int, found: Correspondences, options: RegistrationOptions, seed: int
 ) -> list[AbsolutePose]:
-    """Possible poses of an image from its matches to the reference images, best support first."""
-    found = correspondences(scene, image, references, options)
-    poses = []
-    for rotation, translation, source in _hypotheses(scene, image, found, options, seed):
-        misfit = _misfits(scene, found, rotation, translation, options)
-        support = np.bincount(found.references, 1 - misfit**2, minlength=scene.num_images)
-        mine = misfit[found.references == support.argmax()] < 1
-        poses.append(
-            AbsolutePose(
-                rotation,
-                translation,
-                source,
-                float(support.max()),
-                int(mine.sum()),
-                float(mine.mean()),
-            )
-        )
+    """Possible poses of an image from its correspondences, best support first."""
+    poses = [
+        rate_pose(scene, found, rotation, translation, source, options)
+        for rotation, translation, source in _hypotheses(scene, image, found, options, seed)
+    ]
     return sorted(poses, key=lambda pose: -pose.support)
 
 
-def _hypotheses(
+def rate_pose(
     scene: Scene,
-    image: int,
     found: Correspondences,
+    rotation: Float64,
+    translation: Float64,
+    source: str,
     options: RegistrationOptions,
-    seed: int,
+) -> AbsolutePose:
+    """A pose with the support that the correspondences give it."""
+    misfit = _misfits(scene, found, rotation, translation, options)
+    support = np.bincount(found.references, 1 - misfit**2, minlength=scene.num_images)
+    matches = np.bincount(found.references, minlength=scene.num_images)
+    inliers = np.bincount(found.references[misfit < 1], minlength=scene.num_images)
+    best = int(np.argmax(support))
+    return AbsolutePose(
+        rotation,
+        translation,
+        source,
+        float(support[best]),
+        int(inliers[best]),
+        float(inliers[best] / max(matches[best], 1)),
+    )
+
+
+def _hypotheses(
+    scene: Scene, image: int, found: Correspondences, options: RegistrationOptions, seed: int
 ) -> Iterator[tuple[Float64, Float64, str]]:
-    """Poses by PnP on all correspondences, and by each reference image's essential matrix."""
-    references = set(found.references.tolist())
+    """Poses from all correspondences, and from each reference image alone."""
     camera = scene.problem.images[image].camera
     xy = scene.keypoints[found.keypoints]
-    pose = estimate_absolute_pose(camera, xy, found.points, options, seed)
-    if pose:
-        yield pose[0], pose[1], "PnP"
-    for pair in scene.problem.pairs if options.lifting else ():
-        if image not in (pair.image_a, pair.image_b) or not pair.calibrated:
+    for factor in PNP_ERROR_FACTORS:
+        pose = estimate_absolute_pose(camera, xy, found.points, options, seed, factor)
+        if pose:
+            yield pose[0], pose[1], "PnP"
+    if not options.lifting:
+        return
+    references = set(found.references.tolist())
+    for pair in scene.problem.pairs:
+        if image not in (pair.image_a, pair.image_b):
             continue
         reference = pair.image_a if image == pair.image_b else pair.image_b
         if reference not in references:
             continue
-        relative = (pair.rotation, pair.translation)
-        if image == pair.image_a:
-            relative = invert(*relative)
-        world = (scene.rotations[reference], scene.translations[reference])
-        length = _baseline(scene, found, reference, relative)
-        if length is not None:
-            rotation, translation = compose((relative[0], relative[1] * length), world)
-            yield rotation, translation, "essential matrix"
+        world = scene.rotations[reference], scene.translations[reference]
+        for factor in PNP_ERROR_FACTORS:
+            reverse = _reverse_pose(scene, image, reference, found, options, seed, factor)
+            if reverse:
+                yield *compose(invert(*reverse), world), "reverse PnP"
+        if pair.calibrated:
+            relative = pair.rotation, pair.translation
+            if image == pair.image_a:
+                relative = invert(*relative)
+            length = _baseline(scene, found, reference, relative)
+            if length is not None:
+                scaled = relative[0], relative[1] * length
+                yield *compose(scaled, world), "essential matrix"
+
+
+def _reverse_pose(
+    scene: Scene,
+    image: int,
+    reference: int,
+    found: Correspondences,
+    options: RegistrationOptions,
+    seed: int,
+    error_factor: float,
+) -> tuple[Float64, Float64] | None:
+    """``reference_from_image`` by PnP on the image's own lifts, at the reference's scale."""
+    depth_map = scene.maps[image]
+    rows = found.keypoints - scene.graph.offsets[image]
+    use = (found.references == reference) & depth_map.keypoint_valid[rows]
+    if use.sum() < options.min_inliers or not depth_map.prior.metric:
+        return None
+    depth = depth_map.prior_at_keypoints(rows[use]) * scene.maps[reference].scale
+    points = scene.rays(found.keypoints[use]) * depth[:, None]
+    camera = scene.problem.images[reference].camera
+    xy = scene.keypoints[found.matched[use]]
+    pose = estimate_absolute_pose(camera, xy, points, options, seed, error_factor)
+    return (pose[0], pose[1]) if pose else None
 
 
 def _baseline(
@@ -199,18 +249,51 @@ def _misfits(
     translation: Float64,
     options: RegistrationOptions,
 ) -> Float64:
-    """(m,) distance of keypoints to the projection of their allowed segment, in limits, <= 1."""
-    fx, fy, cx, cy = scene.intrinsics[scene.graph.image_of[found.keypoints]].T
+    """(m,) how far each match is from supporting a pose, in terms of the limits; at most 1."""
+    image = scene.graph.image_of[found.keypoints]
+    fx, fy, cx, cy = scene.intrinsics[image].T
     xy = scene.keypoints[found.keypoints]
-    ends = []
+    ends, depths = [], []
     for points in (found.near, found.far):
         camera = points @ rotation.T + translation
         z = np.where(camera[:, 2] > 1e-9, camera[:, 2], np.nan)
         ends.append(np.stack([fx * camera[:, 0] / z + cx, fy * camera[:, 1] / z + cy], axis=1))
+        depths.append(z)
     along = ends[1] - ends[0]
     length = np.maximum((along**2).sum(axis=1), 1e-12)
     share = np.clip(((xy - ends[0]) * along).sum(axis=1) / length, 0, 1)
     distance = np.linalg.norm(ends[0] + share[:, None] * along - xy, axis=1)
-    limit = options.max_support_error_px * scene.keypoint_std_px
-    misfits: Float64 = distance / limit[scene.graph.image_of[found.keypoints]]
+    misfits = distance / (options.max_support_error_px * scene.keypoint_std_px[image])
+    depth = 1 / ((1 - share) / depths[0] + share / depths[1])
+    misfits = np.fmax(misfits, _depth_misfits(scene, found, depth, misfits < 1, options))
     return np.where(misfits < 1, misfits, 1.0)
+
+
+def _depth_misfits(
+    scene: Scene,
+    found: Correspondences,
+    depth: Float64,
+    near: Bool,
+    options: RegistrationOptions,
+) -> Float64:
+    """(m,) how far depths in the new image are from its prior, up to one scale; NaN: unknown."""
+    misfits = np.full(len(depth), np.nan)
+    if not len(depth):
+        return misfits
+    image = int(scene.graph.image_of[found.keypoints[0]])
+    rows = found.keypoints - scene.graph.offsets[image]
+    known = scene.maps[image].keypoint_valid[rows] & (depth > 0)
+    if (known & near).any():
+        log_ratio = np.log(depth[known] / scene.maps[image].prior_at_keypoints(rows[known]))
+        own, other = scene.maps[image].keypoint_log_std[rows[known]], _log_std(scene, found, known)
+        limit = options.depth_deviations * np.hypot(own, other)
+        misfits[known] = np.abs(log_ratio - np.median(log_ratio[near[known]])) / limit
+    return misfits
+
+
+def _log_std(scene: Scene, found: Correspondences, chosen: Bool) -> Float64:
+    """Std of log depth at the matches in the registered images."""
+    matched = found.matched[chosen]
+    log_std = np.concatenate([m.keypoint_log_std for m in scene.maps])
+    at_matches: Float64 = log_std[matched]
+    return at_matches
