@@ -1,0 +1,1 @@
+"""Uncertainty of depth and normals from a second pass on the mirrored image."""

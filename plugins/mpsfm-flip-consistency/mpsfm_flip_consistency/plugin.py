@@ -1,0 +1,20 @@
+"""Announces the wrapper."""
+
+from __future__ import annotations
+
+from mpsfm_core import ProviderSpec, hookimpl
+
+
+@hookimpl
+def mpsfm_providers() -> list[ProviderSpec]:
+    """One wrapper, for depth and for normals."""
+    return [
+        ProviderSpec(
+            kind="wrapper",
+            name="flip-consistency",
+            factory="mpsfm_flip_consistency.wrapper:FlipConsistency",
+            capabilities=frozenset({"wraps-depth", "wraps-normals"}),
+            summary="second pass on the mirrored image: mean, and variance from the disagreement",
+            code_license="Apache-2.0",
+        )
+    ]

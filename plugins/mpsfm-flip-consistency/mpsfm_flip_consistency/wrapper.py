@@ -1,0 +1,33 @@
+"""The wrapper of a depth or normals provider."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mpsfm_core import DepthPrior, NormalPrior, ProviderContext, View
+from mpsfm_core.errors import DataError
+from mpsfm_flip_consistency.fusion import fuse_depth, fuse_normals
+from mpsfm_flip_consistency.mirror import mirror_depth, mirror_normals, mirror_view
+
+
+class FlipConsistency:
+    """Runs a provider on the view and on its mirror image, and fuses both."""
+
+    def __init__(self, inner: Any, options: None, context: ProviderContext) -> None:
+        self._inner = inner
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> DepthPrior | NormalPrior:
+        """What the provider predicts, with a variance; ``depth`` is for normals that need it.
+
+        Raises:
+            DataError: both passes have grids of different sizes.
+        """
+        given, mirrored = ((), ()) if depth is None else ((depth,), (mirror_depth(depth),))
+        first = self._inner.predict(view, *given)
+        second = self._inner.predict(mirror_view(view), *mirrored)
+        if first.shape != second.shape:
+            text = f"must have one size for a view and its mirror image, got {first.shape} and "
+            raise DataError("output", f"{text}{second.shape}")
+        if isinstance(first, DepthPrior):
+            return fuse_depth(first, mirror_depth(second))
+        return fuse_normals(first, mirror_normals(second), view.camera)
