@@ -23,13 +23,28 @@ from mpsfm_core.evaluation.pose_auc import (
 def read_poses(folder: Path) -> dict[str, Pose]:
     """``cam_from_world`` of the registered images of a COLMAP model, by image name.
 
-    ``folder``: a model (binary or text), or an output folder that has it in ``sparse`` or
-    ``sparse/0``. Raises :class:`~mpsfm_core.errors.InputError` when there is none.
+    Raises what :func:`model_folder` and :func:`read_model` raise.
+    """
+    return reconstruction_poses(read_model(model_folder(folder)))
+
+
+def model_folder(folder: Path) -> Path:
+    """Where a COLMAP model (binary or text) lies: here, in ``sparse`` or in ``sparse/0``.
+
+    Raises :class:`~mpsfm_core.errors.InputError` when there is none.
     """
     for candidate in (folder, folder / "sparse", folder / "sparse" / "0"):
         if any((candidate / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):
-            return reconstruction_poses(_read(candidate))
+            return candidate
     raise InputError(f"{folder}: no COLMAP model here (images.bin or images.txt)")
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """A COLMAP model; raises :class:`~mpsfm_core.errors.InputError` when it cannot be read."""
+    try:
+        return pycolmap.Reconstruction(str(folder))
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise InputError(f"{folder}: not a readable COLMAP model: {error}") from error
 
 
 def reconstruction_poses(model: pycolmap.Reconstruction) -> dict[str, Pose]:
@@ -95,13 +110,6 @@ def evaluate(
         "auc": {str(threshold): 100 * area for threshold, area in areas.items()},
         "trajectory": _describe(trajectory_errors(poses, reference)),
     }
-
-
-def _read(folder: Path) -> pycolmap.Reconstruction:
-    try:
-        return pycolmap.Reconstruction(str(folder))
-    except (RuntimeError, ValueError, IndexError) as error:
-        raise InputError(f"{folder}: not a readable COLMAP model: {error}") from error
 
 
 def _choose(images: Sequence[str], truth: Mapping[str, Pose]) -> list[str]:
