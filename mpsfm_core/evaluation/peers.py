@@ -1,0 +1,136 @@
+"""COLMAP's own mappers on our verified matches: the peers that a benchmark compares with.
+
+All see the same keypoints and verified matches, with intrinsics that are known and kept. All keep
+models of two images, as ours does (COLMAP's default drops models of fewer than 80 % of a small
+set), use one thread and a fixed seed.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import Float64, MappingProblem, VerifiedPair
+from mpsfm_core.evaluation.models import reconstruction_poses
+from mpsfm_core.evaluation.pose_auc import Pose
+from mpsfm_core.results.colmap_model import pinhole
+
+Models = Mapping[int, pycolmap.Reconstruction]
+
+_TUNED_ANGLE_DEG = 0.001
+"""Paper, baselines: all minimum triangulation angles for low parallax."""
+
+
+def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path], Models]:
+    """``tuned``: paper, baselines. ``structure_less``: COLMAP's fallback to 2D-2D registration,
+    which pycolmap 4.2 has on by default."""
+
+    def run(database: Path, output: Path) -> Models:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.structure_less_registration_fallback = structure_less
+        options.min_model_size = 2
+        options.extract_colors = False
+        options.num_threads = 1
+        options.random_seed = 0
+        options.ba_refine_focal_length = False
+        options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = False
+        options.mapper.abs_pose_refine_extra_params = False
+        if tuned:
+            options.mapper.init_min_tri_angle = _TUNED_ANGLE_DEG
+            options.mapper.ba_local_min_tri_angle = _TUNED_ANGLE_DEG
+            options.mapper.filter_min_tri_angle = _TUNED_ANGLE_DEG
+            options.triangulation.min_angle = _TUNED_ANGLE_DEG
+            options.triangulation.ignore_two_view_tracks = False
+        models: Models = pycolmap.incremental_mapping(database, output, output, options)
+        return models
+
+    return run
+
+
+def _global(database: Path, output: Path) -> Models:
+    options = pycolmap.GlobalPipelineOptions()
+    options.min_model_size = 2
+    options.num_threads = 1
+    options.random_seed = 0
+    options.mapper.bundle_adjustment.refine_focal_length = False
+    options.mapper.bundle_adjustment.refine_extra_params = False
+    models: Models = pycolmap.global_mapping(database, output, output, options)
+    return models
+
+
+PEERS: Mapping[str, Callable[[Path, Path], Models]] = MappingProxyType(
+    {
+        "colmap": _incremental(tuned=False, structure_less=False),
+        "colmap-tuned": _incremental(tuned=True, structure_less=False),
+        "colmap-structureless": _incremental(tuned=False, structure_less=True),
+        "colmap-tuned-structureless": _incremental(tuned=True, structure_less=True),
+        "colmap-global": _global,
+    }
+)
+"""Name -> ``run(database, output)``. ``colmap-structureless`` is pycolmap 4.2's default."""
+
+
+def run_peer(name: str, problem: MappingProblem) -> dict[str, Pose]:
+    """Poses of the largest model that a peer makes of a problem, by image name."""
+    with tempfile.TemporaryDirectory(prefix="mpsfm-peer-") as folder:
+        output = Path(folder)
+        database = output / "database.db"
+        write_database(problem, database)
+        models = list(PEERS[name](database, output).values())
+        if not models:
+            return {}
+        return reconstruction_poses(max(models, key=lambda model: int(model.num_reg_images())))
+
+
+def write_database(problem: MappingProblem, path: Path) -> None:
+    """Write keypoints, verified matches and two-view geometries as a COLMAP database.
+
+    Image ids are positions in the problem plus one; each image has a camera of its own.
+    """
+    with pycolmap.Database.open(path) as database:
+        for number, image in enumerate(problem.images, start=1):
+            camera = pinhole(image.camera)
+            camera.camera_id = number
+            camera.has_prior_focal_length = True
+            database.write_camera(camera, use_camera_id=True)
+            rig = pycolmap.Rig(rig_id=number)
+            rig.add_ref_sensor(camera.sensor_id)
+            database.write_rig(rig, use_rig_id=True)
+            row = pycolmap.Image(name=image.name, camera_id=number, image_id=number)
+            database.write_image(row, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=number, rig_id=number)
+            frame.add_data_id(row.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_keypoints(number, image.keypoints.astype(np.float32))
+        for pair in problem.pairs:
+            ids = pair.image_a + 1, pair.image_b + 1
+            database.write_matches(*ids, pair.matches.astype(np.uint32))
+            database.write_two_view_geometry(*ids, _geometry(problem, pair))
+
+
+def _geometry(problem: MappingProblem, pair: VerifiedPair) -> pycolmap.TwoViewGeometry:
+    """The pair as COLMAP stores it: an essential matrix, or without a baseline a homography."""
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.inlier_matches = pair.matches.astype(np.uint32)
+    pose = np.column_stack([pair.rotation, pair.translation])
+    geometry.cam2_from_cam1 = pycolmap.Rigid3d(pose)
+    first, second = (problem.images[i].camera.matrix for i in (pair.image_a, pair.image_b))
+    if pair.translation.any():
+        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+        geometry.E = _cross(pair.translation) @ pair.rotation
+        geometry.F = np.linalg.inv(second).T @ geometry.E @ np.linalg.inv(first)
+    else:
+        geometry.config = pycolmap.TwoViewGeometryConfiguration.PANORAMIC
+        geometry.H = second @ pair.rotation @ np.linalg.inv(first)
+    return geometry
+
+
+def _cross(t: Float64) -> Float64:
+    """The matrix of the cross product with a vector."""
+    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
