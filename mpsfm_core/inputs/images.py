@@ -28,6 +28,7 @@ from mpsfm_core.inputs.undistortion import (
     pinhole_camera,
     resized_camera,
     to_original,
+    to_view,
 )
 
 _log = logging.getLogger(__name__)
@@ -64,6 +65,10 @@ class SourceImage:
     def original_pixels(self, xy: Float64) -> Float64:
         """Pixels (n, 2) of the undistorted view as pixels of the upright original image."""
         return to_original(self.pinhole, self.camera, xy)
+
+    def view_pixels(self, xy: Float64) -> Float64:
+        """Pixels (n, 2) of the upright original image as pixels of the undistorted view."""
+        return to_view(self.pinhole, self.camera, xy)
 
     @property
     def original_size(self) -> tuple[int, int]:
@@ -190,7 +195,7 @@ def load_images(
     options = options or InputOptions()
     if options.masks is not None and not options.masks.is_dir():
         raise InputError(f"masks folder {options.masks} does not exist")
-    names = _find(folder)
+    names = find_images(folder)
     if image_list is not None:
         names = _listed(image_list, names, folder)
     if len(names) < 2:
@@ -260,7 +265,7 @@ def _source_image(
     return SourceImage(name, path, camera, pinhole, focal != "default", focal, file.digest)
 
 
-def _find(folder: Path) -> list[str]:
+def find_images(folder: Path) -> list[str]:
     """Names of all images below the folder, in natural order; hidden files are left out."""
     if not folder.is_dir():
         raise InputError(f"images folder {folder} does not exist")
