@@ -129,7 +129,7 @@ class _NormalEquations:
         self.parts = [kernels.System(*(np.empty(shape) for shape in shapes)) for _ in p.ranges]
         self.scratch = [kernels.make_scratch(p.longest) for _ in p.ranges]
         self.total = self.parts[0]
-        self.eliminated = np.empty((len(p.state.points), 12))
+        self.eliminated = np.empty((len(p.state.points), 10))
         self.p = p
         self.run = run
         self.dense = poses <= options.dense_poses

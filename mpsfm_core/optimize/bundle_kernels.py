@@ -116,7 +116,7 @@ class Scratch(NamedTuple):
 
     ``y``, ``yf``: (longest, 3, 6) and (longest, 3, 1), coupling of the point with pose slots
     ``slots`` and focal slots ``focals``. ``before``: (longest, 2), cost and depth. ``block``:
-    (1, 12), laid out as a row of ``eliminated``.
+    (1, 10), laid out as a row of ``eliminated``.
     """
 
     slots: Int64
@@ -165,7 +165,7 @@ def make_scratch(longest: int) -> Scratch:
         yf=np.empty((longest, 3, 1)),
         columns=np.empty((3, POSE)),
         before=np.empty((longest, 2)),
-        block=np.empty((1, 12)),
+        block=np.empty((1, 10)),
         vector=np.empty(3),
     )
 
@@ -328,7 +328,7 @@ def _add_focal(
 
 @_kernel
 def _add_point(s: Sight, rotation: Float64, image: int, block: Float64, p: int) -> None:
-    """block[p] (12,) += packed lower triangle of R^T h R at 0..5 and R^T g at 6..8."""
+    """block[p] (10,) += packed lower triangle of R^T h R at 0..5 and R^T g at 6..8."""
     r = rotation
     for a in range(3):
         r0, r1, r2 = r[image, 0, a], r[image, 1, a], r[image, 2, a]
@@ -356,21 +356,25 @@ def _add_coupling(
 
 @_kernel
 def _invert_factor(block: Float64, p: int, damping: float) -> bool:
-    """Replace the packed V in block[p, :6] by L^-1, V + damping diag(V) = L L^T, and keep the
-    diagonal of V in block[p, 9:]. False (block unusable) if it is not positive definite."""
-    boost = 1.0 + damping
-    block[p, 9], block[p, 10], block[p, 11] = block[p, 0], block[p, 2], block[p, 5]
-    a = block[p, 0] * boost
+    """Replace the packed V in block[p, :6] by L^-1, where V + damping m I = L L^T; m, the mean
+    of V's diagonal, goes to block[p, 9]. False (nothing replaced) if it is not positive definite.
+
+    The same damping in all directions lets a point that is seen once move sideways only; scaled
+    by V's own diagonal it would slide along its ray.
+    """
+    block[p, 9] = (block[p, 0] + block[p, 2] + block[p, 5]) / 3.0
+    boost = damping * block[p, 9]
+    a = block[p, 0] + boost
     if not (a > 0.0 and a < np.inf):
         return False
     i00 = 1.0 / np.sqrt(a)
     l10, l20 = block[p, 1] * i00, block[p, 3] * i00
-    b = block[p, 2] * boost - l10 * l10
+    b = block[p, 2] + boost - l10 * l10
     if not (b > 0.0 and b < np.inf):
         return False
     i11 = 1.0 / np.sqrt(b)
     l21 = (block[p, 4] - l20 * l10) * i11
-    c = block[p, 5] * boost - l20 * l20 - l21 * l21
+    c = block[p, 5] + boost - l20 * l20 - l21 * l21
     if not (c > 0.0 and c < np.inf):
         return False
     i22 = 1.0 / np.sqrt(c)
@@ -478,9 +482,9 @@ def reduce_points(
 ) -> float:
     """Linearise the points ``first:last``, eliminate them, and return their cost.
 
-    Adds to ``system``, undamped on the camera side. Fills ``eliminated`` (p, 12): packed L^-1 of
-    the damped 3 x 3 block, its gradient, its diagonal; a row is 0, so that the point stays, if
-    the point is constant or its block is not definite (nothing sees it).
+    Adds to ``system``, undamped on the camera side. Fills ``eliminated`` (p, 10): packed L^-1 of
+    the damped 3 x 3 block V, its gradient, the mean of V's diagonal. A row is 0, so that the
+    point stays, if it is constant or its block is not definite (nothing sees it).
     """
     obs, layout = bundle.obs, bundle.layout
     slots, focals, columns = scratch.slots, scratch.focals, scratch.columns
@@ -488,7 +492,7 @@ def reduce_points(
     cost = 0.0
     for p in range(first, last):
         count = num_focals = 0
-        for a in range(12):
+        for a in range(10):
             eliminated[p, a] = 0.0
         for k in range(obs.start[p], obs.start[p + 1]):
             s = observe(k, p, bundle, state)
@@ -522,7 +526,7 @@ def reduce_points(
                 _add_coupling(columns, 1, state.rotations, image, scratch.yf, n, fresh)
                 num_focals = max(num_focals, n + 1)
         if not _invert_factor(eliminated, p, damping):
-            for a in range(12):
+            for a in range(10):
                 eliminated[p, a] = 0.0
             continue
         g0, g1, g2 = eliminated[p, 6], eliminated[p, 7], eliminated[p, 8]
@@ -580,7 +584,7 @@ def _joint_step(
     _point_step(eliminated, p, g0, g1, g2, step)
     promised = 0.0
     for a in range(3):
-        promised += step[a] * (damping * eliminated[p, 9 + a] * step[a] - eliminated[p, 6 + a])
+        promised += step[a] * (damping * eliminated[p, 9] * step[a] - eliminated[p, 6 + a])
     return 0.5 * promised
 
 
@@ -591,7 +595,7 @@ def _look(p: int, bundle: Bundle, trial: State, scratch: Scratch) -> tuple[float
     obs, before, block = bundle.obs, scratch.before, scratch.block
     cost = lost = 0.0
     safe = True
-    for a in range(12):
+    for a in range(10):
         block[0, a] = 0.0
     for k in range(obs.start[p], obs.start[p + 1]):
         s = observe(k, p, bundle, trial)
@@ -756,7 +760,7 @@ def point_covariances(
     """Inverse of ``V + damping I`` of each of the points ``first:last``, to out (p, 3, 3)."""
     block = scratch.block
     for p in range(first, last):
-        for a in range(12):
+        for a in range(10):
             block[0, a] = 0.0
         block[0, 0] = block[0, 2] = block[0, 5] = damping
         for k in range(bundle.obs.start[p], bundle.obs.start[p + 1]):

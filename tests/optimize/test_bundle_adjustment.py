@@ -1,0 +1,439 @@
+"""Bundle adjustment: Ceres' optimum, all modes, single views, gross errors, degenerate input."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mpsfm_core.data import Float64
+from mpsfm_core.errors import DataError
+from mpsfm_core.optimize.bundle_adjustment import (
+    BundleOptions,
+    BundleProblem,
+    BundleResult,
+    adjust_bundle,
+)
+from mpsfm_core.optimize.losses import Loss
+from tests.optimize.bundle_reference import (
+    make_problem,
+    perturb,
+    rotation,
+    solve_with_ceres,
+    whitened_residuals,
+    without_depth,
+)
+
+TIGHT = BundleOptions(function_tolerance=1e-13, max_iterations=1000)
+PARAMETERS = ("rotations", "translations", "intrinsics", "points")
+
+
+def assert_same_optimum(start: BundleProblem, *, refine_focal: bool = False) -> None:
+    initial, final, rec = solve_with_ceres(start, refine_focal=refine_focal)
+    result = adjust_bundle(start, TIGHT)
+    assert result.converged
+    assert result.initial_cost == pytest.approx(initial, rel=1e-12)
+    assert result.final_cost == pytest.approx(final, rel=1e-6)
+    poses = [rec.images[i + 1].cam_from_world() for i in range(len(start.rotations))]
+    turns = np.stack([pose.rotation.matrix() for pose in poses])
+    shifts = np.stack([pose.translation for pose in poses])
+    np.testing.assert_allclose(result.rotations, turns, atol=1e-5)
+    centers = [
+        -np.einsum("nji,nj->ni", r, t)
+        for r, t in ((result.rotations, result.translations), (turns, shifts))
+    ]
+    if start.obs_log_depth is None:
+        # the scale is a convention: Ceres may hold another coordinate of the second camera
+        centers = [(c - c[0]) / np.linalg.norm(c[1] - c[0]) for c in centers]
+    np.testing.assert_allclose(*centers, atol=1e-5)
+    if refine_focal:
+        np.testing.assert_allclose(result.intrinsics[0, 0], rec.cameras[1].params[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_same_optimum_as_ceres_with_depth(seed: int) -> None:
+    assert_same_optimum(perturb(make_problem(6, 60, 3.5), seed, amount=2.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_same_optimum_as_ceres_from_twenty_starts(seed: int) -> None:
+    assert_same_optimum(perturb(make_problem(8, 150, 4), seed, amount=2.0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_same_optimum_as_ceres_without_depth(seed: int) -> None:
+    assert_same_optimum(without_depth(perturb(make_problem(6, 200, 3.5), seed)))
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_same_optimum_as_ceres_with_focal_length(depth: bool) -> None:
+    start = perturb(make_problem(8, 80, 5), 0)
+    start = replace(start, variable_focal=np.array([True]))
+    start = replace(start, intrinsics=start.intrinsics * [1.05, 1.05, 1, 1])
+    assert_same_optimum(start if depth else without_depth(start), refine_focal=True)
+
+
+def test_focal_length_per_camera() -> None:
+    """Each image with its own wrong focal length; exact measurements give all of them back."""
+    truth = exact(make_problem(6, 200, 5))
+    truth = replace(
+        truth,
+        intrinsics=np.repeat(truth.intrinsics, 6, axis=0),
+        camera_of_image=np.arange(6),
+        variable_focal=np.ones(6, dtype=np.bool_),
+    )
+    wrong = truth.intrinsics * np.linspace(0.9, 1.1, 6)[:, None] ** [1, 1, 0, 0]
+    result = adjust_bundle(replace(perturb(truth, 0, 0.5), intrinsics=wrong), TIGHT)
+    np.testing.assert_allclose(result.intrinsics, truth.intrinsics, rtol=1e-6)
+    np.testing.assert_allclose(result.points, truth.points, atol=1e-5)
+
+
+def exact(problem: BundleProblem) -> BundleProblem:
+    """The problem with noise-free measurements."""
+    residual = whitened_residuals(problem, robust=False)
+    return replace(
+        problem,
+        obs_xy=problem.obs_xy + residual[:, :2],
+        obs_log_depth=problem.obs_log_depth + residual[:, 2] * problem.obs_std_log_depth,
+    )
+
+
+def assert_fixed(problem: BundleProblem, result: BundleResult, names: tuple[str, ...]) -> None:
+    for name in names:
+        np.testing.assert_array_equal(getattr(result, name), getattr(problem, name))
+
+
+def test_points_only() -> None:
+    truth = exact(make_problem(5, 300, 3))
+    start = replace(truth, points=perturb(truth, 0, 3.0).points, variable_pose=np.zeros(5, bool))
+    result = adjust_bundle(start, TIGHT)
+    assert_fixed(start, result, ("rotations", "translations", "intrinsics"))
+    np.testing.assert_allclose(result.points, truth.points, atol=1e-6)
+
+
+def test_poses_only() -> None:
+    truth = exact(make_problem(5, 300, 3))
+    start = replace(perturb(truth, 0), points=truth.points, variable_point=np.zeros(300, bool))
+    result = adjust_bundle(start, TIGHT)
+    assert_fixed(start, result, ("points", "intrinsics"))
+    np.testing.assert_allclose(result.rotations, truth.rotations, atol=1e-7)
+    np.testing.assert_allclose(result.translations, truth.translations, atol=1e-6)
+
+
+def test_local() -> None:
+    """Two variable poses among constant ones; some points constant."""
+    truth = exact(make_problem(6, 300, 4))
+    variable_pose = np.isin(np.arange(6), [2, 3])
+    variable_point = np.random.default_rng(0).random(300) < 0.7
+    start = perturb(truth, 0)
+    pose = variable_pose[:, None]
+    start = replace(
+        start,
+        rotations=np.where(pose[..., None], start.rotations, truth.rotations),
+        translations=np.where(pose, start.translations, truth.translations),
+        points=np.where(variable_point[:, None], start.points, truth.points),
+        variable_pose=variable_pose,
+        variable_point=variable_point,
+    )
+    result = adjust_bundle(start, TIGHT)
+    np.testing.assert_array_equal(result.rotations[~variable_pose], start.rotations[~variable_pose])
+    np.testing.assert_array_equal(result.points[~variable_point], start.points[~variable_point])
+    np.testing.assert_allclose(result.translations, truth.translations, atol=1e-6)
+    np.testing.assert_allclose(result.points, truth.points, atol=1e-5)
+
+
+def test_depth_fixes_the_scale() -> None:
+    truth = exact(make_problem(6, 200, 4))
+    small = replace(truth, translations=truth.translations * 0.8, points=truth.points * 0.8)
+    first = small.rotations[0].T @ small.translations[0]
+    result = adjust_bundle(small, TIGHT)
+    assert_fixed(small, result, ("intrinsics",))
+    np.testing.assert_array_equal(result.translations[0], small.translations[0])
+    expected = truth.points + truth.rotations[0].T @ truth.translations[0] - first
+    np.testing.assert_allclose(result.points, expected, atol=1e-5)
+
+
+def test_scale_anchor_holds_one_coordinate_and_costs_nothing() -> None:
+    start = without_depth(perturb(make_problem(6, 200, 4), 0))
+    anchored = adjust_bundle(start, TIGHT)
+    free = adjust_bundle(replace(start, scale_anchor=None), TIGHT)
+    centers = -np.einsum("nji,nj->ni", start.rotations, start.translations)
+    baseline = np.abs(start.rotations[1] @ (centers[1] - centers[0]))
+    same = anchored.translations[1] == start.translations[1]
+    np.testing.assert_array_equal(same, np.arange(3) == baseline.argmax())
+    assert anchored.final_cost == pytest.approx(free.final_cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_conjugate_gradients_reach_the_dense_optimum(plain: bool) -> None:
+    start = perturb(make_problem(30, 800, 5), 0)
+    start = replace(start, variable_focal=np.array([True]))
+    start = without_depth(start) if plain else start
+    dense = adjust_bundle(start, TIGHT)
+    sparse = adjust_bundle(start, TIGHT.model_copy(update={"dense_poses": 0}))
+    assert sparse.final_cost == pytest.approx(dense.final_cost, rel=1e-9)
+    np.testing.assert_allclose(sparse.translations, dense.translations, atol=1e-5)
+
+
+def test_result_does_not_depend_on_threads() -> None:
+    """Bit for bit, and from run to run; the problem is large enough for several ranges."""
+    start = perturb(make_problem(12, 6000, 4.5), 0)
+    assert len(start.obs_image) > 24_000
+    results = [adjust_bundle(start, BundleOptions(threads=n)) for n in (1, 2, 3, 2)]
+    for other in results[1:]:
+        for name in (*PARAMETERS, "final_cost", "iterations"):
+            np.testing.assert_array_equal(getattr(results[0], name), getattr(other, name))
+
+
+def test_order_of_observations_does_not_matter() -> None:
+    start = perturb(make_problem(6, 300, 4), 0)
+    order = np.random.default_rng(0).permutation(len(start.obs_image))
+    shuffled = replace(
+        start,
+        **{n: getattr(start, n)[order] for n in ("obs_image", "obs_point", "obs_xy")},
+        obs_log_depth=start.obs_log_depth[order],
+    )
+    first, second = adjust_bundle(start), adjust_bundle(shuffled)
+    for name in PARAMETERS:
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_input_is_neither_changed_nor_kept() -> None:
+    start = perturb(make_problem(5, 100, 3), 0)
+    arrays = {f.name: getattr(start, f.name) for f in fields(start)}
+    arrays = {name: a for name, a in arrays.items() if isinstance(a, np.ndarray)}
+    copies = {name: a.copy() for name, a in arrays.items()}
+    for array in arrays.values():
+        array.flags.writeable = False
+    result = adjust_bundle(start)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(array, copies[name])
+    for name in PARAMETERS:
+        assert not np.shares_memory(getattr(result, name), getattr(start, name))
+
+
+def test_integer_types_and_strides_of_the_input_do_not_matter() -> None:
+    start = perturb(make_problem(5, 100, 3), 0)
+    strange = replace(
+        start,
+        obs_image=start.obs_image.astype(np.uint16),
+        obs_point=np.asfortranarray(start.obs_point.astype(np.int32)),
+        points=np.asfortranarray(start.points),
+        obs_xy=np.repeat(start.obs_xy, 2, axis=0)[::2],
+        camera_of_image=start.camera_of_image.astype(np.int8),
+    )
+    np.testing.assert_array_equal(adjust_bundle(start).points, adjust_bundle(strange).points)
+
+
+def one_camera(points: Float64, **changes: object) -> BundleProblem:
+    """A constant camera at the origin that sees each point once, at the image centre."""
+    count = len(points)
+    problem = BundleProblem(
+        rotations=np.eye(3)[None],
+        translations=np.zeros((1, 3)),
+        intrinsics=np.array([[1000.0, 1000.0, 500.0, 500.0]]),
+        camera_of_image=np.array([0]),
+        points=points,
+        obs_image=np.zeros(count, dtype=np.int64),
+        obs_point=np.arange(count),
+        obs_xy=np.full((count, 2), 500.0),
+        variable_pose=np.array([False]),
+    )
+    return replace(problem, **changes)
+
+
+def test_lifted_points_go_to_their_depth() -> None:
+    start = one_camera(
+        np.array([[0.1, 0.2, 3.0], [-0.3, 0.1, 2.5]]),
+        obs_log_depth=np.log([2.0, 4.0]),
+        obs_std_log_depth=0.05,
+    )
+    result = adjust_bundle(start, BundleOptions(depth_loss=Loss.TRIVIAL, function_tolerance=1e-15))
+    np.testing.assert_allclose(result.points, [[0, 0, 2], [0, 0, 4]], atol=1e-6)
+
+
+def test_points_seen_once_without_depth_move_sideways_only() -> None:
+    start = one_camera(np.array([[0.1, 0.2, 3.0], [-0.3, 0.1, 2.5]]))
+    result = adjust_bundle(start, TIGHT)
+    assert result.final_cost < 1e-12
+    np.testing.assert_allclose(result.points[:, :2], 0, atol=1e-6)
+    np.testing.assert_allclose(result.points[:, 2], start.points[:, 2], rtol=0.02)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 0.2, 5.0, 1e3])
+def test_depth_that_is_far_off_does_not_throw_points_behind_the_camera(factor: float) -> None:
+    start = one_camera(
+        np.array([[0.0, 0.0, 2.0 * factor]]),
+        obs_log_depth=np.log([2.0]),
+        obs_std_log_depth=0.05,
+    )
+    options = BundleOptions(depth_loss=Loss.TRIVIAL, function_tolerance=1e-15)
+    result = adjust_bundle(start, options)
+    np.testing.assert_allclose(result.points, [[0, 0, 2]], atol=1e-6)
+
+
+def test_points_behind_the_camera_count_nothing_and_stay() -> None:
+    start = one_camera(
+        np.array([[0.1, 0.0, -2.0], [0.1, 0.0, 2.0], [0.0, 0.0, 0.0]]),
+        obs_log_depth=np.log([2.0, 2.0, 2.0]),
+    )
+    result = adjust_bundle(start, TIGHT)
+    np.testing.assert_array_equal(result.points[[0, 2]], start.points[[0, 2]])
+    assert result.initial_cost == adjust_bundle(one_camera(start.points[1:2])).initial_cost
+    np.testing.assert_allclose(result.points[1], [0, 0, 2], atol=1e-6)
+
+
+def test_nothing_is_gained_by_leaving_the_view() -> None:
+    """Measurements that no point in front of both cameras fits; the best point is behind one."""
+    start = BundleProblem(
+        rotations=np.stack([np.eye(3), np.eye(3)]),
+        translations=np.array([[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]),
+        intrinsics=np.array([[1000.0, 1000.0, 500.0, 500.0]]),
+        camera_of_image=np.array([0, 0]),
+        points=np.array([[0.5, 0.0, 2.0]]),
+        obs_image=np.array([0, 1]),
+        obs_point=np.array([0, 0]),
+        obs_xy=np.array([[300.0, 500.0], [700.0, 500.0]]),  # the rays meet behind the cameras
+        variable_pose=np.zeros(2, dtype=np.bool_),
+    )
+    result = adjust_bundle(start)
+    assert result.points[0, 2] > 0
+    assert 0 < result.final_cost < result.initial_cost
+
+
+def test_survives_gross_errors() -> None:
+    truth = make_problem(8, 400, 4)
+    start = perturb(truth, 0, amount=10.0)
+    result = adjust_bundle(start, BundleOptions(max_iterations=200))
+    good = adjust_bundle(perturb(truth, 0), BundleOptions(max_iterations=200))
+    assert result.final_cost < 1.05 * good.final_cost
+
+
+@pytest.mark.parametrize("points", [0, 3])
+def test_without_observations(points: int) -> None:
+    start = one_camera(np.ones((points, 3)))
+    none = np.zeros(0, dtype=np.int64)
+    start = replace(
+        start,
+        obs_image=none,
+        obs_point=none,
+        obs_xy=np.zeros((0, 2)),
+        variable_pose=np.array([True]),
+        variable_focal=np.array([True]),
+    )
+    result = adjust_bundle(start)
+    assert_fixed(start, result, PARAMETERS)
+    assert (result.initial_cost, result.final_cost, result.converged) == (0, 0, True)
+
+
+def test_iteration_limit_is_reported() -> None:
+    start = perturb(make_problem(5, 100, 3), 0)
+    result = adjust_bundle(start, BundleOptions(max_iterations=1, function_tolerance=0))
+    assert (result.iterations, result.converged) == (1, False)
+    assert "limit" in result.message
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("rotations", np.zeros((5, 3))),
+        ("translations", np.zeros((4, 3))),
+        ("points", np.full((40, 3), np.nan)),
+        ("intrinsics", np.zeros((1, 3))),
+        ("camera_of_image", np.full(5, 1)),
+        ("camera_of_image", np.zeros(5)),
+        ("obs_xy", np.zeros((3, 2))),
+        ("obs_std_px", 0.0),
+        ("obs_std_px", np.ones(3)),
+        ("obs_log_depth", np.zeros(3)),
+        ("obs_std_log_depth", -1.0),
+        ("variable_pose", np.ones(5)),
+        ("variable_point", np.ones(3, dtype=np.bool_)),
+        ("variable_focal", np.ones(2, dtype=np.bool_)),
+        ("scale_anchor", 0),
+        ("scale_anchor", 7),
+    ],
+)
+def test_wrong_input_is_named(field: str, value: object) -> None:
+    problem = make_problem(5, 40, 3)
+    with pytest.raises(DataError) as caught:
+        adjust_bundle(replace(problem, **{field: value}))
+    assert caught.value.field == field
+
+
+@pytest.mark.parametrize("field", ["obs_image", "obs_point"])
+@pytest.mark.parametrize("value", [-1, 1000])
+def test_indices_out_of_range_are_named(field: str, value: int) -> None:
+    problem = make_problem(5, 40, 3)
+    rows = getattr(problem, field).copy()
+    rows[3] = value
+    with pytest.raises(DataError, match=field):
+        adjust_bundle(replace(problem, **{field: rows}))
+
+
+@st.composite
+def degenerate_problems(draw: st.DrawFn) -> BundleProblem:
+    """Few images and points at random, many of them coinciding, collinear, behind or far away."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    images, points = draw(st.integers(1, 5)), draw(st.integers(1, 12))
+    count = draw(st.integers(0, 40))
+    scale = 10.0 ** draw(st.integers(-6, 6))
+    shape = draw(st.sampled_from(["any", "same centre", "line", "plane", "on the cameras"]))
+    turns = rng.normal(0, draw(st.sampled_from([0.0, 0.1, 3.0])), (images, 3))
+    rotations = np.stack([rotation(turn) for turn in turns])
+    centers = rng.normal(size=(images, 3)) * (0.0 if shape == "same centre" else 1.0)
+    xyz = rng.normal(size=(points, 3))
+    xyz[:, 2] += draw(st.sampled_from([-3.0, 0.0, 3.0, 1e5]))
+    if shape == "line":
+        xyz = np.outer(rng.normal(size=points), [0, 0, 1])
+        centers *= [0, 0, 1]
+    elif shape == "plane":
+        xyz[:, 2] = 3.0
+    elif shape == "on the cameras":
+        xyz = centers[rng.integers(0, images, points)]
+    far = 10.0 ** draw(st.integers(0, 8))
+    return BundleProblem(
+        rotations=rotations,
+        translations=-np.einsum("nij,nj->ni", rotations, centers) * scale,
+        intrinsics=rng.uniform(100, 2000, (images, 4)),
+        camera_of_image=rng.integers(0, images, images),
+        points=xyz * scale,
+        obs_image=rng.integers(0, images, count),
+        obs_point=rng.integers(0, points, count),
+        obs_xy=rng.uniform(-far, far, (count, 2)),
+        obs_std_px=10.0 ** rng.uniform(-3, 3, count),
+        obs_log_depth=np.where(rng.random(count) < 0.5, rng.normal(0, 5, count), np.nan),
+        obs_std_log_depth=10.0 ** rng.uniform(-6, 2, count),
+        variable_pose=rng.random(images) < draw(st.sampled_from([0.0, 0.5, 1.0])),
+        variable_point=rng.random(points) < draw(st.sampled_from([0.0, 0.5, 1.0])),
+        variable_focal=rng.random(images) < draw(st.sampled_from([0.0, 0.5])),
+    )
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(
+    problem=degenerate_problems(),
+    reprojection_loss=st.sampled_from(Loss),
+    depth_loss=st.sampled_from(Loss),
+    dense=st.booleans(),
+)
+def test_degenerate_geometry(
+    problem: BundleProblem, reprojection_loss: Loss, depth_loss: Loss, dense: bool
+) -> None:
+    """No exception, no warning (they are errors), nothing but finite numbers, no cost increase."""
+    options = BundleOptions(
+        reprojection_loss=reprojection_loss,
+        depth_loss=depth_loss,
+        dense_poses=500 if dense else 0,
+    )
+    result = adjust_bundle(problem, options)
+    assert np.isfinite([result.initial_cost, result.final_cost]).all()
+    assert result.final_cost <= result.initial_cost
+    for name in PARAMETERS:
+        assert np.isfinite(getattr(result, name)).all()
+    again = adjust_bundle(
+        replace(problem, **{name: getattr(result, name) for name in PARAMETERS}), options
+    )
+    assert again.initial_cost == pytest.approx(result.final_cost, rel=1e-9, abs=1e-9)
