@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera, UInt8
-from mpsfm_core.geometry import inside, pixel_centers, rays, scale_pixels
+from mpsfm_core.geometry import inside, pixel_centers, project, rays, scale_pixels
 
 _ROWS = 256
 """Rows of a warp that are computed at once: bounds the memory for large images."""
@@ -15,7 +15,7 @@ _ROWS = 256
 
 def is_pinhole(camera: pycolmap.Camera) -> bool:
     """Whether pixels of the camera are those of a pinhole camera already."""
-    return bool(camera.is_perspective_pinhole and camera.is_undistorted())
+    return bool(camera.is_perspective_pinhole() and camera.is_undistorted())
 
 
 def resized_camera(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:
@@ -47,6 +47,15 @@ def to_original(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64) ->
         return scale_pixels(xy, pinhole.size, (camera.width, camera.height))
     original: Float64 = camera.img_from_cam(rays(pinhole, xy))
     return original
+
+
+def to_view(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64) -> Float64:
+    """Pixels (n, 2) of the original camera as pixels of the undistorted view; NaN where a
+    distortion has no inverse."""
+    if is_pinhole(camera):
+        return scale_pixels(xy, (camera.width, camera.height), pinhole.size)
+    direction: Float64 = camera.cam_from_img(xy)
+    return project(pinhole, np.concatenate([direction, np.ones((len(xy), 1))], axis=1))
 
 
 class Warp:
