@@ -235,7 +235,7 @@ def _fault(camera: pycolmap.Camera, entry: CameraEntry, size: tuple[int, int]) -
             f"the intrinsics are for {entry.size[0]}x{entry.size[1]} pixels; give those of the "
             f"image as it is seen upright, or the images they were made for"
         )
-    if not camera.is_perspective:
+    if not camera.is_perspective():
         return f"{entry.model} images cannot be undistorted to a perspective view"
     center = camera.principal_point_x, camera.principal_point_y
     ratio = [2 * c / s for c, s in zip(center, size, strict=True)]

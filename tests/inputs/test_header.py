@@ -1,0 +1,75 @@
+"""Focal lengths from EXIF, and damaged headers."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from mpsfm_core.inputs.header import Header, read_header
+
+FOCAL_35MM, FOCAL_MM = 0xA405, 0x920A
+PIXELS_X, PIXELS_Y = 0xA002, 0xA003
+PLANE_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
+
+
+def header(**tags: float) -> Header:
+    numbers = {
+        "f35": FOCAL_35MM,
+        "mm": FOCAL_MM,
+        "x": PIXELS_X,
+        "y": PIXELS_Y,
+        "resolution": PLANE_RESOLUTION,
+        "unit": PLANE_UNIT,
+    }
+    return Header(None, 1, {numbers[name]: value for name, value in tags.items()})
+
+
+def test_equivalent_of_full_frame_sensor() -> None:
+    """On a 3:2 sensor 36 mm are as wide as the image."""
+    assert header(f35=36).focal_px(6000, 4000) == pytest.approx(6000)
+
+
+def test_equivalent_is_by_diagonal() -> None:
+    expected = 26 / math.hypot(36, 24) * 5000
+    assert header(f35=26).focal_px(4000, 3000) == pytest.approx(expected)
+    assert header(f35=26).focal_px(3000, 4000) == pytest.approx(expected)
+
+
+def test_focal_plane_resolution() -> None:
+    """A Canon 5D: 35.8 mm for 4368 pixels, resolution in inches."""
+    resolution = 4368 / 35.8 * 25.4
+    found = header(mm=50, resolution=resolution, unit=2).focal_px(4368, 2912)
+    assert found == pytest.approx(50 / 35.8 * 4368)
+    metric = header(mm=50, resolution=resolution / 2.54, unit=3).focal_px(4368, 2912)
+    assert metric == pytest.approx(found)
+
+
+def test_resized_photo() -> None:
+    """The resolution is that of the sensor, the photo has a quarter of its pixels."""
+    tags = {"mm": 50, "resolution": 4368 / 35.8, "unit": 4, "x": 4368, "y": 2912}
+    assert header(**tags).focal_px(1092, 728) == pytest.approx(50 / 35.8 * 1092)
+
+
+def test_cropped_photo_has_no_focal_length() -> None:
+    assert header(f35=26, x=4000, y=3000).focal_px(4000, 2250) is None
+    assert header(f35=26, x=4000, y=3000).focal_px(1000, 751) is not None
+
+
+@pytest.mark.parametrize("tags", [{}, {"mm": 50}, {"f35": 0}, {"mm": 50, "resolution": 0}])
+def test_not_enough(tags: dict[str, float]) -> None:
+    assert header(**tags).focal_px(4000, 3000) is None
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+def test_read_from_files(suffix, write_image) -> None:
+    tags = {FOCAL_MM: 4.25, FOCAL_35MM: 26, PIXELS_X: 80, PIXELS_Y: 60}
+    found = read_header(write_image(f"a{suffix}", tags=tags).read_bytes())
+    assert {tag: found.tags[tag] for tag in tags} == pytest.approx(tags)
+    assert found.focal_px(80, 60) == pytest.approx(26 / math.hypot(36, 24) * 100)
+
+
+def test_any_truncation_is_survived(write_image) -> None:
+    data = write_image("a.jpg", tags={FOCAL_MM: 4.25, FOCAL_35MM: 26}).read_bytes()
+    for length in range(200):
+        read_header(data[:length])

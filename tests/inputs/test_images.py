@@ -1,0 +1,237 @@
+"""From a folder to views: what is found, refused, loaded, and kept."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mpsfm_core.errors import InputError
+from mpsfm_core.inputs import images as module
+from mpsfm_core.inputs.images import ImageSet, load_images
+from mpsfm_core.inputs.options import InputOptions
+
+INTRINSICS = "1: {params: [70, 70, 40, 30], images: all}"
+DISTORTED = "1: {model: SIMPLE_RADIAL, params: [70, 40, 30, 0.2], images: all}"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, write_image) -> Path:
+    write_image("img10.png")
+    write_image("img2.jpg")
+    write_image("side/A.PNG".lower())
+    (tmp_path / "images" / "notes.txt").write_text("no image")
+    (tmp_path / "images" / ".hidden.png").write_bytes(b"no image either")
+    return tmp_path / "images"
+
+
+@pytest.fixture
+def intrinsics(tmp_path: Path) -> Path:
+    path = tmp_path / "intrinsics.yaml"
+    path.write_text(INTRINSICS)
+    return path
+
+
+def refused(*arguments: object) -> str:
+    with pytest.raises(InputError) as caught:
+        load_images(*arguments)
+    return str(caught.value)
+
+
+def write_list(tmp_path: Path, *names: str) -> Path:
+    path = tmp_path / "list.txt"
+    path.write_text("# a comment\n\n" + "\n".join(names) + "\n")
+    return path
+
+
+def test_names_and_natural_order(folder: Path, intrinsics: Path) -> None:
+    found = load_images(folder, intrinsics)
+    assert found.names == ["img2.jpg", "img10.png", "side/a.png"]
+    assert [image.focal_source for image in found] == ["intrinsics"] * 3
+    assert all(image.focal_known for image in found)
+    assert found[0].pinhole.params.tolist() == [70, 70, 40, 30]
+
+
+def test_list_keeps_its_order(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
+    chosen = write_list(tmp_path, "side/a.png", "img2.jpg")
+    assert load_images(folder, intrinsics, chosen).names == ["side/a.png", "img2.jpg"]
+
+
+def test_bad_lists(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
+    message = refused(folder, intrinsics, write_list(tmp_path, "img2.jpg", "img10.pmg"))
+    assert "list.txt" in message and "'img10.pmg'" in message and "'img10.png'" in message
+    twice = write_list(tmp_path, "img2.jpg", "img10.png", "img2.jpg")
+    assert "'img2.jpg' is listed twice" in refused(folder, intrinsics, twice)
+    assert "only one image" in refused(folder, intrinsics, write_list(tmp_path, "img2.jpg"))
+    assert "no images" in refused(folder, intrinsics, write_list(tmp_path))
+    assert "cannot be read" in refused(folder, intrinsics, tmp_path / "absent.txt")
+
+
+def test_bad_folders(tmp_path: Path, write_image) -> None:
+    assert "does not exist" in refused(tmp_path / "absent")
+    (tmp_path / "images").mkdir()
+    assert "no images" in refused(tmp_path / "images")
+    write_image("one.png")
+    message = refused(tmp_path / "images")
+    assert "only one image, 'one.png'" in message and "two or more" in message
+
+
+def test_unreadable_files_are_all_named(folder: Path, intrinsics: Path) -> None:
+    (folder / "broken.jpg").write_bytes(b"hello")
+    (folder / "empty.png").write_bytes(b"")
+    message = refused(folder, intrinsics)
+    assert "broken.jpg" in message and "empty.png" in message
+
+
+def test_truncated_file_is_refused_when_decoded(folder: Path, intrinsics: Path) -> None:
+    path = folder / "img2.jpg"
+    path.write_bytes(path.read_bytes()[:-400])
+    found = load_images(folder, intrinsics)
+    with pytest.raises(InputError, match=r"img2\.jpg cannot be decoded"):
+        found.view(0)
+
+
+def test_focal_length_from_exif(tmp_path: Path, write_image) -> None:
+    for name in ("a.jpg", "b.jpg"):
+        write_image(name, tags={0xA405: 36})
+    found = load_images(tmp_path / "images")
+    assert found[0].focal_source == "exif" and found[0].focal_known
+    assert found[0].camera.focal_length == pytest.approx(36 / 43.2666 * 100, rel=1e-5)
+    assert found[0].camera.camera_id == found[1].camera.camera_id == 1
+
+
+def test_default_focal_length_warns_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        found = load_images(folder)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "3 of 3 images" in caplog.text and "1.2 times" in caplog.text
+    assert found[0].camera.focal_length == pytest.approx(1.2 * 80)
+    assert not found[0].focal_known and found[0].focal_source == "default"
+
+
+def test_rotated_photo_is_upright(tmp_path: Path, write_image, photo) -> None:
+    for name in ("a.png", "b.png"):
+        write_image(name, tags={0x0112: 6, 0xA405: 36})
+    found = load_images(tmp_path / "images")
+    assert found[0].original_size == (60, 80) == found[0].pinhole.size
+    expected = cv2.rotate(photo, cv2.ROTATE_90_CLOCKWISE)
+    assert np.array_equal(found.view(0).image, expected)
+
+
+def test_view_of_a_pinhole_camera(folder: Path, intrinsics: Path, photo) -> None:
+    view = load_images(folder, intrinsics).view(1)
+    assert (view.name, view.mask) == ("img10.png", None)
+    assert np.array_equal(view.image, photo)
+    assert view.camera.size == (80, 60)
+
+
+def test_reduced_view(folder: Path, intrinsics: Path, photo) -> None:
+    found = load_images(folder, intrinsics, None, InputOptions(max_image_size=40))
+    view = found.view(1)
+    assert view.camera.size == (40, 30) and view.camera.params.tolist() == [35, 35, 20, 15]
+    quarters = photo.reshape(30, 2, 40, 2, 3).mean(axis=(1, 3))
+    assert np.abs(view.image - quarters).max() <= 1
+    assert found[1].original_pixels(np.array([[20.0, 15.0]])).tolist() == [[40.0, 30.0]]
+
+
+def test_distorted_view_and_back(folder: Path, tmp_path: Path, photo) -> None:
+    path = tmp_path / "distorted.yaml"
+    path.write_text(DISTORTED)
+    found = load_images(folder, path)
+    view, source = found.view(1), found[1]
+    xy = np.array([[10.5, 8.5], [view.camera.cx, view.camera.cy], [60.5, 40.5]])
+    original = source.original_pixels(xy)
+    assert np.allclose(original[1], [40, 30])
+    for (u, v), (x, y) in zip(xy, original, strict=True):
+        here = view.image[int(v), int(u)].astype(float)
+        patch = cv2.getRectSubPix(photo, (1, 1), (x - 0.5, y - 0.5))[0, 0]
+        assert np.abs(here - patch).max() <= 2
+
+
+def test_masks(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
+    masks = tmp_path / "masks"
+    (masks / "side").mkdir(parents=True)
+    drawn = np.full((60, 80), 255, np.uint8)
+    drawn[:, :20] = 0
+    cv2.imwrite(str(masks / "img2.jpg.png"), drawn)
+    cv2.imwrite(str(masks / "side" / "a.png"), drawn[:, ::-1])
+    found = load_images(folder, intrinsics, None, InputOptions(masks=masks, max_image_size=40))
+    left, none, right = (found.view(i).mask for i in range(3))
+    assert none is None and found.mask(1) is None
+    assert left is not None and right is not None
+    assert not left[:, :10].any() and left[:, 10:].all()
+    assert right[:, :30].all() and not right[:, 30:].any()
+
+
+def test_bad_masks(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
+    masks = tmp_path / "masks"
+    assert "does not exist" in refused(folder, intrinsics, None, InputOptions(masks=masks))
+    masks.mkdir()
+    cv2.imwrite(str(masks / "img2.jpg.png"), np.zeros((5, 5), np.uint8))
+    found = load_images(folder, intrinsics, None, InputOptions(masks=masks))
+    with pytest.raises(InputError, match=r"img2\.jpg\.png has 5x5 pixels"):
+        found.view(0)
+
+
+def keys(folder: Path, text: str, tmp_path: Path, **options: object) -> list[str]:
+    path = tmp_path / "keys.yaml"
+    path.write_text(text)
+    found = load_images(folder, path, None, InputOptions(**options))
+    return [found.pixel_key(index) for index in range(len(found))]
+
+
+def test_pixel_key_changes_exactly_with_the_view(folder: Path, tmp_path: Path, photo) -> None:
+    plain = keys(folder, INTRINSICS, tmp_path)
+    assert plain == keys(folder, INTRINSICS, tmp_path)
+    # Pixels of a pinhole image do not depend on the intrinsics, those of a distorted one do.
+    assert plain == keys(folder, INTRINSICS.replace("70", "75"), tmp_path)
+    distorted = keys(folder, DISTORTED, tmp_path)
+    assert not set(distorted) & set(plain)
+    assert not set(distorted) & set(keys(folder, DISTORTED.replace("0.2", "0.1"), tmp_path))
+    assert not set(plain) & set(keys(folder, INTRINSICS, tmp_path, max_image_size=40))
+    (folder / "img10.png").write_bytes((folder / "img2.jpg").read_bytes())
+    changed = keys(folder, INTRINSICS, tmp_path)
+    assert [a == b for a, b in zip(plain, changed, strict=True)] == [True, False, True]
+
+
+def test_pixel_key_knows_the_mask(folder: Path, tmp_path: Path) -> None:
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    path = masks / "img2.jpg.png"
+    cv2.imwrite(str(path), np.full((60, 80), 255, np.uint8))
+    first = keys(folder, INTRINSICS, tmp_path, masks=masks)
+    cv2.imwrite(str(path), np.eye(60, 80, dtype=np.uint8))
+    second = keys(folder, INTRINSICS, tmp_path, masks=masks)
+    assert [a == b for a, b in zip(first, second, strict=True)] == [False, True, True]
+
+
+def test_views_are_decoded_once_and_forgotten(
+    folder: Path, intrinsics: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded: list[str] = []
+    load = ImageSet._load
+    monkeypatch.setattr(
+        ImageSet, "_load", lambda self, image: decoded.append(image.name) or load(self, image)
+    )
+    monkeypatch.setattr(module, "_CACHED_BYTES", 2 * 60 * 80 * 3)
+    found = load_images(folder, intrinsics)
+    for index in (0, 1, 0, 1, 2, 0):
+        found.view(index)
+    assert decoded == ["img2.jpg", "img10.png", "side/a.png", "img2.jpg"]
+
+
+def test_file_that_changes_its_size(folder: Path, intrinsics: Path, write_image, photo) -> None:
+    found = load_images(folder, intrinsics)
+    write_image("img10.png", photo[:30])
+    with pytest.raises(InputError, match="changed"):
+        found.view(1)
+
+
+def test_shared_scenes(shared_data: Path) -> None:
+    kitchen = shared_data / "data" / "kitchen_example"
+    found = load_images(kitchen / "images", kitchen / "intrinsics.yaml")
+    assert len(found) == 6  # PNG data in files named .JPG
+    assert found.view(0).image.shape == (793, 1393, 3)

@@ -1,0 +1,168 @@
+"""Cameras from intrinsics.yaml and COLMAP models, and what is wrong with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from mpsfm_core.errors import InputError
+from mpsfm_core.inputs.intrinsics import read_intrinsics
+
+SIZE = (640, 480)
+
+
+def read(tmp_path: Path, text: str):
+    path = tmp_path / "intrinsics.yaml"
+    path.write_text(text)
+    return read_intrinsics(path)
+
+
+def refused(tmp_path: Path, text: str, name: str = "a.jpg", size: tuple[int, int] = SIZE) -> str:
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, text).camera(name, size)
+    return str(caught.value)
+
+
+def test_default_models(tmp_path: Path) -> None:
+    cameras = read(tmp_path, "1: {params: [500, 510, 320, 240], images: [a.jpg]}\n"
+                             "2: {params: [500, 320, 240], images: all}")  # fmt: skip
+    first, second = cameras.camera("a.jpg", SIZE), cameras.camera("b/c.jpg", SIZE)
+    assert (first.model_name, first.camera_id) == ("PINHOLE", 1)
+    assert first.params.tolist() == [500, 510, 320, 240]
+    assert (second.model_name, second.camera_id) == ("SIMPLE_PINHOLE", 2)
+    assert (second.width, second.height) == SIZE
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("OPENCV", [500, 500, 320, 240, 0.1, 0.01, 0, 0]),
+        ("SIMPLE_RADIAL_FISHEYE", [300, 320, 240, 0.01]),
+        ("THIN_PRISM_FISHEYE", [300, 300, 320, 240, 0, 0, 0, 0, 0, 0, 0, 0]),
+    ],
+)
+def test_any_model(tmp_path: Path, model: str, params: list[float]) -> None:
+    camera = read(tmp_path, f"7: {{model: {model}, params: {params}}}").camera("a.jpg", SIZE)
+    assert (camera.model_name, camera.params.tolist()) == (model, params)
+
+
+def test_wrong_size_names_everything(tmp_path: Path) -> None:
+    text = "3: {params: [500, 500, 320, 240], width: 640, height: 480, images: all}"
+    message = refused(tmp_path, text, "x/y.jpg", (480, 640))
+    for part in ("intrinsics.yaml", "camera 3", "'x/y.jpg'", "480x640", "640x480"):
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("params", "hint"),
+    [
+        ([1000, 1000, 640, 480], "outside"),  # of an image twice as large
+        ([250, 250, 160, 120], "320x240"),  # of one half as large
+        ([30, 30, 320, 240], "focal length"),
+        ([9000, 9000, 320, 240], "focal length"),
+    ],
+)
+def test_implausible_intrinsics(tmp_path: Path, params: list[float], hint: str) -> None:
+    assert hint in refused(tmp_path, f"1: {{params: {params}, images: all}}")
+
+
+def test_declared_size_allows_an_odd_principal_point(tmp_path: Path) -> None:
+    text = "1: {params: [250, 250, 160, 120], width: 640, height: 480, images: all}"
+    assert read(tmp_path, text).camera("a.jpg", SIZE).principal_point_x == 160
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        ("", "expected numbered cameras"),
+        ("[1, 2]", "expected numbered cameras"),
+        ("1: [", "not valid YAML"),
+        ("a: {params: [1, 2, 3]}", "numbered"),
+        ("1: 5", "expected a mapping"),
+        ("1: {parms: [1, 2, 3]}", "did you mean 'params'"),
+        ("1: {params: 5}", "list of numbers"),
+        ("1: {params: [1, 2, x]}", "list of numbers"),
+        ("1: {params: [1, 2]}", "need a 'model'"),
+        ("1: {model: OPENVC, params: [1, 2, 3]}", "did you mean 'OPENCV'"),
+        ("1: {model: OPENCV, params: [1, 2, 3]}", "has the parameters fx, fy, cx, cy"),
+        ("1: {params: [1, 2, 3], width: 5}", "'width' and 'height'"),
+        ("1: {params: [1, 2, 3], images: a.jpg}", "'all' or a list"),
+        ("{1: {params: [1, 2, 3]}, 2: {params: [1, 2, 3]}}", "only one camera"),
+        (
+            "{1: {params: [1, 2, 3], images: [a]}, 2: {params: [1, 2, 3], images: [a]}}",
+            "two cameras, 1 and 2",
+        ),
+    ],
+)
+def test_wrong_files(tmp_path: Path, text: str, hint: str) -> None:
+    assert hint in refused(tmp_path, text)
+
+
+def test_image_without_camera(tmp_path: Path) -> None:
+    message = refused(tmp_path, "1: {params: [500, 320, 240], images: [a.jpeg]}")
+    assert "no camera for image 'a.jpg'" in message and "did you mean 'a.jpeg'" in message
+
+
+def test_absent_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        read_intrinsics(tmp_path / "none.yaml")
+
+
+def test_spherical_images_are_refused(tmp_path: Path) -> None:
+    message = refused(tmp_path, "1: {model: EQUIRECTANGULAR, params: [640, 480], images: all}")
+    assert "cannot be undistorted" in message
+
+
+@pytest.fixture
+def model() -> pycolmap.Reconstruction:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, 1, 2
+    options.num_points3D = 10
+    options.camera_model_id = pycolmap.CameraModelId.SIMPLE_RADIAL
+    options.camera_params = [1280, 512, 384, 0.05]
+    return pycolmap.synthesize_dataset(options)
+
+
+@pytest.mark.parametrize("form", ["binary", "text", "cameras.txt"])
+def test_colmap_model(tmp_path: Path, model: pycolmap.Reconstruction, form: str) -> None:
+    if form == "binary":
+        model.write_binary(tmp_path)
+    else:
+        model.write_text(tmp_path)
+    found = read_intrinsics(tmp_path / "cameras.txt" if form == "cameras.txt" else tmp_path)
+    assert len(model.images) == 4
+    for image in model.images.values():
+        size = image.camera.width, image.camera.height
+        camera = found.camera(image.name, size)
+        assert camera.camera_id == image.camera_id
+        assert np.allclose(camera.params, image.camera.params)
+    with pytest.raises(InputError, match="no camera for image"):
+        found.camera("other.jpg", SIZE)
+
+
+def test_one_camera_alone_is_for_all(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.txt"
+    path.write_text("# comment\n1 PINHOLE 640 480 500 500 320 240\n")
+    assert read_intrinsics(path).camera("any.jpg", SIZE).camera_id == 1
+    path.write_text("1 PINHOLE 640\n")
+    with pytest.raises(InputError, match=r"cameras\.txt, camera 1"):
+        read_intrinsics(path)
+
+
+def test_folder_without_a_model(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no COLMAP model"):
+        read_intrinsics(tmp_path)
+
+
+def test_shared_scenes(shared_data: Path) -> None:
+    for folder in sorted((shared_data / "data").iterdir()):
+        if (folder / "gt").is_dir():
+            given = read_intrinsics(folder / "intrinsics.yaml")
+            truth = read_intrinsics(folder / "gt")
+            name = sorted((folder / "images").iterdir())[0].name
+            camera = truth.camera(name, truth.entries[0].size)
+            size = camera.width, camera.height
+            assert np.allclose(given.camera(name, size).params, camera.params, atol=1e-3)
