@@ -34,6 +34,8 @@ __all__ = ["BundleOptions", "BundleProblem", "BundleResult", "adjust_bundle"]
 MIN_DAMPING = 1e-10
 """Holds what nothing observes, as the depth of a point that is seen once (our choice)."""
 MAX_DAMPING = 1e16
+MAX_FOCAL_STEP = 1.0
+"""A focal length changes by at most a factor of e in a step (our choice)."""
 CG_TOLERANCE = 1e-3
 """Of the reduced system beyond ``dense_poses`` (our measurement)."""
 MAX_CG_ITERATIONS = 500
@@ -104,11 +106,11 @@ def _minimize(p: Prepared, options: BundleOptions, run: Run) -> BundleResult:
             gain = decrease / promised if promised > 0 else 1.0
             damping = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), MIN_DAMPING)
             growth = 2.0
-            converged = decrease <= tolerated
+            converged = bool(decrease <= tolerated)
         else:
             damping *= growth
             growth *= 2.0
-            converged = promised <= tolerated
+            converged = bool(promised <= tolerated)
         if converged:
             message = "cost change below the tolerance"
             break
@@ -189,6 +191,8 @@ class _NormalEquations:
         delta = self._solve_dense(boost) if self.dense else self._solve_sparse(boost)
         if not np.isfinite(delta).all():
             return np.inf, -np.inf, np.inf
+        focals = delta[self.total.border.shape[1] :]
+        np.clip(focals, -MAX_FOCAL_STEP, MAX_FOCAL_STEP, out=focals)
         for old, new in zip(state[:3], trial[:3], strict=True):
             np.copyto(new, old)
         kernels.move_cameras(delta, self.p.bundle.layout, state, trial)
@@ -208,8 +212,8 @@ class _NormalEquations:
             )
             return costs
 
-        visible, lost, promised = np.sum(self.run(move), axis=0)
-        promised += 0.5 * delta @ (boost * delta - self.total.gradient)
+        visible, lost, promised = (float(x) for x in np.sum(self.run(move), axis=0))
+        promised += 0.5 * float(delta @ (boost * delta - self.total.gradient))
         return visible, cost - visible - lost, promised
 
     def _solve_dense(self, boost: Float64) -> Float64:

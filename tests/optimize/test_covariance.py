@@ -1,0 +1,116 @@
+"""Point covariances against a dense inverse, COLMAP and sampling."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+from mpsfm_core.optimize.bundle_adjustment import BundleOptions, BundleProblem
+from mpsfm_core.optimize.covariance import (
+    DAMPING,
+    depth_variance_of_points,
+    point_covariances,
+)
+from tests.optimize.bundle_reference import (
+    ceres_adjuster,
+    dense_point_information,
+    make_problem,
+    rotation,
+    to_pycolmap,
+)
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_equals_dense_inverse(depth: bool) -> None:
+    problem = make_problem(5, 40, 3.5)
+    problem = problem if depth else replace(problem, obs_log_depth=None)
+    count = len(problem.points)
+    information = dense_point_information(problem) + DAMPING * np.eye(3 * count)
+    inverse = np.linalg.inv(information).reshape(count, 3, count, 3)
+    expected = inverse[np.arange(count), :, np.arange(count)]
+    actual = point_covariances(problem)
+    scale = np.linalg.norm(expected, axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-6)
+    np.testing.assert_array_equal(actual, actual.transpose(0, 2, 1))
+
+
+def test_equals_colmap() -> None:
+    problem = replace(make_problem(8, 300, 4), obs_log_depth=None)
+    rec = to_pycolmap(problem)
+    options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.POINTS)
+    adjuster = ceres_adjuster(rec)
+    theirs = pycolmap.estimate_ba_covariance(options, rec, adjuster)
+    expected = np.stack([theirs.get_point_cov(p + 1) for p in range(300)])
+    np.testing.assert_allclose(point_covariances(problem), expected, rtol=1e-6, atol=1e-12)
+
+
+def test_depth_lowers_the_variance() -> None:
+    problem = make_problem(5, 40, 3)
+    with_depth = np.trace(point_covariances(problem), axis1=1, axis2=2)
+    without = np.trace(point_covariances(replace(problem, obs_log_depth=None)), axis1=1, axis2=2)
+    assert (with_depth < without).all()
+
+
+def test_predicts_the_scatter_of_triangulated_depth() -> None:
+    """Two exact cameras, 1 px noise: linearised triangulation scatters as the covariance says."""
+    rng = np.random.default_rng(0)
+    turns = np.stack([rotation(np.array([0, 0.1, 0])), rotation(np.array([0.1, -0.2, 0.3]))])
+    point = np.array([0.2, -0.1, 4.0])
+    problem = BundleProblem(
+        rotations=turns,
+        translations=np.array([[0.1, 0, 0], [-0.8, 0, 0.2]]),
+        intrinsics=np.array([[1000.0, 1000.0, 500.0, 500.0]]),
+        camera_of_image=np.array([0, 0]),
+        points=point[None],
+        obs_image=np.array([0, 1]),
+        obs_point=np.array([0, 0]),
+        obs_xy=np.zeros((2, 2)),
+        variable_pose=np.zeros(2, dtype=np.bool_),
+    )
+    in_camera = np.einsum("nij,j->ni", turns, point) + problem.translations
+    xy = 1000 * in_camera[:, :2] / in_camera[:, 2:] + 500
+    trivial = BundleOptions(reprojection_loss=0)
+    covariance = point_covariances(replace(problem, obs_xy=xy), trivial)
+    jacobian = np.empty((4, 3))
+    for a in range(3):
+        moved = in_camera + 1e-6 * turns[:, :, a]
+        jacobian[:, a] = ((1000 * moved[:, :2] / moved[:, 2:] + 500 - xy) / 1e-6).ravel()
+    samples = rng.normal(size=(20_000, 4)) @ np.linalg.pinv(jacobian).T
+    for turn in turns:
+        sampled = (samples @ turn[2]).var()
+        predicted = depth_variance_of_points(covariance, turn)
+        assert predicted.shape == (1,)
+        assert predicted[0] == pytest.approx(sampled, rel=0.05)
+
+
+def test_depth_variance_is_the_rotated_last_entry() -> None:
+    rng = np.random.default_rng(0)
+    factors = rng.normal(size=(50, 3, 3))
+    covariances = factors @ factors.transpose(0, 2, 1)
+    turns = np.stack([rotation(v) for v in rng.normal(size=(50, 3))])
+    expected = [(r @ s @ r.T)[2, 2] for r, s in zip(turns, covariances, strict=True)]
+    np.testing.assert_allclose(depth_variance_of_points(covariances, turns), expected, rtol=1e-12)
+    one = depth_variance_of_points(covariances, turns[0])
+    assert one[7] == pytest.approx((turns[0] @ covariances[7] @ turns[0].T)[2, 2], rel=1e-12)
+
+
+def test_unobserved_directions_have_huge_but_finite_variance() -> None:
+    """A single view at any distance, a point behind the camera, and one that nothing sees."""
+    problem = BundleProblem(
+        rotations=rotation(np.array([0.3, -0.2, 0.1]))[None],
+        translations=np.zeros((1, 3)),
+        intrinsics=np.array([[1000.0, 1000.0, 500.0, 500.0]]),
+        camera_of_image=np.array([0]),
+        points=np.array([[0.1, 0.1, 0.01], [0, 0.1, 2], [1, 1, 1e3], [0, 0, -2], [0, 0, 3]]),
+        obs_image=np.zeros(4, dtype=np.int64),
+        obs_point=np.arange(4),
+        obs_xy=np.full((4, 2), 500.0),
+    )
+    covariances = point_covariances(problem)
+    assert np.isfinite(covariances).all()
+    np.testing.assert_allclose(covariances[3:], np.eye(3) / DAMPING * np.ones((2, 1, 1)))
+    values, vectors = np.linalg.eigh(covariances[1])
+    ray = problem.points[1] / np.linalg.norm(problem.points[1])
+    assert values[2] > 1e4 * values[1]
+    assert abs(vectors[:, 2] @ ray) > 1 - 1e-6
