@@ -103,7 +103,7 @@ def _minimize(p: Prepared, options: BundleOptions, run: Run) -> BundleResult:
         tolerated = max(options.function_tolerance, np.finfo(float).eps) * cost
         if np.isfinite(decrease) and decrease >= max(MIN_GAIN * promised, 0.0):
             state, trial, cost = trial, state, trial_cost
-            gain = decrease / promised if promised > 0 else 1.0
+            gain = min(decrease / promised, 1.0) if promised > 0 else 1.0
             damping = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), MIN_DAMPING)
             growth = 2.0
             converged = bool(decrease <= tolerated)
