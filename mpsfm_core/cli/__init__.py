@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli import config, demo, evaluate, models, plugins, reconstruct
+from mpsfm_core.cli import benchmark, config, demo, evaluate, models, plugins, reconstruct
 from mpsfm_core.cli.errors import GuardedGroup
 
 
@@ -35,6 +35,7 @@ def build_app() -> typer.Typer:
     app.command("reconstruct")(reconstruct.reconstruct)
     app.command("demo")(demo.demo)
     app.command("evaluate")(evaluate.evaluate)
+    app.command("benchmark")(benchmark.benchmark)
     app.add_typer(plugins.app, name="plugins")
     app.add_typer(config.app, name="config")
     app.add_typer(models.app, name="models")

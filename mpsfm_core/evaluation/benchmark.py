@@ -1,0 +1,201 @@
+"""Runs configurations and peers on the sets of scene folders, on the same verified matches.
+
+For each scene and configuration, priors, features and matches are computed once for all images of
+the sets, matches only for pairs inside a set; the cache keeps them. Each finished run is a file
+(:mod:`mpsfm_core.evaluation.records`), and a run that has its file already is not repeated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import pycolmap
+
+from mpsfm_core.config import load_config
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.evaluation.methods import OURS, Outcome, Task, run_tasks
+from mpsfm_core.evaluation.peers import PEERS
+from mpsfm_core.evaluation.prior_quality import QUALITIES, prior_settings
+from mpsfm_core.evaluation.records import Record, read_record, record_file, write_record
+from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
+from mpsfm_core.extraction.cache import content_key, digest
+from mpsfm_core.extraction.runner import extract
+from mpsfm_core.inputs.images import load_images
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.providers import hookimpl
+from mpsfm_core.registry import Registry, core_version
+from mpsfm_core.stages import Stages
+
+Done = Callable[[Record, bool], None]
+"""Is told of each record, and whether it was there already."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run.
+
+    ``configs``: names or files. ``buckets``: None for all. ``priors``: of
+    :data:`~mpsfm_core.evaluation.prior_quality.QUALITIES`, our mapper runs with each. ``peers``:
+    of :data:`~mpsfm_core.evaluation.peers.PEERS`. ``overrides``: settings ``KEY=VALUE`` of all
+    configurations. ``workers``: sets that are mapped at the same time.
+    """
+
+    scenes: tuple[Path, ...]
+    configs: tuple[str, ...] = ("benchmark",)
+    buckets: tuple[str, ...] | None = None
+    priors: tuple[str, ...] = ("config",)
+    peers: tuple[str, ...] = tuple(PEERS)
+    overrides: tuple[str, ...] = ()
+    workers: int = 1
+
+
+def run_benchmark(
+    plan: Plan, output: Path, registry: Registry | None = None, done: Done | None = None
+) -> list[Record]:
+    """Run a plan and return the records of all its runs, old and new.
+
+    What a method raises is in its record. Raises :class:`InputError` (or another
+    :class:`~mpsfm_core.errors.MpsfmError` of the extraction) for what no run could do without.
+    """
+    registry = registry or Registry.discover()
+    _check_names("prior", plan.priors, QUALITIES)
+    _check_names("peer", plan.peers, PEERS)
+    scenes = [read_scene(path) for path in plan.scenes]
+    if len({scene.name for scene in scenes}) < len(scenes):
+        raise InputError("two scene folders have the same name, as their results would")
+    only = PairsOfSets()
+    registry.register(only, name="pairs of sets")
+    records = []
+    for scene in scenes:
+        sets = scene.chosen(plan.buckets)
+        only.allow(sets)
+        for config in plan.configs:
+            runs = _SceneRuns(scene, sets, config, plan, output, registry)
+            for record, known in runs():
+                records.append(record)
+                if done is not None:
+                    done(record, known)
+    return records
+
+
+class PairsOfSets:
+    """Plugin that lets only pairs be matched whose images are in one set together."""
+
+    def __init__(self) -> None:
+        self._allowed: set[tuple[str, str]] = set()
+
+    def allow(self, sets: Sequence[EvaluationSet]) -> None:
+        """Allow the pairs of these sets from now on."""
+        self._allowed = {pair for item in sets for pair in combinations(sorted(item.images), 2)}
+
+    @hookimpl
+    def mpsfm_filter_pairs(self, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+        """Those inside a set."""
+        return [(a, b) for a, b in pairs if (min(a, b), max(a, b)) in self._allowed]
+
+
+class _SceneRuns:
+    """All runs of one scene with one configuration."""
+
+    def __init__(
+        self,
+        scene: SceneFolder,
+        sets: Sequence[EvaluationSet],
+        config: str,
+        plan: Plan,
+        output: Path,
+        registry: Registry,
+    ) -> None:
+        self._scene = scene
+        self._sets = sets
+        self._config = config
+        self._config_name = Path(config).stem
+        self._plan = plan
+        self._output = output
+        self._registry = registry
+
+    def __call__(self) -> Iterator[tuple[Record, bool]]:
+        """Records and whether they were there already."""
+        for number, prior in enumerate(self._plan.priors):
+            problem, options = self._problem(prior)
+            methods = {f"{OURS}-{prior}": OURS}
+            if number == 0:  # peers see no prior
+                methods |= {peer: peer for peer in self._plan.peers}
+            places: dict[Task, tuple[EvaluationSet, str]] = {}
+            for item in self._sets:
+                subset = problem.subset(list(item.images))
+                for label, method in methods.items():
+                    task = Task(label, method, subset, options)
+                    key = _key(task)
+                    known = self._known(item, label, key)
+                    if known is not None:
+                        yield known, True
+                    else:
+                        places[task] = item, key
+            for task, outcome in run_tasks(list(places), self._plan.workers):
+                record = self._record(*places[task], task, outcome)
+                write_record(self._output, record)
+                yield record, False
+
+    def _problem(self, prior: str) -> tuple[MappingProblem, MapperOptions]:
+        """Verified matches and priors of all images of the sets."""
+        scene, work = self._scene, self._output / "work" / self._scene.name
+        names = sorted({name for item in self._sets for name in item.images})
+        settings = prior_settings(prior, scene, names, work / "degraded-depth")
+        config = load_config(
+            self._config, (*settings, *self._plan.overrides), registry=self._registry
+        )
+        work.mkdir(parents=True, exist_ok=True)
+        listed = work / "images.txt"
+        listed.write_text("\n".join(names) + "\n", encoding="utf-8")
+        images = load_images(scene.images, scene.intrinsics, listed, config.inputs)
+        extraction = extract(images, config, self._registry, Stages(self._registry))
+        return extraction.problem, config.mapping
+
+    def _known(self, item: EvaluationSet, label: str, key: str) -> Record | None:
+        path = self._output / record_file(self._scene.name, self._config_name, item.name, label)
+        try:
+            record = read_record(path) if path.is_file() else None
+        except InputError:
+            return None
+        return record if record is not None and record.key == key else None
+
+    def _record(self, item: EvaluationSet, key: str, task: Task, outcome: Outcome) -> Record:
+        return Record(
+            self._scene.name,
+            self._config_name,
+            item.bucket,
+            item.name,
+            task.label,
+            key,
+            outcome.poses,
+            {name: self._scene.truth[name] for name in item.images},
+            len(task.problem.pairs),
+            outcome.seconds,
+            outcome.cpu_seconds,
+            outcome.error,
+        )
+
+
+def _key(task: Task) -> str:
+    """Names all that the outcome of a task depends on."""
+    parts: list[object] = [task.method, core_version(), pycolmap.__version__]
+    if task.method == OURS:
+        parts.append(task.options.model_dump(mode="json"))
+        parts += [digest(image) for image in task.problem.images]
+    else:
+        parts += [
+            [image.name, image.camera.params.tolist(), digest(image.keypoints)]
+            for image in task.problem.images
+        ]
+    return content_key(parts, [digest(pair) for pair in task.problem.pairs])
+
+
+def _check_names(what: str, names: Iterable[str], known: Collection[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise InputError(f"no {what} {name!r}{did_you_mean(name, known)}")

@@ -1,0 +1,190 @@
+"""Is one benchmark better than another? Differences of AUC with a paired bootstrap.
+
+Both sides are compared on the sets they share. A resample draws sets with replacement; where a
+bucket has few sets it draws image pairs instead, those of the two orders together. Pairs of a set
+share images, so such intervals are narrower than those of new sets would be; the table says what
+was drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
+from pathlib import Path
+
+import numpy as np
+
+from mpsfm_core.data import Float64
+from mpsfm_core.errors import InputError
+from mpsfm_core.evaluation.pose_auc import (
+    CONVENTIONS,
+    THRESHOLDS_DEG,
+    PoseConvention,
+    pose_auc,
+    pose_errors_deg,
+)
+from mpsfm_core.evaluation.records import Record, read_records
+
+MIN_SETS = 6
+"""Fewer sets have too few different resamples to tell a 95 % interval (ours)."""
+RESAMPLES = 2000
+_CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Second side minus first, in percent points of AUC.
+
+    ``auc``: threshold -> (first, second). ``interval``: threshold -> 95 % interval of the
+    difference. ``p_value``: threshold -> two-sided, share of resamples that say the opposite.
+    ``unit``: what was drawn, ``sets`` or ``pairs``.
+    """
+
+    scene: str
+    config: str
+    bucket: str
+    method: str
+    sets: int
+    unit: str
+    auc: Mapping[int, tuple[float, float]]
+    interval: Mapping[int, tuple[float, float]]
+    p_value: Mapping[int, float]
+
+
+def read_side(place: str) -> dict[str, list[Record]]:
+    """Records of a benchmark by method; ``DIR``, or ``DIR:METHOD`` for one method, called ``*``."""
+    folder, colon, method = place.rpartition(":")
+    if not colon or Path(place).is_dir():
+        folder, method = place, ""
+    sides: dict[str, list[Record]] = {}
+    for record in read_records(Path(folder)):
+        sides.setdefault(record.label, []).append(record)
+    if not method:
+        return sides
+    if method not in sides:
+        raise InputError(f"{folder}: no method {method!r}; it has {', '.join(sides)}")
+    return {"*": sides[method]}
+
+
+def compare(
+    first: Mapping[str, Sequence[Record]],
+    second: Mapping[str, Sequence[Record]],
+    convention: PoseConvention = CONVENTIONS["paper"],
+    seed: int = 0,
+) -> list[Difference]:
+    """Differences for each scene, configuration, bucket and method that both sides have.
+
+    Raises :class:`InputError` when they share nothing.
+    """
+    rng = np.random.default_rng(seed)
+    differences = []
+    for method in first:
+        if method not in second:
+            continue
+        matched = _matched(first[method], second[method])
+        for (scene, config, bucket), pairs in matched.items():
+            errors = [tuple(_unordered(r, convention) for r in pair) for pair in pairs]
+            place = (scene, config, bucket, _name(method, pairs[0]))
+            differences.append(_difference(place, errors, convention, rng))
+    if not differences:
+        raise InputError("the two benchmarks have no set and method in common")
+    return differences
+
+
+def describe(
+    differences: Sequence[Difference], convention: PoseConvention = CONVENTIONS["paper"]
+) -> str:
+    """A Markdown table, the convention in words above it."""
+    head = ["scene", "bucket", "method", "sets", "drawn"]
+    head += [f"AUC@{t}° (95 %, p)" for t in THRESHOLDS_DEG]
+    lines = [head, ["---"] * len(head)]
+    for d in differences:
+        cells = [d.scene, d.bucket, d.method, str(d.sets), d.unit]
+        for t in THRESHOLDS_DEG:
+            (a, b), (low, high) = d.auc[t], d.interval[t]
+            cells.append(f"{a:.1f} → {b:.1f} ({low:+.1f} .. {high:+.1f}, {d.p_value[t]:.3f})")
+        lines.append(cells)
+    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return (
+        f"Pose AUC in percent, convention `{convention.name}`: {convention.description}. "
+        f"Paired bootstrap of {RESAMPLES} resamples.\n\n{table}\n"
+    )
+
+
+_Place = tuple[str, str, str, str]
+_SetErrors = tuple[Float64, ...]
+"""Errors (pairs, orders) of both sides on one set."""
+
+
+def _matched(
+    first: Iterable[Record], second: Iterable[Record]
+) -> dict[tuple[str, str, str], list[tuple[Record, Record]]]:
+    """Records of the same set of images, by scene, configuration and bucket."""
+    others = {record.name[:3]: record for record in second}
+    matched: dict[tuple[str, str, str], list[tuple[Record, Record]]] = {}
+    for record in first:
+        other = others.get(record.name[:3])
+        if other is not None and set(other.truth) == set(record.truth):
+            place = record.scene, record.config, record.bucket
+            matched.setdefault(place, []).append((record, other))
+    return matched
+
+
+def _name(method: str, pair: tuple[Record, Record]) -> str:
+    return f"{pair[0].label} → {pair[1].label}" if method == "*" else method
+
+
+def _unordered(record: Record, convention: PoseConvention) -> Float64:
+    """Errors (pairs, orders): those of both orders of a pair in one row."""
+    errors = pose_errors_deg(record.estimated, record.truth, convention)
+    count = len(record.truth)
+    if not convention.ordered:
+        return errors[:, None]
+    row = {pair: number for number, pair in enumerate(permutations(range(count), 2))}
+    rows = [[row[a, b], row[b, a]] for a, b in combinations(range(count), 2)]
+    return np.asarray(errors[np.array(rows)])
+
+
+def _difference(
+    place: _Place,
+    errors: Sequence[_SetErrors],
+    convention: PoseConvention,
+    rng: np.random.Generator,
+) -> Difference:
+    unit = "sets" if len(errors) >= MIN_SETS else "pairs"
+    drawn = np.stack([_gain(_resampled(errors, unit, rng), convention) for _ in range(RESAMPLES)])
+    low, high = np.quantile(drawn, [(1 - _CONFIDENCE) / 2, (1 + _CONFIDENCE) / 2], axis=0)
+    opposite = np.minimum((drawn <= 0).mean(axis=0), (drawn >= 0).mean(axis=0))
+    both = [_areas([side[k] for side in errors], convention) for k in (0, 1)]
+    columns = list(enumerate(THRESHOLDS_DEG))
+    return Difference(
+        *place,
+        sets=len(errors),
+        unit=unit,
+        auc={t: (float(both[0][k]), float(both[1][k])) for k, t in columns},
+        interval={t: (float(low[k]), float(high[k])) for k, t in columns},
+        p_value={t: float(min(1.0, 2 * opposite[k])) for k, t in columns},
+    )
+
+
+def _resampled(
+    errors: Sequence[_SetErrors], unit: str, rng: np.random.Generator
+) -> list[_SetErrors]:
+    """The same units of both sides, drawn with replacement."""
+    if unit == "sets":
+        return [errors[k] for k in rng.integers(len(errors), size=len(errors))]
+    joined = [np.concatenate([side[k] for side in errors]) for k in (0, 1)]
+    rows = rng.integers(len(joined[0]), size=len(joined[0]))
+    return [(joined[0][rows], joined[1][rows])]
+
+
+def _gain(errors: Sequence[_SetErrors], convention: PoseConvention) -> Float64:
+    first, second = (_areas([side[k] for side in errors], convention) for k in (0, 1))
+    return second - first
+
+
+def _areas(errors: Sequence[Float64], convention: PoseConvention) -> Float64:
+    """AUC in percent at all thresholds of errors that are pooled."""
+    pooled = np.concatenate([values.ravel() for values in errors])
+    return 100 * np.array(list(pose_auc(pooled, convention).values()))

@@ -1,0 +1,127 @@
+"""What is compared: our mapper and its peers, each run in a process of its own.
+
+A mapper that crashes takes its process with it, not the benchmark.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+
+import pycolmap
+from threadpoolctl import threadpool_limits
+
+from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.evaluation.peers import run_peer
+from mpsfm_core.evaluation.pose_auc import Pose
+from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.testing.problems import mapping_problem
+from mpsfm_core.testing.scenes import arc_poses, room_scene
+
+OURS = "ours"
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a method made of a set.
+
+    ``poses``: of its largest model, by image name. ``seconds``: wall clock; ``cpu_seconds``: of
+    the process, which other jobs on the machine do not stretch. ``error``: why it failed, empty
+    if it did not.
+    """
+
+    poses: dict[str, Pose] = field(default_factory=dict)
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    error: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One run: ``method`` is :data:`OURS` or the name of a peer."""
+
+    label: str
+    method: str
+    problem: MappingProblem
+    options: MapperOptions
+
+
+def run_tasks(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, Outcome]]:
+    """Run tasks in ``workers`` processes; yields them as they are done."""
+    lanes = _Lanes()
+    pool = ThreadPoolExecutor(max(1, workers), thread_name_prefix="mpsfm-benchmark")
+    try:
+        futures: dict[Future[Outcome], Task] = {pool.submit(lanes.run, t): t for t in tasks}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        lanes.close()
+
+
+def run_method(method: str, problem: MappingProblem, options: MapperOptions) -> Outcome:
+    """Run a method here and now; what it raises becomes the outcome's error."""
+    started, cpu_started = time.perf_counter(), time.process_time()
+    poses: dict[str, Pose] = {}
+    error = ""
+    try:
+        with threadpool_limits(1):
+            poses = _ours(problem, options) if method == OURS else run_peer(method, problem)
+    except Exception as raised:  # whatever a mapper raises is its result
+        error = f"{type(raised).__name__}: {raised}"
+    seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
+    return Outcome(poses, seconds, cpu_seconds, error)
+
+
+def _ours(problem: MappingProblem, options: MapperOptions) -> dict[str, Pose]:
+    models = mapper.reconstruct(problem, options).reconstructions
+    if not models:
+        return {}
+    return {image.name: (image.rotation, image.translation) for image in models[0].images}
+
+
+class _Lanes:
+    """A process for each thread that asks for one, and a new one when it died."""
+
+    def __init__(self) -> None:
+        self._local = threading.local()
+        self._lock = threading.Lock()
+        self._processes: list[ProcessPoolExecutor] = []
+
+    def run(self, task: Task) -> Outcome:
+        """Run a task in the process of the calling thread."""
+        process = getattr(self._local, "process", None) or self._start()
+        try:
+            return process.submit(run_method, task.method, task.problem, task.options).result()
+        except BrokenProcessPool:
+            self._start()
+            return Outcome(error="its process died")
+
+    def close(self) -> None:
+        """End all processes."""
+        for process in self._processes:
+            process.shutdown(wait=True, cancel_futures=True)
+
+    def _start(self) -> ProcessPoolExecutor:
+        # Forked processes would inherit locks of threads that do not exist in them.
+        context = multiprocessing.get_context("spawn")
+        process = ProcessPoolExecutor(1, mp_context=context, initializer=_prepare)
+        self._local.process = process
+        with self._lock:
+            self._processes.append(process)
+        return process
+
+
+def _prepare() -> None:
+    """Silence COLMAP, and load the compiled loops, which would otherwise count for the first
+    set."""
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    camera = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
+    problem = mapping_problem(room_scene(), camera, arc_poses(3, 8.0), map_width=48)
+    run_method(OURS, problem, MapperOptions())

@@ -1,0 +1,82 @@
+"""Depth of a stated quality for a scene whose true depth is known.
+
+``sensor``: the true depth, declared good to 1 %: an upper bound. ``degraded``: the true depth with
+the errors of :mod:`mpsfm_core.testing.degraded_depth`, declared honestly: stands for a good
+monocular network. ``config``: what the configuration's own provider predicts.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+
+from mpsfm_core.data import Float32
+from mpsfm_core.errors import InputError
+from mpsfm_core.evaluation.scene_folder import SceneFolder
+from mpsfm_core.testing.degraded_depth import DepthErrors, degrade_depth
+
+QUALITIES = ("sensor", "degraded", "config")
+SENSOR_STD = 0.01
+"""Declared relative std of the true depth."""
+_MILLIMETRE = 0.001
+
+
+def prior_settings(
+    quality: str, scene: SceneFolder, images: Iterable[str], work: Path
+) -> tuple[str, ...]:
+    """Settings ``KEY=VALUE`` that make a configuration use depth of a quality.
+
+    ``work``: folder where degraded maps of the images are written. Raises :class:`InputError`
+    when the scene has no true depth to make it of.
+    """
+    if quality == "config":
+        return ()
+    if scene.depth is None:
+        raise InputError(f"{scene.path}: prior {quality!r} needs true depth in gt_depth/")
+    if quality == "sensor":
+        return _from_files(scene.depth, SENSOR_STD)
+    errors = DepthErrors()
+    for image in images:
+        stem = PurePosixPath(image).with_suffix("")
+        target = work / f"{stem}.png"
+        if not target.is_file():
+            degraded = degrade_depth(read_depth(scene.depth / f"{stem}.png"), str(stem), errors)
+            write_depth(target, degraded)
+    return _from_files(work, round(errors.std, 3))
+
+
+def read_depth(path: Path) -> Float32:
+    """True depth (h, w) in metres, 0 where unknown; raises :class:`InputError`."""
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if stored is None or stored.ndim != 2 or stored.dtype != np.uint16:
+        raise InputError(f"{path}: no 16-bit depth image")
+    return np.asarray(stored * np.float32(_MILLIMETRE))
+
+
+def write_depth(path: Path, depth: Float32) -> None:
+    """Write depth in metres as 16-bit PNG in millimetres; what does not fit becomes 0."""
+    stored = np.rint(np.nan_to_num(depth, nan=0.0, posinf=0.0) / _MILLIMETRE)
+    stored = np.where((stored > 0) & (stored <= np.iinfo(np.uint16).max), stored, 0)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}")
+    ok, data = cv2.imencode(".png", stored.astype(np.uint16))
+    assert ok
+    temporary.write_bytes(data.tobytes())
+    temporary.replace(path)
+
+
+def _from_files(folder: Path, std: float) -> tuple[str, ...]:
+    return (
+        "depth.use=files",
+        f"depth.options.directory={json.dumps(str(folder.resolve()))}",
+        "depth.options.suffix=.png",
+        f"depth.options.scale={_MILLIMETRE}",
+        f"depth.options.relative_std={std}",
+        # The declared std is the total one already.
+        "depth.calibration={std_scale: 1, relative_std: 0, std_floor: 0}",
+        "normals.use=from-depth",
+    )

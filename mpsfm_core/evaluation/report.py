@@ -1,0 +1,190 @@
+"""One table of a benchmark: Markdown for people, JSON for programs, HTML with recall curves."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mpsfm_core.data import Float64
+from mpsfm_core.evaluation.pose_auc import (
+    CONVENTIONS,
+    THRESHOLDS_DEG,
+    PoseConvention,
+    pose_auc,
+    pose_errors_deg,
+)
+from mpsfm_core.evaluation.records import Record
+
+ALL_SCENES = "all scenes"
+_COLORS = ("#1b6ca8", "#d1495b", "#2e8b57", "#e08e0b", "#7b4fa3", "#5c5c5c", "#17a2b8", "#a0522d")
+_PLOT = (440, 260)
+_RANGE_DEG = 20
+
+
+Group = tuple[str, str, str, str]
+"""Scene, configuration, bucket and method."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method on a bucket.
+
+    ``auc``: threshold in degrees -> percent, errors of all sets pooled. ``registered``: share of
+    the images. ``cpu_seconds``, ``seconds``: mean of a set. ``failed``: sets on which it raised.
+    """
+
+    scene: str
+    config: str
+    bucket: str
+    method: str
+    sets: int
+    pairs: int
+    auc: Mapping[int, float]
+    registered: float
+    seconds: float
+    cpu_seconds: float
+    failed: int
+
+    @property
+    def place(self) -> Group:
+        """Which group of records the row is about."""
+        return self.scene, self.config, self.bucket, self.method
+
+
+def errors_of(records: Iterable[Record], convention: PoseConvention) -> Float64:
+    """Errors in degrees of all image pairs of some records, one after the other."""
+    return np.concatenate(
+        [pose_errors_deg(record.estimated, record.truth, convention) for record in records]
+    )
+
+
+def grouped(records: Iterable[Record]) -> dict[Group, list[Record]]:
+    """Records by scene, configuration, bucket and method; if there are several scenes, also
+    pooled over them as the scene :data:`ALL_SCENES`."""
+    records = list(records)
+    groups: dict[Group, list[Record]] = {}
+    several = len({record.scene for record in records}) > 1
+    for scene in (None, ALL_SCENES) if several else (None,):
+        for r in records:
+            groups.setdefault((scene or r.scene, r.config, r.bucket, r.label), []).append(r)
+    return groups
+
+
+def make_rows(
+    records: Iterable[Record], convention: PoseConvention = CONVENTIONS["paper"]
+) -> list[Row]:
+    """The table's rows, in the order of the records."""
+    rows = []
+    for key, group in grouped(records).items():
+        areas = pose_auc(errors_of(group, convention), convention)
+        images = sum(len(record.truth) for record in group)
+        rows.append(
+            Row(
+                *key,
+                sets=len(group),
+                pairs=sum(record.pairs for record in group),
+                auc={threshold: 100 * area for threshold, area in areas.items()},
+                registered=sum(len(record.estimated) for record in group) / images,
+                seconds=float(np.mean([record.seconds for record in group])),
+                cpu_seconds=float(np.mean([record.cpu_seconds for record in group])),
+                failed=sum(bool(record.error) for record in group),
+            )
+        )
+    return rows
+
+
+def markdown(rows: Sequence[Row], convention: PoseConvention = CONVENTIONS["paper"]) -> str:
+    """A table for each scene and configuration, the convention in words above it."""
+    parts = [f"Pose AUC in percent, convention `{convention.name}`: {convention.description}."]
+    header = ["bucket", "sets", "method", *(f"AUC@{t}°" for t in THRESHOLDS_DEG)]
+    header += ["registered", "CPU s / set", "failed"]
+    for scene, config in dict.fromkeys((row.scene, row.config) for row in rows):
+        parts.append(f"### {scene}, configuration `{config}`")
+        lines = [header, ["---"] * 3 + ["---:"] * (len(header) - 3)]
+        lines += [_cells(row) for row in rows if (row.scene, row.config) == (scene, config)]
+        parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def write_report(output: Path, records: Sequence[Record]) -> None:
+    """Write ``report.md``, ``report.json`` and ``report.html``; the JSON has all conventions."""
+    convention = CONVENTIONS["paper"]
+    rows = make_rows(records)
+    (output / "report.md").write_text(markdown(rows, convention), encoding="utf-8")
+    content = {
+        name: {
+            "description": other.description,
+            "auc_unit": "percent",
+            "rows": [asdict(row) for row in make_rows(records, other)],
+        }
+        for name, other in CONVENTIONS.items()
+    }
+    errors = [[*record.name, record.error] for record in records if record.error]
+    text = json.dumps({"conventions": content, "errors": errors}, indent=1)
+    (output / "report.json").write_text(text + "\n", encoding="utf-8")
+    (output / "report.html").write_text(_page(rows, records, convention), encoding="utf-8")
+
+
+def _cells(row: Row) -> list[str]:
+    areas = [f"{row.auc[t]:.1f}" for t in THRESHOLDS_DEG]
+    rest = [f"{row.registered:.0%}", f"{row.cpu_seconds:.2f}", str(row.failed or "")]
+    return [row.bucket, str(row.sets), row.method, *areas, *rest]
+
+
+def _page(rows: Sequence[Row], records: Sequence[Record], convention: PoseConvention) -> str:
+    """One self-contained page: a table and recall curves for each bucket."""
+    parts = [
+        "<!doctype html><meta charset='utf-8'><title>Benchmark</title>",
+        "<style>body{font:14px sans-serif;margin:2em}td,th{padding:2px 10px;text-align:right}"
+        "td:first-child,th:first-child{text-align:left}</style>",
+        f"<p>Pose AUC in percent, convention {html.escape(convention.name)}: "
+        f"{html.escape(convention.description)}.</p>",
+    ]
+    groups = grouped(records)
+    for place in dict.fromkeys((row.scene, row.config, row.bucket) for row in rows):
+        here = [row for row in rows if (row.scene, row.config, row.bucket) == place]
+        parts.append(f"<h3>{html.escape(', '.join(place))}</h3>")
+        parts.append(_table(here))
+        curves = {}
+        for row in here:
+            curves[row.method] = errors_of(groups[row.place], convention)
+        parts.append(_curves(curves))
+    return "\n".join(parts) + "\n"
+
+
+def _table(rows: Sequence[Row]) -> str:
+    head = ["method", *(f"AUC@{t}°" for t in THRESHOLDS_DEG), "registered", "CPU s / set", "failed"]
+    lines = ["".join(f"<th>{cell}</th>" for cell in head)]
+    lines += ["".join(f"<td>{html.escape(c)}</td>" for c in _cells(row)[2:]) for row in rows]
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
+
+
+def _curves(errors: Mapping[str, Float64]) -> str:
+    """Recall over the error's threshold, a drawing in SVG."""
+    width, height = _PLOT
+    shapes = [f"<rect width='{width}' height='{height}' fill='none' stroke='#999'/>"]
+    for degrees in range(0, _RANGE_DEG + 1, 5):
+        x = degrees / _RANGE_DEG * width
+        shapes.append(f"<path d='M{x} 0V{height}' stroke='#ddd'/>")
+        shapes.append(f"<text x='{x}' y='{height + 16}' text-anchor='middle'>{degrees}°</text>")
+    for number, (method, values) in enumerate(errors.items()):
+        color = _COLORS[number % len(_COLORS)]
+        below = np.sort(values[values <= _RANGE_DEG])
+        across = np.concatenate([[0.0], np.repeat(below, 2), [_RANGE_DEG]]) * (width / _RANGE_DEG)
+        recall = np.repeat(np.arange(len(below) + 1), 2) / len(values)
+        points = " ".join(
+            f"{a:.1f},{height * (1 - b):.1f}"
+            for a, b in zip(across.tolist(), recall.tolist(), strict=True)
+        )
+        shapes.append(f"<polyline points='{points}' fill='none' stroke='{color}'/>")
+        y = 16 + 16 * number
+        shapes.append(f"<text x='{width + 12}' y='{y}' fill='{color}'>{html.escape(method)}</text>")
+    return (
+        f"<svg viewBox='-20 -10 {width + 260} {height + 40}' width='{width + 260}' "
+        f"height='{height + 40}' font-size='12'>{''.join(shapes)}</svg>"
+    )
