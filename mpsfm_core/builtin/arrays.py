@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import io
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -41,16 +43,13 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
     Colours are in RGB order. Raises :class:`InputError` when the file cannot be read.
     """
     try:
-        if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-        elif path.suffix == ".npy":
-            arrays = {main: np.load(path, allow_pickle=False)}
+        if path.suffix in (".npz", ".npy"):
+            arrays = _read_numpy(path, main)
         elif path.suffix == ".exr":
             arrays = {main: _read_exr(path)}
         else:
             arrays = {main: _read_image(path)}
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path} cannot be read: {error}") from error
     if main not in arrays:
         raise InputError(f"{path} has no array {main!r}, it has {', '.join(arrays) or 'none'}")
@@ -71,6 +70,14 @@ def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> No
             f"{path} has {width}x{height} pixels and so does not cover image {view.name!r} "
             f"({view.camera.width}x{view.camera.height})"
         )
+
+
+def _read_numpy(path: Path, main: str) -> dict[str, NDArray[Any]]:
+    # From memory, because numpy leaves a damaged file open.
+    loaded = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
+    if isinstance(loaded, np.ndarray):
+        return {main: loaded}
+    return {name: loaded[name] for name in loaded.files}
 
 
 def _read_image(path: Path) -> NDArray[Any]:

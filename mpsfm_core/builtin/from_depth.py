@@ -20,7 +20,8 @@ _MIN_SPREAD = 1e-3
 _NOISE_MARGIN = 6.0
 """Standard deviations of the map's own roughness that no edge hides in."""
 _VARIANCE_RANGE = (1e-12, np.pi**2)
-_MAD_TO_STD = 1.4826
+_MEDIAN_BEND = 1.052
+"""Median of the larger of two independent absolute errors of std 1."""
 _BEND_NOISE = np.sqrt(1.5)
 """Std of ``w1 - (w0 + w2) / 2`` for independent errors of std 1."""
 
@@ -50,7 +51,7 @@ class FromDepth:
         xy = rays(view.camera.resized(columns, rows), pixel_centers(columns, rows))[..., :2]
         inverse = 1.0 / np.where(depth.valid, depth.depth, 1.0).astype(np.float64)
         bends = _relative_bends(inverse, depth.valid)
-        roughness = _MAD_TO_STD * float(np.median(bends[bends > 0])) if (bends > 0).any() else 0.0
+        roughness = float(np.median(bends[depth.valid])) / _MEDIAN_BEND if depth.valid.any() else 0
         edges = bends > max(self._options.edge, _NOISE_MARGIN * roughness)
         noise = (roughness / _BEND_NOISE * inverse) ** 2
         radius = max(1, round(self._options.radius * max(rows, columns)))

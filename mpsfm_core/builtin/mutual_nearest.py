@@ -11,6 +11,9 @@ from mpsfm_core.providers import ProviderContext
 
 _BLOCK = 1024
 """Rows compared at once: 32 MB for 8192 features on the other side."""
+_ROUNDING = np.float32(1e-3)
+"""Error of a small distance relative to the descriptors' length, as it is a difference of squares
+in float32."""
 
 
 class MutualNearest:
@@ -63,7 +66,8 @@ def _mutual(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
     pairs = np.stack([rows, best[rows]], axis=1)
     distance = np.sqrt(nearest[rows])
     limit = np.sqrt(np.minimum(second[rows], second_back[mutual]))
-    return pairs, distance, distance / np.maximum(limit, np.float32(1e-9))
+    rounding = _ROUNDING * np.linalg.norm(a[rows], axis=1)  # equal ones have a ratio of 1
+    return pairs, distance, (distance + rounding) / (limit + rounding)
 
 
 def _nearest_two(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:

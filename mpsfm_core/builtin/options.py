@@ -95,4 +95,4 @@ class FromDepthOptions(Options):
     slope_std: float = Field(4.0, ge=0)
     """Angular std in radians for a depth error of relative std 1 (ours: with it FastDepth's
     standardised angular errors have a median of 1.00 of the expected one on the rendered kitchen
-    and of 1.06 against the sensor's normals in the HoloLens room)."""
+    and of 1.08 against the sensor's normals in the HoloLens room)."""
