@@ -79,7 +79,7 @@ def test_formats(name, suffix, tolerance, folder: Path, context: ProviderContext
 @needs_exr
 @pytest.mark.parametrize("channels", [["Z"], ["Y"], ["custom"], ["Z", "A"], ["R", "G", "B"]])
 def test_exr(channels, folder: Path, context: ProviderContext) -> None:
-    write_exr(folder / "side" / "a.exr", {name: DEPTH for name in channels})
+    write_exr(folder / "side" / "a.exr", dict.fromkeys(channels, DEPTH))
     assert np.array_equal(depth_of(folder, context).depth, DEPTH)
 
 

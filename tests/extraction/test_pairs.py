@@ -1,0 +1,60 @@
+"""Pair selection."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mpsfm_core.extraction.options import PairOptions
+from mpsfm_core.extraction.pairs import apply_filters, exhaustive, retrieval, sequential
+
+
+def test_exhaustive() -> None:
+    assert exhaustive(3) == [(0, 1), (0, 2), (1, 2)]
+    assert exhaustive(1) == []
+    assert len(exhaustive(20)) == 190
+
+
+def test_sequential() -> None:
+    assert sequential(4, PairOptions(overlap=2)) == [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)]
+    assert sequential(2, PairOptions(overlap=5)) == [(0, 1)]
+
+
+def test_quadratic() -> None:
+    pairs = sequential(10, PairOptions(overlap=4, quadratic=True))
+    assert [b for a, b in pairs if a == 0] == [1, 2, 4, 8]
+
+
+def unit(*angles_deg: float) -> list[np.ndarray]:
+    radians = np.radians(angles_deg)
+    return list(np.stack([np.cos(radians), np.sin(radians)], axis=1).astype(np.float32))
+
+
+def test_retrieval_takes_the_most_similar() -> None:
+    pairs = retrieval(unit(0, 10, 40, 45), PairOptions(top_k=1))
+    assert pairs == [(0, 1), (2, 3)]
+
+
+def test_retrieval_is_a_union_over_images() -> None:
+    """Image 2 asks for 1 although 1 prefers 0."""
+    assert retrieval(unit(0, 10, 40), PairOptions(top_k=1)) == [(0, 1), (1, 2)]
+
+
+@pytest.mark.parametrize(("least", "expected"), [(0.0, [(0, 1)]), (-1.0, [(0, 1), (0, 2), (1, 2)])])
+def test_retrieval_has_a_least_similarity(least, expected) -> None:
+    descriptors = unit(0, 10, 150)
+    assert retrieval(descriptors, PairOptions(min_similarity=least)) == expected
+
+
+def test_retrieval_never_pairs_an_image_with_itself() -> None:
+    options = PairOptions(top_k=5, min_similarity=-np.inf)
+    assert retrieval(unit(0, 0, 0), options) == [(0, 1), (0, 2), (1, 2)]
+
+
+def test_filters_intersect_and_ignore_order() -> None:
+    names = ["a", "b", "c"]
+    pairs = [(0, 1), (0, 2), (1, 2)]
+    assert apply_filters(pairs, names, []) == pairs
+    answers = [[("b", "a"), ("a", "c")], [("a", "b"), ("b", "c"), ("x", "y")]]
+    assert apply_filters(pairs, names, answers) == [(0, 1)]
+    assert apply_filters(pairs, names, [[]]) == []

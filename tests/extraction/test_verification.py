@@ -1,0 +1,138 @@
+"""Two-view verification against COLMAP itself and against known geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+
+from mpsfm_core.data import PinholeCamera
+from mpsfm_core.extraction.options import VerificationOptions
+from mpsfm_core.extraction.verification import verify
+from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_angle_deg
+from mpsfm_core.testing.scenes import AnalyticScene, Plane, arc_poses, room_scene
+
+CAMERA = PinholeCamera(640, 480, 500.0, 510.0, 318.0, 243.0)
+OTHER = PinholeCamera(480, 640, 450.0, 450.0, 240.0, 320.0)
+POSES = arc_poses(2, 15.0)
+
+
+def relative_pose() -> tuple[np.ndarray, np.ndarray]:
+    a, b = ((pose[:, :3], pose[:, 3]) for pose in POSES)
+    return compose(b, invert(*a))
+
+
+def correspondences(scene: AnalyticScene, count: int, noise: float, camera_b=CAMERA):
+    rng = np.random.default_rng(count)
+    xy = rng.uniform(0, 1, (3 * count, 2)) * CAMERA.size
+    found = scene.correspondences(CAMERA, POSES[0], camera_b, POSES[1], xy)
+    rows = np.flatnonzero(found.visible)[:count]
+    assert len(rows) == count
+    return xy[rows], found.xy_b[rows] + rng.normal(0, noise, (count, 2))
+
+
+def add_outliers(xy_a: np.ndarray, xy_b: np.ndarray, count: int, camera=CAMERA):
+    rng = np.random.default_rng(5)
+    rows = rng.choice(len(xy_a), count, replace=False)
+    xy_b = xy_b.copy()
+    xy_b[rows] = rng.uniform(0, 1, (count, 2)) * camera.size
+    good = np.ones(len(xy_a), dtype=np.bool_)
+    good[rows] = False
+    return xy_a, xy_b, good
+
+
+@pytest.mark.parametrize("camera_b", [CAMERA, OTHER])
+def test_pose_and_inliers(camera_b) -> None:
+    points = correspondences(room_scene(), 300, 0.5, camera_b)
+    xy_a, xy_b, good = add_outliers(*points, 100, camera_b)
+    found = verify(CAMERA, camera_b, xy_a, xy_b, VerificationOptions())
+    rotation, translation = relative_pose()
+    assert (found.reason, found.configuration) == ("", "calibrated")
+    assert rotation_angle_deg(found.rotation @ rotation.T) < 0.3
+    assert angle_between_deg(found.translation, translation) < 1.5
+    assert np.linalg.norm(found.translation) == pytest.approx(1)
+    kept = np.zeros(len(xy_a), dtype=np.bool_)
+    kept[found.inliers] = True
+    assert kept[good].mean() > 0.99
+    assert kept[~good].mean() < 0.15  # a few lie near their epipolar line by chance
+
+
+def test_same_as_colmap() -> None:
+    xy_a, xy_b, _ = add_outliers(*correspondences(room_scene(), 200, 0.5), 80)
+    options = pycolmap.TwoViewGeometryOptions()
+    options.compute_relative_pose = True
+    options.ransac.max_num_trials = 20_000
+    options.ransac.min_inlier_ratio = 0.1
+    options.ransac.random_seed = 3
+    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=CAMERA.params)
+    matches = np.column_stack([np.arange(200), np.arange(200)]).astype(np.uint32)
+    expected = pycolmap.estimate_calibrated_two_view_geometry(
+        camera, xy_a, camera, xy_b, matches, options
+    )
+    found = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(), seed=3)
+    configuration = pycolmap.TwoViewGeometryConfiguration(expected.config)
+    assert found.configuration == configuration.name.lower() == "calibrated"
+    assert found.inliers.tolist() == expected.inlier_matches[:, 0].tolist()
+    assert np.array_equal(found.rotation, expected.cam2_from_cam1.rotation.matrix())
+    assert np.array_equal(found.translation, expected.cam2_from_cam1.translation)
+
+
+def test_deterministic() -> None:
+    xy_a, xy_b, _ = add_outliers(*correspondences(room_scene(), 150, 1.0), 90)
+    first, second = (
+        verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(), seed=1) for _ in range(2)
+    )
+    assert first.inliers.tolist() == second.inliers.tolist()
+    assert np.array_equal(first.rotation, second.rotation)
+
+
+def test_planar_scene() -> None:
+    wall = AnalyticScene((Plane((4.0, 0.0, 0.0), (1.0, 0.2, 0.0)),))
+    xy_a, xy_b = correspondences(wall, 100, 0.3)
+    found = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
+    assert found.configuration in ("planar", "planar or panoramic")
+    assert len(found.inliers) > 90
+    assert rotation_angle_deg(found.rotation @ relative_pose()[0].T) < 5
+
+
+def test_pure_rotation() -> None:
+    angle = np.radians(10)
+    turn = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1, 1, (80, 2)), rng.uniform(3, 6, 80)])
+    xy_a, xy_b = (
+        (p[:, :2] / p[:, 2:]) * [500, 510] + [318, 243] for p in (points, points @ turn.T)
+    )
+    found = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
+    assert found.configuration == "panoramic"
+    assert rotation_angle_deg(found.rotation @ turn.T) < 0.1
+    assert np.linalg.norm(found.translation) < 1e-6
+
+
+def test_too_few_matches() -> None:
+    xy = np.zeros((14, 2))
+    found = verify(CAMERA, CAMERA, xy, xy, VerificationOptions())
+    assert found.reason == "14 matches, at least 15 are needed" and not len(found.inliers)
+    assert verify(CAMERA, CAMERA, xy[:0], xy[:0], VerificationOptions()).reason
+
+
+@pytest.mark.parametrize("count", [20, 40, 250])
+def test_random_matches_are_dropped(count: int) -> None:
+    """Also the many that fit some epipolar geometry because there are many."""
+    rng = np.random.default_rng(count)
+    xy_a, xy_b = rng.uniform(0, 1, (2, count, 2)) * CAMERA.size
+    dropped = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
+    assert "matches" in dropped.reason and not len(dropped.inliers)
+    if count > 100:
+        lenient = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(max_chance=1.0))
+        assert not lenient.reason  # what the number of inliers alone would say
+        assert "by chance" in dropped.reason
+
+
+def test_noisier_keypoints_have_a_larger_threshold() -> None:
+    xy_a, xy_b = correspondences(room_scene(), 200, 6.0)
+    sharp = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
+    wide = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(), std_px=4.0)
+    assert len(wide.inliers) > 180 > len(sharp.inliers)
