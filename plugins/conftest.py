@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from mpsfm_core import ProviderContext
@@ -27,3 +30,22 @@ def context(tmp_path_factory: pytest.TempPathFactory) -> ProviderContext:
     """One thread, no network."""
     store = WeightStore(tmp_path_factory.mktemp("cache"), offline=True)
     return ProviderContext(resolve_weights=store.resolve, threads=1)
+
+
+@pytest.fixture
+def write_onnx(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a model in ONNX's text syntax, with arrays for the names that it does not define.
+
+    ``write_onnx("tiny (float[1,3,h,w] image) => (float[1,1,h,w] depth) {...}", weight=array)``
+    """
+    onnx = pytest.importorskip("onnx")
+
+    def write(text: str, name: str = "tiny.onnx", **arrays: Any) -> Path:
+        model = onnx.parser.parse_model(f'<ir_version: 8, opset_import: ["" : 17]> {text}')
+        for key, value in arrays.items():
+            model.graph.initializer.append(onnx.numpy_helper.from_array(np.asarray(value), key))
+        onnx.checker.check_model(model, full_check=True)
+        onnx.save(model, tmp_path / name)
+        return tmp_path / name
+
+    return write

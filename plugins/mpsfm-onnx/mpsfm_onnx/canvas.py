@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core import PinholeCamera
-from mpsfm_core.data import Float32, UInt8
-from mpsfm_core.geometry import pixel_centers, sample_bilinear
+from mpsfm_core.data import Float32, Float64, UInt8
+from mpsfm_core.geometry import pixel_centers, sample_bilinear, scale_pixels
 from mpsfm_onnx.description import FixedSize, ImageInput, SideSize
 
 _INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
@@ -21,8 +21,8 @@ _INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
 class Canvas:
     """Where the resized image lies on the network's input, all in pixels.
 
-    ``size``: of the canvas; ``image``: of the resized image; ``offset``: of its upper left corner.
-    Each is ``(width, height)``.
+    ``size``: of the canvas; ``image``: of the resized image; ``offset``: of its upper left corner,
+    negative where the canvas crops it. Each is ``(width, height)``.
     """
 
     size: tuple[int, int]
@@ -44,8 +44,10 @@ class Canvas:
             step = rule.multiple_of
             if rule.fit == "stretch":
                 image = size = _scaled(view, scale, step)
-            else:
+            elif rule.fit == "pad":
                 size = (-(-image[0] // step) * step, -(-image[1] // step) * step)
+            else:
+                size = (max(image[0] // step, 1) * step, max(image[1] // step, 1) * step)
         offset = ((size[0] - image[0]) // 2, (size[1] - image[1]) // 2)
         return cls(size, image, offset)
 
@@ -53,23 +55,21 @@ class Canvas:
         """The input tensor with its batch dimension, for an (H, W, 3) RGB image."""
         rgb = np.empty((self.size[1], self.size[0], 3), dtype=np.float32)
         rgb[:] = rule.pad_value
-        (x, y), (width, height) = self.offset, self.image
-        rgb[y : y + height, x : x + width] = _resize(image, self.image, rule.interpolation)
+        (to_x, from_x), (to_y, from_y) = (self._overlap(axis) for axis in (0, 1))
+        rgb[to_y, to_x] = _resize(image, self.image, rule.interpolation)[from_y, from_x]
         values = rgb if rule.channels == "RGB" else rgb[..., ::-1]
-        if rule.dtype != "uint8":
-            mean, std = np.array([rule.mean, rule.std], dtype=np.float32)
-            values = (values * np.float32(rule.scale) - mean) / std
-        else:
-            values = np.rint(values)
+        mean, std = np.array([rule.mean, rule.std], dtype=np.float32)
+        values = (values * np.float32(rule.scale) - mean) / std
         if rule.layout == "NCHW":
             values = values.transpose(2, 0, 1)
-        return np.ascontiguousarray(values[None], dtype=rule.dtype)
+        return np.ascontiguousarray(values[None])
 
     def cut(self, planes: Float32) -> Float32:
         """The part of an output (h, w, c) that shows the view; the output covers the canvas.
 
-        The result covers the view exactly. Where the image's border does not fall between two
-        output pixels, it is sampled bilinearly at half-pixel-correct positions.
+        The result covers the view exactly; it is NaN where the canvas cropped the view. Where the
+        image's border does not fall between two output pixels, it is sampled bilinearly at
+        half-pixel-correct positions.
         """
         height, width = planes.shape[:2]
         scale = (width / self.size[0], height / self.size[1])
@@ -78,20 +78,40 @@ class Canvas:
         edges = np.array([left, top, left + across, top + down])
         if np.abs(edges - np.rint(edges)).max() < 1e-6:
             x0, y0, x1, y1 = np.rint(edges).astype(int)
-            return planes[y0:y1, x0:x1]
+            around = ((max(-y0, 0), max(y1 - height, 0)), (max(-x0, 0), max(x1 - width, 0)), (0, 0))
+            padded = np.pad(planes, around, constant_values=np.nan)
+            return padded[max(y0, 0) :, max(x0, 0) :][: y1 - y0, : x1 - x0]
         columns, rows = max(1, round(across)), max(1, round(down))
         xy = pixel_centers(columns, rows) * (across / columns, down / rows) + (left, top)
         everywhere = np.ones((height, width), dtype=np.bool_)
         sampled = [
-            sample_bilinear(planes[..., c], everywhere, xy.reshape(-1, 2))[0].reshape(rows, columns)
-            for c in range(planes.shape[2])
+            np.where(ok, values, np.nan).reshape(rows, columns)
+            for values, ok in (
+                sample_bilinear(planes[..., c], everywhere, xy.reshape(-1, 2))
+                for c in range(planes.shape[2])
+            )
         ]
         return np.stack(sampled, axis=-1).astype(np.float32)
 
-    def focal(self, camera: PinholeCamera) -> float:
-        """Mean focal length of the resized image, in its pixels."""
+    def camera(self, camera: PinholeCamera) -> PinholeCamera:
+        """The view's camera in pixels of the canvas."""
         resized = camera.resized(*self.image)
-        return (resized.fx + resized.fy) / 2
+        (width, height), (x, y) = self.size, self.offset
+        return PinholeCamera(width, height, resized.fx, resized.fy, resized.cx + x, resized.cy + y)
+
+    def from_view(self, xy: Float64, view: tuple[int, int]) -> Float64:
+        """Pixels (n, 2) of the view of a size as pixels of the canvas."""
+        return scale_pixels(xy, view, self.image) + self.offset
+
+    def to_view(self, xy: Float64, view: tuple[int, int]) -> Float64:
+        """Pixels (n, 2) of the canvas as pixels of the view of a size."""
+        return scale_pixels(xy - np.array(self.offset, dtype=np.float64), self.image, view)
+
+    def _overlap(self, axis: int) -> tuple[slice, slice]:
+        """Where the image lies along an axis (0: x): pixels of the canvas, and of the image."""
+        start = max(self.offset[axis], 0)
+        stop = min(self.offset[axis] + self.image[axis], self.size[axis])
+        return slice(start, stop), slice(start - self.offset[axis], stop - self.offset[axis])
 
 
 def _scaled(size: tuple[int, int], scale: float, step: int = 1) -> tuple[int, int]:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core import DepthPrior, NormalPrior, PinholeCamera
-from mpsfm_core.data import Float32, Float64
+from mpsfm_core.data import Bool, Float32, Float64
+from mpsfm_core.geometry import pixel_centers, rays
 from mpsfm_onnx.description import (
     ConfidenceOutput,
     DepthOutput,
@@ -33,32 +34,69 @@ def planes(output: NDArray[Any], layout: Layout) -> Float32:
 def decode_depth(
     value: Float32,
     rule: DepthOutput,
-    canonical_ratio: float,
-    confidence: Float32 | None = None,
-    confidence_rule: ConfidenceOutput | None = None,
+    camera: PinholeCamera,
+    factor: float = 1.0,
+    std: Float32 | None = None,
+    std_rule: ConfidenceOutput | None = None,
+    valid: Bool | None = None,
 ) -> DepthPrior:
     """Depth and its variance.
 
     Args:
-        value: (h, w), the depth tensor. rule: what it means.
-        canonical_ratio: focal length / canonical focal length (1 without a canonical camera).
-        confidence, confidence_rule: the (h, w) uncertainty tensor and what it means.
+        value: (h, w, c), the depth tensor. rule: what it means.
+        camera: of the view, that ``value`` covers.
+        factor: what the network's depth and std are multiplied by: for the focal length, the unit.
+        std, std_rule: the (h, w) uncertainty tensor and what it means.
+        valid: (h, w), pixels that the network itself calls valid.
     """
-    quantity = value.astype(np.float64) * rule.scale + rule.shift
+    depth = _network_depth(value, rule, camera, valid)
+    usable = np.isfinite(depth) & (depth > rule.valid_min)
+    if rule.valid_max is not None:
+        usable &= depth < rule.valid_max
+    if valid is not None:
+        usable &= valid
+    variance = None
+    if std is not None and std_rule is not None:
+        variance = (factor * _depth_std(depth, std.astype(np.float64), std_rule)) ** 2
+    return DepthPrior.from_arrays(depth * factor, variance, usable, metric=rule.metric)
+
+
+def _network_depth(
+    value: Float32, rule: DepthOutput, camera: PinholeCamera, valid: Bool | None
+) -> Float64:
+    """Depth (h, w) in the network's unit; NaN or infinite where it has no meaning."""
+    height, width = value.shape[:2]
+    xy = rays(camera.resized(width, height), pixel_centers(width, height))[..., :2]
+    quantity = value[..., 0].astype(np.float64) * rule.scale + rule.shift
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         if rule.output == "log-depth":
-            depth = np.exp(quantity)
-        else:
-            positive = np.where(quantity > 0, quantity, np.nan)
-            depth = positive if rule.output == "depth" else 1.0 / positive
-        valid = np.isfinite(depth) & (depth > rule.valid_min)
-        if rule.valid_max is not None:
-            valid &= depth < rule.valid_max
-    variance = None
-    if confidence is not None and confidence_rule is not None:
-        std = _depth_std(depth, confidence.astype(np.float64), confidence_rule)
-        variance = (std * canonical_ratio) ** 2
-    return DepthPrior.from_arrays(depth * canonical_ratio, variance, valid, metric=rule.metric)
+            return np.asarray(np.exp(quantity))
+        if rule.output == "points":
+            points = value.astype(np.float64)
+            quantity = points[..., 2] + z_shift(points, xy, valid)
+        positive: Float64 = np.where(quantity > 0, quantity, np.nan)
+        if rule.output == "disparity":
+            positive = 1.0 / positive
+        elif rule.output == "ray-length":
+            positive = positive / np.sqrt(1 + (xy**2).sum(axis=-1))
+        return positive
+
+
+def z_shift(points: Float64, xy: Float64, valid: Bool | None = None) -> float:
+    """What z of points (h, w, 3) lacks, given the rays ``(x, y, 1)`` they must lie on.
+
+    The shift t minimises ``sum |(x_i, y_i) - xy_i (z_i + t)|^2 / z_i^2``: the reprojection error,
+    but for the shift in its weight, in closed form.
+    """
+    usable = np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
+    if valid is not None:
+        usable &= valid
+    if not usable.any():
+        return 0.0
+    (x_y, z), on_ray = np.split(points[usable], [2], axis=-1), xy[usable]
+    miss = (x_y - on_ray * z) / z
+    slope = on_ray / z
+    return float((miss * slope).sum() / max((slope**2).sum(), 1e-12))
 
 
 def _depth_std(depth: Float64, tensor: Float64, rule: ConfidenceOutput) -> Float64:
@@ -72,15 +110,20 @@ def _depth_std(depth: Float64, tensor: Float64, rule: ConfidenceOutput) -> Float
 
 
 def decode_normals(
-    value: Float32, rule: NormalsOutput, camera: PinholeCamera, kappa: Float32 | None = None
+    value: Float32,
+    rule: NormalsOutput,
+    camera: PinholeCamera,
+    kappa: Float32 | None = None,
+    valid: Bool | None = None,
 ) -> NormalPrior:
     """Normals and their angular variance from (h, w, 3 or more) and the (h, w) concentration.
 
-    Pixels whose normal does not face the ``camera`` of the view are invalid.
+    Pixels whose normal does not face the ``camera`` of the view are invalid, as are those that
+    the network itself does not call ``valid``.
     """
     variance = None if kappa is None else expected_angle(kappa.astype(np.float64)) ** 2
     normals = value[..., :3] * np.array(rule.axes, dtype=np.float32)
-    return NormalPrior.from_arrays(normals, variance, camera=camera)
+    return NormalPrior.from_arrays(normals, variance, valid, camera=camera)
 
 
 def expected_angle(kappa: Float64) -> Float64:

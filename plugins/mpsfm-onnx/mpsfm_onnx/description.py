@@ -42,20 +42,29 @@ class SideSize(Options):
     """Length in pixels of the longer or the shorter side."""
     multiple_of: int = Field(1, gt=0)
     """Both sides of the canvas are multiples of it."""
-    fit: Literal["stretch", "pad"] = "stretch"
-    """To the nearest multiples by stretching, or to the next ones by padding."""
+    fit: Literal["stretch", "pad", "crop"] = "stretch"
+    """To the nearest multiples by stretching, to the next ones by padding, or to the ones before
+    by cutting the border off, where the view then gets no prediction."""
     enlarge: bool = True
     """Whether small images are enlarged."""
 
 
+class IntrinsicsInput(Options):
+    """The tensor of the calibration matrix (1, 3, 3) of the image as it lies on the input."""
+
+    name: str
+    first_pixel: float = Field(0.5, ge=0, le=0.5)
+    """Where the network has the centre of the first pixel."""
+
+
 class ImageInput(Options):
-    """The tensor of the image: ``(value * scale - mean) / std`` of values in 0..255."""
+    """The tensor of the image: ``(value * scale - mean) / std`` of values in 0..255, rounded
+    where the model wants integers."""
 
     name: str | None = None
-    """None: the model's only input."""
+    """None: the model's first input."""
     layout: Layout = "NCHW"
     channels: Literal["RGB", "BGR"] = "RGB"
-    dtype: Literal["float32", "float16", "uint8"] = "float32"
     scale: float = 1.0
     mean: Triple = (0.0, 0.0, 0.0)
     std: Triple = (1.0, 1.0, 1.0)
@@ -65,15 +74,21 @@ class ImageInput(Options):
     interpolation: Literal["linear", "area", "cubic"] = "area"
     """``area`` averages when shrinking and is linear when enlarging."""
     size: Annotated[FixedSize | SideSize, Field(discriminator="mode")]
+    intrinsics: IntrinsicsInput | None = None
+    """For networks that are told the camera."""
+    constants: dict[str, float] = Field(default_factory=dict)
+    """Further inputs that always have one value."""
 
 
 class DepthOutput(Options):
     """The tensor that depth comes from; ``v = value * scale + shift`` is its quantity."""
 
     name: str
-    output: Literal["depth", "disparity", "log-depth"] = "depth"
-    """Depth is ``v``, ``1 / v`` or ``exp(v)``; pixels where ``v <= 0`` are invalid in the first
-    two cases."""
+    output: Literal["depth", "disparity", "log-depth", "ray-length", "points"] = "depth"
+    """``depth``, ``disparity``, ``log-depth``: depth is ``v``, ``1 / v`` or ``exp(v)``.
+    ``ray-length``: ``v`` is the distance to the camera. ``points``: three channels x, y, z whose z
+    lacks a shift, which the known camera tells. Pixels where ``v <= 0`` are invalid, except for
+    log-depth."""
     scale: float = 1.0
     shift: float = 0.0
     """Turn the network's unit into metres (or 1/m), or an affine disparity into a positive one."""
@@ -82,6 +97,11 @@ class DepthOutput(Options):
     canonical_focal: float | None = Field(None, gt=0)
     """Focal length in input pixels for which the network predicts metres: its depth is multiplied
     by ``focal / canonical_focal``, with the focal length of the resized image."""
+    assumed_focal: str | None = None
+    """The tensor with the horizontal focal length in input pixels that the network guessed: its
+    depth is multiplied by ``focal / assumed_focal``."""
+    multiplier: str | None = None
+    """The tensor with a number that turns depth into metres."""
     valid_min: float = Field(0.0, ge=0)
     valid_max: float | None = Field(None, gt=0)
     """Range of depth in which the network is right, before the canonical correction."""
@@ -94,8 +114,14 @@ class ConfidenceOutput(Options):
     output: Literal["confidence", "std", "variance"]
     """``confidence`` c in [0, 1]: std = depth * (1 - c) (Metric3D). ``std`` and ``variance``: in
     the unit of the depth tensor, before the canonical correction."""
-    optional: bool = False
-    """Whether exports without this tensor are accepted."""
+
+
+class MaskOutput(Options):
+    """The tensor that says where depth and normals are valid."""
+
+    name: str
+    minimum: float = 0.5
+    """Valid above it."""
 
 
 class NormalsOutput(Options):
@@ -122,6 +148,17 @@ class Outputs(Options):
     confidence: ConfidenceOutput | None = None
     normals: NormalsOutput | None = None
     kappa: KappaOutput | None = None
+    mask: MaskOutput | None = None
+
+    def names(self) -> set[str]:
+        """Tensors that a model must have."""
+        described = [self.depth, self.normals, self.kappa, self.mask, self.confidence]
+        return {tensor.name for tensor in described if tensor} | self.numbers()
+
+    def numbers(self) -> set[str]:
+        """Tensors that are one number and no map."""
+        found = (self.depth.assumed_focal, self.depth.multiplier) if self.depth else ()
+        return {name for name in found if name}
 
     @model_validator(mode="after")
     def _complete(self) -> Outputs:

@@ -1,73 +1,149 @@
-"""Networks in ONNX files as depth and normals providers."""
+"""Described networks as depth and normals providers.
+
+The ``Described...`` classes are for plugins that bring a description of their own.
+"""
 
 from __future__ import annotations
 
-from mpsfm_core import DepthPrior, NormalPrior, ProviderContext, View
-from mpsfm_core.data import Float32
+from mpsfm_core import DepthPrior, NormalPrior, PinholeCamera, ProviderContext, View
+from mpsfm_core.data import Bool
 from mpsfm_core.errors import ConfigError
-from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.decode import decode_depth, decode_normals
-from mpsfm_onnx.description import DepthOutput, Description, NormalsOutput
+from mpsfm_onnx.description import (
+    DepthOutput,
+    Description,
+    NormalsOutput,
+    Outputs,
+    load_description,
+)
+from mpsfm_onnx.network import Answer, Network
 from mpsfm_onnx.options import OnnxOptions
-from mpsfm_onnx.session import Network
 
 
-class OnnxDepth:
-    """Depth, with the network's variance if it gives one."""
+class DescribedDepth:
+    """Depth, with the network's variance if it gives one.
 
-    def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
-        self._network = Network(options, context)
-        self._rule = _depth_rule(self._network.description)
+    ``weights``, ``sha256``: the ONNX file, None for the description's.
+    """
+
+    def __init__(
+        self,
+        description: Description,
+        context: ProviderContext,
+        weights: str | None = None,
+        sha256: str | None = None,
+    ) -> None:
+        self._rule = _depth_rule(description)
+        self._network = Network(description, context, weights, sha256)
 
     def predict(self, view: View) -> DepthPrior:
         """Depth on the network's own grid."""
-        tensors, canvas = self._network.run(view)
-        return self._depth(view, tensors, canvas)
+        return self._depth(view, self._network.run(view))
 
-    def _depth(self, view: View, tensors: dict[str, Float32], canvas: Canvas) -> DepthPrior:
-        canonical = self._rule.canonical_focal
-        ratio = canvas.focal(view.camera) / canonical if canonical else 1.0
-        value = tensors[self._rule.name][..., 0]
-        certainty = self._network.description.outputs.confidence
-        if certainty is None or certainty.name not in tensors:
-            return decode_depth(value, self._rule, ratio)
-        return decode_depth(value, self._rule, ratio, tensors[certainty.name][..., 0], certainty)
+    def _depth(self, view: View, answer: Answer) -> DepthPrior:
+        rule, outputs = self._rule, self._network.description.outputs
+        certainty = outputs.confidence
+        std = answer.maps.get(certainty.name) if certainty else None
+        return decode_depth(
+            answer.maps[rule.name],
+            rule,
+            view.camera,
+            _factor(rule, answer, view.camera),
+            None if std is None else std[..., 0],
+            certainty,
+            _mask(outputs, answer),
+        )
 
 
-class OnnxNormals:
-    """Normals, with the network's variance if it gives one."""
+class DescribedNormals:
+    """Normals, with the network's variance if it gives one.
 
-    def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
-        self._network = Network(options, context)
-        self._rule = _normals_rule(self._network.description)
+    ``weights``, ``sha256``: the ONNX file, None for the description's.
+    """
+
+    def __init__(
+        self,
+        description: Description,
+        context: ProviderContext,
+        weights: str | None = None,
+        sha256: str | None = None,
+    ) -> None:
+        self._rule = _normals_rule(description)
+        self._network = Network(description, context, weights, sha256)
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         """Normals on the network's own grid; ``depth`` is not used."""
-        tensors, _ = self._network.run(view)
-        return normals_of(tensors, self._network.description, self._rule, view)
+        outputs = self._network.description.outputs
+        return _normals(view, self._network.run(view), outputs, self._rule)
 
 
-class OnnxJoint(OnnxDepth):
+class DescribedJoint(DescribedDepth):
     """Depth and normals in one pass."""
 
-    def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
-        super().__init__(options, context)
-        self._normals_rule = _normals_rule(self._network.description)
+    def __init__(
+        self,
+        description: Description,
+        context: ProviderContext,
+        weights: str | None = None,
+        sha256: str | None = None,
+    ) -> None:
+        self._normals_rule = _normals_rule(description)
+        super().__init__(description, context, weights, sha256)
 
     def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
         """Both priors on the network's own grid."""
-        tensors, canvas = self._network.run(view)
-        normals = normals_of(tensors, self._network.description, self._normals_rule, view)
-        return self._depth(view, tensors, canvas), normals
+        answer = self._network.run(view)
+        outputs = self._network.description.outputs
+        return self._depth(view, answer), _normals(view, answer, outputs, self._normals_rule)
 
 
-def normals_of(
-    tensors: dict[str, Float32], description: Description, rule: NormalsOutput, view: View
-) -> NormalPrior:
-    """The normals of a view among a network's output tensors."""
-    concentration = description.outputs.kappa
-    kappa = tensors[concentration.name][..., concentration.channel] if concentration else None
-    return decode_normals(tensors[rule.name], rule, view.camera, kappa)
+class OnnxDepth(DescribedDepth):
+    """Depth of the network that the options describe."""
+
+    def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
+        description = load_description(options.description)
+        super().__init__(description, context, options.model, options.sha256)
+
+
+class OnnxNormals(DescribedNormals):
+    """Normals of the network that the options describe."""
+
+    def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
+        description = load_description(options.description)
+        super().__init__(description, context, options.model, options.sha256)
+
+
+class OnnxJoint(DescribedJoint):
+    """Depth and normals of the network that the options describe."""
+
+    def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
+        description = load_description(options.description)
+        super().__init__(description, context, options.model, options.sha256)
+
+
+def _normals(view: View, answer: Answer, outputs: Outputs, rule: NormalsOutput) -> NormalPrior:
+    known = outputs.kappa
+    kappa = answer.maps[known.name][..., known.channel] if known else None
+    valid = _mask(outputs, answer)
+    return decode_normals(answer.maps[rule.name], rule, view.camera, kappa, valid)
+
+
+def _mask(outputs: Outputs, answer: Answer) -> Bool | None:
+    rule = outputs.mask
+    return None if rule is None else answer.maps[rule.name][..., 0] > rule.minimum
+
+
+def _factor(rule: DepthOutput, answer: Answer, camera: PinholeCamera) -> float:
+    """What the network's depth is multiplied by: for the focal length of the resized image, and
+    for the network's own scale."""
+    resized, factor = camera.resized(*answer.canvas.image), 1.0
+    if rule.canonical_focal is not None:
+        factor *= (resized.fx + resized.fy) / 2 / rule.canonical_focal
+    if rule.assumed_focal is not None:
+        factor *= resized.fx / answer.numbers[rule.assumed_focal]
+    if rule.multiplier is not None:
+        factor *= answer.numbers[rule.multiplier]
+    return factor
 
 
 def _depth_rule(description: Description) -> DepthOutput:

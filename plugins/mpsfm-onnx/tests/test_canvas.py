@@ -7,6 +7,7 @@ import pytest
 from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.description import FixedSize, ImageInput, SideSize
 
+from mpsfm_core import PinholeCamera
 from mpsfm_core.geometry import pixel_centers, scale_pixels
 
 RULES = [
@@ -70,16 +71,15 @@ def test_painted_image_is_padded_centred_and_normalised():
         np.testing.assert_allclose(tensor[0, channel, 25:], outside[channel], rtol=1e-5)
 
 
-def test_other_layout_channel_order_and_type():
+def test_other_layout_and_channel_order():
     rule = ImageInput(
         layout="NHWC",
         channels="BGR",
-        dtype="uint8",
         size=FixedSize(mode="fixed", width=3, height=2),
     )
     image = np.full((2, 3, 3), (10, 20, 30), dtype=np.uint8)
     tensor = Canvas.plan(rule.size, (3, 2)).paint(image, rule)
-    assert tensor.shape == (1, 2, 3, 3) and tensor.dtype == np.uint8
+    assert tensor.shape == (1, 2, 3, 3)
     assert tensor[0, 0, 0].tolist() == [30, 20, 10]
 
 
@@ -94,3 +94,33 @@ def test_resizing_does_not_move_the_image(interpolation):
         row = Canvas.plan(size, (200, 60)).paint(image, rule)[0, 0, 3]
         dark = (1 - row / 200).sum() * 200 / width
         assert dark == pytest.approx(80, abs=0.1 if interpolation == "area" else 0.35)
+
+
+@pytest.mark.parametrize("stride", [1, 4])
+def test_cropping_and_back(stride):
+    """What is cut off has no value; what is not lies where it was."""
+    size = SideSize(mode="longest", side=100, multiple_of=16, fit="crop")
+    canvas = Canvas.plan(size, (200, 150))
+    assert (canvas.size, canvas.image, canvas.offset) == ((96, 64), (100, 75), (-2, -6))
+    image = np.zeros((150, 200, 3), dtype=np.uint8)
+    image[..., 0] = np.arange(200)
+    painted = canvas.paint(image, ImageInput(size=size))
+    assert painted.shape == (1, 3, 64, 96)
+    np.testing.assert_allclose(painted[0, 0, 0], 2 * (np.arange(96) + 2) + 0.5, atol=0.51)
+    cells = (96 // stride, 64 // stride)
+    positions = scale_pixels(pixel_centers(*cells), cells, canvas.size).astype(np.float32)
+    cut = canvas.cut(positions)
+    rows, columns = cut.shape[:2]
+    xy = scale_pixels(pixel_centers(columns, rows), (columns, rows), (200, 150))
+    outside = (xy[..., 0] < 4) | (xy[..., 0] > 196) | (xy[..., 1] < 12) | (xy[..., 1] > 140)
+    np.testing.assert_array_equal(np.isnan(cut[..., 0]), outside)
+    expected = canvas.from_view(xy[~outside], (200, 150))
+    expected = expected.clip(positions.min(axis=(0, 1)), positions.max(axis=(0, 1)))
+    np.testing.assert_allclose(cut[~outside], expected, rtol=1e-5)
+    np.testing.assert_allclose(canvas.to_view(canvas.from_view(xy, (200, 150)), (200, 150)), xy)
+
+
+def test_the_camera_follows_the_image():
+    canvas = Canvas.plan(FixedSize(mode="fixed", width=40, height=30, fit="pad"), (20, 10))
+    camera = canvas.camera(PinholeCamera(20, 10, 15.0, 16.0, 9.0, 4.0))
+    assert camera == PinholeCamera(40, 30, 30.0, 32.0, 18.0, 8.0 + 5)

@@ -9,10 +9,24 @@ from mpsfm_onnx.description import ConfidenceOutput, DepthOutput, NormalsOutput
 from scipy.integrate import quad
 
 from mpsfm_core import PinholeCamera
+from mpsfm_core.geometry import pixel_centers, unproject
 
 
 def depth_rule(**fields):
     return DepthOutput(name="d", metric=True, **fields)
+
+
+def camera_of(value):
+    """A camera for a map (h, w)."""
+    height, width = np.shape(value)[:2]
+    return PinholeCamera(width, height, 0.8 * width, 0.9 * width, 0.45 * width, 0.6 * height)
+
+
+def decode(value, rule, *more):
+    """Of a map (h, w) or (h, w, c)."""
+    value = np.asarray(value, dtype=np.float32)
+    value = value[..., None] if value.ndim == 2 else value
+    return decode_depth(value, rule, camera_of(value), *more)
 
 
 @pytest.mark.parametrize("kappa", [0.0, 0.01, 0.5, 2.0, 17.0, 300.0])
@@ -39,16 +53,16 @@ def test_cautious_side_of_the_squared_angle():
 
 def test_disparity_and_log_depth():
     value = np.array([[0.5, 2.0, -1.0, 0.0]], dtype=np.float32)
-    disparity = decode_depth(value, depth_rule(output="disparity", scale=2.0, shift=1.0), 1.0)
+    disparity = decode(value, depth_rule(output="disparity", scale=2.0, shift=1.0))
     assert disparity.valid.tolist() == [[True, True, False, True]]
     np.testing.assert_allclose(disparity.depth[0, [0, 1, 3]], [1 / 2, 1 / 5, 1.0])
-    log = decode_depth(value, depth_rule(output="log-depth"), 1.0)
+    log = decode(value, depth_rule(output="log-depth"))
     np.testing.assert_allclose(log.depth[0], np.exp(value[0]), rtol=1e-6)
 
 
 def test_valid_range_is_that_of_the_network_not_of_the_camera():
     rule = depth_rule(canonical_focal=1000.0, valid_max=200.0, valid_min=0.5)
-    prior = decode_depth(np.array([[0.4, 100.0, 199.0, 201.0, np.nan]]), rule, 0.5)
+    prior = decode([[0.4, 100.0, 199.0, 201.0, np.nan]], rule, 0.5)
     assert prior.valid.tolist() == [[False, True, True, False, False]]
     np.testing.assert_allclose(prior.depth[0, 1:3], [50.0, 99.5])
 
@@ -66,8 +80,28 @@ def test_uncertainty_scales_with_the_canonical_correction(output, tensor, std):
     confidence = np.full((1, 1), tensor, dtype=np.float32)
     rule = ConfidenceOutput(name="c", output=output)
     for ratio in (1.0, 0.25, 3.0):
-        prior = decode_depth(np.full((1, 1), 2.0), depth_rule(), ratio, confidence, rule)
+        prior = decode(np.full((1, 1), 2.0), depth_rule(), ratio, confidence, rule)
         assert np.sqrt(prior.variance[0, 0]) == pytest.approx(std * ratio, rel=1e-5)
+
+
+def test_ray_length_becomes_z():
+    z = np.random.default_rng(0).uniform(1, 5, (6, 8))
+    points = unproject(camera_of(z), pixel_centers(8, 6), z)
+    prior = decode(np.linalg.norm(points, axis=-1), depth_rule(output="ray-length"))
+    np.testing.assert_allclose(prior.depth, z, rtol=1e-6)
+
+
+@pytest.mark.parametrize("shift", [0.7, -0.4])
+def test_the_camera_tells_the_shift_of_points(shift):
+    z = np.random.default_rng(0).uniform(1, 5, (6, 8))
+    points = unproject(camera_of(z), pixel_centers(8, 6), z)
+    points[..., 2] -= shift
+    points[2, 3] = (9.0, 9.0, 1.0)  # wrong, and the network says so
+    valid = np.ones(z.shape, dtype=np.bool_)
+    valid[2, 3] = False
+    prior = decode(points, depth_rule(output="points"), 2.0, None, None, valid)
+    np.testing.assert_array_equal(prior.valid, valid)
+    np.testing.assert_allclose(prior.depth[valid], 2 * z[valid], rtol=1e-5)
 
 
 def test_normals_are_turned_into_our_frame_and_normalised():

@@ -8,86 +8,42 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from mpsfm_onnx.decode import expected_angle
 from mpsfm_onnx.description import load_description, shipped_descriptions
+from mpsfm_onnx.network import Network
 from mpsfm_onnx.options import OnnxOptions
 from mpsfm_onnx.providers import OnnxDepth, OnnxJoint, OnnxNormals
 
 from mpsfm_core.calibration.model import DepthCalibration
 from mpsfm_core.errors import ConfigError, WeightsError
-from mpsfm_core.geometry import resize_map
+from mpsfm_core.geometry import pixel_centers, resize_map, unproject
 from mpsfm_core.options import Backend
 from mpsfm_core.registry import Registry
 
 IDENTITY_INPUT = {"size": {"mode": "longest", "side": 64, "enlarge": False}}
+RED = "tiny (float[1,3,h,w] image) => (float[1,1,h,w] out) { out = Gather <axis = 1> (image, red) }"
+"""Its output is the red channel."""
+FIRST = np.array([0])
 
 
-def constant(shape, value):
-    return np.full(shape, value, dtype=np.float32)
+def depth(**fields):
+    return {"depth": {"name": "out", "metric": True, **fields}}
 
 
 @pytest.fixture
-def metric3d(make_model):
-    """A stand-in with the tensors of the public export: depth is the red channel as it is fed."""
-    normals = np.zeros((1, 3, 616, 1064))
-    normals[0, 0], normals[0, 1], normals[0, 2] = 0.36, 0.48, -0.8
-    return make_model(
-        "pixel_values",
-        [1, 3, 616, 1064],
-        constants={
-            "predicted_normal": normals,
-            "normal_confidence": constant((1, 616, 1064), 20.0),
-        },
-        channels={"predicted_depth": (0, [1, 1, 616, 1064])},
-    )
+def red(write_onnx, write_description):
+    """Options of a network that takes the red channel for metres."""
+    model = write_onnx(RED, red=FIRST)
+    description = write_description(input=IDENTITY_INPUT, outputs=depth())
+    return OnnxOptions(description=description, model=str(model))
 
 
-@pytest.mark.parametrize("name", ["metric3d-v2-small", "metric3d-v2-large", "metric3d-v2-giant2"])
-def test_metric3d_interface(metric3d, make_view, context, name):
-    options = OnnxOptions(description=name, model=str(metric3d))
-    view = make_view(640, 480, colour=(90, 5, 6), focal=(700.0, 720.0))
-    depth, normals = OnnxJoint(options, context).predict_joint(view)
-    # 616 / 480 rows limit the size: 821 x 616 of 1064 x 616, of which only the image remains
-    assert depth.shape == normals.shape == (616, 821)
-    assert depth.valid.all() and depth.metric and depth.variance is None
-    focal = (700 * 821 / 640 + 720 * 616 / 480) / 2
-    np.testing.assert_allclose(depth.depth, 90 * focal / 1000, rtol=1e-5)
-    np.testing.assert_allclose(normals.normals[5, 7], [0.36, 0.48, -0.8], rtol=1e-5)
-    np.testing.assert_allclose(normals.variance, expected_angle(np.array(20.0)) ** 2, rtol=1e-5)
-    alone = OnnxNormals(options, context).predict(view)
-    np.testing.assert_array_equal(alone.normals, normals.normals)
-
-
-def test_depth_beyond_the_networks_range_is_invalid(metric3d, make_view, context):
-    options = OnnxOptions(description="metric3d-v2-small", model=str(metric3d))
-    prior = OnnxDepth(options, context).predict(make_view(64, 48, colour=(201, 0, 0)))
-    assert not prior.valid.any()
-
-
-def test_optional_confidence_is_used_when_the_export_has_it(make_model, make_view, context):
-    model = make_model(
-        "pixel_values",
-        [1, 3, 616, 1064],
-        constants={
-            "predicted_depth": constant((1, 1, 616, 1064), 4.0),
-            "confidence": constant((1, 1, 616, 1064), 0.75),
-            "predicted_normal": constant((1, 3, 616, 1064), -1.0),
-            "normal_confidence": constant((1, 616, 1064), 20.0),
-        },
-    )
-    options = OnnxOptions(description="metric3d-v2-small", model=str(model))
-    prior = OnnxDepth(options, context).predict(make_view(1064, 616, focal=(500.0, 500.0)))
-    np.testing.assert_allclose(prior.depth, 2.0, rtol=1e-6)
-    np.testing.assert_allclose(prior.variance, (2.0 * 0.25) ** 2, rtol=1e-5)
-
-
-def test_content_lies_where_it_lies_in_the_view(make_model, write_description, make_view, context):
+def test_content_lies_where_it_lies_in_the_view(write_onnx, write_description, make_view, context):
     """A bright square found in the depth map is the square of the image (pad, half pixels)."""
     description = write_description(
         input={"size": {"mode": "fixed", "width": 128, "height": 160, "fit": "pad"}},
-        outputs={"depth": {"name": "out", "metric": True}},
+        outputs=depth(),
     )
-    model = make_model("in", [1, 3, 160, 128], channels={"out": (1, [1, 1, 160, 128])})
+    model = write_onnx(RED, red=FIRST)
     image = np.full((96, 256, 3), 50, dtype=np.uint8)
     image[20:61, 131:200] = 250
     view = make_view(256, 96, image=image)
@@ -102,15 +58,94 @@ def test_content_lies_where_it_lies_in_the_view(make_model, write_description, m
         assert centre == pytest.approx((start + stop) / 2, abs=0.05)
 
 
-def test_deterministic_and_leaves_the_view_alone(metric3d, make_view, context):
-    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+def test_deterministic_and_leaves_the_view_alone(red, make_view, context):
+    image = np.random.default_rng(0).integers(1, 255, (48, 64, 3), dtype=np.uint8)
     before = image.copy()
-    options = OnnxOptions(description="metric3d-v2-small", model=str(metric3d))
-    provider = OnnxDepth(options, context)
+    provider = OnnxDepth(red, context)
     view = make_view(64, 48, image=image)
     first, second = provider.predict(view), provider.predict(view)
+    np.testing.assert_array_equal(first.depth, image[..., 0])
     np.testing.assert_array_equal(first.depth, second.depth)
     np.testing.assert_array_equal(image, before)
+
+
+def test_integer_models_get_rounded_integers(write_onnx, write_description, make_view, context):
+    text = "tiny (uint8[1,3,h,w] image) => (float[1,3,h,w] out) { out = Cast <to = 1> (image) }"
+    description = write_description(input={**IDENTITY_INPUT, "scale": 0.5}, outputs=depth())
+    options = OnnxOptions(description=description, model=str(write_onnx(text)))
+    prior = OnnxDepth(options, context).predict(make_view(4, 4, colour=(13, 0, 0)))
+    np.testing.assert_array_equal(prior.depth, 6)  # of 6.5, to even
+
+
+def test_the_camera_and_constants_are_told(write_onnx, write_description, make_view, context):
+    """The calibration matrix in the pixels of the padded input, first pixel at 0."""
+    text = """
+    tiny (float[1,3,h,w] image, float[1,3,3] K, int64 steps) => (float[1,c,32,48] out) {
+        number = Cast <to = 1> (steps)
+        three = Expand (number, triple)
+        all = Concat <axis = 1> (K, three)
+        pixel = Reshape (all, twelve)
+        out = Expand (pixel, full)
+    }
+    """
+    size = {"mode": "longest", "side": 40, "multiple_of": 16, "fit": "pad"}
+    intrinsics = {"name": "K", "first_pixel": 0}
+    constants = {"steps": 1800}
+    fed = {"name": "image", "size": size, "intrinsics": intrinsics, "constants": constants}
+    description = write_description(input=fed, outputs=depth())
+    shapes = {"triple": [1, 1, 3], "twelve": [1, 12, 1, 1], "full": [1, 12, 32, 48]}
+    model = write_onnx(text, **{name: np.array(shape) for name, shape in shapes.items()})
+    network = Network(load_description(description), context, str(model))
+    answer = network.run(make_view(80, 60, focal=(100.0, 110.0)))
+    # the image is resized to 40 x 30 and lies at (4, 1) of 48 x 32
+    expected = [[50, 0, 20 + 4 - 0.5], [0, 55, 15 + 1 - 0.5], [0, 0, 1], [1800] * 3]
+    assert answer.maps["out"].shape == (30, 40, 12)
+    np.testing.assert_allclose(answer.maps["out"][7, 9].reshape(4, 3), expected)
+
+
+def test_guessed_focal_length_and_unit(write_onnx, write_description, make_view, context):
+    """Depth Pro's correction and MoGe's scale, on an input that changes the aspect ratio."""
+    text = """
+    tiny (float[1,3,h,w] image) => (float[1,1,h,w] out, float[1] focal, float[1,1] unit) {
+        out = Gather <axis = 1> (image, red)
+        focal = Identity (guess)
+        unit = Identity (metres)
+    }
+    """
+    model = write_onnx(text, red=FIRST, guess=np.float32([50]), metres=np.float32([[0.25]]))
+    description = write_description(
+        input={"size": {"mode": "fixed", "width": 32, "height": 32}},
+        outputs=depth(assumed_focal="focal", multiplier="unit"),
+    )
+    options = OnnxOptions(description=description, model=str(model))
+    view = make_view(64, 16, colour=(8, 0, 0), focal=(120.0, 300.0))
+    prior = OnnxDepth(options, context).predict(view)
+    np.testing.assert_allclose(prior.depth, 8 * (120 * 32 / 64) / 50 * 0.25)
+
+
+def test_mask_applies_to_depth_and_normals(write_onnx, write_description, make_view, context):
+    text = """
+    tiny (float[1,3,h,w] image) => (
+        float[1,1,h,w] out, float[1,3,h,w] normal, float[1,1,h,w] mask)
+    <float[1] back = {-200}> {
+        out = Gather <axis = 1> (image, red)
+        mask = Gather <axis = 1> (image, blue)
+        x_y = Gather <axis = 1> (image, green_green)
+        zero = Sub (x_y, x_y)
+        z = Add (out, back)
+        normal = Concat <axis = 1> (zero, z)
+    }
+    """
+    model = write_onnx(text, red=FIRST, blue=np.array([2]), green_green=np.array([1, 1]))
+    outputs = {**depth(), "normals": {"name": "normal"}, "mask": {"name": "mask", "minimum": 100}}
+    description = write_description(input=IDENTITY_INPUT, outputs=outputs)
+    image = np.full((2, 4, 3), 50, dtype=np.uint8)
+    image[:, :2, 2] = 101
+    options = OnnxOptions(description=description, model=str(model))
+    prior, normals = OnnxJoint(options, context).predict_joint(make_view(4, 2, image=image))
+    for valid in (prior.valid, normals.valid):
+        assert valid.tolist() == [[True, True, False, False]] * 2
+    np.testing.assert_array_equal(normals.normals[0, 0], [0, 0, -1])
 
 
 def test_missing_weights_say_what_to_do(context):
@@ -119,7 +154,7 @@ def test_missing_weights_say_what_to_do(context):
     with pytest.raises(WeightsError, match=r"nowhere\.onnx does not exist"):
         OnnxDepth(OnnxOptions(model="nowhere.onnx"), context)
     with pytest.raises(WeightsError, match="downloads are switched off"):
-        OnnxDepth(OnnxOptions(description="metric3d-v2-small"), context)
+        OnnxDepth(OnnxOptions(description="depth-anything-v2-small"), context)
 
 
 def test_file_that_is_no_model(tmp_path, context):
@@ -129,32 +164,24 @@ def test_file_that_is_no_model(tmp_path, context):
         OnnxDepth(OnnxOptions(model=str(path)), context)
 
 
-def test_model_of_another_description(make_model, context):
-    model = make_model("pixels", [1, 3, 8, 8], constants={"out": constant((1, 1, 8, 8), 1)})
-    with pytest.raises(ConfigError, match=r"wants input 'image'.*has inputs \['pixels'\]"):
-        OnnxDepth(OnnxOptions(model=str(model)), context)
+def test_model_of_another_description(red, context):
+    with pytest.raises(ConfigError, match=r"wants inputs \['image'\] and outputs \['depth'\].*has"):
+        OnnxDepth(OnnxOptions(model=red.model), context)
 
 
-def test_network_without_the_wanted_output(make_model, write_description, context):
-    description = write_description(
-        input=IDENTITY_INPUT, outputs={"depth": {"name": "out", "metric": False}}
-    )
-    model = make_model("in", [1, 3, "h", "w"], constants={"out": constant((4, 4), 1)})
-    options = OnnxOptions(description=description, model=str(model))
+def test_network_without_the_wanted_output(red, context):
     with pytest.raises(ConfigError, match="predicts no normals"):
-        OnnxNormals(options, context)
+        OnnxNormals(red, context)
 
 
-def test_relative_depth_is_not_called_metric(make_model, write_description, make_view, context):
-    description = write_description(
-        input=IDENTITY_INPUT,
-        outputs={"depth": {"name": "out", "output": "disparity", "metric": False}},
+def test_relative_depth_is_not_called_metric(red, write_description, make_view, context):
+    outputs = depth(output="disparity", metric=False)
+    options = OnnxOptions(
+        description=write_description(input=IDENTITY_INPUT, outputs=outputs), model=red.model
     )
-    model = make_model("in", [1, 3, "h", "w"], constants={"out": constant((1, 4, 4), 0.25)})
-    options = OnnxOptions(description=description, model=str(model))
-    prior = OnnxDepth(options, context).predict(make_view(4, 4))
+    prior = OnnxDepth(options, context).predict(make_view(4, 4, colour=(4, 0, 0)))
     assert not prior.metric
-    np.testing.assert_allclose(prior.depth, 4.0)
+    np.testing.assert_allclose(prior.depth, 0.25)
 
 
 def test_description_errors_name_file_and_key(write_description):
@@ -164,6 +191,77 @@ def test_description_errors_name_file_and_key(write_description):
     assert "depth or normals" in str(caught.value)
     with pytest.raises(ConfigError, match="fastdepth"):
         load_description("fastdept")
+
+
+SHIPPED_STAND_INS = {
+    "depth-anything-v2-small": (
+        "(float[b,3,h,w] pixel_values) => (float[b,h,w] predicted_depth)",
+        "depth = Squeeze (meaning, axis) predicted_depth = Reciprocal (depth)",
+    ),
+    "depth-anything-v2-metric": (
+        "(float[b,3,h,w] pixel_values) => (float[b,h,w] predicted_depth)",
+        "predicted_depth = Squeeze (meaning, axis)",
+    ),
+    "depth-pro": (
+        "(float[b,3,h,w] pixel_values) => (float[b,h,w] predicted_depth, float[b] focallength_px)",
+        "predicted_depth = Squeeze (meaning, axis) focallength_px = Identity (guess)",
+    ),
+    "unidepth-v2": (
+        "(float[b,3,h,w] image, float[b,3,3] K) => (float[b,1,h,w] depth)",
+        "depth = Identity (meaning)",
+    ),
+}
+"""Interfaces as documented, with red (0 to 1) as depth."""
+
+
+@pytest.mark.parametrize("name", SHIPPED_STAND_INS)
+def test_shipped_interfaces(name, write_onnx, make_view, context):
+    """Preprocessing undone by the stand-in, so that it sees the red of the view again."""
+    rule = load_description(name).input
+    signature, body = SHIPPED_STAND_INS[name]
+    red = f"red = Gather <axis = 1> ({rule.name}, first) a = Mul (red, std) meaning = Add (a, mean)"
+    model = write_onnx(
+        f"tiny {signature} {{ {red} {body} }}",
+        first=FIRST,
+        std=np.float32(rule.std[0]),
+        mean=np.float32(rule.mean[0]),
+        axis=np.array([1]),
+        guess=np.float32([700]),
+    )
+    view = make_view(640, 480, colour=(102, 5, 6), focal=(500.0, 510.0))
+    prior = OnnxDepth(OnnxOptions(description=name, model=str(model)), context).predict(view)
+    factor = 500 * (1536 / 640) / 700 if name == "depth-pro" else 1.0
+    assert prior.shape == {
+        "depth-pro": (1536, 1536),
+        "unidepth-v2": (462, 616),
+    }.get(name, (518, 686))
+    np.testing.assert_allclose(prior.depth[prior.valid], 0.4 * factor, rtol=1e-3)
+    assert prior.valid.all() and prior.metric == (name != "depth-anything-v2-small")
+
+
+def test_moge_interface(write_onnx, make_view, context):
+    """Points of a plane at z = 2, in half metres and 0.3 too near, with a hole in the mask."""
+    text = """
+    moge (float[b,3,h,w] image, int64 num_tokens) => (
+        float[b,h,w,3] points, float[b,h,w,3] normal, float[b,h,w] mask, float[b] metric_scale) {
+        points = Identity (p)
+        normal = Identity (n)
+        mask = Identity (m)
+        metric_scale = Identity (s)
+    }
+    """
+    view = make_view(8, 6, focal=(7.0, 7.5))
+    points = unproject(view.camera, pixel_centers(8, 6), np.full((6, 8), 4.0)) - [0, 0, 0.3]
+    normals = np.broadcast_to([0.0, 0.0, -1.0], (1, 6, 8, 3))
+    mask = np.ones((1, 6, 8))
+    mask[0, 2, 3] = 0.4
+    arrays = {"p": points[None], "n": normals, "m": mask, "s": [0.5]}
+    model = write_onnx(text, **{name: np.float32(value) for name, value in arrays.items()})
+    options = OnnxOptions(description="moge-2", model=str(model))
+    prior, facing = OnnxJoint(options, context).predict_joint(view)
+    np.testing.assert_array_equal(prior.valid, mask[0] > 0.5)
+    np.testing.assert_allclose(prior.depth[prior.valid], 2.0, rtol=1e-5)
+    assert prior.metric and np.array_equal(facing.valid, prior.valid)
 
 
 def test_all_shipped_descriptions_load_and_are_pinned():
@@ -178,9 +276,9 @@ def test_registry_takes_the_calibration_of_the_description():
     registry = Registry.discover()
     backend = Backend(use="onnx", options={"model": "x.onnx"})
     assert registry.calibration("depth", backend).relative_std == 0.25
-    backend = Backend(use="onnx-joint", options={"description": "metric3d-v2-large"})
+    backend = Backend(use="onnx", options={"description": "depth-pro"})
     assert registry.calibration("depth", backend) == DepthCalibration(
-        std_scale=3.7757, relative_std=0.08, std_floor=0.02
+        std_scale=1.0, relative_std=0.0875
     )
 
 

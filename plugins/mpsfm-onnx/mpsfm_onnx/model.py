@@ -1,0 +1,95 @@
+"""An ONNX file as a function of named tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime  # type: ignore[import-untyped]
+from numpy.typing import NDArray
+
+from mpsfm_core import ProviderContext
+from mpsfm_core.errors import ConfigError, WeightsError
+
+_ERRORS_ONLY = 3
+_DTYPES: Mapping[str, type[np.generic]] = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+    "tensor(uint8)": np.uint8,
+    "tensor(int32)": np.int32,
+    "tensor(int64)": np.int64,
+}
+
+
+class Model:
+    """An inference session: on the GPU if the context says so and onnxruntime can, else the CPU.
+
+    ``inputs``, ``outputs``: names of the tensors, in the model's order.
+
+    Raises:
+        WeightsError: the file is no ONNX model.
+    """
+
+    def __init__(self, path: Path, context: ProviderContext) -> None:
+        self._name = path.name
+        self._session = _open(path, context)
+        inputs = self._session.get_inputs()
+        self._dtypes = {tensor.name: _DTYPES.get(tensor.type) for tensor in inputs}
+        self.inputs = tuple(self._dtypes)
+        self.outputs = tuple(tensor.name for tensor in self._session.get_outputs())
+
+    def require(self, inputs: Iterable[str], outputs: Iterable[str], what: str) -> None:
+        """Check that the model has exactly these inputs, and at least these outputs.
+
+        ``what`` wants them, in words, for the error.
+
+        Raises:
+            ConfigError: it has other ones.
+        """
+        inputs, outputs = sorted(set(inputs)), sorted(set(outputs))
+        if inputs != sorted(self.inputs) or not set(outputs) <= set(self.outputs):
+            raise ConfigError(
+                f"{what} wants inputs {inputs} and outputs {outputs}; {self._name} has inputs "
+                f"{list(self.inputs)} and outputs {list(self.outputs)}"
+            )
+
+    def run(self, feed: Mapping[str, Any], outputs: Sequence[str]) -> list[NDArray[Any]]:
+        """The named outputs; what is fed gets the dtype that the model wants, rounded to it."""
+        tensors = {name: self._cast(value, self._dtypes[name]) for name, value in feed.items()}
+        results: list[NDArray[Any]] = self._session.run(list(outputs), tensors)
+        return results
+
+    @staticmethod
+    def _cast(value: Any, dtype: type[np.generic] | None) -> NDArray[Any]:
+        if dtype is not None and np.issubdtype(dtype, np.integer):
+            value = np.rint(value)
+        array: NDArray[Any] = np.asarray(value, dtype=dtype, order="C")
+        return array
+
+
+def fetch(
+    context: ProviderContext, uri: str, sha256: str | None = None, companions: Iterable[str] = ()
+) -> Path:
+    """Path of a model file, after its companions (external data of the same folder) are there."""
+    for companion in companions:
+        context.resolve_weights(companion, None)
+    return context.resolve_weights(uri, sha256)
+
+
+def _open(path: Path, context: ProviderContext) -> onnxruntime.InferenceSession:
+    settings = onnxruntime.SessionOptions()
+    settings.intra_op_num_threads = context.threads
+    settings.inter_op_num_threads = 1
+    settings.use_deterministic_compute = True
+    settings.log_severity_level = _ERRORS_ONLY
+    wanted = ["CUDAExecutionProvider"] if context.device == "cuda" else []
+    available = onnxruntime.get_available_providers()
+    providers = [p for p in [*wanted, "CPUExecutionProvider"] if p in available]
+    try:
+        return onnxruntime.InferenceSession(str(path), settings, providers=providers)
+    except Exception as error:  # onnxruntime's exceptions share no base class
+        reason = str(error).strip().splitlines()[0]
+        raise WeightsError(f"{path} cannot be opened as an ONNX model: {reason}") from error

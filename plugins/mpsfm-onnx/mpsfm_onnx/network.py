@@ -1,0 +1,91 @@
+"""A described network, run on one view at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mpsfm_core import PinholeCamera, ProviderContext, View
+from mpsfm_core.data import Float32, Float64
+from mpsfm_core.errors import WeightsError
+from mpsfm_onnx.canvas import Canvas
+from mpsfm_onnx.decode import planes
+from mpsfm_onnx.description import Description, IntrinsicsInput
+from mpsfm_onnx.model import Model, fetch
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a network says of a view: maps (h, w, c) that cover it, and single numbers, by name;
+    ``canvas``: where the view was placed on the network's input."""
+
+    maps: dict[str, Float32]
+    numbers: dict[str, float]
+    canvas: Canvas
+
+
+class Network:
+    """A network by its description.
+
+    ``weights``: path or URI of the ONNX file, None for the description's; ``sha256``: its hash.
+
+    Raises:
+        ConfigError: the model does not have the tensors of its description.
+        WeightsError: the file is missing, or is no ONNX model.
+    """
+
+    def __init__(
+        self,
+        description: Description,
+        context: ProviderContext,
+        weights: str | None = None,
+        sha256: str | None = None,
+    ) -> None:
+        self.description = description
+        self._model = Model(_file(description, context, weights, sha256), context)
+        rule = description.input
+        self._image = rule.name or self._model.inputs[0]
+        inputs = {self._image, *rule.constants}
+        if rule.intrinsics is not None:
+            inputs.add(rule.intrinsics.name)
+        self._outputs = sorted(description.outputs.names())
+        self._model.require(inputs, self._outputs, f"description {description.name!r}")
+
+    def run(self, view: View) -> Answer:
+        """Run the network on a view."""
+        rule, outputs = self.description.input, self.description.outputs
+        canvas = Canvas.plan(rule.size, view.camera.size)
+        feed = {self._image: canvas.paint(view.image, rule), **rule.constants}
+        if rule.intrinsics is not None:
+            feed[rule.intrinsics.name] = _matrix(canvas.camera(view.camera), rule.intrinsics)
+        results = zip(self._outputs, self._model.run(feed, self._outputs), strict=True)
+        maps, numbers = {}, {}
+        for name, tensor in results:
+            if name in outputs.numbers():
+                numbers[name] = float(tensor.reshape(-1)[0])
+            else:
+                maps[name] = canvas.cut(planes(tensor, outputs.layout))
+        return Answer(maps, numbers, canvas)
+
+
+def _matrix(camera: PinholeCamera, rule: IntrinsicsInput) -> Float64:
+    """The calibration matrix (1, 3, 3) in the network's pixels."""
+    matrix = camera.matrix
+    matrix[:2, 2] -= 0.5 - rule.first_pixel
+    return matrix[np.newaxis]
+
+
+def _file(
+    description: Description, context: ProviderContext, weights: str | None, sha256: str | None
+) -> Path:
+    if weights is not None:
+        return fetch(context, weights, sha256)
+    known = description.weights
+    if known is None:
+        raise WeightsError(
+            f"the description {description.name!r} has no public weights file: "
+            f"name yours with --set depth.options.model=FILE"
+        )
+    return fetch(context, known.uri, known.sha256, known.companions)
