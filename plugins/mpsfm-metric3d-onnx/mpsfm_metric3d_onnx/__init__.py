@@ -1,0 +1,1 @@
+"""Metric3D v2 depth and normals with ONNX Runtime."""

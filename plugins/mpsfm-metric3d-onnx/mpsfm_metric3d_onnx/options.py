@@ -1,0 +1,81 @@
+"""The sizes of the network: weights, options, calibration. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mpsfm_core import Options, WeightsFile
+from mpsfm_core.calibration.model import DepthCalibration
+
+WEIGHTS_LICENSE = "CC0-1.0 (export; the authors name none for their weights)"
+
+RELATIVE_STD_ALONE = 0.08
+"""Share of depth for exports without confidence: about what the reference declares for networks
+that have none (0.079 and 0.0875). Not measured; fit it on data of yours."""
+
+
+def _file(repository: str, name: str) -> WeightsFile:
+    return WeightsFile(f"hf://onnx-community/{repository}/onnx/{name}", license=WEIGHTS_LICENSE)
+
+
+_SMALL = _file("metric3d-vit-small@672e63a9d45ee93c39a3f59cdfd0edf648187f37", "model.onnx")
+_LARGE = _file("metric3d-vit-large@7d679e55ebc155d3f7c919371f0784080fb5f5bd", "model.onnx")
+_GIANT2 = tuple(
+    _file("metric3d-vit-giant2@bee0a79a684eaad2850904db5f790ad20abe921b", name)
+    for name in ("model.onnx", "model.onnx_data")
+)
+
+
+class Metric3dOptions(Options):
+    """What the sizes share."""
+
+    weights: str
+    """Path or URI of the ONNX file."""
+    companions: tuple[str, ...] = ()
+    """URIs of further files of its folder, for models with external data."""
+    sha256: str | None = None
+    """Expected hash of ``weights``."""
+    confidence: bool = False
+    """Whether the file has the output ``confidence``, which the public exports lack: depth then
+    has a variance, and the reference's calibration applies."""
+
+
+class SmallOptions(Metric3dOptions):
+    """ViT-small."""
+
+    weights: str = _SMALL.uri
+
+
+class LargeOptions(Metric3dOptions):
+    """ViT-large."""
+
+    weights: str = _LARGE.uri
+
+
+class Giant2Options(Metric3dOptions):
+    """ViT-giant2."""
+
+    weights: str = _GIANT2[0].uri
+    companions: tuple[str, ...] = (_GIANT2[1].uri,)
+
+
+@dataclass(frozen=True)
+class Size:
+    """One size of the network; ``calibration`` is the reference's, for exports with confidence."""
+
+    name: str
+    options: type[Metric3dOptions]
+    weights: tuple[WeightsFile, ...]
+    calibration: DepthCalibration
+
+    @property
+    def calibration_alone(self) -> DepthCalibration:
+        """For exports without confidence."""
+        return self.calibration.model_copy(update={"relative_std": RELATIVE_STD_ALONE})
+
+
+SIZES = (
+    Size("small", SmallOptions, (_SMALL,), DepthCalibration(std_scale=2.045, relative_std=0.0433)),
+    Size("large", LargeOptions, (_LARGE,), DepthCalibration(std_scale=3.7757, relative_std=0.05)),
+    Size("giant2", Giant2Options, _GIANT2, DepthCalibration(std_scale=3.33, relative_std=0.0263)),
+)

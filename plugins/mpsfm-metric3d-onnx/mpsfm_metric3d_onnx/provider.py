@@ -1,0 +1,35 @@
+"""Metric3D v2 as depth and normals provider."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mpsfm_onnx.description import Description, Weights, load_description
+from mpsfm_onnx.providers import DescribedJoint, DescribedNormals
+
+from mpsfm_core import ProviderContext
+from mpsfm_metric3d_onnx.options import Metric3dOptions
+
+
+class Metric3dDepth(DescribedJoint):
+    """Metric depth and, in the same pass, normals."""
+
+    def __init__(self, options: Metric3dOptions, context: ProviderContext) -> None:
+        super().__init__(describe(options), context)
+
+
+class Metric3dNormals(DescribedNormals):
+    """Normals with their angular variance."""
+
+    def __init__(self, options: Metric3dOptions, context: ProviderContext) -> None:
+        super().__init__(describe(options), context)
+
+
+def describe(options: Metric3dOptions) -> Description:
+    """The description of the network that the options name."""
+    general = load_description(str(Path(__file__).with_name("description.yaml")))
+    weights = Weights(uri=options.weights, sha256=options.sha256, companions=options.companions)
+    update: dict[str, object] = {"weights": weights}
+    if not options.confidence:
+        update["outputs"] = general.outputs.model_copy(update={"confidence": None})
+    return general.model_copy(update=update)
