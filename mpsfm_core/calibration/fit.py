@@ -1,10 +1,11 @@
 """Fitting a std of the form ``max_j(theta_j * term_j)`` to errors.
 
-Criterion. An error is normal with the modelled variance plus the truth's, or, with a small
-probability that is fitted too, gross: uniform up to the largest possible error. Maximising this
-likelihood finds the proportions of the terms without being led by outliers. Errors of networks
-are no clean mixture, though, so their common factor is then set by coverage: 68.27 % of the errors
-that are not gross lie within one std. Every image counts the same, however many pixels it has.
+Criterion. An error has the modelled variance plus the truth's and a Student t distribution, as
+networks err more often by a lot than a normal distribution has it; or, with a small probability
+that is fitted too, it is gross: uniform up to the largest possible error. Maximising this
+likelihood finds the proportions of the terms without being led by outliers. Their common factor
+is then set by coverage, which a user can check: 68.27 % of the errors that are not gross lie
+within one std. Every image counts the same, however many pixels it has.
 
 The paper chose the factors of appendix C by looking at calibration plots and at the area under
 sensitivity curves; the likelihood rewards both the ranking and the size of the std.
@@ -17,15 +18,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.special import gamma
 
 from mpsfm_core.calibration.samples import Residuals
 from mpsfm_core.data import Bool, Float64, Int64
 
 ONE_SIGMA = 0.6827
 """Share of normal errors within one std."""
+FREEDOM = 4.0
+"""Degrees of freedom of the errors (Lange, Little & Taylor, JASA 1989: 4 as a robust choice)."""
 MAX_GROSS = 0.5
 DOMINANT_SHARE = 0.01
 """A term that is the largest for fewer of the samples is not determined by them (ours)."""
+_NORMALISER = gamma(0.5 * (FREEDOM + 1)) / gamma(0.5 * FREEDOM) / np.sqrt(FREEDOM * np.pi)
 _RANGE = 1e4
 """A factor lies within this of what it is as the only one."""
 
@@ -186,16 +191,18 @@ class _Problem:
             variance = np.where(self._edges, variance * np.exp(2 * vector[count]), variance)
         total = variance + self._noise
         gross = _gross(vector[-1])
-        normal = np.exp(-0.5 * self._squared / total) / np.sqrt(2 * np.pi * total)
-        density = (1 - gross) * normal + gross * self._uniform
-        inlier = (1 - gross) * normal / density
+        usual = _NORMALISER / np.sqrt(total)
+        usual *= (1 + self._squared / (FREEDOM * total)) ** (-0.5 * (FREEDOM + 1))
+        density = (1 - gross) * usual + gross * self._uniform
+        inlier = (1 - gross) * usual / density
         return _State(largest, variance, total, inlier, np.log(density))
 
     def _objective(self, vector: Float64) -> tuple[float, Float64]:
         """Negative mean log density and its gradient."""
         state, weights, count = self._evaluate(vector), self._weights, len(self._names)
         # d log density / d log std, through the variance
-        slope = weights * state.inlier * (self._squared / state.total - 1)
+        far = self._squared / (FREEDOM * state.total)
+        slope = weights * state.inlier * ((FREEDOM + 1) * far / (1 + far) - 1)
         slope *= state.variance / state.total
         gradient = np.zeros(len(vector))
         gradient[:count] = np.bincount(state.largest, weights=slope, minlength=count)

@@ -84,11 +84,14 @@ def std_of(calibration: Calibration, residuals: Residuals) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class DepthData:
-    """Samples of depth priors, one entry an image; ``alignments``: what may be tried, the simplest
-    first."""
+    """Samples of depth priors, one entry an image.
+
+    ``alignments``: what may be tried, the simplest first. ``in_metres``: whether the truth is.
+    """
 
     samples: tuple[DepthSamples, ...]
     alignments: tuple[Alignment, ...] = ("scale",)
+    in_metres: bool = True
 
     def of(self, images: Int64) -> DepthData:
         """The data of some images."""
@@ -107,7 +110,7 @@ class DepthData:
             model = _shift(self.samples, alignment)
             attempt = _Attempt(model, self.residuals(model), ("relative_std", *floor))
             search.offer(f"relative_std, aligned by {alignment}", [attempt])
-        if self.samples[0].network_std is not None:
+        if "std_scale" in search.best.residuals.names:
             for names in (("std_scale", *floor), ("std_scale", "relative_std", *floor)):
                 search.offer(" + ".join(names), [search.best._replace(names=names)])
         with_edges = [search.best._replace(edge_ratio=ratio) for ratio in EDGE_RATIOS]

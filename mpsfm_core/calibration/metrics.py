@@ -5,33 +5,42 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student_t
 
+from mpsfm_core.calibration.fit import FREEDOM, ONE_SIGMA, weighted_quantile
 from mpsfm_core.calibration.samples import Residuals
 from mpsfm_core.data import Bool, Float64, Int64
 
 CURVE_POINTS = 50
 BINS = 10
 RANGES = 5
-NORMAL_COVERAGE = (0.6827, 0.9545, 0.9973)
+NORMAL_COVERAGE = (ONE_SIGMA, 0.9545, 0.9973)
 """Of normal errors, within 1, 2 and 3 standard deviations."""
 MAD_TO_STD = 1.4826
 
 
 def measure(residuals: Residuals, std: Float64) -> dict[str, Any]:
-    """All metrics of a std (n,), as plain data.
+    """All metrics of a std (n,), as plain data. Every image counts the same but in the curves.
 
     ``coverage``: share of errors within 1, 2, 3 std. ``z_mad``: 1.4826 times the median of
-    ``|error / std|``, 1 when right. ``nll``: mean negative log density of normal errors. ``ause``:
-    area between the sensitivity curve and that of the true order of errors, as a share of the
-    total RMSE; 0 is a perfect order. ``rmse``: in metres or rad. Then the curves behind them.
+    ``|error / std|``, 1 when right. ``nll``: mean negative log density if errors were normal,
+    ``nll_heavy``: if they had the fit's heavy tails and the same coverage of 1 std. ``ause``: area
+    between the sensitivity curve and that of the true order of errors, as a share of the total
+    RMSE; 0 is a perfect order. ``rmse``: in metres or rad. Then the curves behind them.
     """
-    total = np.hypot(std, residuals.noise)
-    z = np.abs(residuals.error) / total
+    total, weights = np.hypot(std, residuals.noise), residuals.weights()
+    heavy_scale = total / student_t(FREEDOM).ppf(0.5 + ONE_SIGMA / 2)
+
+    def mean(values: Float64) -> float:
+        return float(np.average(values, weights=weights))
+
     sensitivity = sensitivity_curve(residuals.magnitude, std * residuals.unit)
     return {
-        **_summary(residuals.error, total),
-        "nll": float((0.5 * z**2 + np.log(total) + 0.5 * np.log(2 * np.pi)).mean()),
-        "rmse": float(np.sqrt((residuals.magnitude**2).mean())),
+        **_summary(residuals.error, total, weights),
+        "nll": -mean(norm.logpdf(residuals.error, scale=total)),
+        "nll_heavy": -mean(student_t(FREEDOM, scale=heavy_scale).logpdf(residuals.error)),
+        "rmse": np.sqrt(mean(residuals.magnitude**2)),
         "ause": float(np.mean(sensitivity["predicted"]) - np.mean(sensitivity["ideal"])),
         "sensitivity": sensitivity,
         "calibration_curve": _curve_by_std(residuals.error, total),
@@ -39,9 +48,10 @@ def measure(residuals: Residuals, std: Float64) -> dict[str, Any]:
     }
 
 
-def coverage(z: Float64) -> list[float]:
-    """Share of absolute standardised errors (n,) within 1, 2 and 3."""
-    return [float((z <= limit).mean()) for limit in (1, 2, 3)]
+def coverage(error: Float64, std: Float64, weights: Float64) -> list[float]:
+    """Share of errors (n,) within 1, 2 and 3 standard deviations (n,)."""
+    z = np.abs(error) / std
+    return [float(np.average(z <= limit, weights=weights)) for limit in (1, 2, 3)]
 
 
 def sensitivity_curve(errors: Float64, std: Float64) -> dict[str, list[float]]:
@@ -83,21 +93,22 @@ def _curve_by_std(error: Float64, total: Float64) -> list[dict[str, float]]:
 
 
 def _by_range(residuals: Residuals, total: Float64) -> list[dict[str, Any]]:
+    weights = residuals.weights()
     return [
         {
             "from": float(residuals.place[rows].min()),
             "to": float(residuals.place[rows].max()),
             "samples": int(rows.sum()),
             "std": float(np.median(total[rows])),
-            **_summary(residuals.error[rows], total[rows]),
+            **_summary(residuals.error[rows], total[rows], weights[rows]),
         }
         for rows in _quantile_bins(residuals.place, RANGES)
     ]
 
 
-def _summary(error: Float64, total: Float64) -> dict[str, Any]:
-    z = np.abs(error) / total
-    return {"coverage": coverage(z), "z_mad": MAD_TO_STD * float(np.median(z))}
+def _summary(error: Float64, total: Float64, weights: Float64) -> dict[str, Any]:
+    z_mad = MAD_TO_STD * weighted_quantile(np.abs(error) / total, weights, 0.5)
+    return {"coverage": coverage(error, total, weights), "z_mad": z_mad}
 
 
 def _quantile_bins(values: Float64, count: int) -> list[Bool]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -106,23 +107,18 @@ class Residuals:
     def __len__(self) -> int:
         return len(self.error)
 
-    def of(self, images: Int64) -> Residuals:
-        """Those of some images, numbered anew in the given order."""
-        number = np.full(self.images, -1, dtype=np.int64)
-        number[images] = np.arange(len(images))
-        rows = number[self.image] >= 0
-        arrays = ("error", "noise", "terms", "step", "magnitude", "unit", "place")
-        return replace(
-            self,
-            **{name: getattr(self, name)[rows] for name in arrays},
-            image=number[self.image[rows]],
-            images=len(images),
-            scales=self.scales[images] if len(self.scales) else self.scales,
-        )
-
     def weights(self) -> Float64:
         """(n,), 1 / the number of samples of the image: every image counts the same."""
         return 1.0 / np.bincount(self.image, minlength=self.images)[self.image]
+
+
+def join(parts: Sequence[Residuals]) -> Residuals:
+    """Residuals of different images as one."""
+    names = ("error", "noise", "terms", "step", "magnitude", "unit", "place", "scales")
+    arrays: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}
+    firsts = np.cumsum([0, *(part.images for part in parts)])
+    image = np.concatenate([p.image + first for p, first in zip(parts, firsts, strict=False)])
+    return replace(parts[0], image=image, images=int(firsts[-1]), **arrays)
 
 
 def compare_depth(
@@ -174,6 +170,7 @@ def depth_residuals(
 
     The scale of an image is the median ratio of truth to prior, as in the mapper.
     """
+    network = all(image.network_std is not None for image in samples)
     parts, scales = [], []
     for number, image in enumerate(samples):
         shifted, gain, ok = model.shift_depth(image.prior, image.medians)
@@ -184,7 +181,7 @@ def depth_residuals(
         error = log_ratio - (scale if scaled else 0.0)
         unit = depth * np.exp(scale if scaled else 0.0)
         terms = [np.ones(len(depth))]
-        if image.network_std is not None:
+        if network and image.network_std is not None:
             terms.insert(0, image.network_std[ok] * gain / depth)
         if image.metric:
             terms.append(1 / depth)
@@ -192,18 +189,18 @@ def depth_residuals(
         magnitude = np.abs(truth - unit)
         columns = (error, noise, image.step[ok], magnitude, unit, truth)
         parts.append((np.stack(columns), np.stack(terms, axis=1), np.full(len(depth), number)))
-    with_network = samples[0].network_std is not None
-    names = ("std_scale",) * with_network + ("relative_std",) + ("std_floor",) * samples[0].metric
+    names = ("std_scale",) * network + ("relative_std",) + ("std_floor",) * samples[0].metric
     return _joined(parts, names, GROSS_DEPTH, np.array(scales))
 
 
 def normal_residuals(samples: Sequence[NormalSamples]) -> Residuals:
     """Errors of normals along both tangent directions, in rad; each pixel counts twice."""
+    network = all(image.network_std is not None for image in samples)
     parts = []
     for number, image in enumerate(samples):
         error = tangent_errors(image.prior, image.truth)
         terms = [np.ones(len(image.prior))]
-        if image.network_std is not None:
+        if network and image.network_std is not None:
             terms.insert(0, image.network_std)
         slant = angle_between_deg(-image.prior, np.array([0.0, 0.0, 1.0]))
         angle = np.linalg.norm(error, axis=1)
@@ -211,7 +208,7 @@ def normal_residuals(samples: Sequence[NormalSamples]) -> Residuals:
         for component in error.T:
             columns = (component, image.truth_std, 0 * ones, angle, ones, slant)
             parts.append((np.stack(columns), np.stack(terms, axis=1), np.full(len(ones), number)))
-    names = ("std_scale",) * (samples[0].network_std is not None) + ("std_floor_deg",)
+    names = ("std_scale",) * network + ("std_floor_deg",)
     return _joined(parts, names, GROSS_NORMAL, np.zeros(0))
 
 

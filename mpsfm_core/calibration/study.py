@@ -1,7 +1,9 @@
-"""From samples to a calibration with its evidence: split, fit, intervals, before and after."""
+"""From samples to a calibration with its evidence: fit, intervals, and how it does on images that
+it was not fitted to."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -12,12 +14,12 @@ from mpsfm_core.calibration.fit import DOMINANT_SHARE, Fit, bootstrap
 from mpsfm_core.calibration.fitting import Candidate, DepthData, NormalData, std_of, winner
 from mpsfm_core.calibration.metrics import MAD_TO_STD, coverage, measure
 from mpsfm_core.calibration.model import Calibration
-from mpsfm_core.calibration.samples import Residuals
-from mpsfm_core.data import Int64
+from mpsfm_core.calibration.samples import Residuals, join
+from mpsfm_core.data import Float64, Int64
 from mpsfm_core.options import Options
 
 FEW_IMAGES = 10
-"""Fewer training images than these do not show how images differ (ours)."""
+"""Fewer images than these do not show how images differ (ours)."""
 WIDE_INTERVAL = 0.25
 """Half width of an interval, as a share of the value, that calls for more data (ours)."""
 MANY_GROSS = 0.2
@@ -31,12 +33,14 @@ class StudyOptions(Options):
     """How a calibration is fitted."""
 
     seed: int = Field(0, ge=0)
-    """Of the choice of pixels, held-out images and bootstrap."""
-    held_out: float = Field(0.25, ge=0, lt=1)
-    """Share of the images that metrics are taken on and nothing is fitted to."""
+    """Of the choice of pixels and of the bootstrap."""
+    folds: int = Field(4, ge=2)
+    """Each of so many groups of successive images is held out once: the model is chosen and fitted
+    on the others and judged on it. Successive, as neighbours in a video are nearly the same image.
+    The final values are fitted to all."""
     bootstraps: int = Field(100, ge=0)
     """Fits on images drawn with replacement, for confidence intervals; 0 for none."""
-    samples_per_image: int = Field(2000, ge=20)
+    samples_per_image: int = Field(500, ge=20)
     """Pixels of dense truth that are used of each image; its errors are far from independent."""
 
 
@@ -57,17 +61,18 @@ def study(data: Data, declared: Calibration, options: StudyOptions) -> Study:
 
     ``data``: one image at least.
     """
-    rng = np.random.default_rng(options.seed)
-    fitted_on, held_out = _split(len(data.samples), options.held_out, rng)
-    training = data.of(fitted_on)
-    candidates = training.fit()
+    candidates = data.fit()
     best = winner(candidates)
-    residuals = training.residuals(best.calibration)
+    residuals = data.residuals(best.calibration)
+    rng = np.random.default_rng(options.seed)
     intervals = _intervals(residuals, best.fit, options.bootstraps, rng)
-    judged = data.of(held_out) if len(held_out) else training
+    folds = _folds(len(data.samples), options.folds)
+    fitted = [winner(data.of(kept).fit()).calibration for kept, _ in folds]
+    held_out = [data.of(left) for _, left in folds] or [data]
     report = {
-        "images": {"fitted_on": _names(training), "held_out": _names(data.of(held_out))},
+        "images": [image.name for image in data.samples],
         "samples": len(residuals),
+        "folds": len(folds),
         "calibration": {
             "before": declared.model_dump(mode="json"),
             "after": best.calibration.model_dump(mode="json"),
@@ -77,31 +82,47 @@ def study(data: Data, declared: Calibration, options: StudyOptions) -> Study:
         "gross_errors": best.fit.gross,
         "candidates": [_describe(candidate) for candidate in candidates],
         "metrics": {
-            "before": _metrics(judged, declared),
-            "after": _metrics(judged, best.calibration),
+            "before": _metrics(held_out, [declared] * len(held_out)),
+            "after": _metrics(held_out, fitted or [best.calibration]),
         },
         "scale": _scale(data, best.calibration),
     }
-    warnings = tuple(_warnings(training, held_out, intervals, best.fit))
+    warnings = tuple(_warnings(len(data.samples), intervals, best.fit))
     return Study(best.calibration, {**report, "warnings": list(warnings)}, warnings)
 
 
-def _split(count: int, share: float, rng: np.random.Generator) -> tuple[Int64, Int64]:
-    """Images to fit on and images held out: none of fewer than four, else at least one."""
-    held_out = 0 if count < 4 or share == 0 else max(1, round(share * count))
-    order = rng.permutation(count)
-    return np.sort(order[held_out:]), np.sort(order[:held_out])
+def _folds(count: int, wanted: int) -> list[tuple[Int64, Int64]]:
+    """Images to fit on and images to judge on, for each fold; none for a single image."""
+    if count < 2:
+        return []
+    everything = np.arange(count)
+    groups = np.array_split(everything, min(wanted, count))
+    return [(np.setdiff1d(everything, group), group) for group in groups]
 
 
-def _metrics(data: Data, calibration: Calibration) -> dict[str, Any]:
-    """Metrics after each image's own scale, and coverage of a metric prior as it is."""
-    residuals = data.residuals(calibration)
-    metrics = measure(residuals, std_of(calibration, residuals))
-    if isinstance(data, NormalData) or not data.samples[0].metric:
-        return metrics
-    raw = data.residuals(calibration, scaled=False)
-    z = np.abs(raw.error) / np.hypot(std_of(calibration, raw), raw.noise)
-    return {**metrics, "coverage_without_scaling": coverage(z)}
+def _metrics(held_out: Sequence[Data], calibrations: Sequence[Calibration]) -> dict[str, Any]:
+    """Metrics over all folds after each image's own scale; coverage of each fold; and that of a
+    metric prior as it is."""
+    scaled, std = _judge(held_out, calibrations, scaled=True)
+    metrics = measure(join(scaled), np.concatenate(std))
+    metrics["coverage_of_folds"] = [_coverage(r, s)[0] for r, s in zip(scaled, std, strict=True)]
+    first = held_out[0]
+    if isinstance(first, DepthData) and first.samples[0].metric and first.in_metres:
+        raw, std = _judge(held_out, calibrations, scaled=False)
+        metrics["coverage_without_scaling"] = _coverage(join(raw), np.concatenate(std))
+    return metrics
+
+
+def _judge(
+    held_out: Sequence[Data], calibrations: Sequence[Calibration], *, scaled: bool
+) -> tuple[list[Residuals], list[Float64]]:
+    """Errors of each fold and the std that its calibration declares for them."""
+    parts = [d.residuals(c, scaled=scaled) for d, c in zip(held_out, calibrations, strict=True)]
+    return parts, [std_of(c, r) for c, r in zip(calibrations, parts, strict=True)]
+
+
+def _coverage(residuals: Residuals, std: Float64) -> list[float]:
+    return coverage(residuals.error, np.hypot(std, residuals.noise), residuals.weights())
 
 
 def _scale(data: Data, calibration: Calibration) -> dict[str, float] | None:
@@ -144,24 +165,13 @@ def _describe(candidate: Candidate) -> dict[str, Any]:
     }
 
 
-def _names(data: Data) -> list[str]:
-    return [image.name for image in data.samples]
-
-
-def _warnings(
-    training: Data, held_out: Int64, intervals: dict[str, list[float]], fit: Fit
-) -> list[str]:
-    warnings = []
-    count = len(training.samples)
-    if count < FEW_IMAGES:
-        warnings.append(f"fitted on only {count} images: too few to know how images differ")
-    if not len(held_out):
-        warnings.append("no image is held out: the metrics are of the images it was fitted on")
+def _warnings(images: int, intervals: dict[str, list[float]], fit: Fit) -> Iterator[str]:
+    if images < FEW_IMAGES:
+        yield f"fitted to only {images} images: too few to know how images differ"
+    if images < 2:
+        yield "no image is held out: the metrics are those of the image it was fitted to"
     for name, (low, high) in intervals.items():
         if high - low > WIDE_INTERVAL * (high + low):
-            warnings.append(f"{name} is between {low:.3g} and {high:.3g}: more images are needed")
+            yield f"{name} is somewhere between {low:.3g} and {high:.3g}: more images are needed"
     if fit.gross > MANY_GROSS:
-        warnings.append(
-            f"{fit.gross:.0%} of the errors are gross: is the truth of these images right?"
-        )
-    return warnings
+        yield f"{fit.gross:.0%} of the errors are gross: is the truth of these images right?"

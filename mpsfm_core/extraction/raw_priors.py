@@ -50,8 +50,9 @@ class RawPriors:
 
         return bench.result(provider, DepthPrior, inputs, compute), None
 
-    def predict_normals(self, index: int, depth: DepthPrior) -> NormalPrior:
-        """Normals of an image by the normals provider; ``depth``: its calibrated depth."""
+    def predict_normals(self, index: int, depth: DepthPrior | None) -> NormalPrior:
+        """Normals of an image by the normals provider; ``depth``: its calibrated depth, which a
+        provider that does not say ``needs-depth`` does without."""
         provider, bench = self.normals, self._bench
         assert provider is not None
         inputs = bench.view_inputs(index, provider)

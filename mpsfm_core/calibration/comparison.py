@@ -1,0 +1,125 @@
+"""Runs the provider that is to be calibrated on all images and compares it with the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from mpsfm_core.calibration.file import CalibratedKind
+from mpsfm_core.calibration.fitting import Alignment, DepthData, NormalData
+from mpsfm_core.calibration.model import DepthCalibration
+from mpsfm_core.calibration.samples import (
+    MIN_SAMPLES,
+    DepthSamples,
+    DepthTruth,
+    NormalSamples,
+    compare_depth,
+    compare_normals,
+)
+from mpsfm_core.calibration.study import Data, StudyOptions
+from mpsfm_core.calibration.truth import FileTruth
+from mpsfm_core.data import NormalPrior
+from mpsfm_core.errors import InputError
+from mpsfm_core.extraction.backends import ActiveProvider
+from mpsfm_core.extraction.raw_priors import RawPriors
+from mpsfm_core.extraction.workbench import Workbench
+
+Samples = TypeVar("Samples", DepthSamples, NormalSamples)
+
+ALL_ALIGNMENTS: tuple[Alignment, ...] = ("scale", "scale-shift", "disparity")
+
+
+class Comparison:
+    """Samples of one kind of prior beside the truth.
+
+    ``alignments``: what may be tried for depth, None for what suits the provider.
+    """
+
+    def __init__(
+        self,
+        bench: Workbench,
+        kind: CalibratedKind,
+        alignments: Sequence[Alignment] | None,
+        options: StudyOptions,
+    ) -> None:
+        self._bench = bench
+        self._kind = kind
+        self._alignments = alignments
+        self._options = options
+        self._raw = RawPriors(bench)
+        depth = bench.registry.calibration("depth", bench.config.depth)
+        assert isinstance(depth, DepthCalibration)
+        self._depth_calibration = depth
+
+    @property
+    def provider(self) -> ActiveProvider:
+        """The provider that is calibrated."""
+        return (self._kind == "normals" and self._raw.normals) or self._raw.depth
+
+    def with_files(self, options: Mapping[str, Any]) -> Data:
+        """Compare with true maps in files; images without a file are left out.
+
+        Raises:
+            InputError: no image has one, or none has enough valid pixels.
+        """
+        sampling = self._options
+        truth = FileTruth(
+            self._bench, self._kind, options, sampling.samples_per_image, sampling.seed
+        )
+        known = [i for i in range(len(self._bench.images)) if truth.has(self._bench.view(i))]
+        if not known:
+            raise InputError(f"{options['directory']} has no file for any of the images")
+        if self._kind == "normals":
+            return NormalData(self._compare(known, lambda i: self._normals(i, truth)))
+
+        def depth(index: int) -> DepthSamples | None:
+            return self._depth(index, truth.depth(self._bench.view(index), index))
+
+        return self._depth_data(self._compare(known, depth), in_metres=True)
+
+    def with_points(self, truth: Mapping[str, DepthTruth]) -> Data:
+        """Compare with depth at points of any unit, by image name.
+
+        Raises:
+            InputError: no image has enough of them.
+        """
+        names = self._bench.images.names
+        known = [i for i, name in enumerate(names) if name in truth]
+        samples = self._compare(known, lambda i: self._depth(i, truth[names[i]]))
+        return self._depth_data(samples, in_metres=False)
+
+    def _compare(
+        self, images: Sequence[int], compare: Callable[[int], Samples | None]
+    ) -> tuple[Samples, ...]:
+        compared = self._bench.each("comparison", images, compare, self.provider.workers)
+        samples = tuple(image for image in compared if image is not None)
+        if not samples:
+            raise InputError(
+                f"none of {len(images)} images has {MIN_SAMPLES} pixels where both the prior and "
+                f"the truth are valid"
+            )
+        return samples
+
+    def _depth_data(self, samples: tuple[DepthSamples, ...], *, in_metres: bool) -> DepthData:
+        usual = ("scale",) if samples[0].metric else ALL_ALIGNMENTS
+        return DepthData(samples, tuple(self._alignments or usual), in_metres)
+
+    def _depth(self, index: int, truth: DepthTruth) -> DepthSamples | None:
+        image = self._bench.images[index]
+        return compare_depth(image.name, self._raw.predict(index)[0], image.pinhole.size, truth)
+
+    def _normals(self, index: int, truth: FileTruth) -> NormalSamples | None:
+        image = self._bench.images[index]
+        known = truth.normals(self._bench.view(index), index)
+        return compare_normals(
+            image.name, self._predicted_normals(index), image.pinhole.size, known
+        )
+
+    def _predicted_normals(self, index: int) -> NormalPrior:
+        provider = self._raw.normals
+        if provider is not None and not provider.can("needs-depth"):
+            return self._raw.predict_normals(index, None)
+        depth, normals = self._raw.predict(index)
+        if normals is None:
+            normals = self._raw.predict_normals(index, self._depth_calibration.apply(depth))
+        return normals
