@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli import benchmark, config, demo, evaluate, models, plugins, reconstruct
+from mpsfm_core.cli import benchmark, config, demo, evaluate, models, plugins, reconstruct, testsets
 from mpsfm_core.cli.errors import GuardedGroup
 
 
@@ -39,6 +39,7 @@ def build_app() -> typer.Typer:
     app.add_typer(plugins.app, name="plugins")
     app.add_typer(config.app, name="config")
     app.add_typer(models.app, name="models")
+    app.add_typer(testsets.app, name="testsets")
     return app
 
 

@@ -88,8 +88,8 @@ class SceneFolder:
         return [item for item in self.sets if any(_answers(item.bucket, b) for b in wanted)]
 
 
-def read_scene(path: Path) -> SceneFolder:
-    """Read a scene folder.
+def read_scene(path: Path, *, with_sets: bool = True) -> SceneFolder:
+    """Read a scene folder; without its sets, there is one set of all images.
 
     Raises :class:`InputError` when images or true poses are missing, or a set names an image
     that is not there or has no true pose.
@@ -100,7 +100,7 @@ def read_scene(path: Path) -> SceneFolder:
     poses = read_poses(path / "gt")
     truth = {name: poses[found] for name, found in match_names(names, poses).items()}
     file = path / TESTSETS
-    if not file.is_file():
+    if not (with_sets and file.is_file()):
         return SceneFolder(path, truth, (EvaluationSet("all", 0, tuple(truth)),))
     sets = []
     for bucket, number, listed in _read_sets(file):

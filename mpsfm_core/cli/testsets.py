@@ -1,0 +1,61 @@
+"""``mpsfm testsets``: scene folders for the benchmark, and their sets of images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="Make scene folders and test sets for benchmark.")
+
+
+@app.command("build")
+def build(
+    scene: Annotated[Path, typer.Argument(help="Scene folder: images/, gt/, maybe gt_depth/.")],
+    source: Annotated[
+        str, typer.Option(metavar="NAME", help="Of overlap: depth, model (its points) or auto.")
+    ] = "auto",
+    min_two_view: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Overlap an image needs with some other.")
+    ] = 0.25,
+    sets: Annotated[int, typer.Option(min=1, help="Sets a bucket; minimal has twice as many.")] = 5,
+    min_images: Annotated[int, typer.Option(min=3, help="Images of a set at least.")] = 5,
+    max_images: Annotated[int | None, typer.Option(min=3, help="Images of a set at most.")] = None,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same sets.")] = 0,
+    replace: Annotated[bool, typer.Option(help="Replace a testsets.yaml that is there.")] = False,
+) -> None:
+    """Write SCENE/testsets.yaml: minimal, leq5, leq10, leq30, triplets and all images.
+
+    leq5 means that no three images of a set share more than 5 % of what one of them sees.
+    """
+    from mpsfm_core.evaluation.build_sets import build_sets
+    from mpsfm_core.evaluation.sampling import SamplingOptions
+
+    options = SamplingOptions(
+        min_two_view=min_two_view,
+        sets=sets,
+        min_images=min_images,
+        max_images=max_images,
+        seed=seed,
+    )
+    for bucket, count in build_sets(scene, source, options, replace=replace).items():
+        typer.echo(f"{bucket}: {count} set{'s' if count > 1 else ''}")
+
+
+@app.command("import")
+def import_dataset(
+    kind: Annotated[
+        str,
+        typer.Argument(help="eth3d, smerf, tanks-and-temples, realestate10k, 7-scenes or scannet."),
+    ],
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="One scene as it is distributed.")],
+    target: Annotated[Path, typer.Argument(metavar="DST", help="Scene folder to write.")],
+    every: Annotated[int, typer.Option(min=1, help="Take every n-th image.")] = 1,
+) -> None:
+    """Turn one scene of a public dataset into a scene folder; photos are linked or copied."""
+    from mpsfm_core.evaluation.importers import import_scene
+
+    scene = import_scene(kind, source, target, every)
+    depth = "with" if scene.depth is not None else "without"
+    typer.echo(f"{target}: {len(scene.truth)} images with true poses, {depth} depth")

@@ -1,0 +1,51 @@
+"""Turns scenes of public datasets, as they are distributed, into scene folders.
+
+One file a dataset; each says in its docstring which layout it reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.evaluation.importers import (
+    eth3d,
+    realestate10k,
+    scannet,
+    seven_scenes,
+    smerf,
+    tanks_and_temples,
+)
+from mpsfm_core.evaluation.importers.frames import Frame, write_frames
+from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
+
+IMPORTERS: Mapping[str, Callable[[Path], list[Frame]]] = MappingProxyType(
+    {
+        "eth3d": eth3d.read_frames,
+        "smerf": smerf.read_frames,
+        "tanks-and-temples": tanks_and_temples.read_frames,
+        "realestate10k": realestate10k.read_frames,
+        "7-scenes": seven_scenes.read_frames,
+        "scannet": scannet.read_frames,
+    }
+)
+"""Name of a dataset -> what reads the frames of one scene, in the order of their names."""
+
+
+def import_scene(kind: str, source: Path, target: Path, every: int = 1) -> SceneFolder:
+    """Write a scene folder of one scene of a dataset, of every n-th of its images.
+
+    Photos are hard-linked where that is possible, else copied. Raises :class:`InputError` when
+    the dataset is unknown, the source has not its layout, or the target holds something already.
+    """
+    if kind not in IMPORTERS:
+        raise InputError(f"no dataset {kind!r}{did_you_mean(kind, IMPORTERS)}")
+    if target.exists() and any(target.iterdir()):
+        raise InputError(f"{target} is not empty")
+    frames = IMPORTERS[kind](source)[::every]
+    if len(frames) < 2:
+        raise InputError(f"{source}: {len(frames)} usable images, two or more are needed")
+    write_frames(target, frames)
+    return read_scene(target)

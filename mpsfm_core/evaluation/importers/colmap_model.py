@@ -1,0 +1,51 @@
+"""Frames of datasets whose truth is a COLMAP model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import Float64, Int64
+from mpsfm_core.errors import InputError
+from mpsfm_core.evaluation.importers.frames import Frame, Observations, photo_size
+
+
+def model_frames(folder: Path, photo_of: Callable[[str], Path]) -> list[Frame]:
+    """Frames of the registered images of a model, named as their photos.
+
+    ``photo_of``: where the photo of an image of the model is; images without one are left out.
+    Photos of another size than the model's cameras have get cameras of their size.
+    """
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise InputError(f"{folder}: not a readable COLMAP model: {error}") from error
+    frames = []
+    for image in sorted(model.images.values(), key=lambda image: str(image.name)):
+        photo = photo_of(str(image.name))
+        if image.has_pose and photo.is_file():
+            pose = np.asarray(image.cam_from_world().matrix(), dtype=np.float64)
+            camera = pycolmap.Camera(image.camera.todict())
+            size = photo_size(photo)
+            scale = np.array(size) / [camera.width, camera.height]
+            if size != (camera.width, camera.height):
+                camera.rescale(*size)
+            seen = _observations(model, image, scale)
+            frames.append(Frame(photo.name, photo, camera, pose, None, seen))
+    return frames
+
+
+def _observations(
+    model: pycolmap.Reconstruction, image: pycolmap.Image, scale: Float64
+) -> Observations:
+    """Each point once."""
+    seen = {int(point.point3D_id): point.xy for point in image.get_observation_points2D()}
+    ids: Int64 = np.array(list(seen), dtype=np.int64)
+    return Observations(
+        np.array([xy * scale for xy in seen.values()]).reshape(-1, 2),
+        ids,
+        np.array([model.points3D[int(i)].xyz for i in ids]).reshape(-1, 3),
+    )

@@ -1,0 +1,68 @@
+"""ScanNet, as its own reader exports a ``.sens`` file.
+
+Reads ``color/N.jpg``, ``depth/N.png`` (millimetres, 0 unknown), ``pose/N.txt`` (4 x 4
+``world_from_cam``, metres; not finite where tracking was lost), ``intrinsic/intrinsic_color.txt``
+and ``intrinsic_depth.txt`` (4 x 4, the first pixel's centre at (0, 0)). Both cameras are taken to
+be in one place, as their published extrinsics say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import Float32
+from mpsfm_core.errors import InputError
+from mpsfm_core.evaluation.importers.frames import (
+    Frame,
+    carried_depth,
+    inverted,
+    need,
+    photo_size,
+    pinhole_camera,
+)
+from mpsfm_core.evaluation.prior_quality import read_depth
+
+
+def read_frames(source: Path) -> list[Frame]:
+    """Frames with a pose, in the order they were taken."""
+    folder = need(source / "color", "folder of photos")
+    intrinsic = need(source / "intrinsic", "folder of intrinsics")
+    frames = []
+    for photo in sorted(folder.glob("*.jpg"), key=lambda path: (len(path.stem), path.stem)):
+        pose_file = source / "pose" / f"{photo.stem}.txt"
+        depth = source / "depth" / f"{photo.stem}.png"
+        if not pose_file.is_file():
+            continue
+        pose = np.loadtxt(pose_file)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            continue
+        camera = _camera(intrinsic / "intrinsic_color.txt", photo_size(photo))
+        frames.append(
+            Frame(
+                f"{photo.stem.zfill(6)}.jpg",
+                photo,
+                camera,
+                inverted(pose),
+                _reader(depth, intrinsic / "intrinsic_depth.txt", camera),
+            )
+        )
+    return frames
+
+
+def _reader(depth: Path, intrinsic: Path, photo: pycolmap.Camera) -> Callable[[], Float32] | None:
+    if not depth.is_file():
+        return None
+    own = _camera(intrinsic, photo_size(depth))
+    return lambda: carried_depth(read_depth(depth), own, photo)
+
+
+def _camera(path: Path, size: tuple[int, int]) -> pycolmap.Camera:
+    matrix = np.loadtxt(need(path, "intrinsics"))
+    if matrix.shape != (4, 4):
+        raise InputError(f"{path}: not a 4 x 4 matrix")
+    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
+    return pinhole_camera(size, float(fx), float(fy), float(cx), float(cy))

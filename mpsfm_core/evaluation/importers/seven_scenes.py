@@ -1,0 +1,51 @@
+"""7-Scenes.
+
+Reads a scene (``chess/`` with ``seq-01/``, ...) or one sequence: ``frame-000000.color.png``,
+``.depth.png`` (millimetres, 65535 and 0 unknown) and ``.pose.txt`` (4 x 4 ``world_from_cam``,
+metres). Its authors give one focal length of 585 pixels for both cameras and treat depth and
+colour as one camera; they differ by some pixels.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mpsfm_core.data import Float32
+from mpsfm_core.errors import InputError
+from mpsfm_core.evaluation.importers.frames import Frame, inverted, photo_size, pinhole_camera
+
+_FOCAL_RATIO = 585 / 640
+"""Focal length over width."""
+_UNKNOWN = 65535
+
+
+def read_frames(source: Path) -> list[Frame]:
+    """Frames with a pose, of all sequences below the source."""
+    frames = []
+    for photo in sorted(source.rglob("frame-*.color.png")):
+        stem = photo.name.removesuffix(".color.png")
+        pose_file = photo.with_name(f"{stem}.pose.txt")
+        depth = photo.with_name(f"{stem}.depth.png")
+        if not pose_file.is_file():
+            continue
+        pose = np.loadtxt(pose_file)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            continue  # tracking was lost
+        width, height = photo_size(photo)
+        focal = _FOCAL_RATIO * width
+        camera = pinhole_camera((width, height), focal, focal, width / 2, height / 2)
+        name = (photo.relative_to(source).parent / f"{stem}.png").as_posix()
+        read = partial(_read, depth) if depth.is_file() else None
+        frames.append(Frame(name, photo, camera, inverted(pose), read))
+    return frames
+
+
+def _read(path: Path) -> Float32:
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if stored is None or stored.dtype != np.uint16:
+        raise InputError(f"{path}: no 16-bit depth image")
+    return np.where(stored == _UNKNOWN, 0, stored * np.float32(0.001)).astype(np.float32)

@@ -1,0 +1,31 @@
+"""Scenes of Zip-NeRF that SMERF uses (Berlin, London, New York, Alameda).
+
+Reads a folder with a COLMAP model in ``sparse/0`` (or ``colmap/sparse/0``) and the photos in
+``images``, else in the largest of ``images_2``, ``images_4``, ``images_8`` that is there. Fisheye
+and undistorted versions both work. There is no depth: overlap comes from the model's points.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mpsfm_core.errors import InputError
+from mpsfm_core.evaluation.importers.colmap_model import model_frames
+from mpsfm_core.evaluation.importers.frames import Frame
+
+_MODELS = ("sparse/0", "colmap/sparse/0", "sparse")
+_PHOTOS = ("images", "images_2", "images_4", "images_8")
+
+
+def read_frames(source: Path) -> list[Frame]:
+    """Frames of one scene."""
+    model = next((source / m for m in _MODELS if has_model(source / m)), None)
+    photos = next((source / p for p in _PHOTOS if (source / p).is_dir()), None)
+    if model is None or photos is None:
+        raise InputError(f"{source}: sparse/0 with a COLMAP model and images/ are needed")
+    return model_frames(model, lambda name: photos / name)
+
+
+def has_model(folder: Path) -> bool:
+    """Whether a folder holds a COLMAP model."""
+    return any((folder / f"images.{suffix}").is_file() for suffix in ("bin", "txt"))
