@@ -65,6 +65,9 @@ class IntegrationOptions:
     """Re-weightings at most (reference)."""
     cg_iterations: int = 2
     """CG iterations per re-weighting. Ours: fastest to equal energy."""
+    over_relaxation: float = 1.4
+    """Steps after the first are this much longer than the minimum of the quadratic, which is
+    pessimistic about a concave energy. Ours: a third fewer re-weightings; flat from 1.3 to 1.6."""
     tolerance: float = 2e-2
     """Stop when a re-weighting lowers the energy by less than this fraction. The reference has 5 %,
     with full solves between; our steps are shorter."""
@@ -208,11 +211,15 @@ class DepthIntegrator:
         while iterations < options.max_iterations and not converged:
             solver.update(here.east, here.south, here.mass)
             step = solver.solve(-here.gradient, options.cg_iterations)
-            there = majorise(z + step.x, terms)
+            further = z + (options.over_relaxation if iterations else 1.0) * step.x
+            there = majorise(further, terms)
+            if not there.energy < here.energy:
+                further = z + step.x
+                there = majorise(further, terms)
             iterations, cg_iterations = iterations + 1, cg_iterations + step.iterations
             converged = not here.energy - there.energy > options.tolerance * here.energy
             if there.energy < here.energy:
-                z, here = z + step.x, there
+                z, here = further, there
         return RefinedDepth(
             log_depth=z,
             valid=self._active,

@@ -147,18 +147,22 @@ def _prepare_smoother(level: _Level) -> None:
     east, south, southeast, southwest = level.east, level.south, level.southeast, level.southwest
     height, width = level.mass.shape
     above = np.zeros(width, np.float32)
+    rest = np.empty(width, np.float32)
     for i in range(1, height - 1):
-        left = _ZERO
         for j in range(1, width - 1):
             diagonal = southeast[i, j] + southeast[i - 1, j - 1]
             diagonal += southwest[i, j] + southwest[i - 1, j + 1] + level.mass[i, j]
             horizontal, vertical = east[i, j] + east[i, j - 1], south[i, j] + south[i - 1, j]
             total = horizontal + vertical + diagonal
             level.diagonal[i, j] = total if total > _TINY else _ONE
-            left = _chain(left, east[i, j - 1], vertical + diagonal)
-            level.row_pivot[i, j] = _inverse(left + max(east[i, j], _ZERO))
+            rest[j] = vertical + diagonal
             above[j] = _chain(above[j], south[i - 1, j], horizontal + diagonal)
             level.column_pivot[i, j] = _inverse(above[j] + max(south[i, j], _ZERO))
+        if i % 2 == 0:
+            left = _ZERO
+            for j in range(1, width - 1):
+                left = _chain(left, east[i, j - 1], rest[j])
+                level.row_pivot[i, j] = _inverse(left + max(east[i, j], _ZERO))
 
 
 @_kernel
@@ -205,7 +209,9 @@ def _relax_rows(level: _Level, nine_point: bool) -> None:
         _residual_row(level, i, nine_point, row)
         change = _ZERO
         for j in range(1, width - 1):
-            change = (row[j] + max(east[i, j - 1], _ZERO) * change) * pivot[i, j]
+            # Everything but one multiply-add is kept out of the recurrence.
+            share = max(east[i, j - 1], _ZERO) * pivot[i, j]
+            change = row[j] * pivot[i, j] + share * change
             row[j] = change
         change = _ZERO
         for j in range(width - 2, 0, -1):
