@@ -58,6 +58,16 @@ def _depth() -> list[ProviderSpec]:
             # The files' uncertainty is declared with them: nothing is added to it.
             calibration=DepthCalibration(std_scale=1.0, relative_std=0.0, std_floor=0.0),
         ),
+        ProviderSpec(
+            kind="depth",
+            name="matcher",
+            factory="mpsfm_core.builtin.matcher_depth:MatcherDepth",
+            capabilities=frozenset({"uncached"}),
+            summary="the depth that the matcher predicts for its pairs (pair-depth)",
+            code_license=_LICENSE,
+            # Reference: the scale of MASt3R's confidence, and nothing beside it.
+            calibration=DepthCalibration(std_scale=0.862, relative_std=0.0, std_floor=0.0),
+        ),
     ]
 
 

@@ -33,14 +33,14 @@ class Candidates:
     """Matches of a pair before verification: rows of the features, then free points.
 
     ``std_px``: localisation noise of the free points. ``precision``: mean inverse variance of the
-    pair depth of both images, None where the matcher gives none.
+    pair depth of both images, 0 where there is none.
     """
 
     pair: Pair
     sparse: SparseMatches
     points: PointMatches
     std_px: float
-    precision: tuple[float, float] | None = None
+    precision: tuple[float, float] = (0.0, 0.0)
 
     def __len__(self) -> int:
         return len(self.sparse) + len(self.points.scores)
@@ -208,11 +208,11 @@ def _typical(parts: list[tuple[int, float]]) -> float:
     return float(np.median(values)) if len(values) else 1.0
 
 
-def _precision(results: list[PairMatches]) -> tuple[float, float] | None:
+def _precision(results: list[PairMatches]) -> tuple[float, float]:
     for result in results:
         if result.depth is not None:
             return _mean_precision(result.depth.depth_a), _mean_precision(result.depth.depth_b)
-    return None
+    return 0.0, 0.0
 
 
 def _mean_precision(depth: DepthPrior) -> float:

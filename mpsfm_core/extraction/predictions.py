@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
+from mpsfm_core.config import Config
 from mpsfm_core.data import DepthPrior, NormalPrior
 from mpsfm_core.errors import ConfigError
 from mpsfm_core.extraction import priors
 from mpsfm_core.extraction.matching import Candidates, PairMatcher
 from mpsfm_core.extraction.raw_priors import RawPriors
 from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.registry import Registry
 
 FROM_MATCHER = "matcher"
 """The depth provider's name that means: take the depth that the matcher predicts."""
@@ -86,17 +88,22 @@ class Predictions:
         return depth, normals
 
 
+def check_depth_source(config: Config, registry: Registry) -> None:
+    """Raise :class:`ConfigError` if depth is to come from a matcher that predicts none."""
+    chosen = [b for b in (config.matcher, config.dense_matcher) if b is not None]
+    specs = [registry.spec("matcher", backend.use) for backend in chosen]
+    able = any("pair-depth" in spec.capabilities for spec in specs)
+    if config.depth.use == FROM_MATCHER and not able:
+        names = ", ".join(repr(spec.name) for spec in specs)
+        raise ConfigError(f"depth.use: 'matcher': {names} predicts no depth (pair-depth)")
+
+
 def _best_pairs(candidates: list[Candidates]) -> dict[int, tuple[Candidates, int]]:
     """For each image the pair, and its place in it, with the highest mean precision."""
     best: dict[int, tuple[float, Candidates, int]] = {}
     for matches in candidates:
-        if matches.precision is None:
-            raise ConfigError(
-                "depth.use: 'matcher' needs a matcher that predicts depth (capability pair-depth)"
-            )
-        for side, (image, precision) in enumerate(
-            zip(matches.pair, matches.precision, strict=True)
-        ):
-            if image not in best or precision > best[image][0]:
+        for side, image in enumerate(matches.pair):
+            precision = matches.precision[side]
+            if precision > 0 and (image not in best or precision > best[image][0]):
                 best[image] = (precision, matches, side)
     return {image: (matches, side) for image, (_, matches, side) in best.items()}

@@ -19,7 +19,7 @@ from mpsfm_core.extraction.backends import thread_count
 from mpsfm_core.extraction.events import ExtractionEvents, Silent
 from mpsfm_core.extraction.features import FeatureTable, choose_pairs
 from mpsfm_core.extraction.matching import PairMatcher, PairVerifier, assemble
-from mpsfm_core.extraction.predictions import Predictions
+from mpsfm_core.extraction.predictions import Predictions, check_depth_source
 from mpsfm_core.extraction.report import describe
 from mpsfm_core.extraction.workbench import Workbench
 from mpsfm_core.inputs.images import ImageSet
@@ -49,7 +49,8 @@ def extract(
     What the cache has is not computed again, so that an interrupted run goes on where it was.
 
     Raises:
-        InputError: a provider, its weights or its files are missing.
+        InputError: a provider, its weights or its files are missing, or the configuration does
+            not fit together.
         ProviderRunError, ProviderOutputError: a provider failed or broke its contract.
         OutputError: the cache cannot be written.
     """
@@ -58,6 +59,7 @@ def extract(
 
 
 def _extract(bench: Workbench) -> Extraction:
+    check_depth_source(bench.config, bench.registry)
     bench.run_masks()
     backend = bench.config.features
     table = None if backend is None else FeatureTable(bench, backend)

@@ -1,0 +1,26 @@
+"""The choice of the matcher's own depth as the prior (the paper's MASt3R configuration)."""
+
+from __future__ import annotations
+
+from mpsfm_core.data import DepthPrior, View
+from mpsfm_core.errors import ProviderError
+from mpsfm_core.options import Options
+from mpsfm_core.providers import ProviderContext
+
+
+class MatcherDepth:
+    """Stands in the configuration as ``depth: {use: matcher}``.
+
+    The extraction takes the depth from the pairs that the matcher has predicted, the most certain
+    pair of each image. One view alone has no pair, so that asking for it is an error.
+    """
+
+    def __init__(self, options: Options | None, context: ProviderContext) -> None:
+        pass
+
+    def predict(self, view: View) -> DepthPrior:
+        """Always raises :class:`ProviderError`."""
+        raise ProviderError(
+            f"the depth of {view.name!r} comes from the pairs of a matcher that predicts depth; "
+            f"it cannot be predicted from one view"
+        )

@@ -1,0 +1,226 @@
+"""What is computed again after a change: exactly what depends on it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mpsfm_core.config import RuntimeOptions
+from mpsfm_core.extraction.options import ExtractionOptions, VerificationOptions
+from mpsfm_core.options import Backend
+
+FULL = {"features": 4, "depth": 4, "normals": 4}
+
+
+@pytest.fixture
+def done(world):
+    """A world where everything has been computed once."""
+    world.extract()
+    assert world.asked() == FULL
+    return world
+
+
+def again(world, **changes) -> Counter[str]:
+    extraction = world.extract(**changes)
+    matcher = next(p for p in extraction.report["providers"] if p["kind"] == "matcher")
+    return world.asked() + Counter(matcher=matcher["computed"])
+
+
+def test_nothing_changed(done) -> None:
+    assert not again(done)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"extraction": ExtractionOptions(integration_size=80, edge_ratio=None)},
+        {"verification": VerificationOptions(max_error_px=2.0)},
+        {"depth": Backend(use="truth", calibration={"relative_std": 0.1})},
+    ],
+)
+def test_what_comes_after_the_providers(done, changes) -> None:
+    assert not again(done, **changes)
+
+
+@pytest.mark.parametrize("runtime", [{"workers": 1}, {"workers": 3, "threads": 2}])
+def test_where_it_is_computed(done, runtime) -> None:
+    assert not again(done, runtime=RuntimeOptions(cache_dir=done.cache, **runtime))
+
+
+def test_options_of_features(done) -> None:
+    changed = Backend(use="truth", options={"flavour": 1})
+    assert again(done, features=changed) == {"features": 4, "matcher": 6}
+    assert not again(done, features=changed)
+    assert not again(done)  # and the way back
+
+
+def test_options_of_the_matcher(done) -> None:
+    matcher = Backend(use="mutual-nearest", options={"ratio": 0.7})
+    assert again(done, matcher=matcher) == {"matcher": 6}
+
+
+def test_options_of_depth_reach_normals_that_need_it(world) -> None:
+    normals = Backend(use="from-depth")
+    first = world.extract(normals=normals)
+    assert world.asked() == {"features": 4, "depth": 4}
+
+    def normals_computed(extraction) -> int:
+        return extraction.report["providers"][-1]["computed"]
+
+    assert normals_computed(first) == 4
+    assert normals_computed(world.extract(normals=normals)) == 0
+    calibrated = Backend(use="truth", calibration={"relative_std": 0.1})
+    assert normals_computed(world.extract(normals=normals, depth=calibrated)) == 4
+    # Another provider that says the same: normals depend on what it says.
+    same = world.extract(normals=normals, depth=Backend(use="truth", options={"flavour": 1}))
+    assert world.asked()["depth"] == 4 and normals_computed(same) == 0
+
+
+def test_weights(world) -> None:
+    weights = world.root / "network.bin"
+    weights.write_bytes(b"first")
+    depth = Backend(use="truth", options={"weights": str(weights)})
+    world.extract(depth=depth)
+    assert world.asked() == FULL
+    assert not again(world, depth=depth)
+    weights.write_bytes(b"second")
+    assert again(world, depth=depth) == {"depth": 4}
+    moved = weights.rename(world.root / "other.bin")
+    elsewhere = Backend(use="truth", options={"weights": str(moved)})
+    assert again(world, depth=elsewhere) == {"depth": 4}
+
+
+def test_pixels_of_one_image(done) -> None:
+    done.write("view2.png", done.truth.renderings["view2.png"].rgb // 2)
+    assert again(done) == {"features": 1, "depth": 1, "normals": 1, "matcher": 3}
+
+
+def test_intrinsics_matter_to_those_who_use_them(done) -> None:
+    intrinsic = Backend(use="intrinsic")
+    again(done, depth=intrinsic)
+    (done.root / "intrinsics.yaml").write_text("1: {params: [141, 140, 80, 60], images: all}")
+    assert not again(done)
+    assert again(done, depth=intrinsic) == {"depth": 4}
+
+
+def test_masks_reach_everything(done) -> None:
+    masks = (Backend(use="left"),)
+    assert again(done, masks=masks) == {"mask": 4, **FULL, "matcher": 6}
+    assert not again(done, masks=masks)
+    wider = (Backend(use="left", options={"flavour": 5}),)
+    assert again(done, masks=wider) == {"mask": 4, **FULL, "matcher": 6}
+    same = (Backend(use="left"), Backend(use="left", options={"flavour": 9}))
+    # Two masks whose intersection is the old one: views are as before.
+    assert again(done, masks=same) == {"mask": 4}
+
+
+def test_version_of_a_plugin(done) -> None:
+    """Providers of another version are asked again."""
+    entries = done.registry._entries
+    for number, entry in enumerate(entries):
+        if (entry.spec.kind, entry.spec.name) == ("depth", "truth"):
+            entries[number] = type(entry)(entry.spec, entry.distribution, "2")
+    assert again(done) == {"depth": 4}
+
+
+def test_seed(done) -> None:
+    assert again(done, runtime=RuntimeOptions(cache_dir=done.cache, seed=1)) == {
+        **FULL,
+        "matcher": 6,
+    }
+
+
+def test_files_are_read_again(world) -> None:
+    folder = world.root / "depth"
+    folder.mkdir()
+    for name in world.names:
+        np.save(folder / f"{name}.npy", np.full((30, 40), 2.0))
+    depth = Backend(use="files", options={"directory": str(folder), "relative_std": 0.02})
+    first = world.extract(depth=depth).problem.images[0].depth.depth
+    np.save(folder / f"{world.names[0]}.npy", np.full((30, 40), 3.0))
+    second = world.extract(depth=depth).problem.images[0].depth.depth
+    assert (np.median(first), np.median(second)) == pytest.approx((2.0, 3.0))
+
+
+def test_damaged_entry(done, caplog: pytest.LogCaptureFixture) -> None:
+    path = sorted((done.cache / "extraction" / "depth").rglob("*.npz"))[0]
+    path.write_bytes(path.read_bytes()[:-100])
+    assert again(done) == {"depth": 1}
+    assert "damaged" in caplog.text
+    assert not again(done)
+
+
+def test_failure_leaves_what_was_done(world) -> None:
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    world.break_on["depth", "view3.png"] = stop
+    with pytest.raises(KeyboardInterrupt):
+        world.extract(runtime=RuntimeOptions(cache_dir=world.cache, workers=1))
+    assert world.asked() == {"features": 4, "depth": 4}
+    world.break_on.clear()
+    assert again(world) == {"depth": 1, "normals": 4}
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from mpsfm_core.config import Config, RuntimeOptions
+from mpsfm_core.extraction.runner import extract
+from mpsfm_core.inputs.images import load_images
+from mpsfm_core.options import Backend
+from mpsfm_core.registry import Registry
+
+root = Path(sys.argv[1])
+depth = {"directory": str(root / "depth"), "relative_std": 0.02}
+config = Config(
+    features=Backend(use="sift"),
+    matcher=Backend(use="mutual-nearest"),
+    depth=Backend(use="files", options=depth),
+    normals=Backend(use="from-depth"),
+    runtime=RuntimeOptions(cache_dir=root / "cache", workers=2),
+)
+report = extract(
+    load_images(root / "images", root / "intrinsics.yaml"), config, Registry.discover()
+).report
+for provider in report["providers"]:
+    print(provider["kind"], provider["computed"])
+"""
+
+
+def start(root: Path) -> subprocess.Popen[str]:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", SCRIPT, str(root)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGINT"])
+def test_stopped_run_goes_on_where_it_was(world, name: str) -> None:
+    (world.root / "depth").mkdir()
+    for image in world.names:
+        np.save(world.root / "depth" / f"{image}.npy", world.truth.renderings[image].depth)
+    entries = world.cache / "extraction"
+    with start(world.root) as process:
+        deadline = time.monotonic() + 120
+        while not list(entries.rglob("*.npz")) and process.poll() is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        process.send_signal(getattr(signal, name))
+    kept = Counter(path.parts[-3] for path in entries.rglob("*.npz"))
+    assert process.returncode != 0 and kept["features"] >= 1
+    with start(world.root) as process:
+        output, _ = process.communicate(timeout=240)
+    computed = dict(line.split() for line in output.splitlines())
+    assert int(computed["features"]) == 4 - kept["features"]
+    assert int(computed["matcher"]) == 6 - kept["matcher"]
+    assert int(computed["normals"]) == 4 - kept["normals"]

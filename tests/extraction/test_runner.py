@@ -1,0 +1,291 @@
+"""The whole room on an analytic scene: what comes out, and in which order it is made."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from mpsfm_core.calibration.model import DepthCalibration
+from mpsfm_core.config import RuntimeOptions
+from mpsfm_core.data import DepthPrior
+from mpsfm_core.errors import ConfigError, ProviderOutputError, ProviderRunError
+from mpsfm_core.extraction.cache import digest
+from mpsfm_core.extraction.options import ExtractionOptions, PairOptions
+from mpsfm_core.extraction.priors import EDGE_VARIANCE
+from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_angle_deg
+from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.options import Backend
+from mpsfm_core.providers import ProviderSpec, hookimpl
+
+ALL_PAIRS = {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)}
+
+
+def pairs_of(problem) -> set[tuple[int, int]]:
+    return {(pair.image_a, pair.image_b) for pair in problem.pairs}
+
+
+def identical(first, second) -> bool:
+    images = [(digest(a), digest(b)) for a, b in zip(first.images, second.images, strict=True)]
+    pairs = [(digest(a), digest(b)) for a, b in zip(first.pairs, second.pairs, strict=True)]
+    return all(a == b for a, b in images + pairs)
+
+
+def test_problem_is_the_truth(world) -> None:
+    problem = world.extract().problem
+    assert [image.name for image in problem.images] == world.names
+    assert pairs_of(problem) == ALL_PAIRS
+    for pair in problem.pairs:
+        a, b = (world.poses[world.names[i]] for i in (pair.image_a, pair.image_b))
+        rotation, translation = compose((b[:, :3], b[:, 3]), invert(a[:, :3], a[:, 3]))
+        assert pair.calibrated
+        assert rotation_angle_deg(pair.rotation @ rotation.T) < 0.3
+        assert angle_between_deg(pair.translation, translation) < 1.0
+        xy_a = problem.images[pair.image_a].keypoints[pair.matches[:, 0]]
+        truth = world.scene.correspondences(
+            problem.images[0].camera, a, problem.images[0].camera, b, xy_a
+        )
+        xy_b = problem.images[pair.image_b].keypoints[pair.matches[:, 1]]
+        # A point hidden in one image can have a neighbour as its nearest descriptor.
+        assert (np.abs(xy_b - truth.xy_b).max(axis=1) < 1e-3).mean() > 0.9
+
+
+def test_priors_are_on_one_grid(world) -> None:
+    options = ExtractionOptions(integration_size=80)
+    image = world.extract(extraction=options).problem.images[1]
+    truth = world.scene.render(image.camera.resized(80, 60), world.poses[image.name])
+    assert image.depth.shape == image.normals.shape == (60, 80)
+    relative = np.abs(image.depth.depth / truth.depth - 1)
+    assert np.median(relative) < 1e-3
+    std = np.sqrt(image.depth.variance) / image.depth.depth
+    expected = np.maximum(DepthCalibration().relative_std, 0.02 / image.depth.depth)
+    assert np.allclose(np.median(std / expected), 1, atol=0.01)
+    edges = image.normals.variance == EDGE_VARIANCE
+    assert 0.01 < edges.mean() < 0.6  # a slanted floor has steep steps on so coarse a grid
+    trusting = ExtractionOptions(integration_size=80, edge_ratio=None)
+    assert world.extract(extraction=trusting).problem.images[1].normals.variance.max() < 0.1
+
+
+def test_report(world) -> None:
+    report = world.extract().report
+    assert (report["pairs_proposed"], report["pairs_matched"]) == (6, 6)
+    assert report["pairs_verified"] == 6
+    first = report["pairs"][0]
+    assert first["images"] == ["view0.png", "view1.png"]
+    assert first["inliers"] <= first["matches"] and first["geometry"] == "calibrated"
+    assert report["images"]["view0.png"]["valid_depth"] == 1.0
+    used = {(p["kind"], p["name"]): (p["computed"], p["from_cache"]) for p in report["providers"]}
+    assert used["features", "truth"] == (4, 0) and used["depth", "truth"][0] == 4
+
+
+def test_reasons_of_dropped_pairs(world) -> None:
+    world.seeds = world.seeds[:10]
+    extraction = world.extract()
+    assert not extraction.problem.pairs
+    reasons = {pair["dropped"] for pair in extraction.report["pairs"]}
+    assert any("at least 15 are needed" in reason for reason in reasons)
+
+
+def test_result_does_not_depend_on_the_number_of_workers(world) -> None:
+    one = world.extract(runtime=RuntimeOptions(cache_dir=world.root / "one", workers=1))
+    many = world.extract(runtime=RuntimeOptions(cache_dir=world.root / "many", workers=3))
+    assert identical(one.problem, many.problem)
+
+
+def test_joint_prediction_takes_one_pass(world) -> None:
+    separate = world.extract().problem
+    world.asked()
+    joint = world.extract(depth=Backend(use="joint"), normals=Backend(use="joint")).problem
+    assert world.asked() == {"joint": 4, "depth": 4}  # the joint pass calls depth itself
+    assert identical(separate, joint)
+
+
+def test_dense_matches_stand_behind_the_sparse_ones(world) -> None:
+    sparse = world.extract().problem
+    both = world.extract(dense_matcher=Backend(use="dense")).problem
+    for before, after in zip(sparse.images, both.images, strict=True):
+        count = len(before.keypoints)
+        assert np.array_equal(after.keypoints[:count], before.keypoints)
+        added = after.keypoints[count:]
+        assert len(added) > 10
+    pair_before, pair_after = sparse.pairs[0], both.pairs[0]
+    assert len(pair_after) > len(pair_before)
+    free = pair_after.matches[:, 0] >= len(sparse.images[0].keypoints)
+    assert np.array_equal(pair_after.matches[~free], pair_before.matches)
+    distance = np.linalg.norm(
+        both.images[0].keypoints[pair_after.matches[free, 0]][:, None]
+        - sparse.images[0].keypoints[None],
+        axis=2,
+    )
+    assert distance.min() >= 6
+
+
+def test_each_dense_match_has_keypoints_of_its_own(world) -> None:
+    problem = world.extract(features=None, matcher=None, dense_matcher=Backend(use="dense")).problem
+    assert pairs_of(problem) == ALL_PAIRS
+    for index, image in enumerate(problem.images):
+        columns = [p.matches[:, 0] for p in problem.pairs if p.image_a == index]
+        columns += [p.matches[:, 1] for p in problem.pairs if p.image_b == index]
+        rows = np.sort(np.concatenate(columns))
+        assert np.array_equal(rows, np.arange(len(image.keypoints)))
+        assert image.keypoint_std_px == 2.0
+
+
+def test_dense_matches_snap_to_features_without_a_sparse_matcher(world) -> None:
+    options = ExtractionOptions(dense_snap_px=4.0)
+    problem = world.extract(
+        matcher=None, dense_matcher=Backend(use="dense"), extraction=options
+    ).problem
+    features = world.positions(world.names[0])[0]
+    assert np.array_equal(problem.images[0].keypoints[: len(features)], features)
+    snapped = problem.pairs[0].matches[:, 0] < len(features)
+    assert 0 < snapped.sum() < len(snapped)
+
+
+def test_depth_of_the_matcher(world) -> None:
+    """The pair whose prediction is most certain gives an image's depth."""
+    calibration = {"std_scale": 1.0, "relative_std": 0.0, "std_floor": 0.0}
+    problem = world.extract(
+        dense_matcher=Backend(use="dense-depth"),
+        depth=Backend(use="matcher", calibration=calibration),
+    ).problem
+    furthest = {0: 3, 1: 2, 2: 2, 3: 3}  # images apart
+    for index, image in enumerate(problem.images):
+        std = np.sqrt(image.depth.variance) / image.depth.depth
+        assert np.median(std) == pytest.approx(0.1 - 0.01 * furthest[index], rel=1e-3)
+
+
+def test_depth_of_a_matcher_without_depth(world) -> None:
+    with pytest.raises(ConfigError, match="'mutual-nearest' predicts no depth"):
+        world.extract(depth=Backend(use="matcher"))
+    assert not world.asked()
+
+
+def test_masks_of_providers(world) -> None:
+    plain = world.extract().problem
+    problem = world.extract(masks=(Backend(use="left"),)).problem
+    for image, full in zip(problem.images, plain.images, strict=True):
+        assert 0 < len(image.keypoints) < len(full.keypoints)
+        assert image.keypoints[:, 0].max() <= 80
+        middle = image.depth.shape[1] // 2
+        assert image.depth.valid[:, :middle].all() and not image.depth.valid[:, middle + 1 :].any()
+        assert not image.normals.valid[:, middle + 1 :].any()
+
+
+def test_masks_of_providers_and_of_the_user_intersect(world) -> None:
+    (world.root / "masks").mkdir()
+    for name in world.names:
+        drawn = np.zeros((120, 160), np.uint8)
+        drawn[60:] = 255
+        cv2.imwrite(str(world.root / "masks" / name), drawn)
+    problem = world.extract(
+        inputs=InputOptions(masks=world.root / "masks"), masks=(Backend(use="left"),)
+    ).problem
+    for image in problem.images:
+        assert image.keypoints[:, 0].max() <= 80 and image.keypoints[:, 1].min() >= 60
+        assert image.depth.valid.mean() == pytest.approx(0.25, abs=0.02)
+
+
+def test_masked_dense_matches(world) -> None:
+    problem = world.extract(
+        features=None,
+        matcher=None,
+        dense_matcher=Backend(use="dense"),
+        masks=(Backend(use="left"),),
+    ).problem
+    assert problem.pairs
+    assert max(image.keypoints[:, 0].max() for image in problem.images) <= 80
+
+
+def test_retrieval(world) -> None:
+    options = PairOptions(mode="retrieval", top_k=1)
+    extraction = world.extract(pairs=options, retrieval=Backend(use="truth"))
+    assert pairs_of(extraction.problem) == {(0, 1), (1, 2), (2, 3)}
+    with pytest.raises(ConfigError, match=r"set retrieval\.use"):
+        world.extract(pairs=options)
+
+
+def test_pair_filters_of_plugins(world) -> None:
+    class OnlyNeighbours:
+        @hookimpl
+        def mpsfm_filter_pairs(self, pairs):
+            return [(b, a) for a, b in pairs if int(b[4]) - int(a[4]) == 1]
+
+    world.registry.register(OnlyNeighbours(), name="only-neighbours")
+    extraction = world.extract()
+    assert pairs_of(extraction.problem) == {(0, 1), (1, 2), (2, 3)}
+    assert (extraction.report["pairs_proposed"], extraction.report["pairs_matched"]) == (6, 3)
+
+
+def test_stages_in_order(world) -> None:
+    class Recorder:
+        def __init__(self) -> None:
+            self.events: list[tuple[object, ...]] = []
+
+        def stage_started(self, stage, total) -> None:
+            self.events.append(("started", stage, total))
+
+        def stage_progress(self, stage, done, total) -> None:
+            self.events.append(("progress", stage, done, total))
+
+        def stage_finished(self, stage, seconds) -> None:
+            assert seconds >= 0
+            self.events.append(("finished", stage))
+
+    recorder = Recorder()
+    world.extract(recorder, masks=(Backend(use="left"),))
+    started = [event[1:] for event in recorder.events if event[0] == "started"]
+    names = ["masks", "features", "matching", "verification", "depth", "normals"]
+    assert started == [(n, 6 if n in ("matching", "verification") else 4) for n in names]
+    progress = [event[2:] for event in recorder.events if event[:2] == ("progress", "depth")]
+    assert progress == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert recorder.events[-1] == ("finished", "normals")
+
+
+def test_normals_from_depth_get_the_calibrated_depth(world) -> None:
+    problem = world.extract(normals=Backend(use="from-depth")).problem
+    truth = world.scene.render(problem.images[0].camera, world.poses[world.names[0]])
+    normals = problem.images[0].normals
+    resized = cv2.resize(truth.normals, normals.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    cosine = (normals.normals * resized).sum(axis=-1)[normals.valid]
+    assert normals.valid.mean() > 0.8 and np.median(np.degrees(np.arccos(cosine.clip(-1, 1)))) < 1
+
+
+def test_broken_provider_is_named(world) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError("in the network")
+
+    world.break_on["depth", "view2.png"] = fail
+    with pytest.raises(ProviderRunError, match=r"'truth', image 'view2\.png': ZeroDivisionError"):
+        world.extract()
+
+
+def test_nan_of_a_provider_is_refused(world) -> None:
+    def spoiled() -> DepthPrior:
+        values = np.full((4, 4), 2.0, np.float32)
+        prior = DepthPrior(values, None, np.ones((4, 4), np.bool_))
+        values[1, 1] = np.nan  # the prior looks at the same memory
+        return prior
+
+    world.break_on["depth", "view1.png"] = spoiled
+    with pytest.raises(ProviderOutputError, match=r"view1\.png.*depth: must be finite"):
+        world.extract()
+    assert world.asked()["features"] == 4
+    world.break_on.clear()
+    world.extract()
+    assert world.asked()["features"] == 0  # what was done before stands
+
+
+def test_the_seed_reaches_the_providers(world) -> None:
+    seeds = []
+
+    def factory(options, context):
+        seeds.append((context.seed, context.threads, context.device))
+        return type("Any", (), {"describe": lambda self, view: np.ones(2, np.float32)})()
+
+    world.registry.add(ProviderSpec(kind="retrieval", name="seeded", factory=factory))
+    runtime = RuntimeOptions(cache_dir=world.cache, workers=1, threads=3, seed=7, device="cpu")
+    world.extract(
+        runtime=runtime, pairs=PairOptions(mode="retrieval"), retrieval=Backend(use="seeded")
+    )
+    assert seeds == [(7, 3, "cpu")]
