@@ -1,0 +1,1 @@
+"""Sky masks, by a network or without weights."""

@@ -1,0 +1,32 @@
+"""Announces the providers. Imports neither onnxruntime nor OpenCV."""
+
+from __future__ import annotations
+
+from mpsfm_core import ProviderSpec, hookimpl
+from mpsfm_sky.options import SimpleSkyOptions, SkyOptions
+
+
+@hookimpl
+def mpsfm_providers() -> list[ProviderSpec]:
+    """A network, and a rule of thumb."""
+    return [
+        ProviderSpec(
+            kind="mask",
+            name="sky",
+            factory="mpsfm_sky.network:SkyNetwork",
+            options=SkyOptions,
+            summary="leaves the sky out, by a segmentation network",
+            requires=("onnxruntime",),
+            install_hint="pip install mpsfm-sky",
+            code_license="Apache-2.0",
+            weights_license="of the chosen model (skyseg: MIT)",
+        ),
+        ProviderSpec(
+            kind="mask",
+            name="sky-simple",
+            factory="mpsfm_sky.simple:SimpleSky",
+            options=SimpleSkyOptions,
+            summary="leaves smooth bright or blue regions at the upper border out; outdoors only",
+            code_license="Apache-2.0",
+        ),
+    ]
