@@ -37,7 +37,7 @@ MAX_DAMPING = 1e16
 MAX_FOCAL_STEP = 1.0
 """A focal length changes by at most a factor of e in a step (our choice)."""
 CG_TOLERANCE = 1e-3
-"""Of the reduced system beyond ``dense_poses`` (our measurement)."""
+"""Of the reduced system beyond ``dense_poses`` (our choice)."""
 MAX_CG_ITERATIONS = 500
 MIN_GAIN = 1e-3
 """A step is taken if the cost falls by this part of the prediction (Ceres' default)."""

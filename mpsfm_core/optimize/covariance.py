@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mpsfm_core.data import Float64
@@ -24,7 +26,8 @@ def point_covariances(problem: BundleProblem, options: BundleOptions | None = No
         DataError: as :func:`~mpsfm_core.optimize.bundle_adjustment.adjust_bundle`.
     """
     options = options or BundleOptions()
-    p = prepare(problem, options)
+    nothing = np.zeros(len(problem.rotations), dtype=np.bool_)
+    p = prepare(replace(problem, variable_pose=nothing, scale_anchor=None), options)
     covariances = np.empty((len(p.state.points), 3, 3))
     scratch = [kernels.make_scratch(0) for _ in p.ranges]
     with workers(p.ranges, options.threads) as run:
