@@ -1,0 +1,68 @@
+"""Reading scene folders."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mpsfm_core.errors import InputError
+from mpsfm_core.evaluation.scene_folder import read_scene
+from tests.evaluation.conftest import NAMES, POSES
+
+
+def test_sets_poses_and_files(scene_folder: Path) -> None:
+    scene = read_scene(scene_folder)
+    assert [item.name for item in scene.sets] == [
+        "all-00",
+        "triplets_20-40-00",
+        "triplets_20-40-01",
+    ]
+    assert scene.sets[0].images == tuple(NAMES)
+    assert scene.sets[2].images == tuple(NAMES[2:])
+    rotation, translation = scene.truth["0003.png"]
+    np.testing.assert_allclose(np.column_stack([rotation, translation]), POSES[3], atol=1e-9)
+    assert scene.depth == scene_folder / "gt_depth"
+    assert scene.intrinsics == scene_folder / "gt"  # there is no intrinsics.yaml
+
+
+def test_buckets_are_chosen_by_name_and_by_group(scene_folder: Path) -> None:
+    scene = read_scene(scene_folder)
+    assert len(scene.chosen(None)) == 3
+    assert [item.bucket for item in scene.chosen(["triplets"])] == ["triplets/20-40"] * 2
+    assert [item.bucket for item in scene.chosen(["all"])] == ["all"]
+    with pytest.raises(InputError, match="no bucket 'minimal'; it has all, triplets/20-40"):
+        scene.chosen(["minimal"])
+
+
+@pytest.fixture
+def copy(scene_folder: Path, tmp_path: Path) -> Path:
+    shutil.copytree(scene_folder, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def test_without_sets_there_is_one_of_all_images(copy: Path) -> None:
+    (copy / "testsets.yaml").unlink()
+    assert [item.images for item in read_scene(copy).sets] == [tuple(NAMES)]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("all: [[0000, 0009]]", "no photo with a true pose is called 0009"),
+        ("all: [[0000]]", "set 0 needs two or more images"),
+        ("- [0000, 0001]", "must map buckets"),
+        ("all: [[0000, 0001]", "cannot be read"),
+    ],
+)
+def test_wrong_sets_are_explained(copy: Path, text: str, message: str) -> None:
+    (copy / "testsets.yaml").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_scene(copy)
+
+
+def test_a_folder_without_photos_is_explained(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="photos in images/"):
+        read_scene(tmp_path)
