@@ -317,7 +317,9 @@ class MappingImage:
     ``keypoints``: (n, 2) float64, COLMAP pixels of the undistorted camera; dense matches add
     theirs behind the sparse ones. ``depth`` has a variance; ``depth`` and ``normals`` share one
     grid. ``keypoint_std_px``: localisation noise. ``focal_known``: False when the focal length is
-    a guess that bundle adjustment may refine.
+    a guess that bundle adjustment may refine; images of equal camera then share it.
+    ``known_pose``: rotation (3, 3) and translation (3,) float64, ``cam_from_world``, when the
+    user brought one.
     """
 
     name: str
@@ -327,6 +329,7 @@ class MappingImage:
     normals: NormalPrior
     keypoint_std_px: float = 1.0
     focal_known: bool = True
+    known_pose: tuple[Float64, Float64] | None = None
 
     def __post_init__(self) -> None:
         _array(self, "keypoints", np.float64, (None, 2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpsfm_core.data import DepthPrior, PinholeCamera
+from mpsfm_core.data import DepthPrior
 from mpsfm_core.scene.reconstruction import MetricScale, Reconstruction, RegisteredImage
 from mpsfm_core.scene.scene import Scene
 
@@ -14,8 +14,11 @@ MIN_METRIC_IMAGES = 3
 """Fewer images cannot show a spread (ours)."""
 
 
-def metric_scale(scene: Scene) -> MetricScale | None:
-    """Metres per world unit, from the scales of the registered images' metric priors."""
+def metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | None:
+    """Metres per world unit, from the scales of the registered images' metric priors.
+
+    ``keep_units``: the world is the user's; the scale is told, but not trusted to be applied.
+    """
     images = [int(i) for i in scene.registered_images()]
     log_scales = [np.log(scene.maps[i].scale) for i in images if scene.maps[i].prior.metric]
     if not log_scales:
@@ -23,13 +26,14 @@ def metric_scale(scene: Scene) -> MetricScale | None:
     center = float(np.median(log_scales))
     spread = 1.4826 * float(np.median(np.abs(np.array(log_scales) - center)))
     trusted = len(log_scales) >= MIN_METRIC_IMAGES and spread <= MAX_METRIC_SPREAD
+    trusted = trusted and not keep_units
     return MetricScale(float(np.exp(-center)), spread, len(log_scales), trusted)
 
 
-def finished(scene: Scene) -> Reconstruction:
+def finished(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
     """The reconstruction as results are written from it; metres if the scale is trusted."""
     scene.tracks.compact()
-    metric = metric_scale(scene)
+    metric = metric_scale(scene, keep_units=keep_units)
     in_metres = metric is not None and metric.trusted
     factor = metric.metres_per_unit if metric and in_metres else 1.0
     tracks = scene.tracks
@@ -50,7 +54,7 @@ def _registered(scene: Scene, index: int, factor: float, in_metres: bool) -> Reg
     return RegisteredImage(
         index=index,
         name=image.name,
-        camera=PinholeCamera(*image.camera.size, *map(float, scene.intrinsics[index])),
+        camera=scene.camera(index),
         rotation=scene.rotations[index].copy(),
         translation=scene.translations[index] * factor,
         point_ids=scene.tracks.point_of[scene.graph.keypoints_of(index)].copy(),

@@ -25,7 +25,7 @@ from mpsfm_core.mapping.registration import (
     find_poses,
     rate_pose,
 )
-from mpsfm_core.mapping.triangulation import triangulate_image
+from mpsfm_core.mapping.triangulation import complete_and_merge, triangulate_image
 from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
 from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
 from mpsfm_core.scene.scene import Scene, Snapshot
@@ -77,15 +77,19 @@ class Mapper:
         available = np.ones(len(self.problem.images), dtype=np.bool_)
         for _ in range(self.options.max_components):
             self._begin()
-            if not self._initialize(available):
+            known = self._start_from_known_poses(available)
+            if not known and not self._initialize(available):
                 return
-            while self._register_next(available):
+            fixed = known and self.options.known_poses == "fixed"
+            while not fixed and self._register_next(available):
                 if self._grown():
                     self._refine_globally()
             self._finish()
             available &= ~self.scene.registered
             if self.scene.registered.sum() >= self.options.min_model_size:
-                yield finished(self.scene)
+                yield finished(self.scene, keep_units=known)
+            if fixed:
+                return
 
     def _begin(self) -> None:
         self.scene = Scene(self.problem)
@@ -93,6 +97,26 @@ class Mapper:
         self.refiner = Refiner(self.scene, self.options, self.scores)
         self.ladder = FailureLadder(self.options.registration, self.options.consistency)
         self._last_size = (0, 0)
+
+    def _start_from_known_poses(self, available: Bool) -> bool:
+        """Register all images that came with a pose; False when there are fewer than two."""
+        known = {
+            index: image.known_pose
+            for index, image in enumerate(self.problem.images)
+            if image.known_pose is not None and available[index]
+        }
+        if len(known) < 2:
+            return False
+        scene, options = self.scene, self.options
+        for image, pose in known.items():
+            scene.register(image, *pose)
+        self.refiner.fixed[list(known)] = options.known_poses == "fixed"
+        complete_and_merge(scene, options.triangulation, create=True)
+        self.refiner.scale_together(list(known))
+        self._refine_globally()
+        for image in map(int, scene.registered_images()):
+            self._accept(image)
+        return True
 
     def _initialize(self, available: Bool) -> bool:
         """Find the first pair among the available images and refine it."""
@@ -263,7 +287,7 @@ class Mapper:
         neighbors = self.options.registration.num_neighbors
         while self.scene.registered.sum() > 2:
             worst, suspect = 0.0, -1
-            for image in map(int, self.scene.registered_images()):
+            for image in map(int, np.flatnonzero(self.scene.registered & ~self.refiner.fixed)):
                 bundle = local_bundle(self.scene, image, neighbors, self.scores)
                 with self._timed("depth check"):
                     score = check_image(self.scene, image, bundle[1:], self.options.consistency)
@@ -288,6 +312,8 @@ class Mapper:
     def _drop(self, images: list[int], reason: str) -> None:
         """Take images out that were registered before; the run goes on."""
         for image in images:
+            if self.refiner.fixed[image]:
+                continue
             self.scene.deregister(image)
             self.refiner.forget(image)
             self._reject(image, reason)

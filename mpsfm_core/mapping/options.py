@@ -98,6 +98,15 @@ class RefinementOptions(Options):
     """Reference and COLMAP: ba_global_max_refinement_change."""
     global_growth: float = Field(0.3, gt=0)
     """Refine globally when images or points grew by this share (reference; COLMAP: 0.1)."""
+    refine_focal: bool = True
+    """Refine focal lengths that are guesses, in global refinement."""
+    focal_min_images: int = Field(3, ge=2)
+    """Registered images below which a guessed focal length stays (ours)."""
+    focal_min_angle_deg: float = Field(2.0, ge=0)
+    """Median triangulation angle below which a guessed focal length stays (ours)."""
+    focal_max_change: float = Field(2.0, gt=1)
+    """A refined focal length that changes by more than this factor is a failure and is undone
+    (ours; COLMAP accepts ratios of 0.1 to 10 of the image size)."""
     max_depth_ratio: float = Field(1.5, gt=1)
     """Depth observations off by more than this factor are ignored (reference: scale_filter)."""
     final_robust: bool = False
@@ -141,6 +150,9 @@ class MapperOptions(Options):
 
     seed: int = 0
     """Seed of every random choice (RANSAC)."""
+    known_poses: Literal["start", "fixed"] = "start"
+    """Of images that come with a pose: "start" refines them and adds the others, "fixed" keeps
+    them, their world and its unit, and leaves images without a pose out."""
     min_model_size: int = Field(2, ge=2)
     """Smallest component that is kept."""
     max_components: int = Field(10, ge=1)

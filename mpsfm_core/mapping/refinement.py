@@ -30,6 +30,7 @@ class Refiner:
     """Refines a scene; remembers the integrators and how well depth and points agree.
 
     ``noise``: how good the priors are in this scene; refreshed by global refinement.
+    ``fixed``: (n,) bool, images whose pose never changes.
     """
 
     def __init__(self, scene: Scene, options: MapperOptions, scores: Float64) -> None:
@@ -37,6 +38,7 @@ class Refiner:
         self.options = options.refinement
         self.triangulation = options.triangulation
         self.scores = scores
+        self.fixed: Bool = np.zeros(scene.num_images, dtype=np.bool_)
         self.noise = DepthNoise()
         self._assumed_multiplier = 1.0
         self._integrators: dict[int, DepthIntegrator] = {}
@@ -60,8 +62,23 @@ class Refiner:
         if len(log_scales):
             depth_map.set_scale(float(np.exp(np.median(log_scales))))
 
+    def scale_together(self, images: list[int]) -> None:
+        """Scale the priors of posed images to their triangulated points.
+
+        An image that sees none takes the median scale of the others.
+        """
+        for image in images:
+            self.estimate_scale(image, [])
+        scales = [scene_map.scale for scene_map in self.scene.maps if scene_map.active]
+        for image in images:
+            if scales and not self.scene.maps[image].active:
+                self.scene.maps[image].set_scale(float(np.median(scales)))
+
     def rescale(self, images: list[int]) -> None:
-        """Estimate all scales anew from points that rays determine; their mean stays."""
+        """Estimate all scales anew from points that rays determine.
+
+        Their mean stays, which holds the scale of the world, unless fixed poses hold it.
+        """
         scene, tracks = self.scene, self.scene.tracks
         stable = scene.track_angles_deg() >= self.options.anchor_min_angle_deg
         log_scales = np.array([np.log(scene.maps[image].scale) for image in images])
@@ -76,7 +93,8 @@ class Refiner:
             good[good] &= self._near(z[good] / (depth_map.scale * prior[good]))
             if good.sum() >= MIN_SCALE_POINTS:
                 updated[position] = np.median(np.log(z[good] / prior[good]))
-        updated += log_scales.mean() - updated.mean()
+        if not self.fixed.any():
+            updated += log_scales.mean() - updated.mean()
         for image, log_scale in zip(images, updated, strict=True):
             scene.maps[image].set_scale(float(np.exp(log_scale)))
 
@@ -84,7 +102,7 @@ class Refiner:
         """Refine the depth maps of some images against the current points."""
         if not self.options.integrate:
             return
-        covariances = self._covariances()
+        covariances = self._covariances(images)
         with ThreadPoolExecutor(max_workers=2) as pool:
             list(pool.map(lambda image: self._integrate(image, *covariances), images))
 
@@ -94,12 +112,13 @@ class Refiner:
         *,
         points_only: bool = False,
         local: bool = False,
+        focal: bool = False,
         depth_scale: float = 1.0,
     ) -> None:
         """Bundle-adjust the poses of some images and the points they see.
 
-        ``points_only``: poses stay, and depth counts quadratically (reference). ``local``: long
-        tracks stay too. ``depth_scale`` multiplies the scale of the depth loss.
+        ``points_only``: poses stay. ``local``: long tracks stay. ``focal``: guessed focal lengths
+        are refined too. ``depth_scale`` multiplies the scale of the depth loss.
         """
         scene, tracks = self.scene, self.scene.tracks
         observations = tracks.observations()
@@ -111,45 +130,55 @@ class Refiner:
             return
         images, image_rows = np.unique(scene.graph.image_of[observations], return_inverse=True)
         points, point_rows = np.unique(tracks.point_of[observations], return_inverse=True)
-        moving = np.isin(images, variable) & (not points_only)
+        moving = np.isin(images, variable) & ~self.fixed[images] & (not points_only)
         if moving.all():
             moving[0] = False
         long_track = np.bincount(point_rows) >= LOCAL_MAX_TRACK_LENGTH
         log_depth, log_std = self._depth_observations(observations)
+        regularized = self.options.depth_regularization and bool(np.isfinite(log_depth).any())
+        free_scale = not regularized and moving.any() and np.count_nonzero(~moving) == 1
         options = self.options.bundle
         scale = options.depth_scale * depth_scale / np.sqrt(self.noise.design_effect)
+        _, first, camera_rows = np.unique(
+            scene.camera_of[images], return_index=True, return_inverse=True
+        )
         result = adjust_bundle(
             BundleProblem(
                 rotations=scene.rotations[images],
                 translations=scene.translations[images],
-                intrinsics=scene.intrinsics[images],
-                camera_of_image=np.arange(len(images)),
+                intrinsics=scene.intrinsics[images][first],
+                camera_of_image=camera_rows,
                 points=tracks.xyz[points],
                 obs_image=image_rows,
                 obs_point=point_rows,
                 obs_xy=scene.keypoints[observations],
                 obs_std_px=scene.keypoint_std_px[images][image_rows],
-                obs_log_depth=log_depth if self.options.depth_regularization else None,
+                obs_log_depth=log_depth if regularized else None,
                 obs_std_log_depth=log_std * self.noise.std_factor,
                 variable_pose=moving,
                 variable_point=~long_track if local else None,
+                scale_anchor=int(np.argmax(moving)) if free_scale else None,
+                variable_focal=self._guessed(images)[first] if focal else None,
             ),
             options.model_copy(update={"depth_scale": scale}),
         )
         scene.rotations[images] = result.rotations
         scene.translations[images] = result.translations
         tracks.xyz[points] = result.points
+        if focal:
+            self._take_focal(images, result.intrinsics[camera_rows])
 
     def refine_locally(self, image: int) -> None:
         """Refine an image and its neighbours until little changes."""
         options = self.options
-        complete_and_merge(self.scene, self.triangulation, create=False)
+        bundle = local_bundle(self.scene, image, options.local_images - 1, self.scores)
+        complete_and_merge(self.scene, self.triangulation, images=bundle)
         for _ in range(options.local_iterations):
             bundle = local_bundle(self.scene, image, options.local_images - 1, self.scores)
             self.integrate([image])
             self.adjust(bundle, local=True)
             changed = filter_points(self.scene, self.triangulation)
-            changed += complete_and_merge(self.scene, self.triangulation, create=False)
+            changed += complete_and_merge(self.scene, self.triangulation, images=bundle)
             if changed < options.local_max_change * max(self._num_observations(), 1):
                 break
 
@@ -164,9 +193,13 @@ class Refiner:
                 self.rescale(images)
             self._measure_noise()
             self.integrate(images)
-            self.adjust(images, depth_scale=options.final_depth_scale if final else 1.0)
+            self.adjust(
+                images,
+                focal=self._focal_is_stable(),
+                depth_scale=options.final_depth_scale if final else 1.0,
+            )
             changed = filter_points(self.scene, self.triangulation)
-            changed += complete_and_merge(self.scene, self.triangulation, create=False)
+            changed += complete_and_merge(self.scene, self.triangulation)
             if changed < options.global_max_change * max(self._num_observations(), 1):
                 break
 
@@ -191,6 +224,32 @@ class Refiner:
         depth_map.set_refined(
             integrator.refine(anchors, scale=depth_map.scale, start=depth_map.refined)
         )
+
+    def _guessed(self, images: Int64) -> Bool:
+        """(m,) bool, images whose focal length is a guess."""
+        known = [self.scene.problem.images[i].focal_known for i in images]
+        return ~np.array(known, dtype=np.bool_)
+
+    def _focal_is_stable(self) -> bool:
+        """Whether guessed focal lengths can be told from the images registered so far."""
+        images, options = self.scene.registered_images(), self.options
+        if not options.refine_focal or len(images) < options.focal_min_images:
+            return False
+        angles = self.scene.track_angles_deg()[self.scene.tracks.lengths() > 0]
+        wide = len(angles) > 0 and float(np.median(angles)) >= options.focal_min_angle_deg
+        return wide and bool(self._guessed(images).any())
+
+    def _take_focal(self, images: Int64, intrinsics: Float64) -> None:
+        """Use refined focal lengths, also for images not yet registered, unless they ran away."""
+        scene, limit = self.scene, self.options.focal_max_change
+        for row in np.flatnonzero(self._guessed(images)):
+            fx, fy = map(float, intrinsics[row, :2])
+            guess = scene.problem.images[images[row]].camera.fx
+            if not 1 / limit < fx / guess < limit:
+                continue
+            for image in np.flatnonzero(scene.camera_of == scene.camera_of[images[row]]):
+                scene.set_focal(int(image), fx, fy)
+                self._integrators.pop(int(image), None)
 
     def _measure_noise(self) -> None:
         """Measure how good the priors are; integrators that assumed much else are made anew."""
@@ -247,10 +306,17 @@ class Refiner:
         near: Bool = (ratio > 1 / limit) & (ratio < limit)
         return near
 
-    def _covariances(self) -> tuple[Float64, Float64]:
-        """Covariance (p, 3, 3) of each point by reprojection alone, and its angle (p,)."""
+    def _covariances(self, seen_by: list[int]) -> tuple[Float64, Float64]:
+        """Covariance (p, 3, 3) of points by reprojection alone, and their angle (p,).
+
+        Only those of points that some image of ``seen_by`` observes mean something.
+        """
         scene, tracks = self.scene, self.scene.tracks
         observations = tracks.observations()
+        images = scene.graph.image_of[observations]
+        wanted = np.zeros(len(tracks.xyz), dtype=np.bool_)
+        wanted[tracks.point_of[observations[np.isin(images, seen_by)]]] = True
+        observations = observations[wanted[tracks.point_of[observations]]]
         images = scene.graph.image_of[observations]
         covariances = point_covariances(
             BundleProblem(

@@ -173,7 +173,7 @@ def _hypotheses(
     scene: Scene, image: int, found: Correspondences, options: RegistrationOptions, seed: int
 ) -> Iterator[tuple[Float64, Float64, str]]:
     """Poses from all correspondences, and from each reference image alone."""
-    camera = scene.problem.images[image].camera
+    camera = scene.camera(image)
     xy = scene.keypoints[found.keypoints]
     for factor in PNP_ERROR_FACTORS:
         pose = estimate_absolute_pose(camera, xy, found.points, options, seed, factor)
@@ -220,7 +220,7 @@ def _reverse_pose(
         return None
     depth = depth_map.prior_at_keypoints(rows[use]) * scene.maps[reference].scale
     points = scene.rays(found.keypoints[use]) * depth[:, None]
-    camera = scene.problem.images[reference].camera
+    camera = scene.camera(reference)
     xy = scene.keypoints[found.matched[use]]
     pose = estimate_absolute_pose(camera, xy, points, options, seed, error_factor)
     return (pose[0], pose[1]) if pose else None

@@ -22,14 +22,21 @@ def triangulate_image(scene: Scene, image: int, options: TriangulationOptions) -
     create_tracks(scene, edges, max_error, options)
 
 
-def complete_and_merge(scene: Scene, options: TriangulationOptions, *, create: bool) -> int:
-    """Add missing observations to tracks everywhere and join tracks of the same point.
+def complete_and_merge(
+    scene: Scene,
+    options: TriangulationOptions,
+    *,
+    images: list[int] | None = None,
+    create: bool = False,
+) -> int:
+    """Add missing observations to tracks and join tracks of the same point.
 
-    ``create``: also try anew the matches that have no point (COLMAP's retriangulation).
-    Returns the number of observations changed.
+    ``images``: where to look, by default all registered ones. ``create``: also try anew the
+    matches that have no point (COLMAP's retriangulation). Returns the number of observations
+    changed.
     """
     before = scene.tracks.point_of.copy()
-    for image in scene.registered_images():
+    for image in scene.registered_images() if images is None else images:
         edges = _registered_edges(scene, image)
         max_error = options.max_error_px * scene.keypoint_std_px[image]
         extend_tracks(scene, edges, max_error)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage
+from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage, PinholeCamera
 from mpsfm_core.geometry import sample_bilinear, scale_pixels
 from mpsfm_core.optimize.depth_integration import RefinedDepth
 
@@ -76,6 +76,11 @@ class DepthMap:
         self._best = refined.depth
         self._best_at = self._sample(self._best)[0]
         self.set_scale(refined.scale)
+
+    def set_camera(self, camera: PinholeCamera) -> None:
+        """Use other intrinsics, given for the image's own grid."""
+        rows, columns = self.prior.shape
+        self.camera = camera.resized(columns, rows)
 
     def reset(self) -> None:
         """Forget scale and refinement."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Float64, Int64, MappingProblem
+from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.optimize.depth_integration import RefinedDepth
 from mpsfm_core.scene.depth_map import DepthMap
@@ -17,11 +17,10 @@ from mpsfm_core.scene.tracks import Tracks
 
 
 class Snapshot(NamedTuple):
-    """A copy of everything in a :class:`Scene` that changes; opaque to others."""
+    """A copy of what registering an image changes in a :class:`Scene`; opaque to others."""
 
     rotations: Float64
     translations: Float64
-    intrinsics: Float64
     registered: Bool
     xyz: Float64
     point_of: Int64
@@ -35,6 +34,8 @@ class Scene:
         rotations: (n, 3, 3), translations: (n, 3) float64, ``cam_from_world`` of each image.
         registered: (n,) bool.
         intrinsics: (n, 4) float64, fx, fy, cx, cy of each image.
+        camera_of: (n,) int64, images of the same number have the same camera: those whose focal
+            length is a guess, and the same guess.
         keypoints: (k, 2) float64, of all images, numbered as in :attr:`graph`.
         maps: the depth map of each image.
     """
@@ -48,6 +49,7 @@ class Scene:
         )
         self.keypoint_std_px: Float64 = np.array([i.keypoint_std_px for i in problem.images])
         self.intrinsics: Float64 = np.array([image.camera.params for image in problem.images])
+        self.camera_of: Int64 = _shared_cameras(problem)
         self.maps = [DepthMap(image) for image in problem.images]
         self.rotations: Float64 = np.tile(np.eye(3), (count, 1, 1))
         self.translations: Float64 = np.zeros((count, 3))
@@ -74,6 +76,16 @@ class Scene:
         self.maps[image].reset()
         keypoints = self.graph.keypoints_of(image)
         self.tracks.remove_observations(np.arange(keypoints.start, keypoints.stop))
+
+    def camera(self, image: int) -> PinholeCamera:
+        """Intrinsics of an image, as refined so far."""
+        size = self.problem.images[image].camera.size
+        return PinholeCamera(*size, *map(float, self.intrinsics[image]))
+
+    def set_focal(self, image: int, fx: float, fy: float) -> None:
+        """Change the focal length of one image, in pixels."""
+        self.intrinsics[image, :2] = fx, fy
+        self.maps[image].set_camera(self.camera(image))
 
     def centers(self) -> Float64:
         """(n, 3) camera centres in the world."""
@@ -133,7 +145,6 @@ class Scene:
         return Snapshot(
             self.rotations.copy(),
             self.translations.copy(),
-            self.intrinsics.copy(),
             self.registered.copy(),
             self.tracks.xyz.copy(),
             self.tracks.point_of.copy(),
@@ -144,7 +155,6 @@ class Scene:
         """Return to an earlier state."""
         self.rotations = snapshot.rotations.copy()
         self.translations = snapshot.translations.copy()
-        self.intrinsics = snapshot.intrinsics.copy()
         self.registered = snapshot.registered.copy()
         self.tracks.xyz = snapshot.xyz.copy()
         self.tracks.point_of = snapshot.point_of.copy()
@@ -155,3 +165,11 @@ class Scene:
                     depth_map.set_refined(refined)
                 if active:
                     depth_map.set_scale(scale)
+
+
+def _shared_cameras(problem: MappingProblem) -> Int64:
+    numbers: dict[object, int] = {}
+    keys = [
+        number if image.focal_known else image.camera for number, image in enumerate(problem.images)
+    ]
+    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)

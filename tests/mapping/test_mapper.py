@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -149,3 +151,58 @@ def test_no_pairs_give_no_reconstruction() -> None:
     result = reconstruct(problem)
     assert result.reconstructions == ()
     assert len(result.report.image_reasons) == 2
+
+
+def with_poses(problem: MappingProblem, poses: dict[int, Float64]) -> MappingProblem:
+    """The problem whose images bring some poses along."""
+    images = tuple(
+        replace(image, known_pose=(poses[i][:, :3].copy(), poses[i][:, 3].copy()))
+        if i in poses
+        else image
+        for i, image in enumerate(problem.images)
+    )
+    return MappingProblem(images, problem.pairs)
+
+
+def test_fixed_poses_stay_and_give_the_world_its_unit() -> None:
+    poses = arc_poses(4, 14.0)
+    problem = mapping_problem(room_scene(), CAMERA, poses, noise=Noise(scale=0.1))
+    doubled = {i: np.column_stack([p[:, :3], 2 * p[:, 3]]) for i, p in enumerate(poses)}
+    fixed = MapperOptions(known_poses="fixed")
+    reconstruction = reconstruct(with_poses(problem, doubled), fixed).reconstructions[0]
+    assert len(reconstruction.images) == 4
+    for image in reconstruction.images:
+        assert np.array_equal(image.rotation, doubled[image.index][:, :3])
+        assert np.array_equal(image.translation, doubled[image.index][:, 3])
+        rows, columns = image.depth.shape
+        truth = room_scene().render(CAMERA.resized(columns, rows), poses[image.index]).depth
+        ratio = np.median(image.depth.depth[image.depth.valid] / truth[image.depth.valid])
+        assert ratio == pytest.approx(2.0, rel=0.01)
+
+
+def test_a_partial_model_is_continued() -> None:
+    poses = arc_poses(5, 14.0)
+    problem = with_poses(
+        mapping_problem(room_scene(), CAMERA, poses), {i: poses[i] for i in (0, 1, 2)}
+    )
+    reconstruction = reconstruct(problem).reconstructions[0]
+    assert len(reconstruction.images) == 5
+    assert relative_errors_deg(reconstruction, poses).max() < 0.05
+    first = reconstruction.images[0]
+    assert np.allclose(first.translation, poses[0][:, 3], atol=0.02)
+
+
+def test_a_guessed_focal_length_is_refined_and_shared() -> None:
+    poses = arc_poses(5, 14.0)
+    problem = mapping_problem(room_scene(), CAMERA, poses, noise=Noise(keypoints_px=0.3))
+    guess = replace(CAMERA, fx=1.08 * CAMERA.fx, fy=1.08 * CAMERA.fy)
+    images = tuple(replace(i, camera=guess, focal_known=False) for i in problem.images)
+    guessed = MappingProblem(images, problem.pairs)
+    reconstruction = reconstruct(guessed).reconstructions[0]
+    focal = {image.camera.fx for image in reconstruction.images}
+    assert len(focal) == 1
+    assert focal.pop() == pytest.approx(CAMERA.fx, rel=0.02)
+
+    kept = MapperOptions.model_validate({"refinement": {"refine_focal": False}})
+    for image in reconstruct(guessed, kept).reconstructions[0].images:
+        assert image.camera.fx == guess.fx
