@@ -110,14 +110,13 @@ class Refiner:
         self,
         variable: list[int],
         *,
-        points_only: bool = False,
         local: bool = False,
         focal: bool = False,
         depth_scale: float = 1.0,
     ) -> None:
         """Bundle-adjust the poses of some images and the points they see.
 
-        ``points_only``: poses stay. ``local``: long tracks stay. ``focal``: guessed focal lengths
+        ``local``: long tracks stay. ``focal``: guessed focal lengths
         are refined too. ``depth_scale`` multiplies the scale of the depth loss.
         """
         scene, tracks = self.scene, self.scene.tracks
@@ -130,7 +129,7 @@ class Refiner:
             return
         images, image_rows = np.unique(scene.graph.image_of[observations], return_inverse=True)
         points, point_rows = np.unique(tracks.point_of[observations], return_inverse=True)
-        moving = np.isin(images, variable) & ~self.fixed[images] & (not points_only)
+        moving = np.isin(images, variable) & ~self.fixed[images]
         if moving.all():
             moving[0] = False
         long_track = np.bincount(point_rows) >= LOCAL_MAX_TRACK_LENGTH
