@@ -16,6 +16,7 @@ from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, NormalPrior, Pin
 from mpsfm_core.errors import DataError
 from mpsfm_core.optimize.depth_variance import inverse_diagonal
 from mpsfm_core.optimize.integration_energy import (
+    MAX_LOG_VARIANCE,
     MIN_LOG_VARIANCE,
     EnergyTerms,
     Losses,
@@ -30,7 +31,6 @@ from mpsfm_core.optimize.multigrid import Multigrid
 # Where there are normals but no prior, the filled-in depth is a prior of this variance (log depth):
 # it says next to nothing, but nothing is left undetermined.
 _FILLED_LOG_VARIANCE = 1.0
-_MAX_LOG_VARIANCE = 1e6
 # Weight that holds known depth fixed, against couplings below 1e12.
 _FIXED = 1e15
 
@@ -152,7 +152,7 @@ class DepthIntegrator:
         values = depth.depth.astype(np.float64)
         spread = depth.variance / np.where(depth.valid, values, 1.0) ** 2
         variance = np.where(depth.valid, spread, _FILLED_LOG_VARIANCE)
-        precision = self._active / np.clip(variance, MIN_LOG_VARIANCE, _MAX_LOG_VARIANCE)
+        precision = self._active / np.clip(variance, MIN_LOG_VARIANCE, MAX_LOG_VARIANCE)
         self._precision = precision.astype(np.float32)
         known = np.log(values[depth.valid])
         self._log_depth = np.full(depth.shape, np.median(known) if known.size else 0.0)
@@ -261,7 +261,7 @@ class DepthIntegrator:
         log_depth, log_variance = np.log(depth[usable]), variance[usable] / depth[usable] ** 2
         near = np.abs(log_depth - prior[rows, columns]) < np.log(self.options.point_max_ratio)
         near &= self._active[rows, columns]
-        precision = 1.0 / np.clip(log_variance[near], MIN_LOG_VARIANCE, _MAX_LOG_VARIANCE)
+        precision = 1.0 / np.clip(log_variance[near], MIN_LOG_VARIANCE, MAX_LOG_VARIANCE)
         return PointTerms(rows[near], columns[near], log_depth[near], precision)
 
     def _integrate_from(self, known: Bool) -> Float64:

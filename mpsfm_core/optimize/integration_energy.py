@@ -20,24 +20,29 @@ sigmoid weights of the published method, which never had an energy of its own. A
 concave in the squared residuals, so that re-weighted least squares majorises this energy: a step
 that lowers the quadratic, however inexact, cannot raise the energy.
 """
+# mypy: allow-untyped-decorators
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
+from numba import njit
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, NormalPrior, PinholeCamera
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 
 _MISSING = 1e30  # squared residual of a side that does not exist
 _SQRT_3 = 1.7320508075688772
 
-# Floors that keep the weights of absurdly confident input finite: 0.06 deg and 0.1 % of depth.
-_MIN_NORMAL_VARIANCE = 1e-6
+# No prior is better than 0.6 deg or 0.1 % of depth, and a factor of e^10 says nothing about depth:
+# beyond, weights would only spoil the condition of the system.
+_MIN_NORMAL_VARIANCE = 1e-4
 MIN_LOG_VARIANCE = 1e-6
+MAX_LOG_VARIANCE = 1e2
+# What a pixel keeps of its prior's weight, however far it is: the system stays definite.
+_MIN_PRIOR_SHARE = 1e-4
 # Normals seen under more than 89.9 deg say nothing about the slope of depth.
 _MIN_FACING = 2e-3
 
@@ -110,7 +115,7 @@ def normal_terms(
     link = np.zeros(shape, np.bool_)
     link[0, 1:-1, 1:-2] = active[:, :-1] & active[:, 1:]
     link[1, 1:-2, 1:-1] = active[:-1] & active[1:]
-    terms = NormalTerms(*(np.zeros(shape, np.float32) for _ in range(3)), link)
+    terms = NormalTerms._make([*np.zeros((3, *shape), np.float32), link])
     usable = normals.valid & active
     _fill_normal_terms(normals.normals, normals.variance, usable, camera.params, weight, terms)
     return terms
@@ -275,7 +280,8 @@ def _exp(x: float) -> float:
     p = 1.0 + f * p * (1 / 3)
     p = 1.0 + f * p * (1 / 2)
     p = 1.0 + f * p
-    return p * np.int64((np.int64(whole) + 1023) << 52).view(np.float64)
+    value: float = p * np.int64((np.int64(whole) + 1023) << 52).view(np.float64)
+    return value
 
 
 @_kernel
@@ -304,9 +310,9 @@ def _add_prior(
             square = precision * offset * offset
             kept = limit * limit / (limit * limit + square)
             energy += prior.weight * square * kept
-            slope = prior.weight * precision * kept * kept
-            mass[i, j] = slope
-            gradient[i, j] += slope * offset
+            full, share = prior.weight * precision, kept * kept
+            mass[i, j] = full * max(share, _MIN_PRIOR_SHARE)
+            gradient[i, j] += full * share * offset
     return energy
 
 

@@ -78,7 +78,7 @@ class ReferenceIntegration:
         pixels = depth.valid.size
         self.prior = np.log(np.where(depth.valid, depth.depth, 1).astype(np.float64)).ravel()
         relative = depth.variance.astype(np.float64) / np.where(depth.valid, depth.depth, 1) ** 2
-        self.prior_precision = np.where(depth.valid, 1 / np.maximum(relative, 1e-6), 0.0).ravel()
+        self.prior_precision = np.where(depth.valid, 1 / np.clip(relative, 1e-6, 1e2), 0.0).ravel()
         self.prior_weight = min(1.0, options.independent_depths / pixels)
         self.axes = self._axes(normals, camera, min(1.0, options.independent_normals / pixels))
 
@@ -108,7 +108,7 @@ class ReferenceIntegration:
             jacobian = np.eye(3)[axis] - ray * (n[..., axis] / facing)[..., None]
             covariance = np.eye(3) - n[..., :, None] * n[..., None, :]
             spread = np.einsum("...i,...ij,...j->...", jacobian, covariance, jacobian)
-            variance = np.maximum(normals.variance, 1e-6) * spread
+            variance = np.maximum(normals.variance, 1e-4) * spread
             last = (x > width - 1) if axis == 0 else (y > height - 1)
             ahead, has_ahead = self._differences(~last.ravel(), step)
             has_behind = np.zeros_like(has_ahead)
@@ -175,9 +175,10 @@ class ReferenceIntegration:
         offset = z - self.prior
         square = self.prior_precision * offset**2
         limit = self.options.prior_limit**2
-        mass = self.prior_weight * self.prior_precision * (limit / (limit + square)) ** 2
+        full, share = self.prior_weight * self.prior_precision, (limit / (limit + square)) ** 2
+        mass = full * np.maximum(share, 1e-4)
         energy = self.prior_weight * float((limit * square / (limit + square)).sum())
-        gradient = mass * offset
+        gradient = full * share * offset
         offset = z[self.pixel] - self.target
         scale = self.options.point_scale**2
         square = self.precision * offset**2
