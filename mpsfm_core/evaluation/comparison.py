@@ -71,6 +71,8 @@ def compare(
     first: Mapping[str, Sequence[Record]],
     second: Mapping[str, Sequence[Record]],
     convention: PoseConvention = CONVENTIONS["paper"],
+    *,
+    resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> list[Difference]:
     """Differences for each scene, configuration, bucket and method that both sides have.
@@ -86,7 +88,8 @@ def compare(
         for (scene, config, bucket), pairs in matched.items():
             errors = [tuple(_unordered(r, convention) for r in pair) for pair in pairs]
             place = (scene, config, bucket, _name(method, pairs[0]))
-            differences.append(_difference(place, errors, convention, rng))
+            draws = _draws(errors, convention, resamples, rng)
+            differences.append(_difference(place, errors, convention, draws))
     if not differences:
         raise InputError("the two benchmarks have no set and method in common")
     return differences
@@ -147,13 +150,8 @@ def _unordered(record: Record, convention: PoseConvention) -> Float64:
 
 
 def _difference(
-    place: _Place,
-    errors: Sequence[_SetErrors],
-    convention: PoseConvention,
-    rng: np.random.Generator,
+    place: _Place, errors: Sequence[_SetErrors], convention: PoseConvention, drawn: Float64
 ) -> Difference:
-    unit = "sets" if len(errors) >= MIN_SETS else "pairs"
-    drawn = np.stack([_gain(_resampled(errors, unit, rng), convention) for _ in range(RESAMPLES)])
     low, high = np.quantile(drawn, [(1 - _CONFIDENCE) / 2, (1 + _CONFIDENCE) / 2], axis=0)
     opposite = np.minimum((drawn <= 0).mean(axis=0), (drawn >= 0).mean(axis=0))
     both = [_areas([side[k] for side in errors], convention) for k in (0, 1)]
@@ -161,11 +159,26 @@ def _difference(
     return Difference(
         *place,
         sets=len(errors),
-        unit=unit,
+        unit=_unit(errors),
         auc={t: (float(both[0][k]), float(both[1][k])) for k, t in columns},
         interval={t: (float(low[k]), float(high[k])) for k, t in columns},
         p_value={t: float(min(1.0, 2 * opposite[k])) for k, t in columns},
     )
+
+
+def _unit(errors: Sequence[_SetErrors]) -> str:
+    return "sets" if len(errors) >= MIN_SETS else "pairs"
+
+
+def _draws(
+    errors: Sequence[_SetErrors],
+    convention: PoseConvention,
+    resamples: int,
+    rng: np.random.Generator,
+) -> Float64:
+    """Differences (resamples, thresholds) of the resamples."""
+    unit = _unit(errors)
+    return np.stack([_gain(_resampled(errors, unit, rng), convention) for _ in range(resamples)])
 
 
 def _resampled(

@@ -1,0 +1,185 @@
+"""The whole benchmark on a small scene: runs, resumes, survives failures, reports."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mpsfm_core.cli import build_app
+from mpsfm_core.errors import InputError
+from mpsfm_core.evaluation import methods
+from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
+from mpsfm_core.evaluation.methods import Outcome, Task, run_method, run_tasks
+from mpsfm_core.evaluation.records import read_record, read_records
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.testing.problems import mapping_problem
+from mpsfm_core.testing.scenes import arc_poses, room_scene
+from tests.evaluation.conftest import CAMERA
+
+pytestmark = pytest.mark.slow  # starts processes that load or compile the mapper's loops
+
+CONFIG = """
+features:
+  use: sift
+matcher:
+  use: mutual-nearest
+depth:
+  use: files
+  options: {{directory: {depth}, scale: 0.001, relative_std: 0.02}}
+normals:
+  use: from-depth
+runtime:
+  workers: 1
+  cache_dir: {cache}
+"""
+
+
+@pytest.fixture(scope="module")
+def config(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("config")
+    path = folder / "sift.yaml"
+    path.write_text(CONFIG.format(depth=scene_folder / "gt_depth", cache=folder / "cache"))
+    return path
+
+
+@pytest.fixture(scope="module")
+def output(
+    scene_folder: Path, config: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, str, str]:
+    """A finished benchmark by the command, with what it printed."""
+    folder = tmp_path_factory.mktemp("benchmark") / "out"
+    result = CliRunner().invoke(build_app(), arguments(scene_folder, config, folder))
+    assert result.exit_code == 0, result.stderr
+    return folder, result.stdout, result.stderr
+
+
+def arguments(scene: Path, config: Path, folder: Path) -> list[str]:
+    settings = f"--config {config} --prior sensor,degraded --sets all --peers colmap -o {folder}"
+    return ["benchmark", str(scene), *settings.split()]
+
+
+def test_the_report_has_all_methods_and_names_its_convention(output) -> None:
+    folder, out, _ = output
+    report = json.loads((folder / "report.json").read_text())["conventions"]
+    assert set(report) == {"paper", "colmap", "vggt"}
+    rows = {row["method"]: row for row in report["paper"]["rows"]}
+    assert set(rows) == {"ours-sensor", "ours-degraded", "colmap"}
+    for row in rows.values():
+        assert (row["scene"], row["config"], row["bucket"]) == ("room", "sift", "all")
+        assert row["registered"] == 1.0 and row["failed"] == 0 and row["cpu_seconds"] > 0
+    assert rows["ours-sensor"]["auc"]["5"] > 80
+    assert (folder / "report.md").read_text() == out
+    assert "convention `paper`: ordered pairs" in out
+    assert "| all | 1 | ours-sensor |" in out
+    page = (folder / "report.html").read_text()
+    assert page.count("<polyline") == 3 and "ordered pairs" in page
+
+
+def test_records_hold_the_poses(output) -> None:
+    folder, _, _ = output
+    record = read_record(folder / "runs" / "room" / "sift" / "all-00" / "ours-sensor.json")
+    assert set(record.estimated) == set(record.truth)
+    for rotation, translation in record.estimated.values():
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+        assert translation.shape == (3,)
+    assert record.pairs >= 4 and not record.error
+
+
+def test_a_second_run_computes_nothing(output, scene_folder: Path, config: Path) -> None:
+    folder, out, _ = output
+    times = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*/*/*/*.json")}
+    assert len(times) == 3
+    result = CliRunner().invoke(build_app(), arguments(scene_folder, config, folder))
+    assert result.exit_code == 0 and result.stdout == out
+    assert result.stderr.count("images, known") == 3
+    assert {path: path.stat().st_mtime_ns for path in times} == times
+
+
+def test_what_changed_or_broke_is_computed_again(output, scene_folder: Path, config: Path) -> None:
+    folder, _, _ = output
+    damaged = folder / "runs" / "room" / "sift" / "all-00" / "colmap.json"
+    damaged.write_text(damaged.read_text()[:100])
+    known = {}
+    plan = Plan(
+        (scene_folder,),
+        (str(config),),
+        ("all",),
+        ("sensor",),
+        ("colmap",),
+        ("mapping.seed=7",),
+    )
+    run_benchmark(plan, folder, done=lambda record, old: known.update({record.label: old}))
+    assert known == {"ours-sensor": False, "colmap": False}
+    assert read_record(damaged).label == "colmap"
+    known.clear()
+    run_benchmark(plan, folder, done=lambda record, old: known.update({record.label: old}))
+    assert known == {"ours-sensor": True, "colmap": True}
+
+
+def test_two_workers_give_the_same_poses(
+    output, scene_folder: Path, config: Path, tmp_path
+) -> None:
+    plan = Plan((scene_folder,), (str(config),), None, ("sensor",), ("colmap",), workers=2)
+    records = {r.name: r for r in run_benchmark(plan, tmp_path / "out")}
+    assert len(records) == 6
+    # Pairs of the first set contain those of the others, so that its matches are the same.
+    folder, _, _ = output
+    for record in read_records(folder):
+        if record.label == "colmap":
+            for name, (rotation, _) in record.estimated.items():
+                other, _ = records[record.name].estimated[name]
+                np.testing.assert_allclose(rotation, other, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"peers": ("colmapp",)}, "no peer 'colmapp'; did you mean 'colmap'"),
+        ({"priors": ("laser",)}, "no prior 'laser'"),
+        ({"buckets": ("leq5",)}, "no bucket 'leq5'"),
+    ],
+)
+def test_wrong_names_are_explained(scene_folder: Path, config: Path, tmp_path, change, message):
+    plan = Plan((scene_folder,), (str(config),), **change)
+    with pytest.raises(InputError, match=message):
+        run_benchmark(plan, tmp_path)
+
+
+def test_two_scenes_of_one_name_are_refused(scene_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="same name"):
+        run_benchmark(Plan((scene_folder, scene_folder)), tmp_path)
+
+
+def small_task(method: str = "ours") -> Task:
+    problem = mapping_problem(room_scene(), CAMERA, arc_poses(3, 10.0), map_width=48)
+    return Task(method, method, problem, MapperOptions())
+
+
+def test_what_a_method_raises_is_its_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*arguments: object) -> None:
+        raise RuntimeError("no memory")
+
+    task = small_task("colmap")
+    monkeypatch.setattr(methods, "run_peer", fails)
+    outcome = run_method(task.method, task.problem, task.options)
+    assert outcome.error == "RuntimeError: no memory" and outcome.poses == {}
+
+
+def test_a_method_that_kills_its_process_is_recorded_and_the_rest_goes_on() -> None:
+    dies = Task("dies", "ours", Deadly(), MapperOptions())  # type: ignore[arg-type]
+    outcomes = {task.label: outcome for task, outcome in run_tasks([dies, small_task()], 1)}
+    assert outcomes["dies"].error == "its process died"
+    assert isinstance(outcomes["ours"], Outcome) and len(outcomes["ours"].poses) == 3
+
+
+class Deadly:
+    """Ends the process that unpickles it, as a failed assertion in native code does."""
+
+    def __reduce__(self) -> tuple:
+        import os
+
+        return os._exit, (11,)

@@ -1,0 +1,109 @@
+"""Differences between benchmarks and their significance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from mpsfm_core.cli import build_app
+from mpsfm_core.errors import InputError
+from mpsfm_core.evaluation.comparison import compare, read_side
+from mpsfm_core.evaluation.records import Record, write_record
+from mpsfm_core.evaluation.report import ALL_SCENES, make_rows, markdown
+
+
+def records(
+    noise_deg: float, *, sets: int = 8, label: str = "ours", seed: int = 0, scene: str = "room"
+) -> list[Record]:
+    """Sets of five cameras whose orientations are off by about ``noise_deg``."""
+    truth_rng, rng = np.random.default_rng(99), np.random.default_rng(seed)
+    made = []
+    for number in range(sets):
+        rotations = Rotation.random(5, rng=truth_rng).as_matrix()
+        truth = {f"{i}.jpg": (rotations[i], truth_rng.normal(size=3)) for i in range(5)}
+        turns = Rotation.from_rotvec(np.radians(noise_deg) * rng.normal(size=(5, 3))).as_matrix()
+        poses = {n: (turns[i] @ r, turns[i] @ t) for i, (n, (r, t)) in enumerate(truth.items())}
+        made.append(
+            Record(scene, "c", "leq10", f"leq10-{number:02d}", label, "", poses, truth, 4, 2.0, 1.0)
+        )
+    return made
+
+
+def difference(a: list[Record], b: list[Record]):
+    [found] = compare({"ours": a}, {"ours": b}, resamples=400)
+    return found
+
+
+def test_a_large_difference_is_significant() -> None:
+    found = difference(records(3.0), records(0.5, seed=1))
+    before, after = found.auc[5]
+    low, high = found.interval[5]
+    assert low < after - before < high
+    assert low > 10 and found.p_value[5] < 0.01
+    assert found.unit == "sets" and found.sets == 8
+
+
+def test_no_difference_is_not() -> None:
+    same = difference(records(1.0), records(1.0))
+    assert same.interval[5] == (0.0, 0.0) and same.p_value[5] == 1.0
+
+
+def test_false_alarms_are_as_rare_as_declared() -> None:
+    p = [
+        difference(records(1.0, seed=2 * k), records(1.0, seed=2 * k + 1)).p_value[5]
+        for k in range(30)
+    ]
+    assert np.mean(np.array(p) < 0.05) < 0.25  # eight sets are few; far from every time
+    assert np.mean(np.array(p) < 0.5) > 0.2
+
+
+def test_few_sets_are_compared_by_pairs() -> None:
+    found = difference(records(3.0, sets=2), records(0.5, sets=2, seed=1))
+    assert found.unit == "pairs" and found.sets == 2
+    assert found.interval[20][0] > 0
+
+
+def test_only_sets_of_both_sides_count() -> None:
+    found = difference(records(1.0, sets=8), records(1.0, sets=6, seed=1)[1:])
+    assert found.sets == 5
+    with pytest.raises(InputError, match="no set and method in common"):
+        compare({"ours": records(1.0)}, {"colmap": records(1.0)})
+
+
+def test_the_command_compares_folders_and_methods(tmp_path: Path) -> None:
+    for record in records(3.0) + records(0.5, seed=1, label="colmap"):
+        write_record(tmp_path / "a", record)
+    for record in records(0.3, seed=2):
+        write_record(tmp_path / "b", record)
+    both = ["benchmark", "--compare", str(tmp_path / "a"), str(tmp_path / "b")]
+    result = CliRunner().invoke(build_app(), both)
+    assert result.exit_code == 0
+    assert "| room | leq10 | ours | 8 | sets |" in result.stdout
+    assert "convention `paper`" in result.stdout and "colmap" not in result.stdout
+    within = ["benchmark", "--compare", f"{tmp_path / 'a'}:ours", f"{tmp_path / 'a'}:colmap"]
+    result = CliRunner().invoke(build_app(), within)
+    assert "ours → colmap" in result.stdout
+    with pytest.raises(InputError, match="no method 'openmvg'; it has"):
+        read_side(f"{tmp_path / 'a'}:openmvg")
+    with pytest.raises(InputError, match="no results of a benchmark"):
+        read_side(str(tmp_path))
+
+
+def test_rows_pool_errors_and_several_scenes() -> None:
+    first = records(1.0, sets=3)
+    lost = Record(**{**vars(first[0]), "estimated": {}, "error": "RuntimeError: no"})
+    rows = make_rows([lost, *first[1:], *records(1.0, sets=2, scene="hall")])
+    assert [row.scene for row in rows] == ["room", "hall", ALL_SCENES]
+    room = rows[0]
+    assert (room.sets, room.failed, room.pairs) == (3, 1, 12)
+    assert room.registered == pytest.approx(2 / 3)
+    assert room.auc[20] < rows[1].auc[20]
+    assert rows[2].sets == 5
+    pooled = (3 * room.auc[5] + 2 * rows[1].auc[5]) / 5  # sets of equal size
+    assert rows[2].auc[5] == pytest.approx(pooled)
+    text = markdown(rows)
+    assert "### all scenes, configuration `c`" in text and "| 67% | 1.00 | 1 |" in text
