@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpsfm_core import DepthPrior, NormalPrior, PinholeCamera
+from mpsfm_core import DepthPrior, NormalPrior
 from mpsfm_core.data import Bool, Float32, Float64
 
 _SMALLEST_RELATIVE_STD = 1e-4
@@ -39,8 +39,8 @@ def fuse_depth(first: DepthPrior, second: DepthPrior) -> DepthPrior:
     return DepthPrior.from_arrays(mean, variance, valid, metric=first.metric and second.metric)
 
 
-def fuse_normals(first: NormalPrior, second: NormalPrior, camera: PinholeCamera) -> NormalPrior:
-    """Both passes as one prior of the view with this camera, valid where both are.
+def fuse_normals(first: NormalPrior, second: NormalPrior) -> NormalPrior:
+    """Both passes as one prior, valid where both are; it faces the camera, as both do.
 
     The mean is the unit vector halfway between both. Both deviate from it by half the angle
     between them, to opposite sides, so their covariance in the tangent plane has the eigenvalues
@@ -55,7 +55,7 @@ def fuse_normals(first: NormalPrior, second: NormalPrior, camera: PinholeCamera)
     variance = np.maximum(angle**2 / 4, _SMALLEST_STD_RAD**2)
     if first.variance is not None and second.variance is not None:
         variance = np.maximum(variance, _stack(first.variance, second.variance, valid).mean(axis=0))
-    return NormalPrior.from_arrays(total, variance, valid, camera=camera)
+    return NormalPrior.from_arrays(total, variance, valid)
 
 
 def _stack(first: Float32, second: Float32, valid: Bool) -> Float64:

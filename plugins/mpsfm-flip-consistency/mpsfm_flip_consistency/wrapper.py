@@ -30,4 +30,4 @@ class FlipConsistency:
             raise DataError("output", f"{text}{second.shape}")
         if isinstance(first, DepthPrior):
             return fuse_depth(first, mirror_depth(second))
-        return fuse_normals(first, mirror_normals(second), view.camera)
+        return fuse_normals(first, mirror_normals(second))

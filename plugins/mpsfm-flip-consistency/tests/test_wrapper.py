@@ -114,7 +114,7 @@ def test_covariance_of_normals_by_explicit_geometry(angle_deg):
     half = np.radians(angle_deg) / 2
     pair = [np.cos(half) * middle + s * np.sin(half) * direction[0] for s in (1, -1)]
     priors = [NormalPrior.from_arrays(n[None, None]) for n in pair]
-    fused = fuse_normals(*priors, PinholeCamera(1, 1, 1.0, 1.0, 0.5, 0.5))
+    fused = fuse_normals(*priors)
     deviations = []
     for n in pair:
         tangent = n - (n @ middle) * middle
@@ -143,20 +143,20 @@ def test_covariance_of_normals_agrees_with_the_papers_spherical_coordinates():
     ).T
     expected = np.trace(jacobian @ spherical @ jacobian.T) / 2
     priors = [NormalPrior.from_arrays(cartesian(*a)[None, None]) for a in angles]
-    fused = fuse_normals(*priors, PinholeCamera(1, 1, 1.0, 1.0, 0.5, 0.5))
+    fused = fuse_normals(*priors)
     assert fused.variance[0, 0] == pytest.approx(expected, rel=1e-3)
 
 
 def test_network_variance_of_normals_is_kept_when_larger():
     normals = np.array([[[0.0, 0.0, -1.0], [0.0, 0.0, -1.0]]])
     prior = NormalPrior.from_arrays(normals, np.array([[0.1, 0.3]]))
-    fused = fuse_normals(prior, mirror_normals(prior), CAMERA)
+    fused = fuse_normals(prior, mirror_normals(prior))
     np.testing.assert_allclose(fused.variance, 0.2, rtol=1e-6)
 
 
 def test_opposite_normals_are_invalid():
     priors = [NormalPrior.from_arrays(np.array([[[x, 0.0, 0.0]]])) for x in (1.0, -1.0)]
-    assert not fuse_normals(*priors, PinholeCamera(1, 1, 1.0, 1.0, 0.5, 0.5)).valid.any()
+    assert not fuse_normals(*priors).valid.any()
 
 
 def test_mirroring_twice_gives_the_view_and_changes_nothing():

@@ -42,7 +42,9 @@ def _spec(kind: Kind, size: Size) -> ProviderSpec:
         factory=f"mpsfm_metric3d_onnx.provider:Metric3d{'Depth' if is_depth else 'Normals'}",
         options=size.options,
         capabilities=frozenset(
-            {"metric", "joint-normals", "intrinsics-aware"} if is_depth else {"variance"}
+            {"metric", "joint-normals", "intrinsics-aware"}
+            if is_depth
+            else {"variance", "intrinsics-aware"}
         ),
         summary=f"Metric3D v2 {size.name}: metric depth and normals",
         requires=("onnxruntime",),
@@ -51,4 +53,5 @@ def _spec(kind: Kind, size: Size) -> ProviderSpec:
         weights_license=WEIGHTS_LICENSE,
         weights=size.weights,
         calibration=size.calibration if is_depth else _NORMALS,
+        contract="mpsfm_metric3d_onnx.contract:setup",
     )

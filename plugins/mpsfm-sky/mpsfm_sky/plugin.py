@@ -20,6 +20,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint="pip install mpsfm-sky",
             code_license="Apache-2.0",
             weights_license="of the chosen model (skyseg: MIT)",
+            contract="mpsfm_sky.contract:network",
         ),
         ProviderSpec(
             kind="mask",
@@ -28,5 +29,6 @@ def mpsfm_providers() -> list[ProviderSpec]:
             options=SimpleSkyOptions,
             summary="leaves smooth bright or blue regions at the upper border out; outdoors only",
             code_license="Apache-2.0",
+            contract="mpsfm_sky.contract:simple",
         ),
     ]

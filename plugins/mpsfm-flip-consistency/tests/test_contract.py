@@ -1,0 +1,5 @@
+"""The contract of the wrapper, around depth and around normals."""
+
+from mpsfm_core.testing import contract_tests
+
+test_flip_consistency = contract_tests("wrapper", "flip-consistency")

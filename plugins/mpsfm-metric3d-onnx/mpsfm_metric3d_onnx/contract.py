@@ -1,0 +1,17 @@
+"""How the contract kit tests the providers without weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mpsfm_onnx.contract import stand_in
+
+from mpsfm_core.testing import Setup
+from mpsfm_metric3d_onnx.options import Metric3dOptions
+from mpsfm_metric3d_onnx.provider import describe
+
+
+def setup(folder: Path) -> Setup:
+    """An export with confidence that reads painted views."""
+    model = stand_in(describe(Metric3dOptions(weights="", confidence=True)), folder)
+    return Setup(options={"weights": str(model), "confidence": True}, knows="painted")

@@ -1,0 +1,136 @@
+"""How the contract kit tests described networks without weights: stand-ins that read what is
+painted into the views, with the tensors of a description."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import ArrayLike
+from onnx import TensorProto, helper, numpy_helper
+
+from mpsfm_core.data import Float64
+from mpsfm_core.testing import Setup
+from mpsfm_core.testing.examples import outdoor_example
+from mpsfm_core.testing.painting import NORMALS_STD, RELATIVE_STD, decoder
+from mpsfm_onnx.canvas import Canvas
+from mpsfm_onnx.description import Description, ImageInput, load_description
+
+KAPPA = (1 + np.sqrt(1 - NORMALS_STD**2)) / NORMALS_STD
+"""Concentration whose expected angle is the std of painted normals (``exp(-kappa pi)`` is 0)."""
+_UNCERTAINTY = {"confidence": 1 - RELATIVE_STD}
+
+_TINY = """
+name: tiny
+input:
+  name: image
+  scale: 0.01
+  mean: [0.5, 1.0, 1.5]
+  std: [2.0, 3.0, 4.0]
+  size: {mode: shortest, side: 112, multiple_of: 14, fit: pad, enlarge: false}
+outputs:
+  depth: {name: depth, metric: true, canonical_focal: 100.0}
+  confidence: {name: confidence, output: confidence}
+  normals: {name: normals, axes: [-1, 1, 1]}
+  kappa: {name: normals, channel: 3}
+"""
+
+
+def depth(folder: Path) -> Setup:
+    """A network with a canonical camera, padding and a confidence."""
+    return Setup(options=_tiny(folder), knows="painted")
+
+
+joint = normals = depth
+
+
+def stand_in(description: Description, folder: Path) -> Path:
+    """A model that gives painted views their depth and normals, through a description with named
+    input, NCHW tensors, ``output: depth`` and a concentration of the normals.
+
+    A canonical camera has the focal length of the kit's main example on the network's input.
+    """
+    outputs, rule = description.outputs, description.input
+    weights, bias = _unnormalised(rule)
+    graph = _Graph(str(rule.name))
+    graph.add("Conv", graph.image, graph.array(weights), graph.array(bias), to="painted")
+    graph.add("Split", "painted", graph.array([1, 3]), to=("metres", "slopes"), axis=1)
+    graph.add("Mul", "metres", graph.array([0.0]), to="nothing")
+    if outputs.depth is not None:
+        unit = graph.array([_canonical_unit(description)])
+        graph.add("Mul", "metres", unit, to=outputs.depth.name)
+    if outputs.confidence is not None:
+        sure = graph.array([_UNCERTAINTY[outputs.confidence.output]])
+        graph.add("Add", "nothing", sure, to=outputs.confidence.name)
+    if outputs.normals is not None and outputs.kappa is not None:
+        normals, kappa = outputs.normals.name, outputs.kappa.name
+        parts = (normals, kappa) if normals != kappa else ("towards", "concentration")
+        axes = np.array(outputs.normals.axes, dtype=np.float64).reshape(1, 3, 1, 1)
+        graph.add("Mul", "slopes", graph.array(axes), to=parts[0])
+        graph.add("Add", "nothing", graph.array([KAPPA]), to=parts[1])
+        if normals == kappa:
+            graph.add("Concat", *parts, to=normals, axis=1)
+    told = rule.intrinsics.name if rule.intrinsics else None
+    return graph.save(sorted(outputs.names()), told, folder / f"{description.name}.onnx")
+
+
+class _Graph:
+    """An ONNX graph of one image (1, 3, h, w)."""
+
+    def __init__(self, image: str) -> None:
+        self.image = image
+        self._nodes: list[onnx.NodeProto] = []
+        self._arrays: list[onnx.TensorProto] = []
+
+    def array(self, values: ArrayLike) -> str:
+        """A constant tensor, float32 or int64; returns its name."""
+        array, name = np.asarray(values), f"array_{len(self._arrays)}"
+        dtype = np.int64 if np.issubdtype(array.dtype, np.integer) else np.float32
+        self._arrays.append(numpy_helper.from_array(array.astype(dtype), name))
+        return name
+
+    def add(self, kind: str, *inputs: str, to: str | tuple[str, ...], **attributes: Any) -> None:
+        """A node."""
+        outputs = (to,) if isinstance(to, str) else to
+        self._nodes.append(helper.make_node(kind, inputs, outputs, **attributes))
+
+    def save(self, outputs: Sequence[str], intrinsics: str | None, path: Path) -> Path:
+        """Write the model; ``intrinsics``: an input (1, 3, 3) that nothing reads."""
+        flat = TensorProto.FLOAT
+        inputs = [helper.make_tensor_value_info(self.image, flat, [1, 3, "h", "w"])]
+        if intrinsics is not None:
+            inputs.append(helper.make_tensor_value_info(intrinsics, flat, [1, 3, 3]))
+        results = [helper.make_tensor_value_info(name, flat, None) for name in outputs]
+        graph = helper.make_graph(self._nodes, "stand_in", inputs, results, self._arrays)
+        opset = [helper.make_opsetid("", 17)]
+        onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=8), path)
+        return path
+
+
+def _tiny(folder: Path) -> dict[str, str]:
+    path = folder / "tiny.yaml"
+    path.write_text(_TINY, encoding="utf-8")
+    description = load_description(str(path))
+    return {"description": str(path), "model": str(stand_in(description, folder))}
+
+
+def _unnormalised(rule: ImageInput) -> tuple[Float64, Float64]:
+    """The layer that reads painted pixels, for values as the network gets them."""
+    weights, bias = decoder()
+    if rule.channels == "BGR":
+        weights = weights[:, ::-1]
+    mean, std = np.array(rule.mean), np.array(rule.std)
+    bias = bias + weights @ mean / rule.scale
+    return (weights * std / rule.scale)[..., None, None], bias
+
+
+def _canonical_unit(description: Description) -> float:
+    rule, camera = description.outputs.depth, outdoor_example("painted").camera
+    if rule is None or rule.canonical_focal is None:
+        return 1.0
+    image = Canvas.plan(description.input.size, camera.size).image
+    resized = camera.resized(*image)
+    return rule.canonical_focal / ((resized.fx + resized.fy) / 2)

@@ -1,0 +1,33 @@
+"""How the contract kit tests the masks without weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import onnx
+
+from mpsfm_core.testing import Setup
+
+_PAINTED_SKY = """
+<ir_version: 8, opset_import: ["" : 17]>
+sky (float[b,3,h,w] image) => (float[b,1,h,w] d0)
+<int64[1] red = {0}, float[1] steep = {-255}, float[1] one = {1}, float[1] zero = {0}> {
+    depth = Gather <axis = 1> (image, red)
+    away = Mul (depth, steep)
+    above = Add (away, one)
+    d0 = Max (above, zero)
+}
+"""
+"""1 where the red of a painted view, which is its depth, is 0."""
+
+
+def network(folder: Path) -> Setup:
+    """The network's stand-in takes for sky what has no depth painted."""
+    path = folder / "sky.onnx"
+    onnx.save(onnx.parser.parse_model(_PAINTED_SKY), path)
+    return Setup(options={"model": str(path), "network": "skysegsmall"}, knows="painted")
+
+
+def simple(folder: Path) -> Setup:
+    """It sees the blue sky of the textured views."""
+    return Setup(knows="seen")
