@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib
 import os
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 from mpsfm_core.config import RuntimeOptions
@@ -52,6 +54,7 @@ class ActiveProvider:
         self._local = threading.local()
         self._lock = threading.Lock()
         self._identity: dict[str, Any] | None = None
+        self._known: set[str] = set()
 
     def can(self, capability: Capability) -> bool:
         """Whether the provider declares a capability."""
@@ -78,21 +81,23 @@ class ActiveProvider:
         """How many threads may use it: one with a GPU."""
         return 1 if _device(self._runtime, self.spec) == "cuda" else worker_count(self._runtime)
 
-    def timed(self, compute: Callable[[Any], T]) -> T:
-        """Compute with this thread's instance, on the provider's clock."""
+    def timed(self, key: str, compute: Callable[[Any], T]) -> T:
+        """Compute the result named ``key`` with this thread's instance, on the provider's clock."""
         provider = self.instance
         started = time.perf_counter()
         result = compute(provider)
         seconds = time.perf_counter() - started
         with self._lock:
+            self._known.add(key)
             self.usage.computed += 1
             self.usage.seconds += seconds
         return result
 
-    def count_cached(self) -> None:
-        """Note that a result came from the cache."""
+    def count_cached(self, key: str) -> None:
+        """Note that a result came from the cache; counts once, not when it is loaded again."""
         with self._lock:
-            self.usage.cached += 1
+            self.usage.cached += key not in self._known
+            self._known.add(key)
 
     def _create(self) -> Any:
         backend = self.backend
@@ -157,6 +162,8 @@ def _device(runtime: RuntimeOptions, spec: ProviderSpec) -> str:
     """``cuda`` where it is asked for, or automatically where the provider's library can use it."""
     if runtime.device != "auto":
         return runtime.device
+    if not _may_have_gpu():
+        return "cpu"
     if "torch" in spec.requires:
         available = importlib.import_module("torch").cuda.is_available()
     elif "onnxruntime" in spec.requires:
@@ -165,6 +172,11 @@ def _device(runtime: RuntimeOptions, spec: ProviderSpec) -> str:
     else:
         available = False
     return "cuda" if available else "cpu"
+
+
+def _may_have_gpu() -> bool:
+    """Without NVIDIA's driver there is none, and no library need be imported to ask for it."""
+    return Path("/dev/nvidiactl").exists() or shutil.which("nvidia-smi") is not None
 
 
 def _texts(values: object) -> Iterator[str]:

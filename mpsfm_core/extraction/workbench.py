@@ -58,14 +58,14 @@ class Workbench:
         compute: Callable[[Any], Result],
     ) -> Result:
         """What a provider returns for inputs that plain data identifies: cached, or computed."""
-        if provider.can("uncached"):
-            return provider.timed(compute)
         key = self.key(provider, inputs)
+        if provider.can("uncached"):
+            return provider.timed(key, compute)
         found = self.cache.load(provider.kind, key, cls)
         if found is not None:
-            provider.count_cached()
+            provider.count_cached(key)
             return found
-        value = provider.timed(compute)
+        value = provider.timed(key, compute)
         self.cache.store(provider.kind, key, value)
         return value
 

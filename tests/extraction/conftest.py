@@ -58,13 +58,14 @@ class Truth:
 class World:
     """Images and providers. ``calls``: ``(kind, image or pair)`` -> how often it was asked.
 
-    ``break_on``: what to return (or raise) instead.
+    ``break_on``: what to return (or raise) instead. ``made``: providers that were constructed.
     """
 
     truth: Truth
     root: Path
     calls: Counter[tuple[str, str]] = field(default_factory=Counter)
     break_on: dict[tuple[str, str], Callable[[], object]] = field(default_factory=dict)
+    made: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
         self.names, self.poses = self.truth.names, self.truth.poses
@@ -118,10 +119,14 @@ class World:
 
     def _register(self) -> None:
         def spec(kind: Any, name: str, cls: type, *capabilities: Any) -> ProviderSpec:
+            def factory(options: FakeOptions, context: ProviderContext) -> object:
+                self.made[kind] += 1
+                return cls(self, options)
+
             return ProviderSpec(
                 kind=kind,
                 name=name,
-                factory=lambda options, context: cls(self, options),
+                factory=factory,
                 options=FakeOptions,
                 capabilities=frozenset(capabilities),
             )
