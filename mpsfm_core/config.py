@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
+from mpsfm_core.calibration.file import CALIBRATIONS, read_values
 from mpsfm_core.errors import ConfigError, ProviderError, did_you_mean
 from mpsfm_core.extraction.options import ExtractionOptions, PairOptions, VerificationOptions
 from mpsfm_core.inputs.options import InputOptions
@@ -95,7 +95,6 @@ _BLOCKS: dict[str, Kind] = {
     "depth": "depth",
     "normals": "normals",
 }
-_CALIBRATIONS: dict[str, type[Options]] = {"depth": DepthCalibration, "normals": NormalCalibration}
 
 
 def shipped_configs() -> dict[str, Path]:
@@ -310,19 +309,16 @@ def _calibration(
     values, path = backend.calibration, (*path, "calibration")
     if values is None:
         return None
-    if kind not in _CALIBRATIONS:
+    if kind not in CALIBRATIONS:
         raise SettingsError((SettingProblem(path, f"a {kind} provider has no uncertainty"),))
     if isinstance(values, str):
         folder = next(layer.folder for layer in reversed(layers) if layer.says(path))
         file = folder / Path(values).expanduser()
         try:
-            values = parse_yaml(file.read_text(encoding="utf-8"), str(file))
-        except (OSError, UnicodeDecodeError) as error:
-            text = f"calibration file {str(file)!r} cannot be read: {error}"
-            raise SettingsError((SettingProblem(path, text),)) from error
-        if not isinstance(values, dict):
-            raise SettingsError((SettingProblem(path, f"{file} does not hold a mapping"),))
-    return parse_settings(_CALIBRATIONS[kind], values, path).model_dump(mode="json")
+            values = dict(read_values(file, kind))
+        except ConfigError as error:
+            raise SettingsError((SettingProblem(path, str(error)),)) from error
+    return parse_settings(CALIBRATIONS[kind], values, path).model_dump(mode="json")
 
 
 def _combination_problems(config: Config, registry: Registry) -> list[SettingProblem]:

@@ -19,7 +19,7 @@ from mpsfm_core.options import Options, SettingsError, parse_settings
 from mpsfm_core.yaml_text import parse_yaml, write_yaml
 
 CalibratedKind = Literal["depth", "normals"]
-CALIBRATIONS: Mapping[CalibratedKind, type[DepthCalibration] | type[NormalCalibration]] = {
+CALIBRATIONS: Mapping[str, type[DepthCalibration] | type[NormalCalibration]] = {
     "depth": DepthCalibration,
     "normals": NormalCalibration,
 }

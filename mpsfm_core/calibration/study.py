@@ -150,7 +150,8 @@ def _intervals(
     if fit.edge_ratio is not None:
         intervals["edge_std_scale"] = [float(low[-1]), float(high[-1])]
     if "std_floor_deg" in intervals:
-        intervals["std_floor_deg"] = [float(np.degrees(v)) for v in intervals["std_floor_deg"]]
+        degrees = [float(np.degrees(bound)) for bound in intervals.pop("std_floor_deg")]
+        intervals["std_floor_deg" if "std_scale" in fit.names else "std_default_deg"] = degrees
     return intervals
 
 

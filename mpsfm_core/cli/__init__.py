@@ -14,7 +14,17 @@ from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli import benchmark, config, demo, evaluate, models, plugins, reconstruct, testsets
+from mpsfm_core.cli import (
+    benchmark,
+    calibrate,
+    config,
+    demo,
+    evaluate,
+    models,
+    plugins,
+    reconstruct,
+    testsets,
+)
 from mpsfm_core.cli.errors import GuardedGroup
 
 
@@ -36,6 +46,7 @@ def build_app() -> typer.Typer:
     app.command("demo")(demo.demo)
     app.command("evaluate")(evaluate.evaluate)
     app.command("benchmark")(benchmark.benchmark)
+    app.command("calibrate")(calibrate.calibrate)
     app.add_typer(plugins.app, name="plugins")
     app.add_typer(config.app, name="config")
     app.add_typer(models.app, name="models")

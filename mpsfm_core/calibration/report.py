@@ -1,0 +1,166 @@
+"""The report of a calibration: one HTML page that needs nothing else, and its numbers as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from mpsfm_core.calibration.metrics import NORMAL_COVERAGE
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
+table { border-collapse: collapse; margin: 0.5rem 0 1.5rem; }
+th, td { border-bottom: 1px solid #ddd; padding: 0.2rem 0.9rem 0.2rem 0; text-align: left; }
+td { font-variant-numeric: tabular-nums; }
+.warning { border-left: 4px solid #b3561d; padding-left: 0.8rem; }
+svg { max-width: 100%; height: auto; }
+"""
+_UNITS = {"depth": ("depth (m)", "log depth"), "normals": ("slant (degrees)", "rad")}
+_METRICS = {
+    "coverage": "within 1 / 2 / 3 std",
+    "coverage_of_folds": "within 1 std, of each fold",
+    "coverage_without_scaling": "the same without a scale of each image",
+    "z_mad": "1.4826 MAD of error / std",
+    "nll": "negative log density, normal",
+    "nll_heavy": "negative log density, heavy tails",
+    "ause": "AUSE",
+    "rmse": "RMSE",
+}
+_IDEAL = {
+    "coverage": NORMAL_COVERAGE,
+    "coverage_of_folds": NORMAL_COVERAGE[:1],
+    "z_mad": 1.0,
+    "ause": 0.0,
+}
+
+
+def write_report(calibration_file: Path, report: Mapping[str, Any]) -> tuple[Path, Path]:
+    """Write ``NAME.report.html`` and ``NAME.report.json`` beside ``NAME.yaml``.
+
+    Plots need matplotlib; without it the page says so. Returns both paths.
+    """
+    page = calibration_file.with_suffix(".report.html")
+    numbers = calibration_file.with_suffix(".report.json")
+    page.write_text(render(report), encoding="utf-8")
+    numbers.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    return page, numbers
+
+
+def render(report: Mapping[str, Any]) -> str:
+    """The report as an HTML page."""
+    made = report["provenance"]
+    title = f"Calibration of {report['kind']} by {made['provider']}"
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        f"<p>{escape(_abstract(report))}</p>",
+        *(f'<p class="warning">{escape(text)}</p>' for text in report["warnings"]),
+        "<h2>Values</h2>",
+        _table(("", "before", "after", "95 % interval", "largest for"), _values(report)),
+        f"<h2>On images held out ({report['folds']} folds)</h2>",
+        _table(("", "before", "after", "ideal"), _metrics(report["metrics"])),
+        _plots(report),
+        f"<h2>By {escape(_UNITS[report['kind']][0])}</h2>",
+        _table(("from", "to", "pixels", "std", "before", "after", "z after"), _ranges(report)),
+        "<h2>Models tried</h2>",
+        "<p>A model is chosen when it explains the errors better than the one chosen before it by "
+        "more than a standard error over the images.</p>",
+        _table(("model", "log density", "gain", "standard error", "chosen"), _candidates(report)),
+        *_rounds(report),
+        "<h2>Where it comes from</h2>",
+        _table((), [(key, _text(value)) for key, value in made.items() if key != "metrics"]),
+    ]
+    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{_STYLE}</style>'
+    return (
+        f"<!DOCTYPE html>\n<html><head>{head}</head><body>\n"
+        + "\n".join(parts)
+        + "\n</body></html>\n"
+    )
+
+
+def _abstract(report: Mapping[str, Any]) -> str:
+    made = report["provenance"]
+    text = (
+        f"Fitted to {report['samples']} pixels of {made['images']} images ({made['data']}); "
+        f"compared with {made['truth']}. "
+        f"{report['gross_errors']:.1%} of the errors are gross and not part of the std."
+    )
+    scale = report["scale"]
+    if scale is None:
+        return text
+    return (
+        f"{text} The std is that of depth after each image was given its own scale, as the mapper "
+        f"does. True over predicted depth is {scale['median']:.3f} in the median image, and its "
+        f"log has a spread of {scale['log_spread']:.3f} over the images; who uses the depth "
+        f"without estimating scales has to add this."
+    )
+
+
+def _values(report: Mapping[str, Any]) -> Iterable[Sequence[str]]:
+    before, after = (report["calibration"][when] for when in ("before", "after"))
+    for name in after:
+        interval = report["intervals_95"].get(name, [])
+        share = report["largest_term"].get(name)
+        largest = "" if share is None else f"{share:.0%} of the pixels"
+        yield name, _text(before[name]), _text(after[name]), _text(interval), largest
+
+
+def _metrics(metrics: Mapping[str, Mapping[str, Any]]) -> Iterable[Sequence[str]]:
+    for name, label in _METRICS.items():
+        if name in metrics["after"]:
+            ideal = _text(_IDEAL.get(name, ""))
+            yield label, *(_text(metrics[when][name]) for when in ("before", "after")), ideal
+
+
+def _ranges(report: Mapping[str, Any]) -> Iterable[Sequence[str]]:
+    before, after = (report["metrics"][when]["by_range"] for when in ("before", "after"))
+    for old, new in zip(before, after, strict=False):
+        shares = (_text(old["coverage"]), _text(new["coverage"]))
+        columns = (new["from"], new["to"], new["samples"], new["std"])
+        yield *map(_text, columns), *shares, _text(new["z_mad"])
+
+
+def _candidates(report: Mapping[str, Any]) -> Iterable[Sequence[str]]:
+    for candidate in report["candidates"]:
+        numbers = (candidate[key] for key in ("log_density", "gain", "standard_error"))
+        yield candidate["name"], *map(_text, numbers), "yes" if candidate["chosen"] else ""
+
+
+def _rounds(report: Mapping[str, Any]) -> Iterable[str]:
+    """The rounds of a self-calibration."""
+    rounds = report.get("rounds", [])
+    if rounds:
+        rows = [
+            (str(number), f"{one['change']:.1%}", _text(one["calibration"]))
+            for number, one in enumerate(rounds, start=1)
+        ]
+        yield "<h2>Reconstructions</h2>"
+        yield _table(("round", "change of the median std", "values"), rows)
+
+
+def _plots(report: Mapping[str, Any]) -> str:
+    try:
+        from mpsfm_core.calibration.plots import draw
+    except ImportError:
+        return "<p>The plots need matplotlib: pip install 'mpsfm-core[report]'</p>"
+    return draw(report["metrics"], *_UNITS[report["kind"]])
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    cells = "".join(f"<th>{escape(text)}</th>" for text in head)
+    lines = [f"<tr>{cells}</tr>"] if head else []
+    for row in rows:
+        lines.append("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>")
+    return "<table>\n" + "\n".join(lines) + "\n</table>"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}: {_text(content)}" for key, content in value.items())
+    if isinstance(value, (list, tuple)):
+        return " / ".join(map(_text, value))
+    return "" if value is None else str(value)
