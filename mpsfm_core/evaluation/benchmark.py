@@ -162,7 +162,9 @@ class _SceneRuns:
             record = read_record(path) if path.is_file() else None
         except InputError:
             return None
-        return record if record is not None and record.key == key else None
+        if record is None or record.key != key or record.error:
+            return None  # what failed may have lacked memory, and is tried again
+        return record
 
     def _record(self, item: EvaluationSet, key: str, task: Task, outcome: Outcome) -> Record:
         return Record(

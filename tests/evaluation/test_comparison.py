@@ -33,8 +33,8 @@ def records(
     return made
 
 
-def difference(a: list[Record], b: list[Record]):
-    [found] = compare({"ours": a}, {"ours": b}, resamples=400)
+def difference(a: list[Record], b: list[Record], resamples: int = 400):
+    [found] = compare({"ours": a}, {"ours": b}, resamples=resamples)
     return found
 
 
@@ -43,7 +43,7 @@ def test_a_large_difference_is_significant() -> None:
     before, after = found.auc[5]
     low, high = found.interval[5]
     assert low < after - before < high
-    assert low > 10 and found.p_value[5] < 0.01
+    assert low > 10 and found.p_value[5] < 0.02
     assert found.unit == "sets" and found.sets == 8
 
 
@@ -53,12 +53,13 @@ def test_no_difference_is_not() -> None:
 
 
 def test_false_alarms_are_as_rare_as_declared() -> None:
+    # Seeds far from those of the other tests; p-values of swaps are uniform for equal sides.
     p = [
-        difference(records(1.0, seed=2 * k), records(1.0, seed=2 * k + 1)).p_value[5]
-        for k in range(30)
+        difference(records(1.0, seed=k), records(1.0, seed=k + 1), resamples=150).p_value[5]
+        for k in range(1000, 1120, 2)
     ]
-    assert np.mean(np.array(p) < 0.05) < 0.25  # eight sets are few; far from every time
-    assert np.mean(np.array(p) < 0.5) > 0.2
+    assert np.mean(np.array(p) < 0.05) < 0.13  # 5 % of 60 and 2.8 standard deviations
+    assert 0.3 < np.mean(np.array(p) < 0.5) < 0.7
 
 
 def test_few_sets_are_compared_by_pairs() -> None:
