@@ -67,6 +67,7 @@ def reconstruct(
     *,
     intrinsics: str | Path | None = None,
     image_list: str | Path | None = None,
+    poses: str | Path | None = None,
     overrides: Sequence[str] = (),
     registry: Registry | None = None,
 ) -> ReconstructionResult:
@@ -79,6 +80,7 @@ def reconstruct(
         config,
         intrinsics=intrinsics,
         image_list=image_list,
+        poses=poses,
         overrides=overrides,
         registry=registry,
     )

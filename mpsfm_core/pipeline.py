@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,10 @@ import pycolmap
 from threadpoolctl import threadpool_limits
 
 from mpsfm_core.config import Config, load_config
-from mpsfm_core.errors import ReconstructionError
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.errors import InputError, ReconstructionError
+from mpsfm_core.evaluation.models import match_names, read_poses
+from mpsfm_core.evaluation.pose_auc import Pose
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.mapping import mapper
@@ -51,6 +54,7 @@ def reconstruct(
     *,
     intrinsics: PathLike | None = None,
     image_list: PathLike | None = None,
+    poses: PathLike | None = None,
     overrides: Sequence[str] = (),
     registry: Registry | None = None,
 ) -> ReconstructionResult:
@@ -62,11 +66,13 @@ def reconstruct(
         config: name of a shipped configuration, a YAML file, or a loaded one.
         intrinsics: ``intrinsics.yaml`` or a COLMAP model; else EXIF, else a default focal length.
         image_list: text file with one image name a line.
+        poses: COLMAP model with known poses of some or all images; ``mapping.known_poses`` says
+            whether they are a start or stay.
         overrides: settings such as ``"runtime.workers=2"``; not with a loaded configuration.
         registry: the providers to choose from, by default those of all installed plugins.
 
     Raises:
-        InputError: images, intrinsics, configuration, weights or output folder are wrong.
+        InputError: images, intrinsics, poses, configuration, weights or output are wrong.
         ReconstructionError: no reconstruction was possible; ``summary.json`` has the reasons.
         MpsfmError: a provider failed or broke its contract, or the disk is full.
     """
@@ -77,7 +83,7 @@ def reconstruct(
         raise TypeError("overrides go into load_config(), this configuration is loaded already")
     run = _Run(config, registry, None if output is None else Path(output))
     with threadpool_limits(config.runtime.workers):
-        return run(Path(images), _path(intrinsics), _path(image_list))
+        return run(Path(images), _path(intrinsics), _path(image_list), _path(poses))
 
 
 class _Run:
@@ -90,22 +96,28 @@ class _Run:
         self._stages = Stages(registry)
 
     def __call__(
-        self, folder: Path, intrinsics: Path | None, image_list: Path | None
+        self,
+        folder: Path,
+        intrinsics: Path | None,
+        image_list: Path | None,
+        poses: Path | None,
     ) -> ReconstructionResult:
         config, stage = self._config, self._stages.stage
         if self._output is not None:
             check_writable(self._output)
         with stage("inputs"):
             images = load_images(folder, intrinsics, image_list, config.inputs)
+            known = {} if poses is None else _known_poses(poses, images)
         with stage("extraction"):
             extraction = extract(images, config, self._registry, self._stages)
+        problem = _with_poses(extraction.problem, known)
         with stage("mapping"):
-            mapping = mapper.reconstruct(extraction.problem, config.mapping, self._stages)
+            mapping = mapper.reconstruct(problem, config.mapping, self._stages)
         if not mapping.reconstructions:
             self._give_up(images, extraction, mapping)
         summary: dict[str, Any] = {}
         with stage("results"):
-            photos = Photos(images, extraction.problem)
+            photos = Photos(images, problem)
             components = [Component.of(part, photos) for part in mapping.reconstructions]
             models = tuple(component.model for component in components)
 
@@ -178,6 +190,19 @@ class _Run:
                 }
             )
         return described
+
+
+def _known_poses(model: Path, images: ImageSet) -> dict[str, Pose]:
+    poses = read_poses(model)
+    matched = match_names(images.names, poses)
+    if not matched:
+        raise InputError(f"{model}: has a pose of none of the images, names differ")
+    return {name: poses[found] for name, found in matched.items()}
+
+
+def _with_poses(problem: MappingProblem, poses: Mapping[str, Pose]) -> MappingProblem:
+    images = (replace(image, known_pose=poses.get(image.name)) for image in problem.images)
+    return replace(problem, images=tuple(images))
 
 
 def _path(value: PathLike | None) -> Path | None:

@@ -35,10 +35,9 @@ def demo(
         folder / "images",
         output,
         "demo",
-        folder / "intrinsics.yaml",
-        None,
-        [*priors, *(overrides or [])],
         quiet,
+        intrinsics=folder / "intrinsics.yaml",
+        overrides=[*priors, *(overrides or ())],
     )
     _compare(reconstruction_poses(result.model), read_poses(folder / "gt"))
     typer.echo("open next:")

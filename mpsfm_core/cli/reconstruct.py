@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,6 +24,13 @@ def reconstruct(
     image_list: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Use these images only, one name a line.")
     ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MODEL",
+            help="COLMAP model with known poses; --set mapping.known_poses=fixed keeps them.",
+        ),
+    ] = None,
     overrides: Overrides = None,
     quiet: Quiet = False,
 ) -> None:
@@ -33,34 +40,32 @@ def reconstruct(
     depth (DIR/depth) and DIR/summary.json. Exits with 0 on success, 2 on wrong input, 3 when no
     reconstruction was possible; the summary then has the reasons.
     """
-    run(images, output, config, intrinsics, image_list, overrides or [], quiet)
+    run(
+        images,
+        output,
+        config,
+        quiet,
+        intrinsics=intrinsics,
+        image_list=image_list,
+        poses=poses,
+        overrides=overrides or (),
+    )
 
 
 def run(
-    images: Path,
-    output: Path,
-    config: str,
-    intrinsics: Path | None,
-    image_list: Path | None,
-    overrides: list[str],
-    quiet: bool,
+    images: Path, output: Path, config: str, quiet: bool, **further: Any
 ) -> ReconstructionResult:
-    """Reconstruct with progress bars and print what came out; both unless ``quiet``."""
+    """Reconstruct with progress bars and print what came out, neither if ``quiet``.
+
+    ``further``: keyword arguments of :func:`mpsfm_core.pipeline.reconstruct`.
+    """
     from mpsfm_core.cli.progress import showing_progress
     from mpsfm_core.pipeline import reconstruct
     from mpsfm_core.registry import Registry
 
     registry = Registry.discover()
     with showing_progress(registry, quiet):
-        result = reconstruct(
-            images,
-            output,
-            config,
-            intrinsics=intrinsics,
-            image_list=image_list,
-            overrides=overrides,
-            registry=registry,
-        )
+        result = reconstruct(images, output, config, registry=registry, **further)
     if not quiet:
         _print_outcome(result, output)
     return result

@@ -110,6 +110,28 @@ def test_a_setting_reaches_the_run(photo_scene, mpsfm, tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "dense.ply").exists()
 
 
+def test_known_poses_stay_and_give_consistent_depth(photo_scene, mpsfm, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    given = (*photo_scene.arguments, "--output", output, "--poses", photo_scene.truth)
+    ended = mpsfm(*given, "--set", "mapping.known_poses=fixed")
+    assert ended.code == 0, ended.err
+    truth, written = read_poses(photo_scene.truth), read_poses(output)
+    assert written.keys() == truth.keys()
+    for name, (rotation, translation) in truth.items():
+        np.testing.assert_allclose(written[name][0], rotation, atol=1e-9)
+        np.testing.assert_allclose(written[name][1], translation, atol=1e-9)
+
+
+def test_poses_of_other_images_are_wrong_input(photo_scene, mpsfm, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(str(photo_scene.truth))
+    for image in model.images.values():
+        image.name = f"other_{image.name}"
+    model.write_text(str(tmp_path))
+    ended = mpsfm(*photo_scene.arguments, "--output", tmp_path / "out", "--poses", tmp_path)
+    assert ended.code == 2
+    assert "none of the images" in ended.err
+
+
 @pytest.fixture(scope="module")
 def unrelated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three photos of noise, with depth files: nothing matches."""
