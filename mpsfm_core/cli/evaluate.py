@@ -21,10 +21,19 @@ def evaluate(
     convention: Annotated[
         str, typer.Option(metavar="NAME", help="Of the pose AUC: paper, colmap or vggt.")
     ] = "paper",
+    gt_depth: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="True depth, 16-bit PNG in mm; for MODEL/depth."),
+    ] = None,
+    scan: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.ply", help="Scan in the frame of GT; for MODEL/dense.ply."),
+    ] = None,
 ) -> None:
-    """Print pose AUC at 1, 5 and 20 degrees, trajectory error and registered share as JSON.
+    """Print pose AUC at 1, 5 and 20 degrees, trajectory errors and registered share as JSON.
 
-    Images are matched by name. Images of GT that MODEL lacks count as unregistered.
+    Images are matched by name. Images of GT that MODEL lacks count as unregistered. With true
+    depth or a scan, also how far the depth maps and the dense cloud of an output folder are off.
     """
     import json
 
@@ -35,7 +44,15 @@ def evaluate(
 
         raise InputError(f"no convention {convention!r}{did_you_mean(convention, CONVENTIONS)}")
     names = _names(images, image_list)
-    report = evaluate(read_poses(model), read_poses(truth), names, CONVENTIONS[convention])
+    poses, true_poses = read_poses(model), read_poses(truth)
+    report = evaluate(poses, true_poses, names, CONVENTIONS[convention])
+    if gt_depth is not None or scan is not None:
+        from mpsfm_core.evaluation.output_folder import evaluate_cloud, evaluate_depth
+
+        if gt_depth is not None:
+            report["depth"] = evaluate_depth(model, gt_depth)
+        if scan is not None:
+            report["cloud"] = evaluate_cloud(model / "dense.ply", scan, poses, true_poses)
     typer.echo(json.dumps(report, indent=2))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,17 +32,31 @@ class TrajectoryErrors:
 
     ``centers``: (n,), after ``truth_from_estimate``, which has the least squared error over the
     centres. ``rotations_deg``: (n,), after the best common rotation of the orientations alone, so
-    that centres on a line do no harm.
+    that centres on a line do no harm. ``steps``: (n - 1,), error of the motion from each image to
+    the next, in the order of the truth, after the scale of the alignment; ``step_turns_deg``: of
+    its rotation. These two are the relative pose error.
     """
 
     truth_from_estimate: Similarity
     centers: Float64
     rotations_deg: Float64
+    steps: Float64
+    step_turns_deg: Float64
 
     @property
     def ate_rmse(self) -> float:
         """Absolute trajectory error: root of the mean squared centre error."""
-        return float(np.sqrt((self.centers**2).mean()))
+        return _rms(self.centers)
+
+    @property
+    def rpe_rmse(self) -> float:
+        """Relative pose error: root of the mean squared error of the steps."""
+        return _rms(self.steps)
+
+    @property
+    def rpe_rmse_deg(self) -> float:
+        """The same of their rotations."""
+        return _rms(self.step_turns_deg)
 
 
 def umeyama(a: Float64, b: Float64) -> Similarity:
@@ -83,4 +97,24 @@ def trajectory_errors(
     turns = np.stack([truth[name][0].T @ estimated[name][0] for name in names])
     u, _, vt = np.linalg.svd(turns.sum(axis=0))
     common = (u * [1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
-    return TrajectoryErrors(similarity, offsets, rotation_angle_deg(turns @ common.T))
+    have = _steps([estimated[name] for name in names], similarity.scale)
+    want = _steps([truth[name] for name in names], 1.0)
+    return TrajectoryErrors(
+        similarity,
+        offsets,
+        rotation_angle_deg(turns @ common.T),
+        np.linalg.norm(have[1] - want[1], axis=1),
+        rotation_angle_deg(have[0] @ want[0].transpose(0, 2, 1)),
+    )
+
+
+def _steps(poses: Sequence[Pose], scale: float) -> Pose:
+    """``b_from_a`` of each image and the next: rotations (n - 1, 3, 3), translations (n - 1, 3)."""
+    rotations = np.stack([rotation for rotation, _ in poses])
+    translations = scale * np.stack([translation for _, translation in poses])
+    relative = rotations[1:] @ rotations[:-1].transpose(0, 2, 1)
+    return relative, translations[1:] - np.einsum("nij,nj->ni", relative, translations[:-1])
+
+
+def _rms(values: Float64) -> float:
+    return float(np.sqrt((values**2).mean()))

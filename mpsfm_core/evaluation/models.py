@@ -128,6 +128,8 @@ def _describe(errors: TrajectoryErrors | None) -> dict[str, float] | None:
         "ate_rmse": errors.ate_rmse,
         "ate_median": float(np.median(errors.centers)),
         "ate_max": float(errors.centers.max()),
+        "rpe_rmse": errors.rpe_rmse,
+        "rpe_rmse_deg": errors.rpe_rmse_deg,
         "rotation_median_deg": float(np.median(errors.rotations_deg)),
         "rotation_max_deg": float(errors.rotations_deg.max()),
         "scale": errors.truth_from_estimate.scale,

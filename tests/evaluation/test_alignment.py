@@ -78,3 +78,26 @@ def test_two_images_or_coinciding_centres_cannot_be_aligned() -> None:
     truth = poses_at(np.eye(3), np.stack([np.eye(3)] * 3))
     assert trajectory_errors({name: truth[name] for name in ("0", "1")}, truth) is None
     assert trajectory_errors(poses_at(np.zeros((3, 3)), np.stack([np.eye(3)] * 3)), truth) is None
+
+
+def test_relative_errors_of_steps() -> None:
+    rng = np.random.default_rng(4)
+    centers = np.cumsum(rng.normal(size=(6, 3)), axis=0)
+    rotations = Rotation.random(6, rng=rng).as_matrix()
+    truth = poses_at(centers, rotations)
+    frame = Rotation.random(rng=rng).as_matrix()
+    exact = trajectory_errors(poses_at(3 * centers @ frame, rotations @ frame), truth)
+    assert exact is not None
+    assert exact.rpe_rmse == pytest.approx(0, abs=1e-9)
+    assert exact.rpe_rmse_deg == pytest.approx(0, abs=1e-6)
+    # The last image turns by 4 degrees about its own centre: the motion into it is wrong, in its
+    # direction as seen from the turned camera too.
+    turn = Rotation.from_euler("y", 4, degrees=True).as_matrix()
+    turned = dict(truth)
+    turned["5"] = (turn @ truth["5"][0], turn @ truth["5"][1])
+    errors = trajectory_errors(turned, truth)
+    assert errors is not None
+    assert errors.step_turns_deg == pytest.approx([0, 0, 0, 0, 4], abs=1e-6)
+    step = truth["5"][1] - truth["5"][0] @ truth["4"][0].T @ truth["4"][1]
+    assert errors.steps[-1] == pytest.approx(np.linalg.norm(turn @ step - step), rel=1e-6)
+    assert errors.steps[:-1] == pytest.approx([0] * 4, abs=1e-9)

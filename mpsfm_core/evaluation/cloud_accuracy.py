@@ -1,0 +1,108 @@
+"""How far a point cloud is from a scan: accuracy and completeness, as ETH3D defines them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mpsfm_core.data import Float64, Int64
+from mpsfm_core.errors import InputError
+
+TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+"""In the scan's unit (ETH3D, metres)."""
+_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+
+
+def cloud_accuracy(
+    points: Float64, scan: Float64, tolerances: Sequence[float] = TOLERANCES
+) -> dict[str, Any]:
+    """Compare points (n, 3) with a scan (m, 3) in the same frame; plain data, ready for JSON.
+
+    ``accuracy``: tolerance -> share of the points that have the scan within it; ``completeness``:
+    of the scan that has a point within it; ``f1``: their harmonic mean. Both clouds are thinned to
+    one point a cube of half the smallest tolerance, so that no place counts twice. Points where
+    the scanner saw nothing count as wrong: crop the cloud first if the scan is partial.
+
+    Raises :class:`InputError` when a cloud is empty.
+    """
+    if not len(points) or not len(scan):
+        raise InputError("a point cloud is empty, there is nothing to compare")
+    points, scan = (thinned(cloud, min(tolerances) / 2) for cloud in (points, scan))
+    to_scan = cKDTree(scan).query(points)[0]
+    to_points = cKDTree(points).query(scan)[0]
+    accuracy = {str(t): float((to_scan <= t).mean()) for t in tolerances}
+    completeness = {str(t): float((to_points <= t).mean()) for t in tolerances}
+    return {
+        "points": len(points),
+        "scan_points": len(scan),
+        "accuracy": accuracy,
+        "completeness": completeness,
+        "f1": {t: _harmonic(accuracy[t], completeness[t]) for t in accuracy},
+        "median_distance_to_scan": float(np.median(to_scan)),
+        "median_distance_to_points": float(np.median(to_points)),
+    }
+
+
+def thinned(points: Float64, size: float) -> Float64:
+    """The first point of each cube of a grid of this size."""
+    cells: Int64 = np.floor(points / size).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    return points[np.sort(first)]
+
+
+def read_ply(path: Path) -> Float64:
+    """Vertices (n, 3) float64 of a PLY file, text or binary; colours, normals, faces are ignored.
+
+    Raises :class:`InputError` when it cannot be read.
+    """
+    try:
+        data = path.read_bytes()
+        end = data.index(b"end_header")
+        start = data.index(b"\n", end) + 1
+        return _vertices(data[:end].decode("ascii").splitlines(), data[start:])
+    except (OSError, ValueError, KeyError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a readable PLY file: {error}") from error
+
+
+def _vertices(header: list[str], body: bytes) -> Float64:
+    words = [line.split() for line in header]
+    order = _ORDERS[next(w[1] for w in words if w and w[0] == "format")]
+    elements = [k for k, w in enumerate(words) if w and w[0] == "element"]
+    if not elements or words[elements[0]][1] != "vertex":
+        raise ValueError("its first element must be the vertices")
+    count = int(words[elements[0]][2])
+    own = words[elements[0] + 1 : elements[1] if len(elements) > 1 else None]
+    properties = [(w[2], order + _TYPES[w[1]]) for w in own if w and w[0] == "property"]
+    if order:
+        table = np.frombuffer(body, dtype=properties, count=count)
+        return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    columns = [[name for name, _ in properties].index(axis) for axis in "xyz"]
+    lines = body.decode("ascii").splitlines()[:count]
+    rows = np.array([line.split() for line in lines], dtype=np.float64).reshape(count, -1)
+    return np.asarray(rows[:, columns])
+
+
+def _harmonic(a: float, b: float) -> float:
+    return 2 * a * b / (a + b) if a + b > 0 else 0.0
