@@ -7,7 +7,7 @@ system with a five-point stencil; a few multigrid-preconditioned CG iterations l
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from scipy import ndimage
@@ -26,7 +26,7 @@ from mpsfm_core.optimize.integration_energy import (
     majorise,
     normal_terms,
 )
-from mpsfm_core.optimize.multigrid import Multigrid
+from mpsfm_core.optimize.multigrid import Multigrid, Solution
 
 # Where there are normals but no prior, the filled-in depth is a prior of this variance (log depth):
 # it says next to nothing, but nothing is left undetermined.
@@ -125,6 +125,26 @@ class RefinedDepth:
         return np.exp(self.log_depth).astype(np.float32)
 
 
+class _Solver(Protocol):
+    """Majorises the energy of one image, and steps towards the minimum of a majoriser."""
+
+    def majorise(self, z: Float64) -> Any: ...
+    def step(self, here: Any, iterations: int) -> Solution: ...
+
+
+class _KernelSolver:
+    def __init__(self, terms: EnergyTerms) -> None:
+        self._terms = terms
+        self._multigrid = Multigrid(*terms.prior.log_depth.shape)
+
+    def majorise(self, z: Float64) -> Majoriser:
+        return majorise(z, self._terms)
+
+    def step(self, here: Majoriser, iterations: int, tolerance: float = 0.0) -> Solution:
+        self._multigrid.update(here.east, here.south, here.mass)
+        return self._multigrid.solve(-here.gradient, iterations, tolerance)
+
+
 class DepthIntegrator:
     """The priors of one image, ready to be refined under changing points and scales.
 
@@ -139,13 +159,20 @@ class DepthIntegrator:
         normals: NormalPrior,
         camera: PinholeCamera,
         options: IntegrationOptions = DEFAULT_OPTIONS,
+        *,
+        torch_device: str | None = None,
     ) -> None:
-        """Raises DataError when grids differ or a variance is missing."""
+        """Raises DataError when grids differ or a variance is missing.
+
+        With a `torch_device` such as "cuda" refinement runs there and needs torch; by default it
+        runs in compiled kernels on one CPU core, which are faster for maps below a megapixel or so.
+        """
         if depth.variance is None or normals.variance is None:
             raise DataError("variance", "depth integration needs one for depth and for normals")
         if not depth.shape == normals.shape == (camera.height, camera.width):
             raise DataError("camera", "depth, normals and camera must have one grid")
         self.options = options
+        self._torch_device = torch_device
         self._normals = normals
         self._camera = camera
         self._active = _reachable(depth.valid, normals.valid)
@@ -174,11 +201,13 @@ class DepthIntegrator:
         rescaled when the scale has changed), which is returned as it is when little is new.
         """
         terms = self._terms(anchors, scale)
+        solver = self._solver(terms)
         if start is None:
-            return self._descend(terms.prior.log_depth, terms, scale)
+            z = terms.prior.log_depth
+            return self._descend(z, solver.majorise(z), solver, scale)
         z = start.log_depth + np.log(scale / start.scale)
-        here = majorise(z, terms)
-        change = abs(_mean_point_energy(here, terms) - start.point_energy)
+        here = solver.majorise(z)
+        change = abs(here.point_energy - start.point_energy)
         if change <= self.options.skip_tolerance * start.point_energy:
             return replace(
                 start,
@@ -188,7 +217,7 @@ class DepthIntegrator:
                 energy=here.energy,
                 skipped=True,
             )
-        return self._descend(z, terms, scale)
+        return self._descend(z, here, solver, scale)
 
     def variance(self, refined: RefinedDepth, anchors: Anchors = NO_ANCHORS) -> Float32:
         """Marginal variance of the refined log depth, (h, w) float32; infinite where not valid.
@@ -200,22 +229,26 @@ class DepthIntegrator:
         here = majorise(refined.log_depth, terms)
         return inverse_diagonal(here.east, here.south, here.mass).astype(np.float32)
 
-    def _descend(self, z: Float64, terms: EnergyTerms, scale: float) -> RefinedDepth:
-        """Re-weighted least squares; every accepted step lowers the energy."""
+    def _solver(self, terms: EnergyTerms) -> _Solver:
+        if self._torch_device is None:
+            return _KernelSolver(terms)
+        from mpsfm_core.optimize.depth_integration_torch import TorchSolver
+
+        return TorchSolver(terms, self._torch_device)
+
+    def _descend(self, z: Float64, here: Any, solver: _Solver, scale: float) -> RefinedDepth:
+        """Re-weighted least squares from z; every accepted step lowers the energy."""
         options = self.options
-        solver = Multigrid(*z.shape)
-        here = majorise(z, terms)
         initial_energy = here.energy
         iterations = cg_iterations = 0
         converged = False
         while iterations < options.max_iterations and not converged:
-            solver.update(here.east, here.south, here.mass)
-            step = solver.solve(-here.gradient, options.cg_iterations)
+            step = solver.step(here, options.cg_iterations)
             further = z + (options.over_relaxation if iterations else 1.0) * step.x
-            there = majorise(further, terms)
+            there = solver.majorise(further)
             if not there.energy < here.energy:
                 further = z + step.x
-                there = majorise(further, terms)
+                there = solver.majorise(further)
             iterations, cg_iterations = iterations + 1, cg_iterations + step.iterations
             converged = not here.energy - there.energy > options.tolerance * here.energy
             if there.energy < here.energy:
@@ -226,7 +259,7 @@ class DepthIntegrator:
             scale=scale,
             initial_energy=initial_energy,
             energy=here.energy,
-            point_energy=_mean_point_energy(here, terms),
+            point_energy=here.point_energy,
             iterations=iterations,
             cg_iterations=cg_iterations,
             converged=converged,
@@ -273,14 +306,9 @@ class DepthIntegrator:
             self._point_terms(NO_ANCHORS, self._log_depth),
             blunt,
         )
-        start = majorise(self._log_depth, terms)
-        solver = Multigrid(*known.shape)
-        solver.update(start.east, start.south, start.mass)
-        return self._log_depth + solver.solve(-start.gradient, iterations=50, tolerance=1e-3).x
-
-
-def _mean_point_energy(here: Majoriser, terms: EnergyTerms) -> float:
-    return here.point_energy / max(len(terms.points.rows), 1)
+        solver = _KernelSolver(terms)
+        step = solver.step(solver.majorise(self._log_depth), iterations=50, tolerance=1e-3)
+        return self._log_depth + step.x
 
 
 def _reachable(depth_valid: Bool, normals_valid: Bool) -> Bool:

@@ -42,7 +42,7 @@ _MIN_NORMAL_VARIANCE = 1e-4
 MIN_LOG_VARIANCE = 1e-6
 MAX_LOG_VARIANCE = 1e2
 # What a pixel keeps of its prior's weight, however far it is: the system stays definite.
-_MIN_PRIOR_SHARE = 1e-4
+MIN_PRIOR_SHARE = 1e-4
 # Normals seen under more than 89.9 deg say nothing about the slope of depth.
 _MIN_FACING = 2e-3
 
@@ -100,7 +100,7 @@ class Majoriser(NamedTuple):
     """energy + 2 gradient . step + step' A step, with A as in `multigrid`; maps are (h, w)."""
 
     energy: float
-    point_energy: float  # the share of the sparse points
+    point_energy: float  # mean share of a sparse point
     gradient: Float64  # half the gradient of the energy
     east: Float32
     south: Float32
@@ -135,7 +135,8 @@ def majorise(z: Float64, terms: EnergyTerms) -> Majoriser:
     energy += _add_prior(z, terms.prior, losses.prior_limit, mass, gradient[inner])
     of_points = _add_points(z, terms.points, losses.point_scale, mass, gradient[inner])
     energy += of_points
-    return Majoriser(energy, of_points, gradient[inner], east[inner], south[inner], mass)
+    mean = of_points / max(len(terms.points.rows), 1)
+    return Majoriser(energy, mean, gradient[inner], east[inner], south[inner], mass)
 
 
 @_kernel
@@ -311,7 +312,7 @@ def _add_prior(
             kept = limit * limit / (limit * limit + square)
             energy += prior.weight * square * kept
             full, share = prior.weight * precision, kept * kept
-            mass[i, j] = full * max(share, _MIN_PRIOR_SHARE)
+            mass[i, j] = full * max(share, MIN_PRIOR_SHARE)
             gradient[i, j] += full * share * offset
     return energy
 

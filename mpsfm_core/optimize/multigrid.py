@@ -170,8 +170,8 @@ def _prepare_smoother(level: _Level) -> None:
 def _chain(hold: np.float32, coupling: np.float32, rest: np.float32) -> np.float32:
     """What holds the next pixel of a line: the rest of its diagonal, and the line up to it."""
     coupling = max(coupling, _ZERO)
-    line: np.float32 = coupling * hold * _inverse(coupling + hold)
-    return max(rest, _ZERO) + line
+    total: np.float32 = max(rest, _ZERO) + coupling * hold * _inverse(coupling + hold)
+    return total
 
 
 @_kernel
