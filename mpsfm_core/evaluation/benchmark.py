@@ -75,10 +75,12 @@ def run_benchmark(
         only.allow(sets)
         for config in plan.configs:
             runs = _SceneRuns(scene, sets, config, plan, output, registry)
+            own = []
             for record, known in runs():
-                records.append(record)
+                own.append(record)
                 if done is not None:
                     done(record, known)
+            records += sorted(own, key=_order(sets, plan))
     return records
 
 
@@ -181,6 +183,13 @@ class _SceneRuns:
             outcome.cpu_seconds,
             outcome.error,
         )
+
+
+def _order(sets: Sequence[EvaluationSet], plan: Plan) -> Callable[[Record], tuple[int, int]]:
+    """Sorts records by set, then ours before the peers: runs end in no particular order."""
+    places = {item.name: number for number, item in enumerate(sets)}
+    labels = [*(f"{OURS}-{prior}" for prior in plan.priors), *plan.peers]
+    return lambda record: (places[record.set_name], labels.index(record.label))
 
 
 def _key(task: Task) -> str:

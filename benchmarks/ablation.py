@@ -1,0 +1,119 @@
+"""What each part of the mapper is worth: our mapper with one part changed at a time.
+
+    python -m benchmarks.ablation [--scene rendered_kitchen] [--priors sensor,degraded]
+        [--sets minimal,leq10,leq30,all] [--only NAME ...] [--output DIR] [--workers 1]
+
+Each variant is a row of :data:`VARIANTS`, settings below ``mapping`` that differ from the
+defaults. Matches are the same for all and come from the cache after the first. Resumable. Writes
+benchmarks/results/ablation-SCENE.md, a table as the paper's table 5: AUC@1 / 5 / 20 degrees.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from benchmarks._scenes import RESULTS, shared_folder
+from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
+from mpsfm_core.evaluation.pose_auc import CONVENTIONS
+from mpsfm_core.evaluation.records import Record
+from mpsfm_core.evaluation.report import Row, make_rows
+from mpsfm_core.optimize.losses import Loss
+from mpsfm_core.yaml_text import write_yaml
+
+VARIANTS: Mapping[str, Mapping[str, object]] = {
+    "default": {},
+    "no lifting": {"registration": {"lifting": False}},
+    "no depth refinement": {"refinement": {"integrate": False}},
+    "no depth regularisation": {"refinement": {"depth_regularization": False}},
+    "no refinement, no regularisation": {
+        "refinement": {"integrate": False, "depth_regularization": False}
+    },
+    "no depth check": {"consistency": {"enabled": False}},
+    "depth check not at the end": {"consistency": {"check_at_end": False}},
+    "final robust pass": {"refinement": {"final_robust": True}},
+    "next view by inlier matches": {"registration": {"next_view": "inlier-matches"}},
+    "next view by visible points": {"registration": {"next_view": "visible-points"}},
+    "declared depth noise": {"refinement": {"measure_depth_noise": False}},
+    "no rescaling of priors": {"refinement": {"rescale": False}},
+    "reprojection loss of the reference": {
+        "refinement": {
+            "bundle": {"reprojection_loss": int(Loss.SOFT_L1), "reprojection_scale": 1.5}
+        }
+    },
+}
+
+
+def main() -> None:
+    """Run the variants and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scene", default="rendered_kitchen")
+    parser.add_argument("--priors", default="sensor,degraded")
+    parser.add_argument("--sets", default="minimal,leq10,leq30,all")
+    names = list(VARIANTS)
+    parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="NAME")
+    parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))
+    parser.add_argument("--workers", type=int, default=1)
+    arguments = parser.parse_args()
+    output = arguments.output / f"ablation-{arguments.scene}"
+    configs = {_file_name(name): name for name in arguments.only}
+    plan = Plan(
+        (shared_folder() / "data" / arguments.scene,),
+        tuple(str(_write_config(output / "configs", name)) for name in arguments.only),
+        tuple(arguments.sets.split(",")),
+        tuple(arguments.priors.split(",")),
+        peers=(),
+        overrides=("runtime.workers=1",),
+        workers=arguments.workers,
+    )
+    rows = make_rows(run_benchmark(plan, output, done=_tell))
+    text = _table(arguments.scene, rows, configs)
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / f"ablation-{arguments.scene}.md").write_text(text, encoding="utf-8")
+    print(text)
+
+
+def _write_config(folder: Path, name: str) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{_file_name(name)}.yaml"
+    path.write_text(write_yaml({"extends": "benchmark", "mapping": dict(VARIANTS[name])}))
+    return path
+
+
+def _file_name(variant: str) -> str:
+    return variant.replace(",", "").replace(" ", "-")
+
+
+def _table(scene: str, rows: Sequence[Row], configs: Mapping[str, str]) -> str:
+    """One table a prior: variants down, buckets across."""
+    convention = CONVENTIONS["paper"]
+    parts = [
+        f"# Ablation on {scene}",
+        f"Pose AUC at 1 / 5 / 20 degrees in percent (registered images), convention "
+        f"`{convention.name}`: {convention.description}.",
+    ]
+    cells = {(row.method, row.config, row.bucket): _cell(row) for row in rows}
+    buckets = list(dict.fromkeys(row.bucket for row in rows))
+    for method in dict.fromkeys(row.method for row in rows):
+        lines = [["variant", *buckets], ["---"] * (len(buckets) + 1)]
+        for config, variant in configs.items():
+            lines.append([variant, *(cells.get((method, config, b), "") for b in buckets)])
+        table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        parts.append(f"## {method}\n\n{table}")
+    return "\n\n".join(parts) + "\n"
+
+
+def _cell(row: Row) -> str:
+    failed = f", {row.failed} failed" if row.failed else ""
+    return f"{'/'.join(f'{v:.1f}' for v in row.auc.values())} ({row.registered:.0%}{failed})"
+
+
+def _tell(record: Record, known: bool) -> None:
+    what = "known" if known else record.error or f"{record.cpu_seconds:.1f} s"
+    print(f"{record.config} {record.set_name} {record.label}: {what}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()
