@@ -3,6 +3,9 @@
 The refined map of one image is carried into another through a nearest-depth buffer. Where it
 lands clearly in front of the surface that the other image sees, the two contradict each other:
 something would have to float in space that was seen to be empty. Behind is an occlusion.
+
+An image is held against all views that it overlaps with, not only those it shares points with:
+those that led an image to a wrong place look alike there, others tell.
 """
 
 from __future__ import annotations
@@ -13,61 +16,126 @@ import numpy as np
 from numba import njit
 
 from mpsfm_core.data import Bool, Float32, Float64
+from mpsfm_core.geometry import pixel_centers, unproject
 from mpsfm_core.mapping.options import ConsistencyOptions
+from mpsfm_core.scene.depth_map import DepthMap
 from mpsfm_core.scene.scene import Scene
 
 WARP_NOISE_PX = 1.0
 """Std of a pixel's position in the lift (reference: 1 px)."""
+OVERLAP_GRID = 16
+"""Columns and rows of the pixels by which overlap is judged (ours)."""
+MIN_OVERLAP = 0.05
+"""Share of those pixels that must fall into another view for a comparison (ours)."""
 
 
 class Inconsistency(NamedTuple):
-    """Share of contradicting pixels in both directions, and how many pixels were compared."""
+    """The view that contradicts an image most, and the share of contradicting pixels.
 
-    outgoing: float
-    incoming: float
-    compared: int
+    ``share``: of the pixels of either map, summed over both directions, as beta in the paper,
+    in [0, 2]. ``other``: -1 when no view overlaps.
+    """
 
-    @property
-    def score(self) -> float:
-        """The worse direction."""
-        return max(self.outgoing, self.incoming)
+    share: float
+    other: int
 
 
 def check_image(
-    scene: Scene, image: int, neighbors: list[int], options: ConsistencyOptions
+    scene: Scene, image: int, options: ConsistencyOptions, std_factor: float = 1.0
 ) -> Inconsistency:
-    """How much the depth of an image contradicts that of its neighbours, pooled over them."""
-    outgoing = np.sum([_compare(scene, image, n, options) for n in neighbors], axis=0)
-    incoming = np.sum([_compare(scene, n, image, options) for n in neighbors], axis=0)
-    shares = [
-        float(violations / total) if (total := violations + surface) >= options.min_pixels else 0.0
-        for violations, surface in (outgoing, incoming)
+    """How much an image contradicts the registered views that it overlaps with most.
+
+    ``std_factor``: how many times its declaration the std of depth is.
+    """
+    found = [
+        Inconsistency(contradiction(scene, image, other, options, std_factor), other)
+        for other in overlapping_views(scene, image, options.num_views)
     ]
-    return Inconsistency(shares[0], shares[1], int(np.sum([outgoing, incoming])))
+    return max(found, default=Inconsistency(0.0, -1))
 
 
-def _compare(
-    scene: Scene, source: int, target: int, options: ConsistencyOptions
-) -> tuple[int, int]:
-    """Pixels of ``target`` that ``source`` contradicts, and those it confirms."""
-    a, b = scene.maps[source], scene.maps[target]
-    rotation = scene.rotations[target] @ scene.rotations[source].T
-    translation = scene.translations[target] - rotation @ scene.translations[source]
-    depth, variance = warp_depth(
-        a.depth,
-        a.variance,
-        a.valid,
-        a.camera.params,
-        rotation,
-        translation,
-        b.camera.params,
-        b.depth.shape,
-    )
-    seen = np.isfinite(depth) & b.valid
-    deviation = (depth[seen] - b.depth[seen]) / np.sqrt(variance[seen] + b.variance[seen])
-    violations = deviation < -options.max_deviation
-    surface = np.abs(deviation) <= options.max_deviation
-    return int(violations.sum()), int(surface.sum())
+def conflicting_images(
+    scene: Scene, options: ConsistencyOptions, std_factor: float = 1.0
+) -> list[tuple[int, float]]:
+    """Registered images to leave out so that no two contradict each other, and how much each did.
+
+    The one with most conflicts goes first.
+    """
+    shares = np.zeros((scene.num_images, scene.num_images))
+    for image in map(int, scene.registered_images()):
+        for other in overlapping_views(scene, image, options.num_views):
+            if not shares[image, other]:
+                share = contradiction(scene, image, other, options, std_factor)
+                shares[image, other] = shares[other, image] = share
+    removed = []
+    while (shares > options.max_violations).any():
+        conflicts = (shares > options.max_violations).sum(axis=1)
+        worst = int(np.lexsort((shares.sum(axis=1), conflicts))[-1])
+        removed.append((worst, float(shares[worst].max())))
+        shares[worst] = shares[:, worst] = 0
+    return removed
+
+
+def overlapping_views(scene: Scene, image: int, limit: int) -> list[int]:
+    """Registered images, most overlapping first, into which a good part of a depth map falls."""
+    others = scene.registered_images()
+    others = others[(others != image) & np.array([scene.maps[i].active for i in others])]
+    depth_map = scene.maps[image]
+    rows, columns = depth_map.depth.shape
+    xy = pixel_centers(OVERLAP_GRID, OVERLAP_GRID) * [columns, rows] / OVERLAP_GRID
+    at = xy[..., 1].astype(np.int64), xy[..., 0].astype(np.int64)
+    points = unproject(depth_map.camera, xy, depth_map.depth[at].astype(np.float64))
+    world = (points[depth_map.valid[at]] - scene.translations[image]) @ scene.rotations[image]
+    local = np.einsum("nij,pj->npi", scene.rotations[others], world)
+    local += scene.translations[others][:, None]
+    size = np.array([scene.problem.images[i].camera.size for i in others]).reshape(-1, 1, 2)
+    focal, center = np.split(scene.intrinsics[others][:, None], 2, axis=2)
+    front = local[..., 2] > 1e-9
+    pixel = focal * local[..., :2] / np.where(front, local[..., 2], 1.0)[..., None] + center
+    inside = front & ((pixel >= 0) & (pixel < size)).all(axis=2)
+    share = inside.sum(axis=1) / OVERLAP_GRID**2
+    order = np.argsort(-share, kind="stable")[:limit]
+    return [int(others[k]) for k in order if share[k] >= MIN_OVERLAP]
+
+
+def contradiction(
+    scene: Scene, a: int, b: int, options: ConsistencyOptions, std_factor: float = 1.0
+) -> float:
+    """Share of pixels of two views at which one sees empty space and the other a surface."""
+    grids = {i: _Grid.of(scene.maps[i], options.map_width, std_factor) for i in (a, b)}
+    total = 0.0
+    for source, target in ((a, b), (b, a)):
+        rotation = scene.rotations[target] @ scene.rotations[source].T
+        translation = scene.translations[target] - rotation @ scene.translations[source]
+        one, two = grids[source], grids[target]
+        depth, variance = warp_depth(*one, rotation, translation, two.params, two.depth.shape)
+        seen = np.isfinite(depth) & two.valid
+        gap = two.depth[seen] - depth[seen]
+        std = np.sqrt(variance[seen] + two.variance[seen])
+        violated = (gap > options.max_deviation * std) & (gap > options.min_gap * two.depth[seen])
+        total += float(violated.sum()) / two.depth.size
+    return total
+
+
+class _Grid(NamedTuple):
+    """A depth map thinned out, with the (fx, fy, cx, cy) that belong to it."""
+
+    depth: Float32
+    variance: Float32
+    valid: Bool
+    params: Float64
+
+    @staticmethod
+    def of(depth_map: DepthMap, width: int, std_factor: float) -> _Grid:
+        """Every n-th pixel, such that about ``width`` columns remain."""
+        step = max(1, round(depth_map.valid.shape[1] / width))
+        thin = (slice(step // 2, None, step),) * 2
+        fx, fy, cx, cy = depth_map.camera.params
+        offset = (step // 2 + 0.5) / step - 0.5
+        params = np.array([fx / step, fy / step, cx / step - offset, cy / step - offset])
+        depth = depth_map.depth[thin]
+        variance = (std_factor * depth_map.log_std[thin] * depth) ** 2
+        return _Grid(depth, variance, depth_map.valid[thin], params)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
-from mpsfm_core.mapping.depth_consistency import check_image
+from mpsfm_core.mapping.depth_consistency import check_image, conflicting_images
 from mpsfm_core.mapping.events import MappingEvents, Silent
 from mpsfm_core.mapping.failure_ladder import FailureLadder
 from mpsfm_core.mapping.filtering import disconnected_images, filter_points, lost_images
@@ -95,7 +95,9 @@ class Mapper:
         self.scene = Scene(self.problem)
         self.scores = pair_score_matrix(self.scene, self.options.registration.next_view)
         self.refiner = Refiner(self.scene, self.options, self.scores)
-        self.ladder = FailureLadder(self.options.registration, self.options.consistency)
+        self.ladder = FailureLadder(self.options.registration)
+        self.attempts: dict[int, int] = defaultdict(int)
+        self.refuted = np.zeros(self.scores.shape, dtype=np.bool_)
         self._last_size = (0, 0)
 
     def _start_from_known_poses(self, available: Bool) -> bool:
@@ -160,14 +162,14 @@ class Mapper:
         filter_points(self.scene, self.options.triangulation)
         if lost_images(self.scene):
             return "too few points are left after refinement"
-        limit = self.options.consistency.max_violations_initial
-        return self._contradiction(b, [a], limit if self.options.consistency.enabled else None)
+        return self._contradiction(b, self.options.consistency.max_violations_initial)
 
     def _register_next(self, available: Bool) -> bool:
         """Register one more image, relaxing step by step; False when none can be."""
         options = self.options.registration
         while True:
-            ranked = rank_next_images(self.scene, self.scores, available, options)
+            trusted = np.where(self.refuted, 0, self.scores)
+            ranked = rank_next_images(self.scene, trusted, available, options)
             for image, reference in ranked:
                 reason = self._try_image(image, reference)
                 if reason is None:
@@ -175,8 +177,6 @@ class Mapper:
                     self._accept(image)
                     return True
                 self._reject(image, reason)
-                if self.ladder.enough_failures:
-                    break
             if not ranked or not self.ladder.relax():
                 return False
 
@@ -185,13 +185,13 @@ class Mapper:
         scene, options = self.scene, self.options.registration
         with self._timed("registration"):
             references = local_bundle(scene, reference, options.num_neighbors, self.scores)
+            references = [other for other in references if not self.refuted[image, other]]
             found = correspondences(scene, image, references, options)
-            poses = find_poses(scene, image, found, options, self.options.seed)
+            self.attempts[image] += 1
+            seed = self.options.seed + self.attempts[image]
+            poses = find_poses(scene, image, found, options, seed)
             snapshot = scene.snapshot()
-            poses = [
-                self._polished(image, pose, found, snapshot)
-                for pose in poses[: options.num_polished]
-            ]
+            poses = [self._polished(image, pose, found, snapshot) for pose in poses]
             poses.sort(key=lambda pose: -pose.support)
         reason: str | None = "neither PnP nor an essential matrix gives a pose"
         for pose in poses:
@@ -238,9 +238,8 @@ class Mapper:
                 return "too few points are left after refinement"
             self.refiner.estimate_scale(image, bundle[1:])
             self.refiner.integrate([image])
-        reason = self._contradiction(image, bundle[1:], self.ladder.max_violations)
+        reason = self._contradiction(image, self.options.consistency.max_violations)
         if reason:
-            self.ladder.check_failures += 1
             return reason
         with self._timed("local refinement"):
             self.refiner.refine_locally(image)
@@ -250,15 +249,17 @@ class Mapper:
         self._drop(lost, "lost its points when another image was refined")
         return None
 
-    def _contradiction(self, image: int, neighbors: list[int], limit: float | None) -> str | None:
-        """Why the depth of an image contradicts its neighbours', if it does."""
-        if limit is None or not neighbors:
+    def _contradiction(self, image: int, limit: float) -> str | None:
+        """Why the depth of an image contradicts that of another view, if it does."""
+        options = self.options.consistency
+        if not options.enabled:
             return None
         with self._timed("depth check"):
-            check = check_image(self.scene, image, neighbors, self.options.consistency)
-        if check.score <= limit:
+            check = check_image(self.scene, image, options, self.refiner.noise.multiplier)
+        if check.share <= limit:
             return None
-        return f"{check.score:.0%} of the compared pixels contradict its neighbours' depth"
+        other = self.problem.images[check.other].name
+        return f"{check.share:.0%} of the pixels contradict the depth of {other}"
 
     def _grown(self) -> bool:
         """Whether images or points grew so much that everything should be refined."""
@@ -283,20 +284,13 @@ class Mapper:
             self._refine_globally(final=True)
 
     def _check_all(self) -> None:
-        """Deregister the image that contradicts its neighbours most until none does."""
-        neighbors = self.options.registration.num_neighbors
-        while self.scene.registered.sum() > 2:
-            worst, suspect = 0.0, -1
-            for image in map(int, np.flatnonzero(self.scene.registered & ~self.refiner.fixed)):
-                bundle = local_bundle(self.scene, image, neighbors, self.scores)
-                with self._timed("depth check"):
-                    score = check_image(self.scene, image, bundle[1:], self.options.consistency)
-                if score.score > worst:
-                    worst, suspect = score.score, image
-            if worst <= self.options.consistency.max_violations:
-                return
-            reason = f"at the end {worst:.0%} of the pixels contradict its neighbours' depth"
-            self._drop([suspect], reason)
+        """Deregister images until no two views contradict each other."""
+        options, noise = self.options.consistency, self.refiner.noise.multiplier
+        with self._timed("depth check"):
+            conflicting = conflicting_images(self.scene, options, noise)
+        for image, share in conflicting:
+            self._drop([image], f"at the end {share:.0%} of the pixels contradict another view's")
+        if conflicting:
             apart = disconnected_images(self.scene)
             self._drop(apart, "held to the rest only by an image that was dropped at the end")
 

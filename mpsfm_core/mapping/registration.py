@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Bool, Float64, Int64, PinholeCamera
-from mpsfm_core.geometry import compose, invert
+from mpsfm_core.geometry import compose, invert, rotation_angle_deg
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.triangulation import midpoints
 from mpsfm_core.scene.scene import Scene
@@ -28,8 +28,14 @@ MIN_CORRESPONDENCES = 4
 PNP_ERROR_FACTORS = (1.0, 4.0)
 """PnP is tried with the allowed error and with this multiple of it, for lifts that miss widely over
 a wide baseline (ours)."""
+MIN_TURN_DEG = 3.0
+"""Hypotheses that differ less are refined to the same pose (ours)."""
 MIN_DEPTH_SHARE = 1e-3
 """Smallest share of its depth that an uncertain depth may shrink to."""
+
+
+Hypothesis = tuple[Float64, Float64, str]
+"""Rotation, translation, and where they come from."""
 
 
 class Correspondences(NamedTuple):
@@ -64,6 +70,13 @@ class AbsolutePose:
     inlier_share: float
 
 
+def colmap_camera(camera: PinholeCamera) -> pycolmap.Camera:
+    """The camera as COLMAP's estimators want it."""
+    return pycolmap.Camera(
+        model="PINHOLE", width=camera.width, height=camera.height, params=camera.params
+    )
+
+
 def estimate_absolute_pose(
     camera: PinholeCamera,
     xy: Float64,
@@ -89,9 +102,7 @@ def estimate_absolute_pose(
     result = pycolmap.estimate_and_refine_absolute_pose(
         xy,
         points,
-        pycolmap.Camera(
-            model="PINHOLE", width=camera.width, height=camera.height, params=camera.params
-        ),
+        colmap_camera(camera),
         pycolmap.AbsolutePoseEstimationOptions(ransac=ransac),
     )
     if result is None:
@@ -137,12 +148,31 @@ def correspondences(
 def find_poses(
     scene: Scene, image: int, found: Correspondences, options: RegistrationOptions, seed: int
 ) -> list[AbsolutePose]:
-    """Possible poses of an image from its correspondences, best support first."""
-    poses = [
-        rate_pose(scene, found, rotation, translation, source, options)
-        for rotation, translation, source in _hypotheses(scene, image, found, options, seed)
-    ]
-    return sorted(poses, key=lambda pose: -pose.support)
+    """A few distinct poses of an image from its correspondences, best support first.
+
+    While no pose is supported by nearly all matches, more are made from random halves of the
+    matches: one wrong match or one bad minimum of few matches does not decide then.
+    """
+    poses: list[AbsolutePose] = []
+
+    def rate(hypotheses: Iterator[Hypothesis]) -> None:
+        poses.extend(rate_pose(scene, found, *pose, options) for pose in hypotheses)
+        poses.sort(key=lambda pose: -pose.support)
+
+    rate(_hypotheses(scene, image, found, options, seed))
+    if options.lifting and (not poses or poses[0].inlier_share < options.confident_share):
+        rate(_resampled_hypotheses(scene, image, found, options, seed))
+    return _distinct(poses)[: options.num_polished]
+
+
+def _distinct(poses: list[AbsolutePose]) -> list[AbsolutePose]:
+    """The poses without those that are turned little from a better one."""
+    kept: list[AbsolutePose] = []
+    for pose in poses:
+        turns = [rotation_angle_deg(pose.rotation @ other.rotation.T) for other in kept]
+        if all(turn > MIN_TURN_DEG for turn in turns):
+            kept.append(pose)
+    return kept
 
 
 def rate_pose(
@@ -171,7 +201,7 @@ def rate_pose(
 
 def _hypotheses(
     scene: Scene, image: int, found: Correspondences, options: RegistrationOptions, seed: int
-) -> Iterator[tuple[Float64, Float64, str]]:
+) -> Iterator[Hypothesis]:
     """Poses from all correspondences, and from each reference image alone."""
     camera = scene.camera(image)
     xy = scene.keypoints[found.keypoints]
@@ -203,6 +233,62 @@ def _hypotheses(
                 yield *compose(scaled, world), "essential matrix"
 
 
+def _resampled_hypotheses(
+    scene: Scene, image: int, found: Correspondences, options: RegistrationOptions, seed: int
+) -> Iterator[Hypothesis]:
+    """Poses from random halves of the matches to the image that has most of them."""
+    if len(found.keypoints) < MIN_CORRESPONDENCES:
+        return
+    rng = np.random.default_rng(seed)
+    reference = int(np.bincount(found.references).argmax())
+    world = scene.rotations[reference], scene.translations[reference]
+    mine = np.flatnonzero(found.references == reference)
+    for trial in range(options.num_resamples):
+        chosen = rng.permutation(mine)[: max(len(mine) // 2, MIN_CORRESPONDENCES)]
+        half = Correspondences(*(values[np.sort(chosen)] for values in found))
+        factor = PNP_ERROR_FACTORS[trial % len(PNP_ERROR_FACTORS)]
+        xy = scene.keypoints[half.keypoints]
+        camera = scene.camera(image)
+        pose = estimate_absolute_pose(camera, xy, half.points, options, seed, factor)
+        if pose:
+            yield pose[0], pose[1], "PnP"
+        reverse = _reverse_pose(scene, image, reference, half, options, seed, factor)
+        if reverse:
+            yield *compose(invert(*reverse), world), "reverse PnP"
+        relative = _relative_pose(scene, image, reference, half, options, seed)
+        length = _baseline(scene, found, reference, relative) if relative else None
+        if relative and length:
+            scaled = relative[0], relative[1] * length
+            yield *compose(scaled, world), "essential matrix"
+
+
+def _relative_pose(
+    scene: Scene,
+    image: int,
+    reference: int,
+    found: Correspondences,
+    options: RegistrationOptions,
+    seed: int,
+) -> tuple[Float64, Float64] | None:
+    """``image_from_reference`` up to its length, by the essential matrix of the matches."""
+    result = pycolmap.estimate_essential_matrix(
+        scene.keypoints[found.matched],
+        scene.keypoints[found.keypoints],
+        colmap_camera(scene.camera(reference)),
+        colmap_camera(scene.camera(image)),
+        pycolmap.RANSACOptions(
+            max_error=0.5 * options.max_support_error_px,
+            min_inlier_ratio=options.min_inlier_ratio,
+            max_num_trials=3000,
+            random_seed=seed,
+        ),
+    )
+    if result is None:
+        return None
+    pose = result["cam2_from_cam1"]
+    return np.array(pose.rotation.matrix()), np.array(pose.translation)
+
+
 def _reverse_pose(
     scene: Scene,
     image: int,
@@ -216,7 +302,7 @@ def _reverse_pose(
     depth_map = scene.maps[image]
     rows = found.keypoints - scene.graph.offsets[image]
     use = (found.references == reference) & depth_map.keypoint_valid[rows]
-    if use.sum() < options.min_inliers or not depth_map.prior.metric:
+    if use.sum() < MIN_CORRESPONDENCES or not depth_map.prior.metric:
         return None
     depth = depth_map.prior_at_keypoints(rows[use]) * scene.maps[reference].scale
     points = scene.rays(found.keypoints[use]) * depth[:, None]
