@@ -171,7 +171,8 @@ def camera_center(rotation: Float64, translation: Float64) -> Float64:
 
 def transform(rotation: Float64, translation: Float64, points: Float64) -> Float64:
     """``R x + t`` for points (n, 3)."""
-    return points @ rotation.T + translation
+    moved: Float64 = points @ rotation.T + translation
+    return moved
 
 
 def invert(rotation: Float64, translation: Float64) -> tuple[Float64, Float64]:
