@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from mpsfm_core import ProviderContext
@@ -34,18 +33,11 @@ def context(tmp_path_factory: pytest.TempPathFactory) -> ProviderContext:
 
 @pytest.fixture
 def write_onnx(tmp_path: Path) -> Callable[..., Path]:
-    """Writes a model in ONNX's text syntax, with arrays for the names that it does not define.
-
-    ``write_onnx("tiny (float[1,3,h,w] image) => (float[1,1,h,w] depth) {...}", weight=array)``
-    """
-    onnx = pytest.importorskip("onnx")
+    """Writes a model in ONNX's text syntax: see ``mpsfm_onnx.stand_in.save_model``."""
+    stand_in = pytest.importorskip("mpsfm_onnx.stand_in")
 
     def write(text: str, name: str = "tiny.onnx", **arrays: Any) -> Path:
-        model = onnx.parser.parse_model(f'<ir_version: 8, opset_import: ["" : 17]> {text}')
-        for key, value in arrays.items():
-            model.graph.initializer.append(onnx.numpy_helper.from_array(np.asarray(value), key))
-        onnx.checker.check_model(model, full_check=True)
-        onnx.save(model, tmp_path / name)
-        return tmp_path / name
+        path: Path = stand_in.save_model(text, tmp_path / name, **arrays)
+        return path
 
     return write

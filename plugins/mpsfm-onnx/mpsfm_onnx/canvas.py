@@ -48,8 +48,8 @@ class Canvas:
                 size = (-(-image[0] // step) * step, -(-image[1] // step) * step)
             else:
                 size = (max(image[0] // step, 1) * step, max(image[1] // step, 1) * step)
-        offset = ((size[0] - image[0]) // 2, (size[1] - image[1]) // 2)
-        return cls(size, image, offset)
+        left, top = (int((s - i) / 2) for s, i in zip(size, image, strict=True))
+        return cls(size, image, (left, top))
 
     def paint(self, image: UInt8, rule: ImageInput) -> NDArray[Any]:
         """The input tensor with its batch dimension, for an (H, W, 3) RGB image."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import onnx
+from mpsfm_onnx.stand_in import save_model
 
 from mpsfm_core.testing import Setup
 
 _PAINTED_SKY = """
-<ir_version: 8, opset_import: ["" : 17]>
 sky (float[b,3,h,w] image) => (float[b,1,h,w] d0)
 <int64[1] red = {0}, float[1] steep = {-255}, float[1] one = {1}, float[1] zero = {0}> {
     depth = Gather <axis = 1> (image, red)
@@ -23,8 +22,7 @@ sky (float[b,3,h,w] image) => (float[b,1,h,w] d0)
 
 def network(folder: Path) -> Setup:
     """The network's stand-in takes for sky what has no depth painted."""
-    path = folder / "sky.onnx"
-    onnx.save(onnx.parser.parse_model(_PAINTED_SKY), path)
+    path = save_model(_PAINTED_SKY, folder / "sky.onnx")
     return Setup(options={"model": str(path), "network": "skysegsmall"}, knows="painted")
 
 

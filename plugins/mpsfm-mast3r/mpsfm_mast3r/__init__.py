@@ -1,0 +1,1 @@
+"""MASt3R in an ONNX file: matches and depth of image pairs."""

@@ -1,0 +1,121 @@
+"""MASt3R as a dense and as a sparse matcher; both give the depth of the pair.
+
+The network runs twice, with either view first: depth of a view is right in its own frame, and
+matches of both passes are better than those of one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mpsfm_core import (
+    DenseMatches,
+    Features,
+    PairDepth,
+    PairMatches,
+    ProviderContext,
+    SparseMatches,
+    View,
+)
+from mpsfm_core.data import Float32, Int64
+from mpsfm_core.errors import ProviderError
+from mpsfm_core.geometry import inside
+from mpsfm_mast3r.neighbours import mutual, reciprocal
+from mpsfm_mast3r.network import PairNetwork, Seen
+from mpsfm_mast3r.options import DenseOptions, SparseOptions
+
+_STD_NETWORK_PX = 0.5
+"""Localisation noise of dense matches in network pixels (reference)."""
+
+
+class DenseMatcher:
+    """Reciprocal nearest neighbours of the descriptors of all pixels."""
+
+    def __init__(self, options: DenseOptions, context: ProviderContext) -> None:
+        self._network = PairNetwork(options, context)
+        self._subsample = options.subsample
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """Matches of both passes, the more certain one where both find the same."""
+        passes = self._network.both(view_a, view_b)
+        found = [self._reciprocal(a, b) for a, b in passes]
+        scores = [_scores(a, b, pairs) for (a, b), pairs in zip(passes, found, strict=True)]
+        pairs, certain = _merge(np.concatenate(found), np.concatenate(scores))
+        a, b = passes[0]
+        xy_a, xy_b = a.positions(pairs[:, 0]), b.positions(pairs[:, 1])
+        keep = inside(xy_a, view_a.camera.size) & inside(xy_b, view_b.camera.size)
+        std_px = max(1.0, _STD_NETWORK_PX * max(a.pixel_size, b.pixel_size))
+        dense = DenseMatches(xy_a[keep], xy_b[keep], certain[keep], std_px)
+        return PairMatches(dense=dense, depth=_depth(passes))
+
+    def _reciprocal(self, a: Seen, b: Seen) -> Int64:
+        """Pairs (m, 2) of cells, searched from both sides."""
+        there = reciprocal(a.descriptors, b.descriptors, self._start(a))
+        back = reciprocal(b.descriptors, a.descriptors, self._start(b))
+        return np.unique(np.concatenate([there, back[:, ::-1]]), axis=0)
+
+    def _start(self, seen: Seen) -> Int64:
+        width, height = seen.canvas.size
+        step = self._subsample
+        rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
+        start: Int64 = (rows * width + columns).reshape(-1).astype(np.int64)
+        return start
+
+
+class SparseMatcher:
+    """Mutual nearest neighbours among the descriptors at given keypoints."""
+
+    def __init__(self, options: SparseOptions, context: ProviderContext) -> None:
+        self._network = PairNetwork(options, context)
+        self._min_similarity = options.min_similarity
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """Matches of keypoints by the mean similarity of both passes."""
+        if features_a is None or features_b is None:
+            raise ProviderError("mast3r-sparse matches keypoints: choose a features provider")
+        passes = self._network.both(view_a, view_b)
+        a, b = passes[0]
+        cells_a, cells_b = a.cells(features_a.keypoints), b.cells(features_b.keypoints)
+        rows_a, rows_b = np.flatnonzero(cells_a >= 0), np.flatnonzero(cells_b >= 0)
+        cells_a, cells_b = cells_a[rows_a], cells_b[rows_b]
+        similarity = np.mean(
+            [a.descriptors[cells_a] @ b.descriptors[cells_b].T for a, b in passes], axis=0
+        )
+        pairs = mutual(similarity)
+        pairs = pairs[similarity[pairs[:, 0], pairs[:, 1]] >= self._min_similarity]
+        cells = np.stack([cells_a[pairs[:, 0]], cells_b[pairs[:, 1]]], axis=1)
+        scores = np.max([_scores(a, b, cells) for a, b in passes], axis=0)
+        indices = np.stack([rows_a[pairs[:, 0]], rows_b[pairs[:, 1]]], axis=1)
+        return PairMatches(sparse=SparseMatches(indices, scores), depth=_depth(passes))
+
+
+def _scores(a: Seen, b: Seen, cells: Int64) -> Float32:
+    """Scores of pairs (m, 2) of cells: the geometric mean c of both certainties (reference), as
+    ``c / (1 + c)`` in [0, 1)."""
+    certainty = np.sqrt(a.match_certainty[cells[:, 0]] * b.match_certainty[cells[:, 1]])
+    scores: Float32 = (certainty / (1 + certainty)).astype(np.float32)
+    return scores
+
+
+def _merge(pairs: Int64, scores: Float32) -> tuple[Int64, Float32]:
+    """Each pair once, with its best score."""
+    order = np.argsort(-scores, kind="stable")
+    unique, first = np.unique(pairs[order], axis=0, return_index=True)
+    return unique, scores[order][first]
+
+
+def _depth(passes: tuple[tuple[Seen, Seen], tuple[Seen, Seen]]) -> PairDepth:
+    """Each view's depth from the pass in which it came first."""
+    return PairDepth(passes[0][0].depth(), passes[1][1].depth())

@@ -1,0 +1,102 @@
+"""The two-view network: what it says of each of two views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpsfm_onnx.canvas import Canvas
+from mpsfm_onnx.description import ImageInput, SideSize
+from mpsfm_onnx.model import Model, fetch
+from numpy.typing import NDArray
+
+from mpsfm_core import DepthPrior, ProviderContext, View
+from mpsfm_core.data import Float32, Float64, Int64
+from mpsfm_mast3r.options import Mast3rOptions
+
+_PATCH = 16
+_TENSORS = ("pts3d", "conf", "desc", "desc_conf")
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One view as a pass of the network sees it, on its canvas (h, w).
+
+    ``points``: (h, w, 3), in the camera frame of the pass's first view. ``certainty``: (h, w),
+    1 and more. ``descriptors``: (h * w, d), unit. ``match_certainty``: (h * w,), positive.
+    """
+
+    view: View
+    canvas: Canvas
+    points: Float32
+    certainty: Float32
+    descriptors: Float32
+    match_certainty: Float32
+
+    def depth(self) -> DepthPrior:
+        """z of the first view of a pass, invalid at the border that was cut off; the std is
+        ``1 / certainty`` metres (reference)."""
+        z = self.canvas.cut(self.points[..., 2:])[..., 0]
+        certainty = self.canvas.cut(self.certainty[..., None])[..., 0]
+        return DepthPrior.from_arrays(z, 1 / certainty.astype(np.float64) ** 2)
+
+    def positions(self, cells: Int64) -> Float64:
+        """Pixels (n, 2) of the view for rows of the descriptors."""
+        rows, columns = np.divmod(cells, self.canvas.size[0])
+        xy = np.stack([columns, rows], axis=-1) + 0.5
+        return self.canvas.to_view(xy, self.view.camera.size)
+
+    def cells(self, xy: Float64) -> Int64:
+        """Rows of the descriptors for pixels (n, 2) of the view, -1 where it was cut off."""
+        placed = np.floor(self.canvas.from_view(xy, self.view.camera.size)).astype(np.int64)
+        width, height = self.canvas.size
+        inside = ((placed >= 0) & (placed < (width, height))).all(axis=1)
+        return np.where(inside, placed[:, 1] * width + placed[:, 0], -1)
+
+    @property
+    def pixel_size(self) -> float:
+        """Longer side of a canvas pixel, in pixels of the view."""
+        return max(v / i for v, i in zip(self.view.camera.size, self.canvas.image, strict=True))
+
+
+class PairNetwork:
+    """MASt3R as an ONNX model.
+
+    Inputs ``img1``, ``img2`` (1, 3, h, w), RGB in [-1, 1]; outputs ``pts3d_1`` (1, h, w, 3),
+    ``conf_1`` (1, h, w), ``desc_1`` (1, h, w, d), ``desc_conf_1`` (1, h, w), and the same of the
+    second view; all points are in the frame of the first.
+    """
+
+    def __init__(self, options: Mast3rOptions, context: ProviderContext) -> None:
+        self._model = Model(fetch(context, options.model, options.sha256), context)
+        self._outputs = [f"{name}_{side}" for side in (1, 2) for name in _TENSORS]
+        self._model.require(("img1", "img2"), self._outputs, "MASt3R")
+        self._rule = ImageInput(
+            scale=1 / 255,
+            mean=(0.5, 0.5, 0.5),
+            std=(0.5, 0.5, 0.5),
+            size=SideSize(mode="longest", side=options.size, multiple_of=_PATCH, fit="crop"),
+        )
+
+    def both(self, view_a: View, view_b: View) -> tuple[tuple[Seen, Seen], tuple[Seen, Seen]]:
+        """``(a, b)`` of the pass with a as first view, and of the pass with b as first view."""
+        backward = self._run(view_b, view_a)
+        return self._run(view_a, view_b), (backward[1], backward[0])
+
+    def _run(self, first: View, second: View) -> tuple[Seen, Seen]:
+        views = (first, second)
+        canvases = [Canvas.plan(self._rule.size, view.camera.size) for view in views]
+        feed = {
+            f"img{side}": canvas.paint(view.image, self._rule)
+            for side, (canvas, view) in enumerate(zip(canvases, views, strict=True), start=1)
+        }
+        tensors = [tensor[0] for tensor in self._model.run(feed, self._outputs)]
+        seen = zip(views, canvases, (tensors[:4], tensors[4:]), strict=True)
+        one, two = (_seen(view, canvas, parts) for view, canvas, parts in seen)
+        return one, two
+
+
+def _seen(view: View, canvas: Canvas, tensors: list[NDArray[np.float32]]) -> Seen:
+    points, certainty, descriptors, match_certainty = (t.astype(np.float32) for t in tensors)
+    flat = descriptors.reshape(-1, descriptors.shape[-1])
+    return Seen(view, canvas, points, certainty, flat, match_certainty.reshape(-1))

@@ -1,0 +1,33 @@
+"""Announces the providers. Imports neither onnxruntime nor OpenCV."""
+
+from __future__ import annotations
+
+from mpsfm_core import ProviderSpec, hookimpl
+from mpsfm_core.options import Options
+from mpsfm_core.providers import Capability
+from mpsfm_mast3r.options import DenseOptions, SparseOptions
+
+
+@hookimpl
+def mpsfm_providers() -> list[ProviderSpec]:
+    """The same network, with free positions and with given keypoints."""
+    return [
+        _spec("mast3r", "dense", DenseOptions, "MASt3R: dense matches and depth of both views"),
+        _spec("mast3r-sparse", "sparse", SparseOptions, "MASt3R at keypoints of any detector"),
+    ]
+
+
+def _spec(name: str, how: Capability, options: type[Options], summary: str) -> ProviderSpec:
+    return ProviderSpec(
+        kind="matcher",
+        name=name,
+        factory=f"mpsfm_mast3r.matcher:{how.capitalize()}Matcher",
+        options=options,
+        capabilities=frozenset({how, "pair-depth"}),
+        summary=summary,
+        requires=("onnxruntime",),
+        install_hint="pip install mpsfm-mast3r",
+        code_license="Apache-2.0",
+        weights_license="CC-BY-NC-SA-4.0",
+        contract=f"mpsfm_mast3r.contract:{how}",
+    )
