@@ -1,0 +1,311 @@
+"""The provider under test, and what a check can ask of it."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+from weakref import WeakKeyDictionary, WeakSet
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpsfm_core import validation
+from mpsfm_core.data import DepthPrior, Features, View
+from mpsfm_core.errors import ProviderError
+from mpsfm_core.options import Backend
+from mpsfm_core.providers import Capability, Kind, ProviderContext, ProviderSpec
+from mpsfm_core.registry import Registry
+from mpsfm_core.testing.examples import Example, Look, indoor_example, outdoor_example
+from mpsfm_core.testing.oracle import ORACLE_SPECS, Oracle
+from mpsfm_core.testing.outcome import CheckSkipped
+from mpsfm_core.weights import WeightStore
+
+Knowledge = Literal["painted", "told", "seen", "nothing"]
+
+_RUN: Mapping[Kind, Callable[..., Any]] = MappingProxyType(
+    {
+        "depth": validation.run_depth,
+        "features": validation.run_features,
+        "retrieval": validation.run_retrieval,
+        "mask": validation.run_mask,
+    }
+)
+
+GIVEN_RELATIVE_STD = 0.02
+"""Of the exact depth that a normals provider with ``needs-depth`` is given."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """How a provider is put under test, and from where it can know the right answer.
+
+    ``options``: of the provider; without weights at hand, those of a stand-in network that the
+    function in ``ProviderSpec.contract`` writes into the folder it is given:
+    ``def contract(folder: Path) -> Setup``.
+
+    ``knows``, by default ``"seen"`` for features, matchers and retrieval, else ``"nothing"``:
+
+    * ``"painted"``: a stand-in network reads depth and normals from the colours of the views
+      (:mod:`mpsfm_core.testing.painting`);
+    * ``"told"``: ``tell`` is called with every example before the provider is asked about it, for
+      instance to write files;
+    * ``"seen"``: the provider sees what is in a textured view, with real weights or without any;
+    * ``"nothing"``: answers cannot be compared with the truth, and checks that would are skipped.
+
+    ``expected_failures``: ids of checks that are known to fail, each with the reason; a check that
+    then passes is a failure.
+    """
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+    knows: Knowledge | None = None
+    tell: Callable[[Example], None] | None = None
+    expected_failures: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if (self.knows == "told") != (self.tell is not None):
+            raise ValueError("tell belongs to knows='told', and that needs it")
+        for check, reason in self.expected_failures.items():
+            if not reason.strip():
+                raise ValueError(f"expected failure of {check!r} needs a reason")
+
+
+class Case:
+    """One provider under test.
+
+    ``kind`` is that of its answers: a wrapper is tested once for each kind it wraps, around an
+    oracle of that kind (``behaves_as``). The provider and the views are made when they are first
+    needed, and kept. ``folder``: for the stand-ins of other providers that it works with.
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        spec: ProviderSpec,
+        setup: Setup,
+        folder: Path,
+        *,
+        behaves_as: Kind | None = None,
+        device: str = "cpu",
+    ) -> None:
+        self.registry = registry
+        self.spec = spec
+        self.kind: Kind = behaves_as or spec.kind
+        self.setup = setup
+        self._folder = folder
+        self._device = device
+        self._oracle = Oracle() if spec.kind == "wrapper" else None
+        self._provider: Any = None
+        self._told: WeakSet[Example] = WeakSet()
+        self._detector: Any = None
+        self._detected: WeakKeyDictionary[View, Features] = WeakKeyDictionary()
+        self._main: Example | None = None
+
+    @property
+    def knows(self) -> Knowledge:
+        """Where the provider can know the right answer from."""
+        if self._oracle is not None:
+            return "told"
+        by_itself = self.kind in ("features", "matcher", "retrieval")
+        return self.setup.knows or ("seen" if by_itself else "nothing")
+
+    def can(self, capability: Capability) -> bool:
+        """Whether the provider declares a capability."""
+        return capability in self.spec.capabilities
+
+    def needs(self, *sources: Knowledge) -> None:
+        """Skip unless the provider knows the right answer from one of these sources."""
+        if self.knows == "nothing":
+            raise CheckSkipped(
+                "no known answer: the provider has no stand-in that reads painted views, is not "
+                "told the truth and is not said to see it (docs/contract.md)"
+            )
+        if self.knows not in sources:
+            raise CheckSkipped(f"says nothing about a provider whose truth is {self.knows}")
+
+    @property
+    def main(self) -> Example:
+        """The example that most checks ask about."""
+        if self._main is None:
+            look: Look = "painted" if self.knows == "painted" or self._oracle else "textured"
+            outdoor = self.kind in ("depth", "normals", "mask")
+            self._main = outdoor_example(look) if outdoor else indoor_example(look)
+        return self._main
+
+    def make(self, **inner: Any) -> Any:
+        """A new instance of the provider; ``inner``: options of the oracle in a wrapper."""
+        if self._oracle is None:
+            return self._create(self.registry, self.kind, self.spec.name, self.setup.options)
+        registry = Registry()
+        oracle = ORACLE_SPECS[self.kind]
+        registry.add(self.spec, replace(oracle, factory=self._oracle.factory(self.kind)))
+        wrapper = Backend(use=self.spec.name, options=dict(self.setup.options))
+        return self._create(registry, self.kind, oracle.name, inner, (wrapper,))
+
+    @property
+    def provider(self) -> Any:
+        """The instance that most checks ask."""
+        if self._provider is None:
+            self._provider = self.make()
+        return self._provider
+
+    def ask(self, example: Example, provider: Any = None) -> Any:
+        """The provider's answer, validated; a matcher is asked for the view and its partner."""
+        self.tell(example, *([example.partner] if self.kind == "matcher" else []))
+        return self.ask_about(example.view, example, provider)
+
+    def ask_about(
+        self, view: View, example: Example, provider: Any = None, extra: Any = None
+    ) -> Any:
+        """The answer about a changed view of an example; everything else is the example's.
+
+        ``extra``: what is handed in besides the view, by default what :meth:`extra` makes.
+        """
+        provider = self.provider if provider is None else provider
+        extra = self.extra(view, example) if extra is None else extra
+        if self.kind == "matcher":
+            views = (view, example.partner.view)
+            return validation.run_matcher(self._rules, provider, views, extra)
+        if self.kind == "normals":
+            return validation.run_normals(self._rules, provider, view, extra)
+        run: Callable[[ProviderSpec, Any, View], Any] = _RUN[self.kind]
+        return run(self._rules, provider, view)
+
+    def extra(self, view: View, example: Example) -> Any:
+        """Depth for normals providers that need it, features for sparse matchers, else None."""
+        if self.kind == "matcher":
+            return self.features_of(view, example.partner.view)
+        if self.kind != "normals" or not (self.can("needs-depth") or self._oracle):
+            return None
+        truth = example.truth()
+        variance = (GIVEN_RELATIVE_STD * truth.depth) ** 2
+        return DepthPrior.from_arrays(truth.depth, variance, truth.valid)
+
+    def ask_pair(self, a: Example, b: Example) -> Any:
+        """A matcher's answer about two examples."""
+        self.tell(a, b)
+        views = (a.view, b.view)
+        features = self.features_of(*views)
+        return validation.run_matcher(self._rules, self.provider, views, features)
+
+    def tell(self, *examples: Example) -> None:
+        """Let the provider know the truth, if that is where it knows it from."""
+        for example in examples:
+            if example in self._told:
+                continue
+            self._told.add(example)
+            if self._oracle is not None:
+                self._oracle.tell(example)
+            if self.setup.tell is not None:
+                self.setup.tell(example)
+
+    def features_of(self, *views: View) -> Any:
+        """Features for a sparse matcher, from the first detector of its family; else None."""
+        if not self.can("sparse"):
+            return None
+        return tuple(self._detect(view) for view in views)
+
+    def given_depth(self) -> list[DepthPrior | None]:
+        """The depth that a wrapper handed to the normals provider inside, at each question."""
+        return [] if self._oracle is None else self._oracle.given_depth
+
+    def calibration(self) -> Any:
+        """The uncertainty model that a run would apply to the provider's answers."""
+        options = dict(self.setup.options)
+        if self._oracle is None:
+            return self.registry.calibration(
+                self.kind, Backend(use=self.spec.name, options=options)
+            )
+        wrapper = Backend(use=self.spec.name, options=options)
+        registry = Registry()
+        registry.add(self.spec, ORACLE_SPECS[self.kind])
+        inner = Backend(use=ORACLE_SPECS[self.kind].name, wrap=(wrapper,))
+        return registry.calibration(self.kind, inner)
+
+    @property
+    def _rules(self) -> ProviderSpec:
+        """The specification that answers are validated against. A wrapper promises nothing of
+        its own (what it has to keep is checked by name), and is given depth to hand on."""
+        if self._oracle is None:
+            return self.spec
+        return replace(self.spec, capabilities=frozenset({"needs-depth"}))
+
+    def _detect(self, view: View) -> Features:
+        if view not in self._detected:
+            spec = self._detector_spec()
+            if self._detector is None:
+                options = setup_of(spec, self._folder).options
+                self._detector = self._create(self.registry, "features", spec.name, options)
+            self._detected[view] = validation.run_features(spec, self._detector, view)
+        return self._detected[view]
+
+    def _detector_spec(self) -> ProviderSpec:
+        family = set(self.spec.tags)
+        for name in sorted(self.registry.names("features"), key=lambda name: name != "sift"):
+            spec = self.registry.spec("features", name)
+            if not family or family & set(spec.tags):
+                return spec
+        wanted = ", ".join(sorted(family)) or "any"
+        raise ProviderError(f"no features provider of the family {wanted} is installed")
+
+    def _create(
+        self,
+        registry: Registry,
+        kind: Kind,
+        name: str,
+        options: Mapping[str, Any],
+        wrap: tuple[Backend, ...] = (),
+    ) -> Any:
+        context = ProviderContext(WeightStore().resolve, device=self._device)
+        return registry.create(kind, name, options, context, wrap)
+
+
+def setup_of(spec: ProviderSpec, folder: Path) -> Setup:
+    """The setup that the plugin gives for the contract kit, or one of defaults.
+
+    Raises :class:`~mpsfm_core.errors.ProviderError` when there is one and it cannot be made.
+    """
+    if spec.contract is None:
+        return Setup()
+    try:
+        if isinstance(spec.contract, str):
+            module, _, name = spec.contract.partition(":")
+            setup = getattr(importlib.import_module(module), name)(folder)
+        else:
+            setup = spec.contract(folder)
+    except Exception as error:
+        text = f"{spec.kind} provider {spec.name!r}: its contract {spec.contract!r} fails"
+        raise ProviderError(f"{text}: {type(error).__name__}: {error}") from error
+    if not isinstance(setup, Setup):
+        raise ProviderError(f"{spec.contract!r} returns a {type(setup).__name__}, not a Setup")
+    return setup
+
+
+def arrays_of(answer: object, name: str = "answer") -> dict[str, NDArray[Any]]:
+    """All arrays and numbers in an answer by their path, to compare answers."""
+    if isinstance(answer, np.ndarray):
+        return {name: answer}
+    if is_dataclass(answer) and not isinstance(answer, type):
+        found: dict[str, NDArray[Any]] = {}
+        for part in fields(answer):
+            found |= arrays_of(getattr(answer, part.name), f"{name}.{part.name}")
+        return found
+    if isinstance(answer, tuple):
+        return {k: v for i, a in enumerate(answer) for k, v in arrays_of(a, f"{name}[{i}]").items()}
+    return {} if answer is None else {name: np.asarray(answer)}
+
+
+def difference(first: object, second: object) -> str:
+    """Where two answers differ, or an empty text."""
+    a, b = arrays_of(first), arrays_of(second)
+    if a.keys() != b.keys():
+        return f"one has {sorted(a)}, the other {sorted(b)}"
+    for name, value in a.items():
+        if value.shape != b[name].shape:
+            return f"{name} has shape {value.shape} and {b[name].shape}"
+        if not np.array_equal(value, b[name]):
+            return f"{name} differs at {(value != b[name]).mean():.1%} of its values"
+    return ""

@@ -1,0 +1,38 @@
+"""Checks of mask providers. The masks of the examples leave out what has no surface: the sky."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mpsfm_core.testing.accuracy import MASK_TOLERANCE, judge
+from mpsfm_core.testing.case import Case
+from mpsfm_core.testing.outcome import CheckFailed
+
+
+def check_mask_polarity(case: Case) -> str:
+    """True is a pixel that may be used, False one that may not."""
+    case.needs("painted", "told", "seen")
+    answer, truth = case.ask(case.main), case.main.truth()
+    agreement = float((answer == truth.valid)[truth.edge_free].mean())
+    if agreement < MASK_TOLERANCE:
+        raise CheckFailed(f"is inverted: {1 - agreement:.0%} of the pixels have the wrong value")
+    return f"{agreement:.1%} of the pixels agree"
+
+
+def check_mask_place(case: Case) -> str:
+    """The mask covers the whole view at its place: it is not shifted, turned or of another part."""
+    case.needs("painted", "told", "seen")
+    return judge(case, case.main, case.ask(case.main))
+
+
+def check_mask_flip(case: Case) -> str:
+    """The mirrored view has the mirrored mask."""
+    answer, mirrored = case.ask(case.main), case.ask(case.main.mirror())
+    where = case.main.truth().edge_free
+    wrong = float((answer != np.asarray(mirrored)[:, ::-1])[where].mean())
+    if wrong > MASK_TOLERANCE:
+        raise CheckFailed(f"differs at {wrong:.0%} of the pixels of the mirrored view")
+    return f"differs at {wrong:.1%} of the pixels"
+
+
+CHECKS = (check_mask_polarity, check_mask_place, check_mask_flip)

@@ -1,0 +1,264 @@
+"""The contract: all checks of a provider, run one by one."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+from mpsfm_core.errors import InputError, MpsfmError, ProviderError, did_you_mean
+from mpsfm_core.providers import Kind, ProviderSpec
+from mpsfm_core.registry import Registry
+from mpsfm_core.testing import (
+    checks_depth,
+    checks_features,
+    checks_mask,
+    checks_matcher,
+    checks_normals,
+    checks_retrieval,
+    checks_wrapper,
+)
+from mpsfm_core.testing.case import Case, Setup, setup_of
+from mpsfm_core.testing.checks_common import (
+    COMMON,
+    STANDALONE,
+    check_construction,
+    check_output_rules,
+    check_specification,
+)
+from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+
+Check = Callable[[Case], str | None]
+Status = Literal["pass", "fail", "skip", "xfail"]
+SetupSource = Setup | Callable[[Path], Setup] | None
+
+CHECKS_BY_KIND: Mapping[Kind, tuple[Check, ...]] = MappingProxyType(
+    {
+        "depth": checks_depth.CHECKS,
+        "normals": checks_normals.CHECKS,
+        "features": checks_features.CHECKS,
+        "matcher": checks_matcher.CHECKS,
+        "retrieval": checks_retrieval.CHECKS,
+        "mask": checks_mask.CHECKS,
+        "wrapper": checks_wrapper.CHECKS,
+    }
+)
+"""The checks of each kind, besides the common ones."""
+
+REQUIRED: tuple[Check, ...] = (check_specification, check_construction, check_output_rules)
+"""Where one of these fails, the others are skipped."""
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """How one check ended.
+
+    ``provider``: kind and name, ``depth/files``. ``around``: what a wrapper was put around, else
+    empty. ``message``: why it failed or was skipped, or a remark.
+    """
+
+    provider: str
+    around: str
+    id: str
+    status: Status
+    message: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Task:
+    """One check of one provider; ``around`` as in :class:`CheckResult`."""
+
+    id: str
+    around: str
+
+    def __str__(self) -> str:
+        return f"{self.around}-{self.id}" if self.around else self.id
+
+
+class Contract:
+    """All checks of one provider.
+
+    ``setup``: how it is put under test, by default what its plugin says (``spec.contract``).
+    ``folder``: for the files of stand-ins. Raises :class:`~mpsfm_core.errors.ProviderError` when
+    there is no such provider or it is unavailable.
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        kind: Kind,
+        name: str,
+        folder: Path,
+        setup: SetupSource = None,
+        *,
+        device: str = "cpu",
+    ) -> None:
+        self.spec = registry.spec(kind, name)
+        self._registry = registry
+        self._folder = folder
+        self._setup = setup
+        self._device = device
+        self._cases: dict[str, Case] = {}
+        self._faults: dict[str, str] = {}
+
+    @property
+    def provider(self) -> str:
+        """Kind and name."""
+        return f"{self.spec.kind}/{self.spec.name}"
+
+    def tasks(self) -> list[Task]:
+        """The checks in the order to run them; knows them without making anything."""
+        return tasks_of(self.spec)
+
+    def run(self, task: Task) -> CheckResult:
+        """Run one check."""
+        started = time.perf_counter()
+        reason = ""
+        try:
+            case = self._case(task.around)
+            reason = case.setup.expected_failures.get(task.id, "")
+            status, message = self._outcome(case, task)
+        except ProviderError as error:  # there is no setup
+            status, message = "fail", str(error)
+        if reason and status == "fail":
+            status, message = "xfail", f"{reason} ({message})"
+        elif reason and status == "pass":
+            status, message = "fail", f"passes, and was expected to fail: {reason}"
+        seconds = time.perf_counter() - started
+        return CheckResult(self.provider, task.around, task.id, status, message, seconds)
+
+    def _outcome(self, case: Case, task: Task) -> tuple[Status, str]:
+        check = check_of(task.id)
+        if check not in REQUIRED and check not in STANDALONE:
+            fault = self._fault(case, task.around)
+            if fault:
+                return "skip", f"{fault} fails"
+        try:
+            return "pass", check(case) or ""
+        except CheckSkipped as skipped:
+            return "skip", str(skipped)
+        except (CheckFailed, MpsfmError) as failed:
+            return "fail", str(failed)
+        except Exception as error:  # of the provider, where it is called directly
+            return "fail", f"{type(error).__name__}: {error}"
+
+    def _fault(self, case: Case, around: str) -> str:
+        """The first of the checks without which the others mean nothing that fails."""
+        if around not in self._faults:
+            failed = (id_of(check) for check in REQUIRED if not _passes(check, case))
+            self._faults[around] = next(failed, "")
+        return self._faults[around]
+
+    def _case(self, around: str) -> Case:
+        if around not in self._cases:
+            setup = self._setup
+            if setup is None:
+                setup = setup_of(self.spec, self._folder)
+            elif not isinstance(setup, Setup):
+                setup = setup(self._folder)
+            known = {task.id for task in self.tasks()}
+            for name in setup.expected_failures:
+                if name not in known:
+                    raise ProviderError(f"expected failure {name!r}{did_you_mean(name, known)}")
+            behaves_as = next((kind for kind in CHECKS_BY_KIND if kind == around), None)
+            self._cases[around] = Case(
+                self._registry,
+                self.spec,
+                setup,
+                self._folder,
+                behaves_as=behaves_as,
+                device=self._device,
+            )
+        return self._cases[around]
+
+
+def run_checks(
+    registry: Registry,
+    kind: Kind,
+    name: str,
+    setup: SetupSource = None,
+    *,
+    only: Collection[str] | None = None,
+    device: str = "cpu",
+    on_result: Callable[[CheckResult], None] | None = None,
+) -> list[CheckResult]:
+    """Run the checks of a provider, or ``only`` those with the given ids.
+
+    ``on_result`` is called after each check. See :class:`Contract`.
+    """
+    results = []
+    with tempfile.TemporaryDirectory(prefix="mpsfm-contract-") as folder:
+        contract = Contract(registry, kind, name, Path(folder), setup, device=device)
+        for task in contract.tasks():
+            if only is None or task.id in only:
+                results.append(contract.run(task))
+                if on_result:
+                    on_result(results[-1])
+    return results
+
+
+def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
+    """Kind and name of the providers that ``name`` means: a provider (``onnx``), one of a kind
+    (``depth/onnx``) or all of a distribution (``mpsfm-onnx``).
+
+    Raises :class:`~mpsfm_core.errors.InputError` when there is none; the reason if it is there and
+    unavailable.
+    """
+    known = [line for line in registry.status() if line.kind != "plugin"]
+    labels = {(line.kind, line.name): (line.name, f"{line.kind}/{line.name}") for line in known}
+    found = [
+        (line.kind, line.name)
+        for line in known
+        if name in (*labels[line.kind, line.name], line.distribution)
+    ]
+    if not found:
+        broken = [p for p in registry.status() if not p.available and name == p.distribution]
+        if broken:
+            raise ProviderError(f"{name} {broken[0].reason}; {broken[0].install_hint}")
+        candidates = [label for names in labels.values() for label in names]
+        candidates += [line.distribution for line in known]
+        raise InputError(f"no provider or plugin {name!r}{did_you_mean(name, candidates)}")
+    return [(kind, name) for kind, name in found if kind != "plugin"]
+
+
+def tasks_of(spec: ProviderSpec) -> list[Task]:
+    """The checks of a provider of this specification, in the order to run them."""
+    wrapped = [kind for kind in ("depth", "normals") if f"wraps-{kind}" in spec.capabilities]
+    tasks = []
+    for around in (wrapped or ["depth"]) if spec.kind == "wrapper" else [""]:
+        special = [*CHECKS_BY_KIND[spec.kind]]
+        special += next((checks for kind, checks in CHECKS_BY_KIND.items() if kind == around), ())
+        checks = [*STANDALONE, check_output_rules, *special, *COMMON]
+        tasks += [Task(id_of(check), around) for check in checks]
+    return tasks
+
+
+def all_checks() -> list[Check]:
+    """Every check of the kit, the common ones first."""
+    special = [check for checks in CHECKS_BY_KIND.values() for check in checks]
+    return [*STANDALONE, check_output_rules, *COMMON, *special]
+
+
+def check_of(id: str) -> Check:
+    """The check with an id."""
+    return next(check for check in all_checks() if id_of(check) == id)
+
+
+def id_of(check: Check) -> str:
+    """The check's name in reports: ``check_depth_is_z`` is ``depth-is-z``."""
+    return check.__name__.removeprefix("check_").replace("_", "-")
+
+
+def _passes(check: Check, case: Case) -> bool:
+    try:
+        check(case)
+    except CheckSkipped:
+        return True
+    except Exception:
+        return False
+    return True

@@ -1,0 +1,49 @@
+"""The contract as tests of a plugin's own test file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from mpsfm_core.providers import Kind
+from mpsfm_core.registry import Registry
+from mpsfm_core.testing.contract import CheckResult, Contract, SetupSource, Task, tasks_of
+
+
+def contract_tests(
+    kind: Kind, name: str, setup: SetupSource = None, *, registry: Registry | None = None
+) -> Callable[..., None]:
+    """A parametrised pytest function with one test for each check of a provider::
+
+        test_contract = contract_tests("depth", "my-depth")
+
+    ``setup``: by default what the plugin's specification says, see
+    :class:`~mpsfm_core.testing.Setup`. ``registry``: by default all installed plugins.
+    """
+    import pytest
+
+    registry = registry or Registry.discover()
+    tasks = tasks_of(registry.spec(kind, name))
+    contracts: list[Contract] = []
+
+    def test_contract(task: Task, tmp_path_factory: pytest.TempPathFactory) -> None:
+        if not contracts:
+            folder = tmp_path_factory.mktemp("contract")
+            contracts.append(Contract(registry, kind, name, folder, setup))
+        report(contracts[0].run(task))
+
+    mark = pytest.mark.parametrize("task", tasks, ids=[str(task) for task in tasks])
+    tests: Callable[..., None] = mark(test_contract)
+    return tests
+
+
+def report(result: CheckResult) -> None:
+    """End a pytest test as the check ended."""
+    import pytest
+
+    __tracebackhide__ = True
+    if result.status == "skip":
+        pytest.skip(result.message)
+    if result.status == "xfail":
+        pytest.xfail(result.message)
+    if result.status == "fail":
+        pytest.fail(result.message, pytrace=False)

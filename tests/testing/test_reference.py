@@ -1,0 +1,87 @@
+"""A correct provider of every kind passes all checks, and none is skipped without a reason."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mpsfm_core.builtin.plugin import mpsfm_providers as builtin_providers
+from mpsfm_core.providers import Kind, ProviderSpec
+from mpsfm_core.registry import Registry
+from mpsfm_core.testing import Setup, run_checks
+from mpsfm_core.testing import reference as ref
+
+PAINTED = Setup(knows="painted")
+JOINT = frozenset({"metric", "variance", "joint-normals", "estimates-focal"})
+MODULE = ref.__name__
+
+
+def told(folder: Path) -> Setup:
+    return Setup(
+        options={"folder": folder}, knows="told", tell=lambda example: ref.tell(folder, example)
+    )
+
+
+def spec(kind: Kind, name: str, *capabilities: str, options: str | None = None) -> ProviderSpec:
+    options = options and f"{MODULE}:{options}"
+    factory = f"{MODULE}:{name}"
+    return ProviderSpec(kind, "reference", factory, options, frozenset(capabilities))
+
+
+@pytest.mark.parametrize(
+    ("given", "setup", "skipped"),
+    [
+        (spec("depth", "PaintedDepth", *JOINT), PAINTED, {"depth-intrinsics"}),
+        (
+            spec("normals", "PaintedNormals", "variance"),
+            PAINTED,
+            {"normals-validity"},
+        ),
+        (
+            spec("matcher", "ToldMatcher", "dense", "pair-depth", options="ToldOptions"),
+            told,
+            {"matcher-no-features", "matcher-few-features", "name-does-not-matter"},
+        ),
+        (spec("retrieval", "Thumbnail"), None, set()),
+        (spec("mask", "PaintedMask"), PAINTED, set()),
+        (
+            spec("wrapper", "Wrapper", "wraps-depth", "wraps-normals"),
+            None,
+            {
+                "wrapper-keeps-unit",
+                "wrapper-uses-the-provider",
+                "wrapper-hands-on-depth",
+                "depth-channel-order",
+                "depth-intrinsics",
+                "depth-variance",
+                "depth-joint",
+                "depth-focal",
+                "normals-channel-order",
+                "normals-variance",
+            },
+        ),
+    ],
+    ids=lambda value: value.kind if isinstance(value, ProviderSpec) else "",
+)
+def test_correct_providers_pass(
+    given: ProviderSpec, setup: Setup | Callable[[Path], Setup] | None, skipped: set[str]
+) -> None:
+    registry = Registry()
+    registry.add(given)
+    results = run_checks(registry, given.kind, given.name, setup)
+    assert {r.id: r.message for r in results if r.status in ("fail", "xfail")} == {}
+    assert {r.id for r in results if r.status == "skip"} == {*skipped, "light-import"}
+    assert all(r.message for r in results if r.status == "skip")
+
+
+@pytest.mark.parametrize("name", ["sift", "mutual-nearest"])
+def test_built_in_features_and_matcher_pass(name: str) -> None:
+    registry = Registry()
+    registry.add(*builtin_providers())
+    (kind,) = [s.kind for s in builtin_providers() if s.name == name]
+    results = run_checks(registry, kind, name)
+    assert {r.id: r.message for r in results if r.status == "fail"} == {}
+    sparse = {"matcher-pixel-convention", "matcher-pair-depth"} if kind == "matcher" else set()
+    assert {r.id for r in results if r.status == "skip"} == {*sparse, "light-import"}
