@@ -58,7 +58,7 @@ def main() -> int:
         buckets, priors = SCENES[name]
         plan = Plan(
             (shared / "data" / name,),
-            (str(config),),
+            (str(config) if "config" in priors else "benchmark",),
             buckets,
             priors,
             overrides=("runtime.workers=1",),
