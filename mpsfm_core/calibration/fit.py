@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import gamma
+from scipy.stats import t as student_t
 
 from mpsfm_core.calibration.samples import Residuals
 from mpsfm_core.data import Bool, Float64, Int64
@@ -30,7 +31,11 @@ FREEDOM = 4.0
 MAX_GROSS = 0.5
 DOMINANT_SHARE = 0.01
 """A term that is the largest for fewer of the samples is not determined by them (ours)."""
+STD_OF_T = float(student_t(FREEDOM).ppf(0.5 + ONE_SIGMA / 2))
+"""Scales of that distribution that cover as much as one std of a normal one."""
 _NORMALISER = gamma(0.5 * (FREEDOM + 1)) / gamma(0.5 * FREEDOM) / np.sqrt(FREEDOM * np.pi)
+_RESTARTS = 5
+_SMALLEST_GAIN = 1e-6
 _RANGE = 1e4
 """A factor lies within this of what it is as the only one."""
 
@@ -41,7 +46,8 @@ class Fit:
 
     ``names``: of the terms used, ``values``: (m,) their factors. ``edge_ratio``: pixels beside a
     larger ratio of depths have ``edge_scale`` times the std; None: no edges. ``gross``: share of
-    gross errors. ``shares``: (m,), of how many samples each term is the largest.
+    gross errors. ``shares``: (m,), of how many samples each term is the largest; ``limits``: (m,),
+    factors up to which a term is the largest for so few that it is not determined.
     ``log_density``: (images,), mean of each image.
     """
 
@@ -51,11 +57,8 @@ class Fit:
     edge_scale: float
     gross: float
     shares: Float64
+    limits: Float64
     log_density: Float64
-
-    def value(self, name: str) -> float | None:
-        """Factor of a term, None if it is not used."""
-        return float(self.values[self.names.index(name)]) if name in self.names else None
 
 
 def fit_std(
@@ -149,8 +152,14 @@ class _Problem:
         span = np.log(_RANGE)
         bounds = [(v - span, v + span) for v in self._alone]
         bounds += [(0.0, span)] * (self._edge_ratio is not None) + [(-9.0, 9.0)]
-        found = minimize(self._objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
-        return np.asarray(found.x), float(found.fun)
+        best = minimize(self._objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
+        for _ in range(_RESTARTS):  # the largest term changes, where its memory is of no use
+            again = minimize(self._objective, best.x, jac=True, method="L-BFGS-B", bounds=bounds)
+            gain = best.fun - again.fun
+            best = again if gain > 0 else best
+            if gain < _SMALLEST_GAIN:
+                break
+        return np.asarray(best.x), float(best.fun)
 
     def finish(self, vector: Float64) -> Fit:
         """Set the common factor by coverage and describe the result."""
@@ -173,8 +182,19 @@ class _Problem:
             float(np.exp(vector[count])) if self._edge_ratio is not None else 1.0,
             _gross(vector[-1]),
             shares / shares.sum(),
+            self._limits(vector),
             per_image,
         )
+
+    def _limits(self, vector: Float64) -> Float64:
+        """Factors up to which each term is hidden by the others; infinite for a single term."""
+        count = len(self._names)
+        limits = np.full(count, np.inf)
+        scaled = self._terms * np.exp(vector[:count])
+        for j in range(count if count > 1 else 0):
+            others = np.delete(scaled, j, axis=1).max(axis=1)
+            limits[j] = weighted_quantile(others / self._terms[:, j], self._weights, DOMINANT_SHARE)
+        return limits
 
     def _factors_alone(self) -> Float64:
         """Log of each factor if its term were the only one, by the median error."""
@@ -191,17 +211,20 @@ class _Problem:
             variance = np.where(self._edges, variance * np.exp(2 * vector[count]), variance)
         total = variance + self._noise
         gross = _gross(vector[-1])
-        usual = _NORMALISER / np.sqrt(total)
-        usual *= (1 + self._squared / (FREEDOM * total)) ** (-0.5 * (FREEDOM + 1))
+        usual = _NORMALISER * STD_OF_T / np.sqrt(total)
+        usual *= (1 + self._far(total)) ** (-0.5 * (FREEDOM + 1))
         density = (1 - gross) * usual + gross * self._uniform
         inlier = (1 - gross) * usual / density
         return _State(largest, variance, total, inlier, np.log(density))
+
+    def _far(self, total: Float64) -> Float64:
+        return self._squared * (STD_OF_T**2 / FREEDOM) / total
 
     def _objective(self, vector: Float64) -> tuple[float, Float64]:
         """Negative mean log density and its gradient."""
         state, weights, count = self._evaluate(vector), self._weights, len(self._names)
         # d log density / d log std, through the variance
-        far = self._squared / (FREEDOM * state.total)
+        far = self._far(state.total)
         slope = weights * state.inlier * ((FREEDOM + 1) * far / (1 + far) - 1)
         slope *= state.variance / state.total
         gradient = np.zeros(len(vector))

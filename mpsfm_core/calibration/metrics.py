@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
-from mpsfm_core.calibration.fit import FREEDOM, ONE_SIGMA, weighted_quantile
+from mpsfm_core.calibration.fit import FREEDOM, ONE_SIGMA, STD_OF_T, weighted_quantile
 from mpsfm_core.calibration.samples import Residuals
 from mpsfm_core.data import Bool, Float64, Int64
 
@@ -30,7 +30,7 @@ def measure(residuals: Residuals, std: Float64) -> dict[str, Any]:
     RMSE; 0 is a perfect order. ``rmse``: in metres or rad. Then the curves behind them.
     """
     total, weights = np.hypot(std, residuals.noise), residuals.weights()
-    heavy_scale = total / student_t(FREEDOM).ppf(0.5 + ONE_SIGMA / 2)
+    heavy_scale = total / STD_OF_T
 
     def mean(values: Float64) -> float:
         return float(np.average(values, weights=weights))

@@ -66,7 +66,7 @@ def render(report: Mapping[str, Any]) -> str:
         _table(("from", "to", "pixels", "std", "before", "after", "z after"), _ranges(report)),
         "<h2>Models tried</h2>",
         "<p>A model is chosen when it explains the errors better than the one chosen before it by "
-        "more than a standard error over the images.</p>",
+        "more than two standard errors over the images.</p>",
         _table(("model", "log density", "gain", "standard error", "chosen"), _candidates(report)),
         *_rounds(report),
         "<h2>Where it comes from</h2>",
