@@ -1,0 +1,1 @@
+"""RoMa in an ONNX file: a dense warp as matches."""

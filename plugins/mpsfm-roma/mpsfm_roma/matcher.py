@@ -1,0 +1,108 @@
+"""RoMa as a dense and as a sparse matcher."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mpsfm_core import (
+    DenseMatches,
+    Features,
+    PairMatches,
+    ProviderContext,
+    SparseMatches,
+    View,
+)
+from mpsfm_core.data import Float32, Float64, Int64
+from mpsfm_core.errors import ProviderError
+from mpsfm_roma.network import Warp, WarpNetwork
+from mpsfm_roma.options import DenseOptions, SparseOptions
+
+
+class DenseMatcher:
+    """The certain parts of the warp, thinned out."""
+
+    def __init__(self, options: DenseOptions, context: ProviderContext) -> None:
+        self._network = WarpNetwork(options, context)
+        self._cell, self._min_certainty = options.cell, options.min_certainty
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """Matches from a to b and, from a symmetric model, from b to a."""
+        there, back = self._network.warps(view_a, view_b)
+        xy_a, xy_b, scores = self._thinned(there)
+        if back is not None:
+            more_b, more_a, more = self._thinned(back)
+            xy_a, xy_b = np.concatenate([xy_a, more_a]), np.concatenate([xy_b, more_b])
+            scores = np.concatenate([scores, more])
+        return PairMatches(dense=DenseMatches(xy_a, xy_b, scores))
+
+    def _thinned(self, warp: Warp) -> tuple[Float64, Float64, Float32]:
+        """Positions in the view and in the other, and scores, of the best match of each cell."""
+        rows, columns = _best_of_cells(warp.certainty, self._cell)
+        scores = warp.certainty[rows, columns]
+        sure = scores > self._min_certainty
+        rows, columns = rows[sure], columns[sure]
+        return warp.source(rows, columns), warp.target[rows, columns], scores[sure]
+
+
+class SparseMatcher:
+    """Keypoints that the warp sends near to each other."""
+
+    def __init__(self, options: SparseOptions, context: ProviderContext) -> None:
+        self._network = WarpNetwork(options, context)
+        self._snap_px, self._min_certainty = options.snap_px, options.min_certainty
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """The most certain ones first, each keypoint once."""
+        if features_a is None or features_b is None:
+            raise ProviderError("roma-sparse matches keypoints: choose a features provider")
+        there, back = self._network.warps(view_a, view_b)
+        xy_a, xy_b = features_a.keypoints, features_b.keypoints
+        pairs, scores = self._snapped(there, xy_a, xy_b)
+        if back is not None:
+            more, certain = self._snapped(back, xy_b, xy_a)
+            pairs = np.concatenate([pairs, more[:, ::-1]])
+            scores = np.concatenate([scores, certain])
+        order = np.argsort(-scores, kind="stable")
+        for column in (0, 1):
+            order = order[np.sort(np.unique(pairs[order, column], return_index=True)[1])]
+        return PairMatches(sparse=SparseMatches(pairs[order], scores[order]))
+
+    def _snapped(self, warp: Warp, xy: Float64, others: Float64) -> tuple[Int64, Float32]:
+        """Pairs (m, 2) of a keypoint and the other view's nearest to where the warp sends it, if
+        that is near and no other keypoint is sent nearer to it."""
+        if not (len(xy) and len(others)):
+            return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.float32)
+        target, certainty = warp.at(xy)
+        distance, nearest = cKDTree(others).query(target)
+        sure = (distance <= self._snap_px) & (certainty > self._min_certainty)
+        rows = np.flatnonzero(sure)
+        rows = rows[np.argsort(distance[rows], kind="stable")]
+        rows = rows[np.unique(nearest[rows], return_index=True)[1]]
+        scores = np.clip(certainty[rows], 0, 1).astype(np.float32)
+        return np.stack([rows, nearest[rows]], axis=1).astype(np.int64), scores
+
+
+def _best_of_cells(certainty: Float32, cell: int) -> tuple[Int64, Int64]:
+    """Row and column of the largest value of each square of ``cell`` x ``cell``."""
+    height, width = certainty.shape
+    down, across = -(-height // cell), -(-width // cell)
+    padded = np.full((down * cell, across * cell), -1, dtype=np.float32)
+    padded[:height, :width] = certainty
+    cells = padded.reshape(down, cell, across, cell).swapaxes(1, 2).reshape(down, across, -1)
+    y, x = np.divmod(cells.argmax(axis=2), cell)
+    rows = y + cell * np.arange(down)[:, None]
+    columns = x + cell * np.arange(across)
+    return rows.reshape(-1), columns.reshape(-1)

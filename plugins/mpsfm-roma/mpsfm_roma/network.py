@@ -1,0 +1,90 @@
+"""The warp between two views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpsfm_onnx.canvas import Canvas
+from mpsfm_onnx.description import FixedSize, ImageInput
+from mpsfm_onnx.model import Model, fetch
+
+from mpsfm_core import ProviderContext, View
+from mpsfm_core.data import Bool, Float32, Float64, Int64
+from mpsfm_core.geometry import sample_bilinear, scale_pixels
+from mpsfm_roma.options import RomaOptions
+
+
+@dataclass(frozen=True)
+class Warp:
+    """Where the pixels of one view lie in the other.
+
+    ``target``: (h, w, 2), pixels of the other view, on a grid that covers the view of ``size``.
+    ``certainty``: (h, w) in [0, 1], 0 where the target is outside of the other view.
+    """
+
+    size: tuple[int, int]
+    target: Float64
+    certainty: Float32
+
+    def source(self, rows: Int64, columns: Int64) -> Float64:
+        """Pixels (n, 2) of the view for cells of the grid."""
+        height, width = self.certainty.shape
+        xy = np.stack([columns, rows], axis=-1) + 0.5
+        return scale_pixels(xy, (width, height), self.size)
+
+    def at(self, xy: Float64) -> tuple[Float64, Float64]:
+        """Target (n, 2) and certainty (n,) at pixels (n, 2) of the view, bilinear."""
+        height, width = self.certainty.shape
+        grid = scale_pixels(xy, self.size, (width, height))
+        everywhere: Bool = np.ones((height, width), dtype=np.bool_)
+        planes = (self.target[..., 0], self.target[..., 1], self.certainty)
+        x, y, certainty = (sample_bilinear(plane, everywhere, grid)[0] for plane in planes)
+        return np.stack([x, y], axis=-1), certainty
+
+
+class WarpNetwork:
+    """RoMa as an ONNX model.
+
+    Inputs: two images (1, 3, height, width), normalised as for ImageNet. Outputs as of RoMa's
+    ``match``: the warp (h, w, 4) or (1, h, w, 4), positions ``x_a, y_a, x_b, y_b`` in [-1, 1] of
+    which the first two are a grid; and its certainty (h, w). A symmetric model gives the warp of
+    the second view to the right of the first one's, with the last two as the grid.
+    """
+
+    def __init__(self, options: RomaOptions, context: ProviderContext) -> None:
+        self._model = Model(fetch(context, options.model, options.sha256), context)
+        self._model.require(options.inputs, options.outputs, "RoMa")
+        self._inputs, self._outputs = options.inputs, options.outputs
+        self._rule = ImageInput(
+            scale=1 / 255,
+            mean=(0.485, 0.456, 0.406),
+            std=(0.229, 0.224, 0.225),
+            interpolation="cubic",
+            size=FixedSize(mode="fixed", width=options.width, height=options.height),
+        )
+
+    def warps(self, view_a: View, view_b: View) -> tuple[Warp, Warp | None]:
+        """The warp from a to b and, from a symmetric model, the one from b to a."""
+        views = (view_a, view_b)
+        images = (
+            Canvas.plan(self._rule.size, v.camera.size).paint(v.image, self._rule) for v in views
+        )
+        feed = dict(zip(self._inputs, images, strict=True))
+        warp, certainty = (np.squeeze(t) for t in self._model.run(feed, self._outputs))
+        size = self._rule.size
+        assert isinstance(size, FixedSize)
+        width = warp.shape[1]
+        symmetric = width * size.height == 2 * warp.shape[0] * size.width
+        half = width // 2 if symmetric else width
+        there = _warp(view_a, view_b, warp[:, :half, 2:], certainty[:, :half])
+        if not symmetric:
+            return there, None
+        return there, _warp(view_b, view_a, warp[:, half:, :2], certainty[:, half:])
+
+
+def _warp(view: View, other: View, target: Float32, certainty: Float32) -> Warp:
+    inside = (np.abs(target) <= 1).all(axis=-1)
+    xy = (np.clip(target, -1, 1).astype(np.float64) + 1) / 2 * other.camera.size
+    sure = np.where(inside, np.clip(certainty, 0, 1), 0).astype(np.float32)
+    return Warp(view.camera.size, xy, sure)
