@@ -18,6 +18,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -168,10 +169,19 @@ def normals_of(depth: Float64, camera: PinholeCamera) -> Float64:
     return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
 
-def timed(function: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> float:
+def timed(
+    function: Callable[[], Any], clock: Callable[[], float] = time.perf_counter
+) -> tuple[float, Any]:
+    """Seconds that a call took, and what it returned."""
     start = clock()
-    function()
-    return clock() - start
+    result = function()
+    return clock() - start, result
+
+
+def median_time(
+    function: Callable[[], Any], repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> float:
+    return statistics.median(timed(function, clock)[0] for _ in range(repeats))
 
 
 def bench_speed(size: tuple[int, int], repeats: int) -> dict[str, float]:
@@ -181,18 +191,19 @@ def bench_speed(size: tuple[int, int], repeats: int) -> dict[str, float]:
     reference = ReferenceIntegration(
         problem.depth, problem.normals, problem.camera, problem.anchors
     )
-    ours = integrator.refine(problem.anchors)
+    run = partial(integrator.refine, problem.anchors)
+    ours = run()
 
     def run_reference() -> list[float]:
         target = ours.energy * (1 + 1e-4)
         return reference.solve(tolerance=0.0, max_iterations=40, target=target)[1]
 
-    energies = run_reference()
     wall: dict[str, list[float]] = {"ours": [], "reference": [], "cpu": []}
     for _ in range(repeats):
-        wall["reference"].append(timed(run_reference))
-        wall["ours"].append(timed(lambda: integrator.refine(problem.anchors)))
-        wall["cpu"].append(timed(lambda: integrator.refine(problem.anchors), time.thread_time))
+        seconds, energies = timed(run_reference)
+        wall["reference"].append(seconds)
+        wall["ours"].append(timed(run)[0])
+        wall["cpu"].append(timed(run, time.thread_time)[0])
     median = {name: statistics.median(values) for name, values in wall.items()}
     return {
         "ours_ms": 1e3 * median["ours"],
@@ -211,9 +222,7 @@ def bench_warm(problem: Problem, repeats: int) -> float:
     integrator = problem.integrator(replace(DEFAULT_OPTIONS, skip_tolerance=0.0))
     before = integrator.refine(problem.anchors)
     moved = problem.anchors._replace(depth=1.01 * problem.anchors.depth)
-    return statistics.median(
-        timed(lambda: integrator.refine(moved, start=before)) for _ in range(repeats)
-    )
+    return median_time(partial(integrator.refine, moved, start=before), repeats)
 
 
 def bench_scaling(repeats: int) -> dict[str, float]:
@@ -222,16 +231,9 @@ def bench_scaling(repeats: int) -> dict[str, float]:
     for size in SCALING_SIZES:
         pixels.append(size[0] * size[1])
         problems = [analytic_problem(size, seed) for seed in range(2)]
-        integrators = [problem.integrator() for problem in problems]
-
-        def refine_all(
-            problems: list[Problem] = problems, integrators: list[DepthIntegrator] = integrators
-        ) -> int:
-            pairs = zip(integrators, problems, strict=True)
-            return sum(integrator.refine(p.anchors).iterations for integrator, p in pairs)
-
-        iterations = refine_all()
-        whole.append(statistics.median(timed(refine_all, time.thread_time) for _ in range(repeats)))
+        runs = [partial(problem.integrator().refine, problem.anchors) for problem in problems]
+        iterations = sum(run().iterations for run in runs)
+        whole.append(sum(median_time(run, repeats, time.thread_time) for run in runs))
         single.append(whole[-1] / iterations)
     grid = np.log(pixels)
     return {
@@ -274,8 +276,8 @@ def bench_variance(repeats: int) -> dict[str, float]:
         problem = analytic_problem(size, seed=0)
         integrator = problem.integrator()
         refined = integrator.refine(problem.anchors)
-        run = lambda i=integrator, r=refined, p=problem: i.variance(r, p.anchors)  # noqa: E731
-        whole = statistics.median(timed(run) for _ in range(repeats))
+        run = partial(integrator.variance, refined, problem.anchors)
+        whole = median_time(run, repeats)
         report[f"whole_map_s_at_{size[0]}"] = whole
         report[f"us_per_pixel_at_{size[0]}"] = 1e6 * whole / refined.log_depth.size
         report[f"pays_off_from_pixels_at_{size[0]}"] = whole / single_solve(integrator, problem)
@@ -292,7 +294,7 @@ def single_solve(integrator: DepthIntegrator, problem: Problem) -> float:
     solver.update(here.east, here.south, here.mass)
     unit = np.zeros(here.mass.shape)
     unit[unit.shape[0] // 2, unit.shape[1] // 2] = 1
-    return statistics.median(timed(lambda: solver.solve(unit, 200, 1e-2)) for _ in range(3))
+    return median_time(partial(solver.solve, unit, 200, 1e-2), repeats=3)
 
 
 def ablation(analytic: list[Problem], real: list[Problem]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import pytest
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.optimize.depth_integration import DepthIntegrator, IntegrationOptions
 from mpsfm_core.testing.scenes import arc_poses, room_scene
-from tests.optimize.test_depth_integration import (
+from tests.optimize.integration_problems import (
     camera_of,
     depth_prior,
     exact_anchors,
