@@ -123,5 +123,5 @@ def _prepare() -> None:
     otherwise count for the first set."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     camera = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
-    problem = mapping_problem(room_scene(), camera, arc_poses(3, 8.0), map_width=48)
+    problem = mapping_problem(room_scene(), camera, arc_poses(3, 8.0))
     run_method(OURS, problem, MapperOptions())
