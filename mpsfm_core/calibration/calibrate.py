@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from mpsfm_core.calibration.comparison import Comparison
 from mpsfm_core.calibration.file import CalibratedKind, CalibrationFile, Provenance
-from mpsfm_core.calibration.fitting import Alignment, std_of
+from mpsfm_core.calibration.fitting import Alignment, rounded, std_of
 from mpsfm_core.calibration.model import Calibration
 from mpsfm_core.calibration.model_truth import model_truth
 from mpsfm_core.calibration.samples import DepthTruth
@@ -191,14 +191,14 @@ class _Run:
             options=_without_folders(chosen["options"]),
             weights=_weights(provider),
             truth=truth,
-            data=f"{len(self._bench.images)} images of {self._photos.folder.resolve().name}",
+            data=f"{len(self._bench.images)} images of {_last_folders(self._photos.folder)}",
             date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
             core=core_version(),
             images=len(report["images"]),
             pixels=report["samples"],
-            intervals_95=report["intervals_95"],
+            intervals_95=_short(report["intervals_95"]),
             metrics={
-                when: {name: metrics[name] for name in _KEPT_METRICS if name in metrics}
+                when: _short({name: metrics[name] for name in _KEPT_METRICS if name in metrics})
                 for when, metrics in report["metrics"].items()
             },
             warnings=found.warnings,
@@ -216,6 +216,20 @@ def _weights(provider: ActiveProvider) -> dict[str, str]:
     for part in provider.identity["providers"]:
         files |= {_without_folders(uri): sha256 for uri, sha256 in part["files"].items()}
     return files
+
+
+def _short(value: Any) -> Any:
+    """Plain data with numbers of four digits, for files that people read."""
+    if isinstance(value, dict):
+        return {key: _short(content) for key, content in value.items()}
+    if isinstance(value, list):
+        return [_short(content) for content in value]
+    return rounded(value) if isinstance(value, float) else value
+
+
+def _last_folders(folder: Path) -> str:
+    """``scene/images``: many folders of photos have one name."""
+    return "/".join(folder.resolve().parts[-2:])
 
 
 def _without_folders(value: Any) -> Any:

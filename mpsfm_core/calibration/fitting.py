@@ -159,7 +159,7 @@ def describe(base: Calibration, fit: Fit) -> Calibration:
     then the usual one.
     """
     found = {
-        name: _rounded(value)
+        name: rounded(value)
         for name, value, share in zip(fit.names, fit.values, fit.shares, strict=True)
         if share >= DOMINANT_SHARE
     }
@@ -168,7 +168,7 @@ def describe(base: Calibration, fit: Fit) -> Calibration:
         "use_network_variance": "std_scale" in found,
     }
     if isinstance(base, NormalCalibration):
-        floor = _rounded(np.degrees(found.get("std_floor_deg", 0.0)))
+        floor = rounded(np.degrees(found.get("std_floor_deg", 0.0)))
         if "std_scale" in found:
             return NormalCalibration(**network, std_floor_deg=floor)
         usual = min(NormalCalibration().std_floor_deg, floor)
@@ -178,11 +178,11 @@ def describe(base: Calibration, fit: Fit) -> Calibration:
     return DepthCalibration(
         **network,
         relative_std=found.get("relative_std", 0.0),
-        std_floor=found.get("std_floor", _rounded(usual)),
-        shift=_rounded(base.shift),
+        std_floor=found.get("std_floor", rounded(usual)),
+        shift=rounded(base.shift),
         shift_space=base.shift_space,
         edge_ratio=fit.edge_ratio,
-        edge_std_scale=_rounded(fit.edge_scale),
+        edge_std_scale=rounded(fit.edge_scale),
     )
 
 
@@ -248,5 +248,6 @@ def _shift_loss(samples: Sequence[DepthSamples], model: DepthCalibration) -> flo
     return float((np.abs(residuals.error).sum() + lost * GROSS_DEPTH) / (len(residuals) + lost))
 
 
-def _rounded(value: float) -> float:
+def rounded(value: float) -> float:
+    """A value to four significant digits: more would pretend."""
     return float(f"{value:.{_DIGITS}g}")

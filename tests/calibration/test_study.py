@@ -1,0 +1,78 @@
+"""What a study reports, and what it warns of."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from mpsfm_core.calibration.fitting import DepthData
+from mpsfm_core.calibration.model import DepthCalibration
+from mpsfm_core.calibration.study import Study, StudyOptions, study
+from tests.calibration.simulation import Simulated, simulate
+
+PRIOR = Simulated(network=False, relative_std=0.1, std_floor=0.0, gross=0.02)
+DECLARED = DepthCalibration(relative_std=0.02, std_floor=0)
+
+
+def run(images: int, parameters: Simulated = PRIOR, **options: int) -> Study:
+    data = DepthData(simulate(parameters, images, pixels=300))
+    return study(data, DECLARED, StudyOptions(bootstraps=20).model_copy(update=options))
+
+
+@pytest.fixture(scope="module")
+def twenty() -> Study:
+    return run(20)
+
+
+def test_coverage_on_held_out_images_before_and_after(twenty: Study) -> None:
+    before, after = (twenty.report["metrics"][when] for when in ("before", "after"))
+    assert before["coverage"][0] < 0.2
+    assert after["coverage"][0] == pytest.approx(0.683 * 0.98, abs=0.03)
+    assert after["nll_heavy"] < before["nll_heavy"]
+    assert len(after["coverage_of_folds"]) == 4
+
+
+def test_the_scale_of_each_image_is_told_and_not_part_of_the_std(twenty: Study) -> None:
+    # Simulated images have scales with a log spread of 0.2, twice the std.
+    assert twenty.report["scale"]["log_spread"] == pytest.approx(0.2, rel=0.5)
+    after = twenty.report["metrics"]["after"]
+    assert after["coverage_without_scaling"][0] < after["coverage"][0] - 0.2
+
+
+def test_truth_in_no_unit_says_nothing_about_the_scale() -> None:
+    data = DepthData(simulate(PRIOR, 8, pixels=200), in_metres=False)
+    report = study(data, DECLARED, StudyOptions(bootstraps=0)).report
+    assert "coverage_without_scaling" not in report["metrics"]["after"]
+
+
+def test_the_report_is_plain_data(twenty: Study) -> None:
+    assert json.loads(json.dumps(twenty.report)) == twenty.report
+
+
+def test_the_same_input_gives_the_same_study(twenty: Study) -> None:
+    assert run(20).report == twenty.report
+
+
+def test_enough_images_give_no_warning(twenty: Study) -> None:
+    assert twenty.warnings == ()
+
+
+def test_few_images_are_warned_of() -> None:
+    assert any("only 3 images" in warning for warning in run(3).warnings)
+    alone = run(1)
+    assert any("no image is held out" in warning for warning in alone.warnings)
+    assert alone.report["folds"] == 0
+
+
+def test_a_wide_interval_is_warned_of() -> None:
+    quiet, loud = (replace(PRIOR, relative_std=std) for std in (0.03, 0.3))
+    mixed = simulate(quiet, 6, pixels=100) + simulate(loud, 6, pixels=100)
+    warnings = study(DepthData(mixed), DECLARED, StudyOptions(bootstraps=40)).warnings
+    assert any("relative_std is somewhere between" in warning for warning in warnings)
+
+
+def test_wrong_truth_is_suspected() -> None:
+    warnings = run(12, replace(PRIOR, gross=0.4)).warnings
+    assert any("is the truth of these images right?" in warning for warning in warnings)
