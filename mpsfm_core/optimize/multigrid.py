@@ -90,7 +90,8 @@ class Multigrid:
     def update(self, east: Float32, south: Float32, mass: Float32) -> None:
         """Set couplings and mass, each (h, w) and non-negative; costs about 1.3 V-cycles.
 
-        `east[:, -1]` and `south[-1]` are ignored. A pixel without couplings and mass stays zero.
+        `east[:, -1]` and `south[-1]` are ignored. Pixels without couplings and mass are detached:
+        they stay zero, and so must their right-hand side be.
         """
         finest = self._levels[0]
         finest.east[1:-1, 1:-2] = east[:, :-1]
@@ -117,8 +118,10 @@ class Multigrid:
             if not product > tolerance**2 * first:
                 break
             _turn(product / previous, finest.x, direction)
-            length = product / _apply(finest, direction, image)
-            _step(length, direction, image, x, residual, finest.rhs)
+            curvature = _apply(finest, direction, image)
+            if not curvature > 0:
+                break
+            _step(product / curvature, direction, image, x, residual, finest.rhs)
             done, previous = done + 1, product
         error = float(np.sqrt(max(product, 0.0) / first)) if first > 0 else 0.0
         return Solution(x[1:-1, 1:-1].copy(), done, error)
