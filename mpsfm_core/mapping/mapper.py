@@ -195,7 +195,7 @@ class Mapper:
             poses.sort(key=lambda pose: -pose.support)
         reason: str | None = "neither PnP nor an essential matrix gives a pose"
         for pose in poses:
-            reason = self._lacks_support(pose) or self._try_pose(image, pose)
+            reason = self._lacks_support(pose) or self._try_pose(image, pose, found)
             if reason is None:
                 return None
             scene.restore(snapshot)
@@ -224,7 +224,7 @@ class Mapper:
             return f"{pose.inlier_share:.0%} of the matches support its pose, not {share:.0%}"
         return None
 
-    def _try_pose(self, image: int, pose: AbsolutePose) -> str | None:
+    def _try_pose(self, image: int, pose: AbsolutePose, found: Correspondences) -> str | None:
         """Grow and refine the scene around a new pose; None, or why it is rejected."""
         scene, options = self.scene, self.options
         with self._timed("local refinement"):
@@ -240,6 +240,7 @@ class Mapper:
             self.refiner.integrate([image])
         reason = self._contradiction(image, self.options.consistency.max_violations)
         if reason:
+            self._refute(image, pose, found)
             return reason
         with self._timed("local refinement"):
             self.refiner.refine_locally(image)
@@ -248,6 +249,14 @@ class Mapper:
             return "too few points are left after refinement"
         self._drop(lost, "lost its points when another image was refined")
         return None
+
+    def _refute(self, image: int, pose: AbsolutePose, found: Correspondences) -> None:
+        """Try an image no more beside those whose matches led to a contradicted pose."""
+        for other in map(int, np.unique(found.references)):
+            alone = Correspondences(*(part[found.references == other] for part in found))
+            options = self.options.registration
+            led = rate_pose(self.scene, alone, pose.rotation, pose.translation, "", options)
+            self.refuted[image, other] |= led.inlier_share >= options.min_inlier_share
 
     def _contradiction(self, image: int, limit: float) -> str | None:
         """Why the depth of an image contradicts that of another view, if it does."""
@@ -271,6 +280,7 @@ class Mapper:
         with self._timed("global refinement"):
             self.refiner.refine_globally(final=final)
             self.scene.tracks.compact()
+        self.refuted[:] = False  # the scene may be right where it was wrong
         self._last_size = int(self.scene.registered.sum()), len(self.scene.tracks)
         self._drop(lost_images(self.scene), "lost its points in global refinement")
 

@@ -67,7 +67,7 @@ def mapping_problem(
     keypoints = [np.concatenate(part) for part in xys]
     keypoints = [xy + noise.keypoints_px * rng.normal(size=xy.shape) for xy in keypoints]
     images = [
-        _image(
+        view_of(
             f"view_{i}.png",
             scene,
             camera,
@@ -89,11 +89,11 @@ def mapping_problem(
             mine = common % len(all_links) == link
             rows_a, rows_b = rows_a[mine], rows_b[mine]
         if len(rows_a) >= 15:
-            pairs.append(_pair(a, b, np.stack([rows_a, rows_b], axis=1), poses))
+            pairs.append(verified_pair(a, b, np.stack([rows_a, rows_b], axis=1), poses))
     return MappingProblem(tuple(images), tuple(pairs))
 
 
-def _image(
+def view_of(
     name: str,
     scene: AnalyticScene,
     camera: PinholeCamera,
@@ -105,6 +105,7 @@ def _image(
     noise: Noise,
     rng: np.random.Generator,
 ) -> MappingImage:
+    """A view of a scene with keypoints (n, 2) and the priors that noise leaves of the truth."""
     grid = camera.resized(map_width, round(map_width * camera.height / camera.width))
     truth = scene.render(grid, pose)
     factor = np.exp(noise.scale * rng.normal() + noise.depth * rng.normal(size=truth.depth.shape))
@@ -121,7 +122,8 @@ def _image(
     )
 
 
-def _pair(a: int, b: int, matches: Int64, poses: Sequence[Float64]) -> VerifiedPair:
+def verified_pair(a: int, b: int, matches: Int64, poses: Sequence[Float64]) -> VerifiedPair:
+    """Matches (m, 2) of two views with their relative pose; ``poses``: (3, 4), by view."""
     rotation = poses[b][:, :3] @ poses[a][:, :3].T
     translation = poses[b][:, 3] - rotation @ poses[a][:, 3]
     scores = np.ones(len(matches), dtype=np.float32)

@@ -1,0 +1,141 @@
+"""The depth check on two rooms that look alike: what it rejects, and what that is worth.
+
+    python -m benchmarks.symmetry [--seeds 3] [--placed-only] [--output FILE]
+
+*Placed*: all views stand at their true poses with refined depth; each view of a room is then judged
+where it belongs, beside all others, and a room too far, beside the views of the other room and the
+corridor. *Mapped*: the whole mapper, with and without the check; a registration is wrong when
+it is nearer to the twin of its place than to its place, as seen from the first pair.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
+from mpsfm_core.geometry import camera_center
+from mpsfm_core.mapping.depth_consistency import check_image
+from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.mapper import Mapper
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.testing.degraded_depth import DepthErrors
+from mpsfm_core.testing.symmetric import SymmetricProblem, moved, twin_room_problem
+
+PRIORS = {"exact, declared 1 %": None, "5 % + 5 % scale, declared 7 %": DepthErrors()}
+HEADER = "| priors | wrong rejected | correct rejected | check, ms |\n|---|---|---|---|"
+HEADER_MAPPED = (
+    "| priors | check | AUC@1/5/20 | registered | wrong rejected | correct rejected | time, s |\n"
+    "|---|---|---|---|---|---|---|"
+)
+
+
+def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
+    """For each placement: whether it is wrong, whether it is rejected, and the check's seconds."""
+    views = zip(case.problem.images, case.poses, strict=True)
+    images = tuple(replace(i, known_pose=(p[:, :3].copy(), p[:, 3].copy())) for i, p in views)
+    pairs = tuple(p for p, false in zip(case.problem.pairs, case.false, strict=True) if not false)
+    options = MapperOptions(known_poses="fixed")
+    mapper = Mapper(MappingProblem(images, pairs), options, Silent())
+    next(mapper.components())
+    scene, room, noise = mapper.scene, np.array(case.room), mapper.refiner.noise.multiplier
+    everything = scene.registered.copy()
+    for image in np.flatnonzero(room >= 0):
+        for wrong in (False, True):
+            pose = moved(case.poses[image], 2 * int(room[image]) - 1) if wrong else None
+            truth = scene.translations[image].copy()
+            if pose is not None:
+                scene.registered = everything & (room != room[image])
+                scene.translations[image] = truth + pose[:, 3] - case.poses[image][:, 3]
+            start = time.perf_counter()
+            check = check_image(scene, int(image), options.consistency, noise)
+            seconds = time.perf_counter() - start
+            yield wrong, check.share > options.consistency.max_violations, seconds
+            scene.translations[image], scene.registered = truth, everything
+
+
+class Observed(Mapper):
+    """The mapper, with a list of every check: whether the pose was wrong, and the verdict."""
+
+    case: SymmetricProblem
+    verdicts: list[tuple[bool, bool]]
+
+    def _contradiction(self, image: int, limit: float) -> str | None:
+        reason = super()._contradiction(image, limit)
+        self.verdicts.append((self._misplaced(image), reason is not None))
+        return reason
+
+    def _misplaced(self, image: int) -> bool:
+        """Whether an image is nearer to its twin's place, the first image being in its own."""
+        scene, poses = self.scene, np.array(self.case.poses)
+        first = next(i for i in scene.registered_images() if i != image)
+        turn = poses[first, :, :3].T @ scene.rotations[first]
+        centers, truth = scene.centers(), camera_center(poses[..., :3], poses[..., 3])
+        step = turn @ (centers[image] - centers[first]) / scene.maps[first].scale
+        return bool(np.linalg.norm(truth[first] + step - truth[image]) > 2.6)
+
+
+def mapped(case: SymmetricProblem, enabled: bool) -> tuple[np.ndarray, int, list, float]:  # type: ignore[type-arg]
+    """Pose errors of the largest component, its size, verdicts, and seconds."""
+    options = MapperOptions.model_validate({"consistency": {"enabled": enabled}})
+    mapper = Observed(case.problem, options, Silent())
+    mapper.case, mapper.verdicts = case, []
+    start = time.perf_counter()
+    best = max(mapper.components(), key=lambda c: len(c.images), default=None)
+    seconds = time.perf_counter() - start
+    found = {i.name: (i.rotation, i.translation) for i in best.images} if best else {}
+    views = zip(case.problem.images, case.poses, strict=True)
+    truth = {image.name: (pose[:, :3], pose[:, 3]) for image, pose in views}
+    return pose_errors_deg(found, truth, CONVENTIONS["paper"]), len(found), mapper.verdicts, seconds
+
+
+def shares(verdicts: list[tuple[bool, bool]]) -> str:
+    """Share rejected of wrong and of correct ones, as two cells."""
+    cells = []
+    for kind in (True, False):
+        chosen = [rejected for wrong, rejected in verdicts if wrong == kind]
+        cells.append(f"{np.mean(chosen):.1%} of {len(chosen)}" if chosen else "-")
+    return " | ".join(cells)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--placed-only", action="store_true")
+    parser.add_argument("--output", type=Path)
+    arguments = parser.parse_args()
+    lines = ["Placed:", "", HEADER]
+    for name, errors in PRIORS.items():
+        cases = [twin_room_problem(seed, errors=errors) for seed in range(arguments.seeds)]
+        rows = [row for case in cases for row in placed(case)]
+        milliseconds = 1e3 * float(np.median([seconds for _, _, seconds in rows]))
+        lines.append(f"| {name} | {shares([row[:2] for row in rows])} | {milliseconds:.1f} |")
+    if not arguments.placed_only:
+        lines += ["", "Mapped:", "", HEADER_MAPPED]
+        for name, errors in PRIORS.items():
+            cases = [twin_room_problem(seed, errors=errors) for seed in range(arguments.seeds)]
+            for enabled in (False, True):
+                runs = [mapped(case, enabled) for case in cases]
+                area = pose_auc(np.concatenate([run[0] for run in runs]), CONVENTIONS["paper"])
+                auc = " / ".join(f"{100 * value:.1f}" for value in area.values())
+                size = sum(run[1] for run in runs) / sum(len(case.poses) for case in cases)
+                verdicts = [v for run in runs for v in run[2]] if enabled else []
+                seconds = np.mean([run[3] for run in runs])
+                lines.append(
+                    f"| {name} | {'on' if enabled else 'off'} | {auc} | {size:.0%} | "
+                    f"{shares(verdicts)} | {seconds:.0f} |"
+                )
+    table = "\n".join(lines)
+    print(table)
+    if arguments.output:
+        arguments.output.write_text(table + "\n")
+
+
+if __name__ == "__main__":
+    main()
