@@ -25,16 +25,22 @@ MULTIPLIER_RANGE = (0.1, 10.0)
 
 
 class DepthNoise(NamedTuple):
-    """``multiplier`` of the declared std, and ``design_effect``: by how much the variance of a
-    mean of residuals exceeds that of independent ones (Kish, Survey Sampling, 1965)."""
+    """``multiplier`` of the declared std; ``correlation`` of errors in the same cell, [0, 1]; and
+    ``design_effect``: by how much the variance of a mean of the observations exceeds that of
+    independent ones (Kish, Survey Sampling, 1965)."""
 
     multiplier: float = 1.0
+    correlation: float = 1.0
     design_effect: float = 1.0
 
     @property
     def std_factor(self) -> float:
         """Factor of the declared std that makes observations count as if independent."""
         return self.multiplier * float(np.sqrt(self.design_effect))
+
+    def independent_pixels(self, pixels: int) -> float:
+        """How many independent measurements a map of so many pixels is worth."""
+        return pixels / (1.0 + (pixels / CELLS**2 - 1.0) * self.correlation)
 
 
 def measure_depth_noise(scene: Scene) -> DepthNoise:
@@ -45,7 +51,7 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
     spread = 1.4826 * float(np.median(np.abs(residuals)))
     multiplier = float(np.clip(spread, *MULTIPLIER_RANGE))
     clipped = np.clip(residuals / max(spread, 1e-12), -3, 3)
-    return DepthNoise(multiplier, _design_effect(clipped, groups))
+    return DepthNoise(multiplier, *_clustering(clipped, groups))
 
 
 def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
@@ -78,16 +84,17 @@ def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
     return residuals, (pair * CELLS + row) * CELLS + column
 
 
-def _design_effect(values: Float64, groups: Int64) -> float:
-    """``1 + (mean group size - 1) * intraclass correlation`` by analysis of variance, >= 1."""
+def _clustering(values: Float64, groups: Int64) -> tuple[float, float]:
+    """Intraclass correlation r by analysis of variance, and ``1 + (mean group size - 1) * r``."""
     _, group, sizes = np.unique(groups, return_inverse=True, return_counts=True)
     count, total = len(sizes), len(values)
     if count < 2 or total <= count:
-        return 1.0
+        return 1.0, 1.0
     means = np.bincount(group, values) / sizes
     between = float((sizes * means**2).sum()) / count
     within = float(((values - means[group]) ** 2).sum()) / (total - count)
     typical = (total - float((sizes**2).sum()) / total) / (count - 1)
-    correlation = (between - within) / max(between + (typical - 1) * within, 1e-12)
+    raw = (between - within) / max(between + (typical - 1) * within, 1e-12)
+    correlation = float(np.clip(raw, 0, 1))
     weighted_size = float((sizes**2).sum()) / total
-    return 1.0 + max(weighted_size - 1, 0.0) * float(np.clip(correlation, 0, 1))
+    return correlation, 1.0 + max(weighted_size - 1, 0.0) * correlation

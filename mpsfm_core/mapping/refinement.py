@@ -40,7 +40,7 @@ class Refiner:
         self.scores = scores
         self.fixed: Bool = np.zeros(scene.num_images, dtype=np.bool_)
         self.noise = DepthNoise()
-        self._assumed_multiplier = 1.0
+        self._assumed = DepthNoise()
         self._integrators: dict[int, DepthIntegrator] = {}
 
     def estimate_scale(self, image: int, others: list[int]) -> None:
@@ -255,9 +255,9 @@ class Refiner:
         if not self.options.measure_depth_noise:
             return
         self.noise = measure_depth_noise(self.scene)
-        assumed = self._assumed_multiplier
-        if not 1 / NOISE_CHANGE < self.noise.multiplier / assumed < NOISE_CHANGE:
-            self._assumed_multiplier = self.noise.multiplier
+        ratio = self.noise.multiplier / self._assumed.multiplier
+        if not 1 / NOISE_CHANGE < ratio < NOISE_CHANGE:
+            self._assumed = self.noise
             self._integrators.clear()
 
     def _integrator(self, image: int) -> DepthIntegrator:
@@ -265,12 +265,13 @@ class Refiner:
         integrator = self._integrators.get(image)
         if integrator is None:
             depth_map, options = self.scene.maps[image], self.options.integration
-            worth = options.independent_depths / self._assumed_multiplier**2
+            prior, noise = depth_map.prior, self._assumed
+            worth = noise.independent_pixels(prior.depth.size)
             integrator = self._integrators[image] = DepthIntegrator(
-                depth_map.prior,
+                replace(prior, variance=prior.variance * np.float32(noise.multiplier**2)),
                 depth_map.normals,
                 depth_map.camera,
-                replace(options, independent_depths=worth),
+                replace(options, independent_depths=max(worth, options.independent_depths)),
             )
         return integrator
 
