@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numba import njit
 
@@ -110,7 +111,9 @@ def contradiction(
         one, two = grids[source], grids[target]
         depth, variance = warp_depth(*one, rotation, translation, two.params, two.depth.shape)
         seen = np.isfinite(depth) & two.valid
-        gap = two.depth[seen] - depth[seen]
+        # A pixel's error of place is an error of depth at edges and where sight grazes a surface.
+        nearest = cv2.erode(np.where(two.valid, two.depth, np.float32(np.inf)), np.ones((3, 3)))
+        gap = nearest[seen] - depth[seen]
         std = np.sqrt(variance[seen] + two.variance[seen])
         violated = (gap > options.max_deviation * std) & (gap > options.min_gap * two.depth[seen])
         total += float(violated.sum()) / two.depth.size
