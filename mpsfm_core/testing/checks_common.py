@@ -26,8 +26,6 @@ import numpy as np
 
 from mpsfm_core.data import NormalPrior, UInt8, View
 from mpsfm_core.discovery import spec_fault
-from mpsfm_core.inputs.header import Header
-from mpsfm_core.inputs.pixels import decode_rgb
 from mpsfm_core.providers import ENTRY_POINT_GROUP
 from mpsfm_core.testing.accuracy import judge
 from mpsfm_core.testing.case import Case, difference
@@ -282,6 +280,9 @@ def check_grayscale(case: Case) -> None:
 def check_sixteen_bit(case: Case) -> None:
     """A gray photo of 16 bit gives an answer; the core makes 8 bit and three channels of it."""
     import cv2  # not at the top: pytest loads this module when it collects
+
+    from mpsfm_core.inputs.header import Header
+    from mpsfm_core.inputs.pixels import decode_rgb
 
     wide = case.main.view.image[..., 0].astype(np.uint16) * 257
     data = cv2.imencode(".png", wide)[1].tobytes()

@@ -12,11 +12,10 @@ import numpy as np
 from mpsfm_core import validation
 from mpsfm_core.data import DepthPrior, NormalPrior
 from mpsfm_core.testing import measure
-from mpsfm_core.testing.accuracy import DEPTH_TOLERANCE, NORMALS_TOLERANCE_DEG
+from mpsfm_core.testing.accuracy import DEPTH_TOLERANCE, NORMALS_TOLERANCE_DEG, accept_shift
 from mpsfm_core.testing.case import Case, difference
 from mpsfm_core.testing.checks_maps import (
     accept_calibration,
-    accept_shift,
     accept_std,
     accept_validity,
     painted_backwards,
@@ -28,7 +27,7 @@ from mpsfm_core.testing.painting import RELATIVE_STD, read_depth
 RAY_TOLERANCE = 0.25
 """Power of ray length over z. Ours: a painted view has 0.002, the length of the ray 1."""
 FLIP_TOLERANCE = 0.3
-"""Median relative difference for networks whose truth is not known (a network is not exactly
+"""Relative difference for networks whose truth is not known (a network is not exactly
 symmetric; a map that is turned or cut on one side differs by more on the slanted wall)."""
 FOCAL_FACTOR = 1.5
 """Of the second camera in the check of the intrinsics."""
@@ -65,10 +64,10 @@ def check_depth_scale(case: Case) -> str:
     factor = float(np.exp(np.median(errors)))
     if abs(np.log(factor)) > DEPTH_TOLERANCE:
         raise CheckFailed(f"is called metric and is {factor:.3g} times too large")
-    spread = float(np.median(np.abs(errors)))
+    spread = measure.typical(errors - np.median(errors))
     if spread > DEPTH_TOLERANCE:
-        raise CheckFailed(f"is not proportional to z: median relative error {spread:.2g}")
-    return f"factor {factor:.3f}, median relative error {spread:.2g}"
+        raise CheckFailed(f"is not proportional to z: relative error {spread:.2g}")
+    return f"factor {factor:.3f}, relative error {spread:.2g}"
 
 
 def check_depth_channel_order(case: Case) -> None:
@@ -87,7 +86,8 @@ def check_depth_pixel_convention(case: Case) -> str:
     shift, no corner-aligned resizing, no border cut off or left on, and the whole view covered."""
     case.needs("painted", "told", "seen")
     prior = _ask(case)
-    return accept_shift(measure.depth_shift(prior, case.main), prior.shape, case)
+    shift = measure.depth_shift(prior, case.main)
+    return accept_shift(case, case.main, shift, prior.shape)
 
 
 def check_depth_orientation(case: Case) -> None:
@@ -117,11 +117,11 @@ def check_depth_flip(case: Case) -> str:
     if not both.any():
         raise CheckFailed("has no pixel that is valid in the view and in the mirrored one")
     ratio = np.log(prior.depth[both] / mirrored.depth[:, ::-1][both].astype(np.float64))
-    median = float(np.median(np.abs(ratio)))
+    found = measure.typical(ratio)
     limit = FLIP_TOLERANCE if case.knows == "nothing" else DEPTH_TOLERANCE
-    if median > limit:
-        raise CheckFailed(f"differs by {median:.1%} on the mirrored view, {limit:.0%} is allowed")
-    return f"median relative difference {median:.2g}"
+    if found > limit:
+        raise CheckFailed(f"differs by {found:.1%} on the mirrored view, {limit:.0%} is allowed")
+    return f"relative difference {found:.2g}"
 
 
 def check_depth_same_in_larger_view(case: Case) -> str:
@@ -236,10 +236,10 @@ def _ask(case: Case) -> DepthPrior:
 def _joint_normals(case: Case, normals: NormalPrior) -> str:
     if case.knows == "nothing":
         return "whether the normals are right is not known"
-    median = float(np.median(measure.angles_deg(normals, case.main)))
-    if median > NORMALS_TOLERANCE_DEG:
-        raise CheckFailed(f"its normals are {median:.0f} degrees off")
-    return f"normals off by {median:.2g} degrees"
+    angle = measure.typical(measure.angles_deg(normals, case.main))
+    if angle > NORMALS_TOLERANCE_DEG:
+        raise CheckFailed(f"its normals are {angle:.0f} degrees off")
+    return f"normals off by {angle:.2g} degrees"
 
 
 def _spread(prior: DepthPrior, expected: Any, where: Any) -> float:

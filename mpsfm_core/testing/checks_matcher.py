@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mpsfm_core import validation
-from mpsfm_core.data import Features, Float64
+from mpsfm_core.data import DepthPrior, Features
 from mpsfm_core.testing import measure
 from mpsfm_core.testing.accuracy import (
     DEPTH_TOLERANCE,
@@ -17,6 +17,7 @@ from mpsfm_core.testing.accuracy import (
     match_points,
 )
 from mpsfm_core.testing.case import Case
+from mpsfm_core.testing.checks_depth import RAY_TOLERANCE
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
@@ -108,17 +109,16 @@ def check_matcher_pair_depth(case: Case) -> str:
     case.needs("painted", "told")
     a, b = case.main, case.main.partner
     depth = case.ask(a).depth
-    errors = []
     for prior, example in ((depth.depth_a, a), (depth.depth_b, b)):
         power = measure.ray_exponent(prior, example)
-        if abs(power) > 0.25:
+        if abs(power) > RAY_TOLERANCE:
             raise CheckFailed(f"depth goes as z * (ray length / z) ** {power:.2f}")
-        errors.append(_median(measure.log_errors(prior, example, any_scale=not prior.metric)))
-    if max(errors) > DEPTH_TOLERANCE:
-        exchanged = _median(measure.log_errors(depth.depth_b, a, any_scale=True))
-        reason = ": the two sides are exchanged" if exchanged < DEPTH_TOLERANCE else ""
-        raise CheckFailed(f"depth has a median relative error of {max(errors):.2g}{reason}")
-    return f"median relative errors {errors[0]:.2g} and {errors[1]:.2g}"
+    error = max(_depth_error(depth.depth_a, a), _depth_error(depth.depth_b, b))
+    if max(_depth_error(depth.depth_a, b), _depth_error(depth.depth_b, a)) < 0.5 * error:
+        raise CheckFailed("depth: the two sides are exchanged")
+    if error > DEPTH_TOLERANCE:
+        raise CheckFailed(f"depth has a relative error of {error:.2g}")
+    return f"relative error {error:.2g}"
 
 
 CHECKS = (
@@ -150,8 +150,8 @@ def _enough(count: int) -> None:
         raise CheckFailed(f"finds only {count} matches between views that overlap by 90 %")
 
 
-def _median(errors: Float64) -> float:
-    return float(np.median(np.abs(errors)))
+def _depth_error(prior: DepthPrior, example: Example) -> float:
+    return measure.typical(measure.log_errors(prior, example, any_scale=not prior.metric))
 
 
 def _first(features: Features, count: int) -> Features:

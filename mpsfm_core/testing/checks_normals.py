@@ -11,11 +11,10 @@ import numpy as np
 from mpsfm_core.data import Float64, NormalPrior
 from mpsfm_core.geometry import angle_between_deg
 from mpsfm_core.testing import measure
-from mpsfm_core.testing.accuracy import NORMALS_TOLERANCE_DEG
+from mpsfm_core.testing.accuracy import NORMALS_TOLERANCE_DEG, accept_shift
 from mpsfm_core.testing.case import Case
 from mpsfm_core.testing.checks_maps import (
     accept_calibration,
-    accept_shift,
     accept_std,
     accept_validity,
     painted_backwards,
@@ -24,7 +23,7 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.painting import NORMALS_STD, read_normals
 
 FLIP_TOLERANCE_DEG = 15.0
-"""Median angle for networks whose truth is not known."""
+"""For networks whose truth is not known."""
 
 _AXES: Mapping[str, tuple[int, int, int]] = MappingProxyType(
     {
@@ -42,10 +41,10 @@ def check_normals_frame(case: Case) -> str:
     OpenGL's, not with a sign or an axis exchanged."""
     case.needs("painted", "told", "seen")
     prior = _ask(case)
-    median = float(np.median(measure.angles_deg(prior, case.main)))
-    if median > NORMALS_TOLERANCE_DEG:
-        raise CheckFailed(f"normals are {median:.0f} degrees off{_explanation(prior, case)}")
-    return f"median angle {median:.2f} degrees"
+    angle = measure.typical(measure.angles_deg(prior, case.main))
+    if angle > NORMALS_TOLERANCE_DEG:
+        raise CheckFailed(f"normals are {angle:.0f} degrees off{_explanation(prior, case)}")
+    return f"angle {angle:.2f} degrees"
 
 
 def check_normals_channel_order(case: Case) -> None:
@@ -64,7 +63,8 @@ def check_normals_pixel_convention(case: Case) -> str:
     """The value at [row, col] belongs to the pixel centre (col + 0.5, row + 0.5)."""
     case.needs("painted", "told", "seen")
     prior = _ask(case)
-    return accept_shift(measure.normals_shift(prior, case.main), prior.shape, case)
+    shift = measure.normals_shift(prior, case.main)
+    return accept_shift(case, case.main, shift, prior.shape)
 
 
 def check_normals_validity(case: Case) -> str:
@@ -84,11 +84,11 @@ def check_normals_flip(case: Case) -> str:
     if not both.any():
         raise CheckFailed("has no pixel that is valid in the view and in the mirrored one")
     back = mirrored.normals[:, ::-1] * (-1.0, 1.0, 1.0)
-    median = _angle(prior.normals[both], back[both])
+    angle = _angle(prior.normals[both], back[both])
     limit = FLIP_TOLERANCE_DEG if case.knows == "nothing" else NORMALS_TOLERANCE_DEG
-    if median > limit:
-        raise CheckFailed(f"differs by {median:.0f} degrees on the mirrored view")
-    return f"median angle {median:.2g} degrees"
+    if angle > limit:
+        raise CheckFailed(f"differs by {angle:.0f} degrees on the mirrored view")
+    return f"angle {angle:.2g} degrees"
 
 
 def check_normals_same_in_larger_view(case: Case) -> str:
@@ -96,10 +96,10 @@ def check_normals_same_in_larger_view(case: Case) -> str:
     case.needs("painted", "told", "seen")
     width, height = case.main.camera.size
     large = case.main.sized(2 * width, 2 * height)
-    median = float(np.median(measure.angles_deg(case.ask(large), large)))
-    if median > NORMALS_TOLERANCE_DEG:
-        raise CheckFailed(f"normals are {median:.0f} degrees off in an enlarged view")
-    return f"median angle {median:.2f} degrees"
+    angle = measure.typical(measure.angles_deg(case.ask(large), large))
+    if angle > NORMALS_TOLERANCE_DEG:
+        raise CheckFailed(f"normals are {angle:.0f} degrees off in an enlarged view")
+    return f"angle {angle:.2f} degrees"
 
 
 def check_normals_variance(case: Case) -> str:
@@ -140,7 +140,7 @@ def _ask(case: Case) -> NormalPrior:
 def _angle(found: Any, expected: Any) -> float:
     if not len(found):
         raise CheckFailed("has no valid normals where the truth is known")
-    return float(np.median(angle_between_deg(found.astype(np.float64), expected)))
+    return measure.typical(angle_between_deg(found.astype(np.float64), expected))
 
 
 def _explanation(prior: NormalPrior, case: Case) -> str:

@@ -135,13 +135,14 @@ class Example:
 def outdoor_example(look: Look, size: tuple[int, int] = (192, 144)) -> Example:
     """Ground, a slanted wall and two balls below an open sky: everything a map can get wrong.
 
-    The camera looks down and to the side, so that no axis of the world is one of the camera's, and
-    its field of view is wide: at the corners a ray is 1.3 times as long as its z.
+    The camera looks down and to the side and is rolled, so that no axis of the world is one of
+    the camera's and nothing is symmetric, and its field of view is wide: at the corners a ray is
+    1.3 times as long as its z.
     """
     scene = AnalyticScene(
         (
             Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-            Box((8.0, 0.0, 0.95), (0.2, 9.0, 0.95), yaw_deg=-13.0),
+            Box((7.7, 0.0, 0.95), (0.2, 9.0, 0.95), yaw_deg=-13.0),
             Sphere((4.6, 1.1, 0.9), 0.9),
             Sphere((3.4, -1.0, 0.7), 0.7),
         ),
@@ -151,7 +152,7 @@ def outdoor_example(look: Look, size: tuple[int, int] = (192, 144)) -> Example:
     focal = 0.75 * width
     camera = PinholeCamera(width, height, focal, focal, width / 2, height / 2)
     pose = look_at((0.0, 0.0, 1.6), (4.0, 0.3, 1.6 - 4.0 * np.tan(np.deg2rad(20.0))))
-    return Example("outdoor.png", scene, camera, pose, look)
+    return Example("outdoor.png", scene, camera, _rolled(pose, 15.0), look)
 
 
 def indoor_example(look: Look, size: tuple[int, int] = (192, 144)) -> Example:
@@ -161,6 +162,13 @@ def indoor_example(look: Look, size: tuple[int, int] = (192, 144)) -> Example:
     camera = PinholeCamera(width, height, focal, focal, width / 2, height / 2)
     scene = replace(room_scene(), texture=Texture(waves_per_octave=8))
     return Example("indoor.png", scene, camera, arc_poses(1, 0.0)[0], look)
+
+
+def _rolled(pose: Float64, degrees: float) -> Float64:
+    """The pose with the camera turned about its optical axis."""
+    cos, sin = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    rolled: Float64 = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ pose
+    return rolled
 
 
 def _beside(pose: Float64) -> Float64:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from mpsfm_core.builtin.plugin import mpsfm_providers as builtin_providers
 from mpsfm_core.providers import Kind, ProviderSpec
 from mpsfm_core.registry import Registry
 from mpsfm_core.testing import Setup, run_checks
@@ -74,14 +73,3 @@ def test_correct_providers_pass(
     assert {r.id: r.message for r in results if r.status in ("fail", "xfail")} == {}
     assert {r.id for r in results if r.status == "skip"} == {*skipped, "light-import"}
     assert all(r.message for r in results if r.status == "skip")
-
-
-@pytest.mark.parametrize("name", ["sift", "mutual-nearest"])
-def test_built_in_features_and_matcher_pass(name: str) -> None:
-    registry = Registry()
-    registry.add(*builtin_providers())
-    (kind,) = [s.kind for s in builtin_providers() if s.name == name]
-    results = run_checks(registry, kind, name)
-    assert {r.id: r.message for r in results if r.status == "fail"} == {}
-    sparse = {"matcher-pixel-convention", "matcher-pair-depth"} if kind == "matcher" else set()
-    assert {r.id for r in results if r.status == "skip"} == {*sparse, "light-import"}

@@ -1,0 +1,55 @@
+"""Providers that are wrong on purpose, and the check that has to say so."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from mpsfm_core.builtin.plugin import mpsfm_providers as builtin_providers
+from mpsfm_core.providers import Kind, ProviderSpec
+from mpsfm_core.registry import Registry
+from mpsfm_core.testing import run_checks
+from mpsfm_core.testing.contract import SetupSource
+
+Caught = Callable[..., None]
+
+
+@pytest.fixture
+def named() -> Callable[..., set[str]]:
+    """The checks that the cases of parametrised tests name, in their second column."""
+
+    def checks(*tests: Any) -> set[str]:
+        marks = [mark for test in tests for mark in test.pytestmark if mark.name == "parametrize"]
+        return {case[1] for mark in marks for case in mark.args[1]}
+
+    return checks
+
+
+@pytest.fixture
+def caught() -> Caught:
+    """Asserts that a check fails for a provider, with a message that matches.
+
+    ``caught("depth", RayLength, "depth-is-z", "length of the ray", setup, "metric")``
+    """
+
+    def catch(
+        kind: Kind,
+        factory: Any,
+        check: str,
+        message: str,
+        setup: SetupSource = None,
+        *capabilities: str,
+        options: Any = None,
+    ) -> None:
+        registry = Registry()
+        registry.add(*builtin_providers())
+        registry.add(ProviderSpec(kind, "wrong", factory, options, frozenset(capabilities)))
+        found = [r for r in run_checks(registry, kind, "wrong", setup, only={check})]
+        failed = [r.message for r in found if r.status == "fail"]
+        assert failed, [(r.status, r.message) for r in found]
+        assert re.search(message, failed[0]), failed[0]
+
+    return catch

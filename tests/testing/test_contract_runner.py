@@ -1,0 +1,158 @@
+"""How results come about: expected failures, gates, setups, and finding providers by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mpsfm_core import ProviderContext, ProviderSpec, View
+from mpsfm_core.errors import InputError, ProviderError
+from mpsfm_core.registry import Registry
+from mpsfm_core.testing import Setup, run_checks
+from mpsfm_core.testing.contract import (
+    CHECKS_BY_KIND,
+    all_checks,
+    check_of,
+    find_providers,
+    id_of,
+)
+from mpsfm_core.testing.reference import PaintedDepth, depth_prior
+
+PAINTED = Setup(knows="painted")
+
+
+class Millimetres(PaintedDepth):
+    def predict(self, view: View) -> Any:
+        prior = super().predict(view)
+        return depth_prior(1000 * prior.depth)
+
+
+def registry_of(*specs: ProviderSpec) -> Registry:
+    registry = Registry()
+    registry.add(*specs, distribution="mpsfm-here")
+    return registry
+
+
+def outcomes(factory: Any, setup: Any, *only: str) -> dict[str, tuple[str, str]]:
+    registry = registry_of(ProviderSpec("depth", "here", factory))
+    results = run_checks(registry, "depth", "here", setup, only=only or None)
+    return {r.id: (r.status, r.message) for r in results}
+
+
+def test_an_expected_failure_is_told_with_its_reason() -> None:
+    setup = Setup(knows="painted", expected_failures={"depth-scale": "the network is in mm"})
+    found = outcomes(Millimetres, setup, "depth-scale", "depth-is-z")
+    assert found["depth-is-z"][0] == "pass"
+    status, message = found["depth-scale"]
+    assert status == "xfail"
+    assert message.startswith("the network is in mm (is called metric")
+
+
+def test_an_expected_failure_that_passes_is_a_failure() -> None:
+    setup = Setup(knows="painted", expected_failures={"depth-scale": "the network is in mm"})
+    status, message = outcomes(PaintedDepth, setup, "depth-scale")["depth-scale"]
+    assert status == "fail"
+    assert message == "passes, and was expected to fail: the network is in mm"
+
+
+def test_expected_failures_need_a_reason_and_a_check() -> None:
+    with pytest.raises(ValueError, match="'depth-scale' needs a reason"):
+        Setup(expected_failures={"depth-scale": " "})
+    setup = Setup(expected_failures={"depth-scal": "because"})
+    status, message = outcomes(PaintedDepth, setup, "depth-scale")["depth-scale"]
+    assert status == "fail"
+    assert "did you mean 'depth-scale'" in message
+
+
+def test_told_needs_somebody_to_tell() -> None:
+    with pytest.raises(ValueError, match="tell belongs to"):
+        Setup(knows="told")
+
+
+def test_without_a_known_answer_accuracy_is_skipped_not_passed() -> None:
+    found = outcomes(PaintedDepth, None)
+    needing = {"depth-is-z", "depth-scale", "depth-channel-order", "depth-pixel-convention"}
+    needing |= {"depth-orientation", "depth-validity", "depth-variance"}
+    assert {found[name][0] for name in needing} == {"skip"}
+    assert all("no known answer" in found[name][1] for name in needing)
+    assert found["odd-size"] == ("pass", "answered; whether it is right is not known")
+
+
+def test_the_plugin_says_how_it_is_tested(tmp_path: Path) -> None:
+    folders = []
+
+    def contract(folder: Path) -> Setup:
+        folders.append(folder)
+        assert folder.is_dir()
+        return PAINTED
+
+    registry = registry_of(ProviderSpec("depth", "here", PaintedDepth, contract=contract))
+    results = run_checks(registry, "depth", "here", only={"depth-is-z", "depth-scale"})
+    assert [r.status for r in results] == ["pass", "pass"]
+    assert len(folders) == 1 and not folders[0].exists()
+
+
+@pytest.mark.parametrize(
+    ("contract", "message"),
+    [
+        ("no_such_module:contract", "No module named 'no_such_module'"),
+        (lambda folder: {"weights": 1}, "returns a dict, not a Setup"),
+    ],
+)
+def test_a_contract_that_fails(contract: Any, message: str) -> None:
+    registry = registry_of(ProviderSpec("depth", "here", PaintedDepth, contract=contract))
+    (result,) = run_checks(registry, "depth", "here", only={"construction"})
+    assert result.status == "fail"
+    assert message in result.message
+
+
+def test_a_matcher_is_given_features_of_its_family() -> None:
+    class Matcher:
+        def __init__(self, options: None, context: ProviderContext) -> None: ...
+
+        def match(self, *arguments: Any) -> Any: ...
+
+    sparse = frozenset({"sparse"})
+    registry = registry_of(ProviderSpec("matcher", "m", Matcher, capabilities=sparse, tags=("x",)))
+    (result,) = run_checks(registry, "matcher", "m", only={"output-rules"})
+    assert (result.status, result.message) == (
+        "fail",
+        "no features provider of the family x is installed",
+    )
+
+
+def test_providers_by_name_kind_and_distribution() -> None:
+    depth, normals = (ProviderSpec(kind, "here", PaintedDepth) for kind in ("depth", "normals"))
+    registry = registry_of(depth, normals)
+    both = [("depth", "here"), ("normals", "here")]
+    assert find_providers(registry, "here") == both
+    assert find_providers(registry, "mpsfm-here") == both
+    assert find_providers(registry, "normals/here") == both[1:]
+    with pytest.raises(InputError, match="no provider or plugin 'hear'; did you mean 'here'"):
+        find_providers(registry, "hear")
+
+
+def test_an_unavailable_provider_says_why() -> None:
+    registry = registry_of(ProviderSpec("depth", "needy", PaintedDepth, requires=("no_such_pkg",)))
+    ((kind, name),) = find_providers(registry, "needy")
+    with pytest.raises(ProviderError, match="needs no_such_pkg, not installed"):
+        run_checks(registry, kind, name)
+
+
+def test_ids_are_unique_and_every_check_says_what_it_is_about() -> None:
+    checks = all_checks()
+    ids = [id_of(check) for check in checks]
+    assert len(set(ids)) == len(ids)
+    assert all(check_of(name) is check for name, check in zip(ids, checks, strict=True))
+    assert all((check.__doc__ or "").strip().endswith(".") for check in checks)
+    assert set(CHECKS_BY_KIND) == {
+        "depth",
+        "normals",
+        "features",
+        "matcher",
+        "retrieval",
+        "mask",
+        "wrapper",
+    }

@@ -1,0 +1,265 @@
+"""Faults that a provider of any kind can have, here in a depth provider."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mpsfm_core import DepthPrior, Options, ProviderContext, ProviderSpec, View
+from mpsfm_core.registry import Registry
+from mpsfm_core.testing import Setup, run_checks
+from mpsfm_core.testing.checks_common import COMMON, STANDALONE
+from mpsfm_core.testing.contract import id_of
+from mpsfm_core.testing.painting import read_depth
+from mpsfm_core.testing.reference import PaintedDepth, depth_prior
+
+PAINTED = Setup(knows="painted")
+
+
+class Changed(PaintedDepth):
+    """Depth of a correct provider, changed by :meth:`change`."""
+
+    def predict(self, view: View) -> DepthPrior:
+        return depth_prior(self.change(read_depth(view.image), view))
+
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        raise NotImplementedError
+
+
+class NotANumber(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        values = np.ones((4, 4), np.float32)
+        prior = DepthPrior(values, None, np.ones((4, 4), bool))
+        values[2, 2] = np.nan
+        return prior
+
+
+class Double(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        return DepthPrior(np.ones((4, 4)), None, np.ones((4, 4), bool))
+
+
+class BareArray(PaintedDepth):
+    def predict(self, view: View) -> Any:
+        return read_depth(view.image)
+
+
+class Random(Changed):
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        return depth * np.random.default_rng().uniform(0.999, 1.001)
+
+
+class RandomWeights(Changed):
+    """Each instance is another one: weights that were never loaded."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(options, context)
+        self.factor = np.random.default_rng().uniform(0.9, 1.1)
+
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        return self.factor * depth
+
+
+class Smoothed(Changed):
+    """A filter over time, as in video."""
+
+    scale = 1.0
+
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        self.scale = 0.5 * self.scale + 0.5 * float(np.median(depth))
+        return depth * self.scale / max(float(np.median(depth)), 1e-6)
+
+
+class WritesToTheImage(Changed):
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        image = view.image.view()
+        image.flags.writeable = True
+        image //= 2
+        return depth
+
+
+class GoesByName(Changed):
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        return depth * len(view.name)
+
+
+class SecretlyCanonical(Changed):
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        return depth * view.camera.fx / 144.0
+
+
+class SharedBuffer(Changed):
+    """All instances work in one array of the class."""
+
+    buffer = np.zeros((0, 0))
+
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        SharedBuffer.buffer = depth
+        time.sleep(0.05)
+        return SharedBuffer.buffer
+
+
+class LocalPrior(PaintedDepth):
+    """Answers with a type of its own that nobody can import."""
+
+    def predict(self, view: View) -> DepthPrior:
+        class Mine(DepthPrior):
+            pass
+
+        prior = super().predict(view)
+        return Mine(prior.depth, prior.variance, prior.valid)
+
+
+class AsksTheNetwork(Changed):
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        socket.getaddrinfo("localhost", 443)
+        return depth
+
+
+class TriesTheNetwork(Changed):
+    """Survives without, but tells somebody about every view."""
+
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        with contextlib.suppress(OSError):
+            socket.getaddrinfo("localhost", 443)
+        return depth
+
+
+class KeepsViews(Changed):
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(options, context)
+        self.seen: list[np.ndarray] = []
+
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        self.seen.append(view.image.astype(np.float32))
+        return depth
+
+
+class LandscapeOnly(Changed):
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        if view.camera.height > view.camera.width:
+            raise RuntimeError("mat1 and mat2 shapes cannot be multiplied")
+        return depth
+
+
+class LeavesPadding(PaintedDepth):
+    """Pads to multiples of 16 for its network and does not cut the padding off."""
+
+    def predict(self, view: View) -> DepthPrior:
+        height, width = view.image.shape[:2]
+        padded = np.pad(view.image, ((0, -height % 16), (0, -width % 16), (0, 0)), mode="edge")
+        return depth_prior(read_depth(padded))
+
+
+class DividesBySpread(Changed):
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        if not np.ptp(view.image):
+            raise ZeroDivisionError("division by zero")
+        return depth
+
+
+class NeedsColour(Changed):
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        if (view.image == view.image[..., :1]).all():
+            raise ValueError("no saturation")
+        return depth
+
+
+class NeedsTwoRows(Changed):
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        return depth + 0 * np.gradient(depth)[0]
+
+
+class NeedsWidth(Changed):
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        if view.camera.width in range(2, 8):
+            raise RuntimeError("kernel size can't be greater than actual input size")
+        return depth
+
+
+class TripsOverMasks(Changed):
+    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
+        return depth if view.mask is None else depth * view.mask[::2]
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [
+        (NotANumber, "output-rules", "depth: must be finite"),
+        (Double, "output-rules", "depth: must have dtype float32"),
+        (BareArray, "output-rules", "must be a DepthPrior, got ndarray"),
+        (Random, "deterministic", "asked twice, the answer is another"),
+        (RandomWeights, "deterministic", "asked a second instance"),
+        (Smoothed, "no-state", "asked after other views"),
+        (WritesToTheImage, "inputs-unchanged", "changes the image"),
+        (GoesByName, "name-does-not-matter", "renamed view"),
+        (SecretlyCanonical, "intrinsics-declared", "depends on the focal length"),
+        (SharedBuffer, "threads", "in two threads at once"),
+        (LocalPrior, "pickles", "its answer cannot be pickled"),
+        (AsksTheNetwork, "offline", "fails without network"),
+        (TriesTheNetwork, "offline", "goes to the network: localhost"),
+        (KeepsViews, "memory-released", "keeps 3.. kB of each view"),
+        (LandscapeOnly, "portrait", "mat1 and mat2"),
+        (LeavesPadding, "odd-size", "shifted by .* px at the border"),
+        (DividesBySpread, "flat", "division by zero"),
+        (NeedsColour, "grayscale", "no saturation"),
+        (NeedsColour, "sixteen-bit", "no saturation"),
+        (NeedsTwoRows, "one-pixel", "Shape of array too small"),
+        (NeedsWidth, "thin-view", "kernel size"),
+        (TripsOverMasks, "masked", "broadcast"),
+    ],
+)
+def test_caught(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+    caught("depth", factory, check, message, PAINTED)
+
+
+def test_what_cannot_be_constructed_is_said_once(caught: Callable[..., None]) -> None:
+    def broken(options: Any, context: ProviderContext) -> None:
+        raise RuntimeError("CUDA is not available")
+
+    caught("depth", broken, "construction", "CUDA is not available", PAINTED)
+    registry = Registry()
+    registry.add(ProviderSpec("depth", "broken", broken))
+    results = run_checks(registry, "depth", "broken")
+    failed = {r.id for r in results if r.status == "fail"}
+    assert failed == {"construction", "output-rules"}
+    skipped = {r.message for r in results if r.status == "skip" and r.id != "light-import"}
+    assert skipped == {"construction fails"}
+
+
+def test_options_that_nobody_can_import(caught: Callable[..., None]) -> None:
+    class Local(Options):
+        factor: float = 1.0
+
+    caught(
+        "depth", PaintedDepth, "pickles", "its options cannot be pickled", PAINTED, options=Local
+    )
+
+
+def test_a_wrapper_of_nothing(caught: Callable[..., None]) -> None:
+    caught("wrapper", PaintedDepth, "specification", "has to declare 'wraps-depth'")
+
+
+def test_a_plugin_that_imports_what_it_does_not_need(install_plugin: Callable[..., str]) -> None:
+    source = """
+        import scipy
+        from mpsfm_core import ProviderSpec, hookimpl
+        @hookimpl
+        def mpsfm_providers():
+            return [ProviderSpec("depth", "heavy", "mpsfm_core.testing.reference:PaintedDepth")]
+    """
+    install_plugin("mpsfm-heavy", source)
+    (result,) = run_checks(Registry.discover(), "depth", "heavy", PAINTED, only={"light-import"})
+    assert (result.status, result.message.split()[-1]) == ("fail", "scipy")
+
+
+def test_every_common_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
+    """But for the one that cannot fail."""
+    caught = named(test_caught) | {"specification", "construction", "light-import"}
+    assert {id_of(check) for check in (*COMMON, *STANDALONE)} - caught == {"speed"}

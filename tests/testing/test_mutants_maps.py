@@ -1,0 +1,404 @@
+"""Depth and normals providers and wrappers with one fault each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from mpsfm_core import DepthPrior, NormalPrior, View
+from mpsfm_core.geometry import pixel_centers, rays
+from mpsfm_core.testing import Setup
+from mpsfm_core.testing.contract import CHECKS_BY_KIND, id_of
+from mpsfm_core.testing.examples import outdoor_example
+from mpsfm_core.testing.painting import RELATIVE_STD, read_depth, read_normals
+from mpsfm_core.testing.reference import (
+    PaintedDepth,
+    PaintedNormals,
+    Wrapper,
+    depth_prior,
+    normal_prior,
+)
+
+PAINTED = Setup(knows="painted")
+
+
+def ray_lengths(view: View) -> np.ndarray:
+    return np.linalg.norm(rays(view.camera, pixel_centers(*view.camera.size)), axis=-1)
+
+
+def shifted(image: np.ndarray, pixels: float) -> np.ndarray:
+    matrix = np.array([[1, 0, pixels], [0, 1, pixels]])
+    size = image.shape[1], image.shape[0]
+    return cv2.warpAffine(image.astype(np.float32), matrix, size, borderMode=cv2.BORDER_REPLICATE)
+
+
+def halved_by_corners(image: np.ndarray) -> np.ndarray:
+    """Half the size with the centres of the corner pixels kept in place (align_corners=True)."""
+    rows, columns = (max(side // 2, 2) for side in image.shape[:2])
+    x = np.linspace(0, image.shape[1] - 1, columns, dtype=np.float32)
+    y = np.linspace(0, image.shape[0] - 1, rows, dtype=np.float32)
+    return cv2.remap(image.astype(np.float32), *np.meshgrid(x, y), cv2.INTER_LINEAR)
+
+
+class RayLength(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        return depth_prior(read_depth(view.image) * ray_lengths(view))
+
+
+class Millimetres(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        return depth_prior(1000 * read_depth(view.image))
+
+
+class Disparity(PaintedDepth):
+    """Hands on what the network says, which is inverse depth."""
+
+    def predict(self, view: View) -> DepthPrior:
+        depth = read_depth(view.image)
+        return DepthPrior.from_arrays(1 / np.maximum(depth, 0.1), valid=depth > 0, metric=False)
+
+
+class BlueFirst(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        return depth_prior(read_depth(view.image[..., ::-1]))
+
+
+class HalfPixel(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        return depth_prior(read_depth(shifted(view.image, 0.5)))
+
+
+class AlignedCorners(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        return depth_prior(read_depth(halved_by_corners(view.image)))
+
+
+class CentreCrop(PaintedDepth):
+    """Cuts the border off, as training does, and forgets that the view has one."""
+
+    def predict(self, view: View) -> DepthPrior:
+        rows, columns = (side // 32 for side in view.image.shape[:2])
+        image = view.image[rows or None : -rows or None, columns or None : -columns or None]
+        return depth_prior(read_depth(image))
+
+
+class Transposed(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        return depth_prior(read_depth(view.image).T)
+
+
+class UpsideDown(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        return depth_prior(read_depth(view.image)[::-1])
+
+
+class FarSky(PaintedDepth):
+    """Ignores validity: what has no depth is 100 m away."""
+
+    def predict(self, view: View) -> DepthPrior:
+        depth = read_depth(view.image)
+        return depth_prior(np.where(depth > 0, depth, 100.0))
+
+
+class NothingIsSure(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        prior = super().predict(view)
+        checkers = np.indices(prior.shape).sum(axis=0) % 2 == 0
+        return DepthPrior.from_arrays(prior.depth, prior.variance, checkers)
+
+
+class Tilted(PaintedDepth):
+    """What lies to the right is taken to be farther away."""
+
+    def predict(self, view: View) -> DepthPrior:
+        slope = np.linspace(0.9, 1.1, view.camera.width)
+        return depth_prior(read_depth(view.image) * slope)
+
+
+class OldIntrinsics(PaintedDepth):
+    """Resizes the image to its network's size, and uses the focal length of the original."""
+
+    def predict(self, view: View) -> DepthPrior:
+        image = cv2.resize(view.image, (192, 144), interpolation=cv2.INTER_AREA)
+        return depth_prior(read_depth(image) * view.camera.fx / 144.0)
+
+
+class UpsideDownFocal(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        return depth_prior(read_depth(view.image) * 0.75 * view.camera.width / view.camera.fx)
+
+
+class StdForVariance(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        depth = read_depth(view.image)
+        return DepthPrior.from_arrays(depth, RELATIVE_STD * depth)
+
+
+class RelativeVariance(PaintedDepth):
+    """The square of the relative std, without the depth."""
+
+    def predict(self, view: View) -> DepthPrior:
+        depth = read_depth(view.image)
+        return DepthPrior.from_arrays(depth, np.full(depth.shape, RELATIVE_STD**2))
+
+
+class HugeVariance(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        depth = read_depth(view.image)
+        return DepthPrior.from_arrays(depth, np.full(depth.shape, 3e38))
+
+
+class TinyVariance(PaintedDepth):
+    """In kilometres squared: nothing is left of it beside what the calibration declares."""
+
+    def predict(self, view: View) -> DepthPrior:
+        prior = super().predict(view)
+        return replace(prior, variance=prior.variance * np.float32(1e-6))
+
+
+class TwoOpinions(PaintedDepth):
+    def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
+        depth, normals = super().predict_joint(view)
+        return depth_prior(depth.depth * 1.01), normals
+
+
+class JointNormalsTurned(PaintedDepth):
+    def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
+        depth, normals = super().predict_joint(view)
+        return depth, normal_prior(normals.normals * (-1, 1, 1), view)
+
+
+class FocalRatio(PaintedDepth):
+    def estimate_focal(self, view: View) -> float:
+        return 0.75
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message", "capabilities"),
+    [
+        (RayLength, "depth-is-z", "is the length of the ray", ()),
+        (Millimetres, "depth-scale", r"is called metric and is 1e\+03 times too large", ()),
+        (Disparity, "depth-scale", "not proportional to z", ()),
+        (BlueFirst, "depth-channel-order", "follows the blue channel", ()),
+        (HalfPixel, "depth-pixel-convention", r"shifted by \(\+0.50, \+0.50\) px", ()),
+        (AlignedCorners, "depth-pixel-convention", "at the border", ()),
+        (CentreCrop, "depth-pixel-convention", "at the border", ()),
+        (Transposed, "depth-orientation", "x and y are swapped", ()),
+        (UpsideDown, "depth-orientation", "upside down", ()),
+        (FarSky, "depth-validity", "100% of the pixels without any surface are called valid", ()),
+        (NothingIsSure, "depth-validity", "50% of the pixels with a surface are not valid", ()),
+        (Tilted, "depth-flip", "differs by .*% on the mirrored view", ()),
+        (OldIntrinsics, "depth-same-in-larger-view", "grows 2 times", ("intrinsics-aware",)),
+        (UpsideDownFocal, "depth-intrinsics", "changes by 0.67", ("intrinsics-aware",)),
+        (StdForVariance, "depth-variance", "is the std itself", ()),
+        (RelativeVariance, "depth-variance", "times what the stand-in reports", ()),
+        (HugeVariance, "depth-calibration", "after calibration, variance: must be finite", ()),
+        (TinyVariance, "depth-calibration", "changes nothing after calibration", ()),
+        (TwoOpinions, "depth-joint", "another depth than predict", ("joint-normals",)),
+        (JointNormalsTurned, "depth-joint", "normals are .* degrees off", ("joint-normals",)),
+        (FocalRatio, "depth-focal", "estimates 1 px, and 1 px", ("estimates-focal",)),
+    ],
+)
+def test_depth(
+    caught: Callable[..., None],
+    factory: type,
+    check: str,
+    message: str,
+    capabilities: tuple[str, ...],
+) -> None:
+    caught("depth", factory, check, message, PAINTED, *capabilities)
+
+
+class Away(PaintedNormals):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        prior = super().predict(view)
+        return replace(prior, normals=-prior.normals)
+
+
+class AwayAndDropped(PaintedNormals):
+    """Turned away, and all of them dropped for it."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        return normal_prior(-read_normals(view.image), view)
+
+
+class OpenGL(PaintedNormals):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        prior = super().predict(view)
+        return replace(prior, normals=prior.normals * np.float32([1, -1, -1]))
+
+
+class LeftIsRight(PaintedNormals):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        return normal_prior(read_normals(view.image) * (-1, 1, 1), view)
+
+
+class WorldFrame(PaintedNormals):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        world_from_camera = outdoor_example("painted").pose[:, :3].T
+        return normal_prior(read_normals(view.image) @ world_from_camera.T, view)
+
+
+class NotUnit(PaintedNormals):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        prior = super().predict(view)
+        return NormalPrior(1.1 * prior.normals, prior.variance, prior.valid)
+
+
+class NormalsBlueFirst(PaintedNormals):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        return normal_prior(read_normals(view.image[..., ::-1]), view)
+
+
+class NormalsHalfPixel(PaintedNormals):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        return normal_prior(read_normals(shifted(view.image, -0.5)), view)
+
+
+class NormalsStd(PaintedNormals):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        prior = super().predict(view)
+        return replace(prior, variance=np.sqrt(prior.variance))
+
+
+class Degrees(PaintedNormals):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        prior = super().predict(view)
+        return replace(prior, variance=np.degrees(np.degrees(prior.variance)))
+
+
+class Leaning(PaintedNormals):
+    """What it sees leans a little to the left."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        return normal_prior(read_normals(view.image) - (0.2, 0, 0), view)
+
+
+class Stretched(PaintedNormals):
+    """Goes by the number of columns instead of by angles."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        return normal_prior(read_normals(view.image) * (1, 192 / view.camera.width, 1), view)
+
+
+class EndlessVariance(PaintedNormals):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        prior = super().predict(view)
+        return replace(prior, variance=prior.variance * np.float32(1e-12))
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [
+        (Away, "output-rules", r"must face the camera \(n . ray < 0\), not so at 100 %"),
+        (AwayAndDropped, "normals-frame", "only 0 of .* pixels with a surface are valid"),
+        (OpenGL, "output-rules", "must face the camera"),
+        (LeftIsRight, "normals-frame", "x is negated"),
+        (WorldFrame, "normals-frame", "in the world's frame"),
+        (NotUnit, "output-rules", "must have unit length"),
+        (NormalsBlueFirst, "normals-channel-order", "blue, green, red"),
+        (NormalsHalfPixel, "normals-pixel-convention", r"shifted by \(-0.*, -0.*\) px"),
+        (NormalsStd, "normals-variance", "is the std itself"),
+        (Degrees, "output-rules", r"must be in rad\^2"),
+        (Leaning, "normals-flip", "on the mirrored view"),
+        (Stretched, "normals-same-in-larger-view", "off in an enlarged view"),
+        (EndlessVariance, "normals-calibration", "changes nothing after calibration"),
+    ],
+)
+def test_normals(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+    caught("normals", factory, check, message, PAINTED)
+
+
+class DropsVariance(Wrapper):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        return replace(super().predict(view, depth), variance=None)
+
+
+class WantsVariance(Wrapper):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        prior = super().predict(view, depth)
+        return replace(prior, variance=prior.variance + prior.variance)
+
+
+class AlwaysMetric(Wrapper):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        return replace(super().predict(view, depth), metric=True)
+
+
+class OfItsOwn(Wrapper):
+    """Scales to a mean depth that it thinks right."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        prior = super().predict(view, depth)
+        return depth_prior(prior.depth * 4 / np.median(prior.depth))
+
+
+class KeepsDepth(Wrapper):
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        return self.inner.predict(view)
+
+
+class MirrorNotUndone(Wrapper):
+    """A second pass in the mirror that is averaged as it comes."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        image = np.ascontiguousarray(view.image[:, ::-1])
+        second = self.inner.predict(replace(view, image=image))
+        return depth_prior((super().predict(view).depth + second.depth) / 2)
+
+
+class MirroredNormals(Wrapper):
+    """A second pass in the mirror whose x components keep their sign."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        second = self.inner.predict(replace(view, image=np.ascontiguousarray(view.image[:, ::-1])))
+        return normal_prior(second.normals[:, ::-1], view)
+
+
+class FillsHoles(Wrapper):
+    """Calls everything valid, the sky too."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        prior = super().predict(view, depth)
+        filled = np.where(prior.valid[..., None], prior.normals, np.float32([0, 0, -1]))
+        return NormalPrior(filled, None, np.ones(prior.shape, bool))
+
+
+class DoublesIntrinsics(Wrapper):
+    """Reduces large views and forgets that depth has a unit."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        prior = super().predict(view, depth)
+        return prior if view.camera.width < 300 else depth_prior(2 * prior.depth)
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message", "wraps"),
+    [
+        (DropsVariance, "wrapper-keeps-variance", "drops the variance", "depth"),
+        (DropsVariance, "wrapper-keeps-variance", "drops the variance", "normals"),
+        (WantsVariance, "wrapper-without-variance", "NoneType", "depth"),
+        (AlwaysMetric, "wrapper-keeps-unit", "calls depth metric=True", "depth"),
+        (OfItsOwn, "wrapper-uses-the-provider", "1.00 times the depth outside", "depth"),
+        (KeepsDepth, "wrapper-hands-on-depth", "does not hand on the depth", "normals"),
+        (MirrorNotUndone, "depth-scale", "not proportional to z", "depth"),
+        (MirroredNormals, "normals-frame", "x is negated", "normals"),
+        (FillsHoles, "normals-validity", "without any surface are called valid", "normals"),
+        (DoublesIntrinsics, "depth-same-in-larger-view", "grows 2 times", "depth"),
+    ],
+)
+def test_wrappers(
+    caught: Callable[..., None], factory: type, check: str, message: str, wraps: str
+) -> None:
+    caught("wrapper", factory, check, message, None, f"wraps-{wraps}")
+
+
+def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
+    kinds = ("depth", "normals", "wrapper")
+    checks = {id_of(check) for kind in kinds for check in CHECKS_BY_KIND[kind]}
+    assert checks - named(test_depth, test_normals, test_wrappers) == set()

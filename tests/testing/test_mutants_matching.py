@@ -1,0 +1,326 @@
+"""Features, matchers, retrieval and masks with one fault each."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mpsfm_core import (
+    DenseMatches,
+    Features,
+    PairDepth,
+    PairMatches,
+    ProviderContext,
+    SparseMatches,
+    View,
+)
+from mpsfm_core.builtin.mutual_nearest import MutualNearest
+from mpsfm_core.builtin.options import MutualNearestOptions, SiftOptions
+from mpsfm_core.builtin.sift import Sift
+from mpsfm_core.testing import Setup
+from mpsfm_core.testing.contract import CHECKS_BY_KIND, id_of
+from mpsfm_core.testing.examples import Example
+from mpsfm_core.testing.reference import (
+    PaintedMask,
+    Thumbnail,
+    ToldMatcher,
+    ToldOptions,
+    tell,
+)
+
+PAINTED = Setup(knows="painted")
+
+
+class Detector(Sift):
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(SiftOptions(max_keypoints=400), context)
+
+
+class RowsFirst(Detector):
+    def extract(self, view: View) -> Features:
+        found = super().extract(view)
+        inside = np.minimum(found.keypoints[:, ::-1], view.camera.size)
+        return replace(found, keypoints=inside)
+
+
+class IntegerCentres(Detector):
+    def extract(self, view: View) -> Features:
+        found = super().extract(view)
+        return replace(found, keypoints=np.maximum(found.keypoints - 0.5, 0))
+
+
+class Outside(Detector):
+    def extract(self, view: View) -> Features:
+        found = super().extract(view)
+        return replace(found, keypoints=found.keypoints + view.camera.width / 2)
+
+
+class SortedAgain(Detector):
+    """Sorts keypoints by where they are and leaves the descriptors as they were."""
+
+    def extract(self, view: View) -> Features:
+        found = super().extract(view)
+        return replace(found, keypoints=found.keypoints[np.argsort(found.keypoints[:, 0])])
+
+
+class EmptyIsFlat(Detector):
+    def extract(self, view: View) -> Features:
+        found = super().extract(view)
+        return found if len(found) else replace(found, descriptors=np.empty((0, 1), np.float32))
+
+
+class NotFinite(Detector):
+    def extract(self, view: View) -> Features:
+        found = super().extract(view)
+        descriptors = found.descriptors.copy()
+        broken = replace(found, descriptors=descriptors)
+        descriptors[:1] = np.nan
+        return broken
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [
+        (RowsFirst, "features-axes", "x and y are swapped"),
+        (IntegerCentres, "features-pixel-convention", r"shifted by .-0.49, -0.49. px"),
+        (Outside, "output-rules", "keypoints: must lie inside of the 192x144 view"),
+        (SortedAgain, "features-descriptors", "of the nearest descriptors are the same point"),
+        (EmptyIsFlat, "features-dimension", "1 and 128 values"),
+        (NotFinite, "output-rules", "descriptors: must be finite"),
+    ],
+)
+def test_features(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+    caught("features", factory, check, message)
+
+
+class Nearest(MutualNearest):
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(MutualNearestOptions(), context)
+
+    def match(self, *arguments: Any) -> PairMatches:
+        matches = super().match(*arguments)
+        assert matches.sparse is not None
+        return PairMatches(self.change(matches.sparse, *arguments))
+
+    def change(self, found: SparseMatches, *arguments: Any) -> SparseMatches:
+        raise NotImplementedError
+
+
+class ColumnsSwapped(Nearest):
+    def change(self, found: SparseMatches, a: View, b: View, fa: Features, fb: Features) -> Any:
+        inside = (found.indices < min(len(fa), len(fb))).all(axis=1)
+        return SparseMatches(found.indices[inside][:, ::-1], found.scores[inside])
+
+
+class SortsViews(Nearest):
+    """Puts the larger name second and forgets to turn the matches back."""
+
+    def match(self, a: View, b: View, fa: Features, fb: Features) -> PairMatches:
+        return super().match(*((b, a, fb, fa) if a.name < b.name else (a, b, fa, fb)))
+
+    def change(self, found: SparseMatches, *arguments: Any) -> SparseMatches:
+        return found
+
+
+class OutOfRange(Nearest):
+    def change(self, found: SparseMatches, *arguments: Any) -> SparseMatches:
+        return SparseMatches(found.indices + 5000, found.scores)
+
+
+class Duplicates(Nearest):
+    def change(self, found: SparseMatches, *arguments: Any) -> SparseMatches:
+        return SparseMatches(found.indices.repeat(2, axis=0), found.scores.repeat(2))
+
+
+class Percent(Nearest):
+    def change(self, found: SparseMatches, *arguments: Any) -> SparseMatches:
+        return SparseMatches(found.indices, 100 * found.scores)
+
+
+class Distances(Nearest):
+    """Half of the matches are random; the score is a distance, small for good ones."""
+
+    def change(self, found: SparseMatches, *arguments: Any) -> SparseMatches:
+        half = len(found) // 2
+        indices = found.indices.copy()
+        indices[:half, 1] = np.roll(indices[:half, 1], 7)
+        scores = np.where(np.arange(len(found)) < half, 0.9, 0.1).astype(np.float32)
+        keep = np.ones(len(found), bool)
+        keep[: half // 4] = False
+        return SparseMatches(indices[keep], scores[keep])
+
+
+class WantsFeatures(MutualNearest):
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(MutualNearestOptions(), context)
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        if not (len(fa) and len(fb)):
+            raise IndexError("index 0 is out of bounds for axis 0 with size 0")
+        return super().match(a, b, fa, fb)
+
+
+class WantsTwoNeighbours(MutualNearest):
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(MutualNearestOptions(), context)
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        if len(fb) == 1:
+            raise ValueError("kth(=1) out of bounds (1)")
+        return super().match(a, b, fa, fb)
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [
+        (ColumnsSwapped, "matcher-sides", "matches are right"),
+        (SortsViews, "matcher-order", "indices: must be below|matches are right"),
+        (OutOfRange, "output-rules", "indices: must be below"),
+        (Duplicates, "output-rules", "must use each feature at most once"),
+        (Percent, "output-rules", r"scores: must lie in \[0, 1\]"),
+        (Distances, "matcher-scores", "right matches score 0.1.*, wrong ones 0.[89]"),
+        (WantsFeatures, "matcher-no-features", "out of bounds"),
+        (WantsTwoNeighbours, "matcher-few-features", "kth"),
+    ],
+)
+def test_sparse_matchers(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
+    caught("matcher", factory, check, message, None, "sparse")
+
+
+class SidesSwapped(ToldMatcher):
+    def matches(self, points_a: np.ndarray, points_b: np.ndarray) -> DenseMatches:
+        return super().matches(points_b, points_a)
+
+
+class DenseIntegerCentres(ToldMatcher):
+    def matches(self, points_a: np.ndarray, points_b: np.ndarray) -> DenseMatches:
+        return super().matches(np.maximum(points_a - 0.5, 0), np.maximum(points_b - 0.5, 0))
+
+
+class DepthSwapped(ToldMatcher):
+    def depths(self, a: Example, b: Example) -> PairDepth:
+        return super().depths(b, a)
+
+
+class DepthOfRays(ToldMatcher):
+    def depths(self, a: Example, b: Example) -> PairDepth:
+        depth = super().depths(a, b)
+        height, width = depth.depth_a.shape
+        x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) - height / 2)
+        rays = np.sqrt(1 + (x**2 + y**2) / a.camera.fx**2).astype(np.float32)
+        return replace(depth, depth_a=replace(depth.depth_a, depth=depth.depth_a.depth * rays))
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [
+        (SidesSwapped, "matcher-sides", "the two sides are exchanged"),
+        (DenseIntegerCentres, "matcher-pixel-convention", r"shifted by \(\+0.50, \+0.50\) px"),
+        (DepthSwapped, "matcher-pair-depth", "the two sides are exchanged"),
+        (DepthOfRays, "matcher-pair-depth", r"depth goes as z \* \(ray length / z\)"),
+    ],
+)
+def test_dense_matchers(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
+    def told(folder: Path) -> Setup:
+        return Setup({"folder": folder}, "told", lambda example: tell(folder, example))
+
+    caught("matcher", factory, check, message, told, "dense", "pair-depth", options=ToldOptions)
+
+
+class Infinite(Thumbnail):
+    def describe(self, view: View) -> np.ndarray:
+        return super().describe(view) / np.float32(0)
+
+
+class Rows(Thumbnail):
+    """A profile of the view, as long as the view is high."""
+
+    def describe(self, view: View) -> np.ndarray:
+        profile = view.image.mean(axis=(1, 2)).astype(np.float32)
+        return profile / np.linalg.norm(profile)
+
+
+class NotNormalised(Thumbnail):
+    def describe(self, view: View) -> np.ndarray:
+        return view.image[:8, :8].astype(np.float32).ravel()
+
+
+class Hash(Thumbnail):
+    """Says whether two views are the same, and nothing about whether they overlap."""
+
+    def describe(self, view: View) -> np.ndarray:
+        digest = hashlib.sha512(view.image.tobytes() + b"5").digest()
+        values = np.frombuffer(digest, np.uint8).astype(np.float32) - 127.5
+        return values / np.linalg.norm(values)
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [
+        (Infinite, "output-rules", "descriptor: must be finite"),
+        (Rows, "retrieval-dimension", "descriptors have .* and .* values"),
+        (NotNormalised, "retrieval-self-similarity", "lengths of descriptors are"),
+        (Hash, "retrieval-overlap", "to its neighbour"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:divide by zero", "ignore:invalid value")
+def test_retrieval(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+    caught("retrieval", factory, check, message)
+
+
+class Inverted(PaintedMask):
+    def mask(self, view: View) -> np.ndarray:
+        return ~super().mask(view)
+
+
+class Reduced(PaintedMask):
+    def mask(self, view: View) -> np.ndarray:
+        return super().mask(view)[::2, ::2] if min(view.camera.size) > 2 else super().mask(view)
+
+
+class Grey(PaintedMask):
+    def mask(self, view: View) -> np.ndarray:
+        return 255 * super().mask(view).astype(np.uint8)
+
+
+class Displaced(PaintedMask):
+    def mask(self, view: View) -> np.ndarray:
+        return np.roll(super().mask(view), view.camera.height // 2, axis=0)
+
+
+class LeftHalf(PaintedMask):
+    def mask(self, view: View) -> np.ndarray:
+        mask = super().mask(view)
+        mask[:, : mask.shape[1] // 2] = True
+        return mask
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [
+        (Inverted, "mask-polarity", "is inverted"),
+        (Reduced, "output-rules", "must have the view's shape"),
+        (Grey, "output-rules", "2-dimensional bool"),
+        (Displaced, "mask-place", "of the pixels have the wrong value"),
+        (LeftHalf, "mask-flip", "of the pixels of the mirrored view"),
+    ],
+)
+def test_masks(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+    caught("mask", factory, check, message, PAINTED)
+
+
+def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
+    kinds = ("features", "matcher", "retrieval", "mask")
+    checks = {id_of(check) for kind in kinds for check in CHECKS_BY_KIND[kind]}
+    tests = (test_features, test_sparse_matchers, test_dense_matchers, test_retrieval, test_masks)
+    assert checks - named(*tests) == set()
