@@ -47,9 +47,6 @@ class Comparison:
         self._alignments = alignments
         self._options = options
         self._raw = RawPriors(bench)
-        depth = bench.registry.calibration("depth", bench.config.depth)
-        assert isinstance(depth, DepthCalibration)
-        self._depth_calibration = depth
 
     @property
     def provider(self) -> ActiveProvider:
@@ -120,6 +117,8 @@ class Comparison:
         if provider is not None and not provider.can("needs-depth"):
             return self._raw.predict_normals(index, None)
         depth, normals = self._raw.predict(index)
-        if normals is None:
-            normals = self._raw.predict_normals(index, self._depth_calibration.apply(depth))
-        return normals
+        if normals is not None:
+            return normals
+        calibration = self._bench.registry.calibration("depth", self._bench.config.depth)
+        assert isinstance(calibration, DepthCalibration)
+        return self._raw.predict_normals(index, calibration.apply(depth))
