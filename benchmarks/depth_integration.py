@@ -306,7 +306,7 @@ def ablation(analytic: list[Problem], real: list[Problem]) -> dict[str, Any]:
         *({"independent_normals": v} for v in (100.0, 300.0, 3000.0, 10_000.0)),
         *({"sharpness": v} for v in (0.5, 1.0, 4.0)),
         *({"normal_limit": v} for v in (2.0, 3.0, 12.0, 50.0, 1e3)),
-        *({"prior_limit": v} for v in (2.0, 5.0, 1e3)),
+        *({"prior_scale": v} for v in (0.5, 2.0, 1e3)),
         *({"point_scale": v} for v in (1.0, 3.0, 1e3)),
         *({"cg_iterations": v} for v in (1, 3, 5)),
         *({"over_relaxation": v} for v in (1.0, 1.2, 1.6)),

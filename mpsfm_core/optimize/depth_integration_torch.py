@@ -2,7 +2,7 @@
 
 Same energy, same preconditioner, same order of operations, so that results agree with the numpy
 kernels to rounding; lines are solved by parallel scans. Each level of the V-cycle is some hundred
-small operations: on a GPU this pays off for large maps only, on a CPU never.
+small operations, whose launch a GPU can only hide on large maps; on a CPU the kernels are faster.
 
 Planes of a level are framed by zeros, one pixel at the top and left and two at the bottom and
 right, so that all strided neighbours of all pixels exist.
@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from mpsfm_core.data import Float64
-from mpsfm_core.optimize.integration_energy import MIN_PRIOR_SHARE, EnergyTerms
+from mpsfm_core.optimize.integration_energy import EnergyTerms
 from mpsfm_core.optimize.multigrid import Solution
 
 _TINY = 1e-30
@@ -85,13 +85,12 @@ class TorchSolver:
         energy = along_x + along_y
         gradient = flux_x.roll(1, 1) - flux_x + flux_y.roll(1, 0) - flux_y
         offset = here - self._prior
-        full = self._prior_weight * self._precision.double()
-        limit = self._losses.prior_limit**2
-        square = self._precision * offset**2
-        share = (limit / (limit + square)) ** 2
-        energy += float((full * offset**2 * limit / (limit + square)).sum())
-        gradient += full * share * offset
-        mass = full * share.clamp(min=MIN_PRIOR_SHARE)
+        scale = self._losses.prior_scale**2
+        ratio = self._precision * offset**2 / scale
+        root = (1 + ratio).sqrt()
+        energy += float(2 * self._prior_weight * scale * (ratio / (root + 1)).sum())
+        mass = self._prior_weight * self._precision / root
+        gradient += mass * offset
         scale = self._losses.point_scale**2
         offset = here.flatten()[self._pixels] - self._targets
         ratio = self._certainty * offset**2 / scale

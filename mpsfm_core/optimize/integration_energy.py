@@ -3,7 +3,7 @@
 Over the log depth z of all pixels (paper appendix B; the logarithm makes perspective linear):
 
     energy = sum over pixels and both axes of  w_n / var_r * soft_min(r_+^2, r_-^2, limit)
-           + sum over pixels of                w_d * geman_mcclure((z - log d)^2 / var_log_d)
+           + sum over pixels of                w_d * charbonnier((z - log d)^2 / var_log_d)
            + sum over sparse points of         cauchy((z - log D)^2 / var_log_D)
 
 r_+ and r_- are the one-sided residuals of bilateral normal integration (Cao et al., ECCV 2022),
@@ -16,9 +16,11 @@ and with sharpness k
     soft_min(a, b, limit) = -log((exp(-k a) + exp(-k b) + exp(-k limit)) / (2 + exp(-k limit))) / k
 
 says that the surface continues to one side, to the other, or to none. Its derivatives are the
-sigmoid weights of the published method, which never had an energy of its own. All three losses are
-concave in the squared residuals, so that re-weighted least squares majorises this energy: a step
-that lowers the quadratic, however inexact, cannot raise the energy.
+sigmoid weights of the published method, which never had an energy of its own. The prior's loss goes
+on growing, 2 c^2 (sqrt(1 + s / c^2) - 1): a truncated one, as in the paper, loses strips at depth
+edges to the vague normals there. All three losses are concave in the squared residuals, so that
+re-weighted least squares majorises this energy: a step that lowers the quadratic, however inexact,
+cannot raise the energy.
 """
 # mypy: allow-untyped-decorators
 
@@ -41,19 +43,17 @@ _SQRT_3 = 1.7320508075688772
 _MIN_NORMAL_VARIANCE = 1e-4
 MIN_LOG_VARIANCE = 1e-6
 MAX_LOG_VARIANCE = 1e2
-# What a pixel keeps of its prior's weight, however far it is: the system stays definite.
-MIN_PRIOR_SHARE = 1e-4
 # Normals seen under more than 89.9 deg say nothing about the slope of depth.
 _MIN_FACING = 2e-3
 
 
 class Losses(NamedTuple):
-    """Scales of the robust losses: `sharpness` and `normal_limit` of the soft minimum (squared
-    residual), `prior_limit` and `point_scale` in standard deviations."""
+    """`sharpness` and `normal_limit` of the soft minimum (in squared residuals), and the scales of
+    the other losses in standard deviations."""
 
     sharpness: float
     normal_limit: float
-    prior_limit: float
+    prior_scale: float
     point_scale: float
 
 
@@ -132,7 +132,7 @@ def majorise(z: Float64, terms: EnergyTerms) -> Majoriser:
     energy = _add_normals(framed, terms.normals, 0, losses, east, gradient)
     energy += _add_normals(framed, terms.normals, 1, losses, south, gradient)
     mass = np.empty(z.shape, np.float32)
-    energy += _add_prior(z, terms.prior, losses.prior_limit, mass, gradient[inner])
+    energy += _add_prior(z, terms.prior, losses.prior_scale, mass, gradient[inner])
     of_points = _add_points(z, terms.points, losses.point_scale, mass, gradient[inner])
     energy += of_points
     mean = of_points / max(len(terms.points.rows), 1)
@@ -301,19 +301,19 @@ def _log(x: float) -> float:
 
 @_kernel
 def _add_prior(
-    z: Float64, prior: PriorTerms, limit: float, mass: Float32, gradient: Float64
+    z: Float64, prior: PriorTerms, scale: float, mass: Float32, gradient: Float64
 ) -> float:
-    """Geman-McClure loss, a smooth truncated L2, of the depth prior; sets the mass."""
+    """Charbonnier loss of the depth prior; sets the mass."""
     energy = 0.0
     for i in range(z.shape[0]):
         for j in range(z.shape[1]):
             offset, precision = z[i, j] - prior.log_depth[i, j], prior.precision[i, j]
-            square = precision * offset * offset
-            kept = limit * limit / (limit * limit + square)
-            energy += prior.weight * square * kept
-            full, share = prior.weight * precision, kept * kept
-            mass[i, j] = full * max(share, MIN_PRIOR_SHARE)
-            gradient[i, j] += full * share * offset
+            ratio = precision * offset * offset / (scale * scale)
+            root = np.sqrt(1.0 + ratio)
+            energy += prior.weight * 2.0 * scale * scale * ratio / (root + 1.0)
+            slope = prior.weight * precision / root
+            mass[i, j] = slope
+            gradient[i, j] += slope * offset
     return energy
 
 

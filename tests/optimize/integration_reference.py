@@ -174,11 +174,11 @@ class ReferenceIntegration:
         """Depth prior and sparse points."""
         offset = z - self.prior
         square = self.prior_precision * offset**2
-        limit = self.options.prior_limit**2
-        full, share = self.prior_weight * self.prior_precision, (limit / (limit + square)) ** 2
-        mass = full * np.maximum(share, 1e-4)
-        energy = self.prior_weight * float((limit * square / (limit + square)).sum())
-        gradient = full * share * offset
+        scale = self.options.prior_scale**2
+        root = np.sqrt(1 + square / scale)
+        energy = self.prior_weight * 2 * scale * float((root - 1).sum())
+        mass = self.prior_weight * self.prior_precision / root
+        gradient = mass * offset
         offset = z[self.pixel] - self.target
         scale = self.options.point_scale**2
         square = self.precision * offset**2

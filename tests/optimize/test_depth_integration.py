@@ -107,6 +107,17 @@ def test_the_quadratic_majorises_the_energy(seed):
         assert energy <= quadratic * (1 + 1e-5)
 
 
+def test_the_pull_of_the_prior_never_fades():
+    depth, normals, _ = random_problem((3, 4), 0)
+    terms = only("prior", DepthIntegrator(depth, normals, camera_of((3, 4)))._terms(NO_ANCHORS, 1))
+    pulls = [
+        majorise(terms.prior.log_depth + offset, terms).gradient for offset in (0.05, 0.5, 5.0)
+    ]
+    assert (pulls[0] > 0).all()
+    assert (pulls[1] > pulls[0]).all()
+    assert (pulls[2] > pulls[1]).all()
+
+
 def test_reaches_the_energy_of_the_reference():
     camera = PinholeCamera(64, 43, 58.0, 58.0, 32.0, 21.5)
     scene, pose = room_scene(), arc_poses(1, 0)[0]
