@@ -30,7 +30,7 @@ class Warp:
     def source(self, rows: Int64, columns: Int64) -> Float64:
         """Pixels (n, 2) of the view for cells of the grid."""
         height, width = self.certainty.shape
-        xy = np.stack([columns, rows], axis=-1) + 0.5
+        xy = np.stack([columns, rows], axis=-1).astype(np.float64) + 0.5
         return scale_pixels(xy, (width, height), self.size)
 
     def at(self, xy: Float64) -> tuple[Float64, Float64]:

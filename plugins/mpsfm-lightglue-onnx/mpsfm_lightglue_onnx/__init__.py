@@ -1,0 +1,1 @@
+"""SuperPoint, DISK and LightGlue with ONNX Runtime."""

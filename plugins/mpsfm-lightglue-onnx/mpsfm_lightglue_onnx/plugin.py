@@ -1,0 +1,74 @@
+"""Announces the providers. Imports neither onnxruntime nor OpenCV."""
+
+from __future__ import annotations
+
+from mpsfm_core import ProviderSpec, hookimpl
+from mpsfm_lightglue_onnx import options as opt
+
+_REQUIRES = ("onnxruntime",)
+_HINT = "pip install mpsfm-lightglue-onnx"
+
+
+@hookimpl
+def mpsfm_providers() -> list[ProviderSpec]:
+    """Two detectors and their matchers."""
+    return [
+        ProviderSpec(
+            kind="features",
+            name="superpoint",
+            factory="mpsfm_lightglue_onnx.features:SuperPoint",
+            options=opt.SuperPointOptions,
+            summary="SuperPoint: the paper's features",
+            requires=_REQUIRES,
+            install_hint=_HINT,
+            code_license="Apache-2.0",
+            weights_license=opt.SUPERPOINT.license,
+            weights=(opt.SUPERPOINT,),
+            tags=("superpoint",),
+            contract="mpsfm_lightglue_onnx.contract:superpoint",
+        ),
+        ProviderSpec(
+            kind="features",
+            name="disk-onnx",
+            factory="mpsfm_lightglue_onnx.features:Disk",
+            options=opt.DiskOptions,
+            summary="DISK without torch",
+            requires=_REQUIRES,
+            install_hint=_HINT,
+            code_license="Apache-2.0",
+            weights_license=opt.DISK.license,
+            weights=(opt.DISK,),
+            tags=("disk",),
+            contract="mpsfm_lightglue_onnx.contract:disk",
+        ),
+        ProviderSpec(
+            kind="matcher",
+            name="lightglue-superpoint",
+            factory="mpsfm_lightglue_onnx.matcher:LightGlue",
+            options=opt.LightGlueOptions,
+            capabilities=frozenset({"sparse"}),
+            summary="LightGlue: learned matching of SuperPoint",
+            requires=_REQUIRES,
+            install_hint=_HINT,
+            code_license="Apache-2.0",
+            weights_license=opt.LIGHTGLUE_SUPERPOINT.license,
+            weights=(opt.LIGHTGLUE_SUPERPOINT,),
+            tags=("superpoint",),
+            contract="mpsfm_lightglue_onnx.contract:lightglue",
+        ),
+        ProviderSpec(
+            kind="matcher",
+            name="lightglue-disk-onnx",
+            factory="mpsfm_lightglue_onnx.matcher:LightGlue",
+            options=opt.DiskLightGlueOptions,
+            capabilities=frozenset({"sparse"}),
+            summary="LightGlue: learned matching of DISK, without torch",
+            requires=_REQUIRES,
+            install_hint=_HINT,
+            code_license="Apache-2.0",
+            weights_license=opt.LIGHTGLUE_DISK.license,
+            weights=(opt.LIGHTGLUE_DISK,),
+            tags=("disk",),
+            contract="mpsfm_lightglue_onnx.contract:lightglue",
+        ),
+    ]

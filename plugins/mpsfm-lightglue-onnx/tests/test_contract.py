@@ -1,0 +1,7 @@
+"""The contract, on a stand-in detector of spots and a matcher by mutual nearest descriptors."""
+
+from mpsfm_core.testing import contract_tests
+
+test_superpoint = contract_tests("features", "superpoint")
+test_disk = contract_tests("features", "disk-onnx")
+test_lightglue = contract_tests("matcher", "lightglue-superpoint")
