@@ -187,9 +187,9 @@ class Mapper:
             references = local_bundle(scene, reference, options.num_neighbors, self.scores)
             references = [other for other in references if not self.refuted[image, other]]
             found = correspondences(scene, image, references, options)
+            attempt, seed = self.attempts[image], self.options.seed
             self.attempts[image] += 1
-            seed = self.options.seed + self.attempts[image]
-            poses = find_poses(scene, image, found, options, seed)
+            poses = find_poses(scene, image, found, options, seed=seed, attempt=attempt)
             snapshot = scene.snapshot()
             poses = [self._polished(image, pose, found, snapshot) for pose in poses]
             poses.sort(key=lambda pose: -pose.support)

@@ -52,6 +52,8 @@ class RegistrationOptions(Options):
     """Support above which a pose needs no rivals from resampled matches (ours)."""
     num_resamples: int = Field(16, ge=0)
     """Random halves of the matches that are tried otherwise, others at each attempt (ours)."""
+    resampled_attempts: int = Field(3, ge=0)
+    """Attempts at an image after which no more halves are tried (ours)."""
     num_polished: int = Field(3, ge=1)
     """Best supported distinct poses that are bundle-adjusted before one is chosen (ours)."""
     min_inlier_ratio: float = Field(0.25, gt=0, le=1)

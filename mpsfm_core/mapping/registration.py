@@ -146,12 +146,19 @@ def correspondences(
 
 
 def find_poses(
-    scene: Scene, image: int, found: Correspondences, options: RegistrationOptions, seed: int
+    scene: Scene,
+    image: int,
+    found: Correspondences,
+    options: RegistrationOptions,
+    *,
+    seed: int,
+    attempt: int,
 ) -> list[AbsolutePose]:
     """A few distinct poses of an image from its correspondences, best support first.
 
     While no pose is supported by nearly all matches, more are made from random halves of the
-    matches: one wrong match or one bad minimum of few matches does not decide then.
+    matches: one wrong match or one bad minimum of few matches does not decide then. ``attempt``
+    counts how often the image was tried; each takes other halves, for a few attempts.
     """
     poses: list[AbsolutePose] = []
 
@@ -160,8 +167,9 @@ def find_poses(
         poses.sort(key=lambda pose: -pose.support)
 
     rate(_hypotheses(scene, image, found, options, seed))
-    if options.lifting and (not poses or poses[0].inlier_share < options.confident_share):
-        rate(_resampled_hypotheses(scene, image, found, options, seed))
+    confident = bool(poses) and poses[0].inlier_share >= options.confident_share
+    if options.lifting and not confident and attempt < options.resampled_attempts:
+        rate(_resampled_hypotheses(scene, image, found, options, seed + attempt))
     return _distinct(poses)[: options.num_polished]
 
 
@@ -279,7 +287,8 @@ def _relative_pose(
         pycolmap.RANSACOptions(
             max_error=0.5 * options.max_support_error_px,
             min_inlier_ratio=options.min_inlier_ratio,
-            max_num_trials=3000,
+            min_num_trials=50,
+            max_num_trials=500,  # a half without a good sample is followed by another half
             random_seed=seed,
         ),
     )
