@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mpsfm_core.data import MappingProblem
+from mpsfm_core.data import MappingProblem, VerifiedPair
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.mapping.depth_consistency import check_image
@@ -65,6 +65,11 @@ class Observed(Mapper):
 
     case: SymmetricProblem
     verdicts: list[tuple[bool, bool]]
+    first: int
+
+    def _try_pair(self, pair: VerifiedPair) -> str | None:
+        self.first = pair.image_a
+        return super()._try_pair(pair)
 
     def _contradiction(self, image: int, limit: float) -> str | None:
         reason = super()._contradiction(image, limit)
@@ -73,8 +78,7 @@ class Observed(Mapper):
 
     def _misplaced(self, image: int) -> bool:
         """Whether an image is nearer to its twin's place, the first image being in its own."""
-        scene, poses = self.scene, np.array(self.case.poses)
-        first = next(i for i in scene.registered_images() if i != image)
+        scene, poses, first = self.scene, np.array(self.case.poses), self.first
         turn = poses[first, :, :3].T @ scene.rotations[first]
         centers, truth = scene.centers(), camera_center(poses[..., :3], poses[..., 3])
         step = turn @ (centers[image] - centers[first]) / scene.maps[first].scale

@@ -8,8 +8,8 @@ from mpsfm_core.mapping.options import RegistrationOptions
 class FailureLadder:
     """Thresholds that give way step by step and snap back at the next success.
 
-    PnP may do with fewer inliers (reference). The depth check never gives way, as the reference's
-    does: what contradicts the rest only waits for its turn (``benchmarks/symmetry.py``).
+    PnP may do with fewer inliers (reference). The depth check does not give way, unlike the
+    reference's: that would let in what it is there to keep out.
     """
 
     def __init__(self, options: RegistrationOptions) -> None:
