@@ -1,15 +1,20 @@
-"""``mpsfm plugins``: what is installed and what is wrong with it."""
+"""``mpsfm plugins``: what is installed, what is wrong with it, and a start for a new one."""
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mpsfm_core.providers import Kind
+
 if TYPE_CHECKING:
     from mpsfm_core.registry import ProviderStatus
+    from mpsfm_core.testing import CheckResult
 
 app = typer.Typer(no_args_is_help=True, help="Installed plugins and their providers.")
 
@@ -26,6 +31,69 @@ def list_plugins(
         typer.echo(json.dumps([asdict(line) for line in status], indent=2, default=str))
     else:
         _print_table(status)
+
+
+@app.command()
+def check(
+    name: Annotated[
+        str, typer.Argument(help="A provider (onnx, depth/onnx) or all of a distribution.")
+    ],
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Its options, instead of its stand-in's."),
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", metavar="CHECK", help="Not all checks.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+) -> None:
+    """Check whether providers keep the contract; exit code 1 if one does not."""
+    from mpsfm_core.registry import Registry
+    from mpsfm_core.testing.contract import find_providers, known_checks, run_checks, setup_from
+
+    registry = Registry.discover()
+    wanted = None if only is None else known_checks(only)
+    results: list[CheckResult] = []
+    for kind, provider in find_providers(registry, name):
+        results += run_checks(
+            registry,
+            kind,
+            provider,
+            setup_from(options or []),
+            only=wanted,
+            device=device,
+            on_result=None if as_json else _print_result,
+        )
+    if as_json:
+        typer.echo(json.dumps([asdict(result) for result in results], indent=2))
+    else:
+        counts = Counter(result.status for result in results)
+        typer.echo(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
+    if any(result.status == "fail" for result in results):
+        raise typer.Exit(1)
+
+
+@app.command()
+def new(
+    name: Annotated[str, typer.Argument(help="Of the package and of its provider: my-depth.")],
+    kind: Annotated[Kind, typer.Option(help="What it provides.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where to.")] = (
+        Path()
+    ),
+) -> None:
+    """Write a package with a provider that passes its contract; put your method into it."""
+    from mpsfm_core.testing.scaffold import write_plugin
+
+    for path in write_plugin(name, kind, output):
+        typer.echo(path)
+    typer.echo(f"next: pip install -e {output / name} && mpsfm plugins check {name}")
+
+
+def _print_result(result: CheckResult) -> None:
+    around = f" around {result.around}" if result.around else ""
+    line = f"{result.status:5} {result.provider}{around}: {result.id}, {result.seconds:.2f} s"
+    typer.echo(f"{line}: {result.message}" if result.message else line)
 
 
 def _print_table(status: tuple[ProviderStatus, ...]) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 from mpsfm_core.errors import InputError, MpsfmError, ProviderError, did_you_mean
 from mpsfm_core.providers import Kind, ProviderSpec
@@ -31,6 +31,7 @@ from mpsfm_core.testing.checks_common import (
     check_specification,
 )
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+from mpsfm_core.yaml_text import parse_yaml
 
 Check = Callable[[Case], str | None]
 Status = Literal["pass", "fail", "skip", "xfail"]
@@ -210,20 +211,37 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
     unavailable.
     """
     known = [line for line in registry.status() if line.kind != "plugin"]
-    labels = {(line.kind, line.name): (line.name, f"{line.kind}/{line.name}") for line in known}
     found = [
         (line.kind, line.name)
         for line in known
-        if name in (*labels[line.kind, line.name], line.distribution)
+        if name in (line.name, f"{line.kind}/{line.name}", line.distribution)
     ]
     if not found:
         broken = [p for p in registry.status() if not p.available and name == p.distribution]
         if broken:
             raise ProviderError(f"{name} {broken[0].reason}; {broken[0].install_hint}")
-        candidates = [label for names in labels.values() for label in names]
-        candidates += [line.distribution for line in known]
+        candidates = {n for line in known for n in (line.name, line.distribution)}
         raise InputError(f"no provider or plugin {name!r}{did_you_mean(name, candidates)}")
     return [(kind, name) for kind, name in found if kind != "plugin"]
+
+
+def setup_from(assignments: Sequence[str]) -> Setup | None:
+    """The setup of a provider with options given as ``key=value`` (or ``a.b=value``) with YAML
+    values; None if there are none, which means what the plugin says.
+
+    Raises :class:`~mpsfm_core.errors.InputError` for what is no assignment.
+    """
+    options: dict[str, Any] = {}
+    for text in assignments:
+        path, equals, value = text.partition("=")
+        *parents, key = path.strip().split(".")
+        if not (equals and key):
+            raise InputError(f"{text!r} must look like key=value")
+        place = options
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        place[key] = parse_yaml(value, text)
+    return Setup(options=options) if options else None
 
 
 def tasks_of(spec: ProviderSpec) -> list[Task]:
@@ -247,6 +265,15 @@ def all_checks() -> list[Check]:
 def check_of(id: str) -> Check:
     """The check with an id."""
     return next(check for check in all_checks() if id_of(check) == id)
+
+
+def known_checks(ids: Collection[str]) -> set[str]:
+    """The ids as a set; raises :class:`~mpsfm_core.errors.InputError` for one that is no check."""
+    known = [id_of(check) for check in all_checks()]
+    for name in ids:
+        if name not in known:
+            raise InputError(f"no check {name!r}{did_you_mean(name, known)}")
+    return set(ids)
 
 
 def id_of(check: Check) -> str:

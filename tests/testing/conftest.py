@@ -47,7 +47,7 @@ def caught() -> Caught:
         registry = Registry()
         registry.add(*builtin_providers())
         registry.add(ProviderSpec(kind, "wrong", factory, options, frozenset(capabilities)))
-        found = [r for r in run_checks(registry, kind, "wrong", setup, only={check})]
+        found = run_checks(registry, kind, "wrong", setup, only={check})
         failed = [r.message for r in found if r.status == "fail"]
         assert failed, [(r.status, r.message) for r in found]
         assert re.search(message, failed[0]), failed[0]

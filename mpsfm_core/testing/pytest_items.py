@@ -1,0 +1,76 @@
+"""Checks as pytest items, for ``pytest --mpsfm-plugin NAME``."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mpsfm_core.errors import MpsfmError
+from mpsfm_core.registry import Registry
+from mpsfm_core.testing.contract import Contract, Task, find_providers, setup_from
+from mpsfm_core.testing.pytest_tests import report
+
+
+class ContractCollection:
+    """Adds an item for each check of each named provider to what pytest collects."""
+
+    def __init__(self, names: Sequence[str], options: Sequence[str]) -> None:
+        self._names = names
+        self._options = options
+        self._folder = Path(tempfile.mkdtemp(prefix="mpsfm-contract-"))
+
+    @pytest.hookimpl(tryfirst=True)  # so that -k and -m choose among them too
+    def pytest_collection_modifyitems(
+        self, session: pytest.Session, items: list[pytest.Item]
+    ) -> None:
+        """Collect without constructing any provider."""
+        try:
+            setup = setup_from(self._options)
+            registry = Registry.discover()
+            found = [p for name in self._names for p in find_providers(registry, name)]
+            contracts = [Contract(registry, *p, self._folder, setup) for p in dict.fromkeys(found)]
+        except MpsfmError as error:
+            raise pytest.UsageError(str(error)) from error
+        for contract in contracts:
+            parent = _Provider.from_parent(
+                session, name=contract.provider, nodeid=contract.provider
+            )
+            for task in contract.tasks():
+                item = ContractItem.from_parent(
+                    parent, name=str(task), contract=contract, task=task
+                )
+                items.append(item)
+
+    def pytest_unconfigure(self) -> None:
+        """Remove the files of the stand-ins."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+class _Provider(pytest.Collector):
+    """The node above the checks of one provider."""
+
+    def collect(self) -> list[pytest.Item | pytest.Collector]:
+        """Nothing: the items are made with it."""
+        return []
+
+
+class ContractItem(pytest.Item):
+    """One check."""
+
+    def __init__(self, *, contract: Contract, task: Task, **rest: Any) -> None:
+        super().__init__(**rest)
+        self._contract = contract
+        self._task = task
+
+    def runtest(self) -> None:
+        """Run the check."""
+        report(self._contract.run(self._task))
+
+    def reportinfo(self) -> tuple[Path, None, str]:
+        """How the check is named in reports."""
+        return self.path, None, f"{self._contract.provider} {self._task}"

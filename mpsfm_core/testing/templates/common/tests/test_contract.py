@@ -1,0 +1,3 @@
+from mpsfm_core.testing import contract_tests
+
+test_contract = contract_tests("$kind", "$name")

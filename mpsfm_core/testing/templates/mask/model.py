@@ -1,0 +1,25 @@
+import numpy as np
+
+from mpsfm_core import Options
+
+
+class ${Class}Options(Options):
+    weights: str  # a path, or hf://ORG/REPO@REVISION/FILE, https://..., package:...
+    sha256: str | None = None
+
+
+class $Class:
+    def __init__(self, options, context):
+        self._network = Network(context.resolve_weights(options.weights, options.sha256))
+
+    def mask(self, view):
+        return self._network(view.image / np.float32(255)) > 0  # True: may be used
+
+
+class Network:  # put yours here: this one is an affine function of each pixel's colour
+    def __init__(self, path):
+        with np.load(path) as weights:
+            self._weights, self._bias = weights["weights"], weights["bias"]
+
+    def __call__(self, rgb):
+        return rgb @ self._weights + self._bias
