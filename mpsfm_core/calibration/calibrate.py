@@ -99,6 +99,25 @@ def calibrate(
         return run.alone() if model is None else run.with_model(model)
 
 
+def compare(
+    photos: Photos,
+    config: Config,
+    ground_truth: Mapping[str, Any],
+    kind: CalibratedKind = "depth",
+    *,
+    options: StudyOptions | None = None,
+    registry: Registry | None = None,
+) -> Data:
+    """A prior beside true maps, for :func:`mpsfm_core.calibration.study.judge`.
+
+    Arguments and errors as of :func:`calibrate`.
+    """
+    registry = registry or Registry.discover()
+    run = _Run(photos, config, kind, registry, None, options or StudyOptions())
+    with threadpool_limits(thread_count(config.runtime), user_api="blas"):
+        return run.prepare().with_files(ground_truth)
+
+
 class _Run:
     """One calibration."""
 
@@ -119,9 +138,10 @@ class _Run:
         self._bench = Workbench(images, config, registry, Stages(registry))
         self._comparison = Comparison(self._bench, kind, alignments, options)
 
-    def prepare(self) -> None:
+    def prepare(self) -> Comparison:
         """Run the mask providers: what they mask is not compared."""
         self._bench.run_masks()
+        return self._comparison
 
     def with_files(self, options: Mapping[str, Any]) -> Calibrated:
         """Compare with true maps."""

@@ -82,8 +82,8 @@ def study(data: Data, declared: Calibration, options: StudyOptions) -> Study:
         "gross_errors": best.fit.gross,
         "candidates": [_describe(candidate) for candidate in candidates],
         "metrics": {
-            "before": _metrics(held_out, [declared] * len(held_out)),
-            "after": _metrics(held_out, fitted or [best.calibration]),
+            "before": judge(held_out, [declared] * len(held_out)),
+            "after": judge(held_out, fitted or [best.calibration]),
         },
         "scale": _scale(data, best.calibration),
     }
@@ -100,20 +100,20 @@ def _folds(count: int, wanted: int) -> list[tuple[Int64, Int64]]:
     return [(np.setdiff1d(everything, group), group) for group in groups]
 
 
-def _metrics(held_out: Sequence[Data], calibrations: Sequence[Calibration]) -> dict[str, Any]:
-    """Metrics over all folds after each image's own scale; coverage of each fold; and that of a
-    metric prior as it is."""
-    scaled, std = _judge(held_out, calibrations, scaled=True)
+def judge(held_out: Sequence[Data], calibrations: Sequence[Calibration]) -> dict[str, Any]:
+    """How good each calibration is on its images: metrics over all of them after each image's own
+    scale, coverage of each part, and coverage of a metric prior without scaling."""
+    scaled, std = _apply(held_out, calibrations, scaled=True)
     metrics = measure(join(scaled), np.concatenate(std))
     metrics["coverage_of_folds"] = [_coverage(r, s)[0] for r, s in zip(scaled, std, strict=True)]
     first = held_out[0]
     if isinstance(first, DepthData) and first.samples[0].metric and first.in_metres:
-        raw, std = _judge(held_out, calibrations, scaled=False)
+        raw, std = _apply(held_out, calibrations, scaled=False)
         metrics["coverage_without_scaling"] = _coverage(join(raw), np.concatenate(std))
     return metrics
 
 
-def _judge(
+def _apply(
     held_out: Sequence[Data], calibrations: Sequence[Calibration], *, scaled: bool
 ) -> tuple[list[Residuals], list[Float64]]:
     """Errors of each fold and the std that its calibration declares for them."""

@@ -1,0 +1,212 @@
+"""What calibration does: coverage and poses with right and wrong uncertainty, in a real room.
+
+    python -m benchmarks.calibration [--buckets minimal leq5 leq10] [--output DIR] [--workers 1]
+
+Two depth priors of the HoloLens room: FastDepth, and the sensor's depth with smooth errors
+(`mpsfm_core.testing.degraded_depth`). Each is calibrated on the images that no set holds, and then
+declared in four ways: calibrated, 5 times too certain, 5 times too uncertain, and uncalibrated
+(the defaults, which are those of another network). Coverage is on the images of the sets, poses
+are of the sets, with the mapper measuring the noise of depth itself (its default) and without.
+Resumable: --output keeps what is done. Writes benchmarks/results/calibration.md; scenes are in
+$MPSFM_SHARED or ../shared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks._scenes import RESULTS, shared_folder
+from mpsfm_core.calibration.calibrate import Photos, calibrate, compare
+from mpsfm_core.calibration.file import load_calibration
+from mpsfm_core.calibration.model import DepthCalibration
+from mpsfm_core.calibration.study import judge
+from mpsfm_core.config import load_config
+from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
+from mpsfm_core.evaluation.prior_quality import prior_settings
+from mpsfm_core.evaluation.records import Record
+from mpsfm_core.evaluation.report import Row, make_rows
+from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
+from mpsfm_core.registry import Registry
+from mpsfm_core.yaml_text import write_yaml
+
+FACTOR = 5.0
+MEASURED = {"measured": True, "trusted": False}
+"""How the mapper weighs depth -> its setting ``measure_depth_noise``."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A depth prior: its ``depth`` block."""
+
+    name: str
+    block: Mapping[str, Any]
+
+
+def main() -> None:
+    """Run and write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--buckets", nargs="+", default=["minimal", "leq5", "leq10"])
+    parser.add_argument("--output", type=Path, default=Path("build/calibration"))
+    parser.add_argument("--workers", type=int, default=1)
+    arguments = parser.parse_args()
+    shared = shared_folder()
+    scene = read_scene(shared / "data" / "hololens_room")
+    output: Path = arguments.output
+    output.mkdir(parents=True, exist_ok=True)
+    in_sets = {name for item in scene.chosen(arguments.buckets) for name in item.images}
+    lists = {True: output / "in_sets.txt", False: output / "others.txt"}
+    for inside, path in lists.items():
+        path.write_text("\n".join(n for n in sorted(scene.truth) if (n in in_sets) is inside))
+    tables = []
+    for prior in _priors(scene, shared / "models" / "fastdepth_224.onnx", output):
+        calibrated = _calibrated(prior, scene, lists[False], output)
+        coverage = _coverage(prior, scene, lists[True], _declarations(calibrated))
+        rows = _poses(prior, scene, _declarations(calibrated), output, arguments)
+        tables += list(_table(prior, calibrated, coverage, rows))
+        text = "\n".join(["# Effect of calibration, hololens_room", "", *tables])
+        RESULTS.mkdir(exist_ok=True)
+        (RESULTS / "calibration.md").write_text(text.rstrip() + "\n", encoding="utf-8")
+    print(text)
+
+
+def _priors(scene: SceneFolder, fastdepth: Path, output: Path) -> Iterator[Prior]:
+    yield Prior("FastDepth", {"use": "onnx", "options": {"model": str(fastdepth)}})
+    degraded = (output / "degraded").resolve()
+    prior_settings("degraded", scene, scene.truth, degraded)
+    # The declared std is nearly nothing, so that the calibration alone says how good it is.
+    options = {"directory": str(degraded), "scale": 0.001, "relative_std": 1e-6}
+    yield Prior("degraded sensor depth", {"use": "files", "options": options})
+
+
+def _declarations(calibrated: DepthCalibration) -> dict[str, DepthCalibration]:
+    """The calibrated uncertainty, wrong ones, and the defaults."""
+    return {
+        "calibrated": calibrated,
+        "5 x too certain": _scaled(calibrated, 1 / FACTOR),
+        "5 x too uncertain": _scaled(calibrated, FACTOR),
+        "uncalibrated": DepthCalibration(),
+    }
+
+
+def _scaled(calibration: DepthCalibration, factor: float) -> DepthCalibration:
+    names = ("std_scale", "relative_std", "std_floor")
+    return calibration.model_copy(update={n: getattr(calibration, n) * factor for n in names})
+
+
+def _calibrated(prior: Prior, scene: SceneFolder, images: Path, output: Path) -> DepthCalibration:
+    """Fitted on the images of a list, or what an earlier run left."""
+    file = output / f"{_slug(prior.name)}.calibration.yaml"
+    if not file.is_file():
+        config = _config(prior, DepthCalibration(), True, output / "fit.yaml")
+        photos = Photos(scene.images, scene.intrinsics, images)
+        result = calibrate(photos, load_config(config), ground_truth=_truth(scene))
+        result.file.write(file)
+    calibration = load_calibration(file)
+    assert isinstance(calibration, DepthCalibration)
+    return calibration
+
+
+def _coverage(
+    prior: Prior, scene: SceneFolder, images: Path, declared: Mapping[str, DepthCalibration]
+) -> dict[str, dict[str, Any]]:
+    """Metrics of each declaration on the images of a list."""
+    config = _config(prior, DepthCalibration(), True, images.with_name("judge.yaml"))
+    photos = Photos(scene.images, scene.intrinsics, images)
+    data = compare(photos, load_config(config), _truth(scene))
+    return {name: judge([data], [calibration]) for name, calibration in declared.items()}
+
+
+def _poses(
+    prior: Prior,
+    scene: SceneFolder,
+    declared: Mapping[str, DepthCalibration],
+    output: Path,
+    arguments: argparse.Namespace,
+) -> dict[tuple[str, str], Row]:
+    """Pose accuracy over all sets, by declaration and how the mapper weighs depth."""
+    configs = {
+        (name, weighing): _config(
+            prior,
+            calibration,
+            measure,
+            output / f"{_slug(prior.name)}-{_slug(name)}-{weighing}.yaml",
+        )
+        for name, calibration in declared.items()
+        for weighing, measure in MEASURED.items()
+    }
+    plan = Plan(
+        (scene.path,),
+        tuple(str(path) for path in configs.values()),
+        tuple(arguments.buckets),
+        peers=(),
+        workers=arguments.workers,
+    )
+    records = run_benchmark(plan, output, Registry.discover(), _tell)
+    rows = {}
+    for key, path in configs.items():
+        own = [replace(r, bucket="all") for r in records if r.config == path.stem]
+        rows[key] = make_rows(own)[0]
+    return rows
+
+
+def _config(prior: Prior, calibration: DepthCalibration, measure: bool, path: Path) -> str:
+    """Write a configuration; returns its path."""
+    depth = {**prior.block, "calibration": calibration.model_dump(mode="json")}
+    values = {
+        "extends": "benchmark",
+        "depth": depth,
+        "mapping": {"refinement": {"measure_depth_noise": measure}},
+        "runtime": {"workers": 1},
+    }
+    path.write_text(write_yaml(values), encoding="utf-8")
+    return str(path)
+
+
+def _truth(scene: SceneFolder) -> dict[str, Any]:
+    return {"directory": scene.depth, "scale": 0.001}
+
+
+def _table(
+    prior: Prior,
+    calibrated: DepthCalibration,
+    coverage: Mapping[str, Mapping[str, Any]],
+    rows: Mapping[tuple[str, str], Row],
+) -> Iterator[str]:
+    values = {n: v for n, v in calibrated.model_dump().items() if isinstance(v, float) and v}
+    yield f"## {prior.name}"
+    yield ""
+    yield "Calibrated: " + ", ".join(f"{name} {value:g}" for name, value in values.items())
+    yield ""
+    sets = next(iter(rows.values())).sets
+    yield f"Pose AUC@1 / 5 / 20 deg in percent over {sets} sets; registered images in percent."
+    yield ""
+    yield (
+        "| declared | within 1 std | within 2 std | 1.4826 MAD of z | nll (heavy) | AUC, noise "
+        "measured | registered | AUC, std trusted | registered |"
+    )
+    yield "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
+    for name, metrics in coverage.items():
+        cells = [f"{metrics['coverage'][0]:.1%}", f"{metrics['coverage'][1]:.1%}"]
+        cells += [f"{metrics['z_mad']:.2f}", f"{metrics['nll_heavy']:.2f}"]
+        for weighing in MEASURED:
+            row = rows[name, weighing]
+            cells += [" / ".join(f"{v:.1f}" for v in row.auc.values()), f"{row.registered:.0%}"]
+        yield f"| {name} | " + " | ".join(cells) + " |"
+    yield ""
+
+
+def _slug(name: str) -> str:
+    return name.lower().replace(" ", "-")
+
+
+def _tell(record: Record, known: bool) -> None:
+    print(f"{record.config} {record.set_name}{' (known)' if known else ''}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()
