@@ -55,6 +55,7 @@ def _depth() -> list[ProviderSpec]:
             capabilities=frozenset({"uncached"}),
             summary="depth maps of a sensor or any network, read from files",
             code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:depth_files",
             # The files' uncertainty is declared with them: nothing is added to it.
             calibration=DepthCalibration(std_scale=1.0, relative_std=0.0, std_floor=0.0),
         ),
@@ -65,6 +66,7 @@ def _depth() -> list[ProviderSpec]:
             capabilities=frozenset({"uncached"}),
             summary="the depth that the matcher predicts for its pairs (pair-depth)",
             code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:depth_of_matcher",
             # Reference: the scale of MASt3R's confidence, and nothing beside it.
             calibration=DepthCalibration(std_scale=0.862, relative_std=0.0, std_floor=0.0),
         ),
@@ -81,6 +83,7 @@ def _normals() -> list[ProviderSpec]:
             capabilities=frozenset({"uncached"}),
             summary="normal maps read from files",
             code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:normal_files",
             calibration=NormalCalibration(std_scale=1.0, std_floor_deg=0.0),
         ),
         ProviderSpec(
@@ -91,6 +94,7 @@ def _normals() -> list[ProviderSpec]:
             capabilities=frozenset({"needs-depth", "variance", "intrinsics-aware"}),
             summary="normals of planes fitted to the depth prior",
             code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:from_depth",
             calibration=NormalCalibration(std_scale=1.0, std_floor_deg=1.0),
         ),
     ]
@@ -106,5 +110,6 @@ def _masks() -> list[ProviderSpec]:
             capabilities=frozenset({"uncached"}),
             summary="masks read from image files",
             code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:mask_files",
         ),
     ]

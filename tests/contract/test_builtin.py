@@ -1,0 +1,31 @@
+"""The built-in providers keep the contract."""
+
+from __future__ import annotations
+
+from mpsfm_core.builtin.plugin import mpsfm_providers
+from mpsfm_core.registry import Registry
+from mpsfm_core.testing import contract_tests
+
+BUILTIN = Registry()
+BUILTIN.add(*mpsfm_providers())
+
+test_sift = contract_tests("features", "sift", registry=BUILTIN)
+test_mutual_nearest = contract_tests("matcher", "mutual-nearest", registry=BUILTIN)
+test_depth_files = contract_tests("depth", "files", registry=BUILTIN)
+test_depth_of_matcher = contract_tests("depth", "matcher", registry=BUILTIN)
+test_normal_files = contract_tests("normals", "files", registry=BUILTIN)
+test_normals_from_depth = contract_tests("normals", "from-depth", registry=BUILTIN)
+test_mask_files = contract_tests("mask", "files", registry=BUILTIN)
+
+
+def test_all_of_them_are_here() -> None:
+    tested = {
+        ("features", "sift"),
+        ("matcher", "mutual-nearest"),
+        ("depth", "files"),
+        ("depth", "matcher"),
+        ("normals", "files"),
+        ("normals", "from-depth"),
+        ("mask", "files"),
+    }
+    assert {(spec.kind, spec.name) for spec in mpsfm_providers()} == tested
