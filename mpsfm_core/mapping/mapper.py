@@ -264,7 +264,7 @@ class Mapper:
         if not options.enabled:
             return None
         with self._timed("depth check"):
-            check = check_image(self.scene, image, options, self.refiner.noise.multiplier)
+            check = check_image(self.scene, image, options, self.refiner.std_factor)
         if check.share <= limit:
             return None
         other = self.problem.images[check.other].name
@@ -295,7 +295,7 @@ class Mapper:
 
     def _check_all(self) -> None:
         """Deregister images until no two views contradict each other."""
-        options, noise = self.options.consistency, self.refiner.noise.multiplier
+        options, noise = self.options.consistency, self.refiner.std_factor
         with self._timed("depth check"):
             conflicting = conflicting_images(self.scene, options, noise)
         for image, share in conflicting:

@@ -43,6 +43,14 @@ class Refiner:
         self._assumed = DepthNoise()
         self._integrators: dict[int, DepthIntegrator] = {}
 
+    @property
+    def std_factor(self) -> float:
+        """How many times its declaration the std of depth is where a decision hangs on it.
+
+        Never below 1: that priors agree where points are does not make them better elsewhere.
+        """
+        return max(1.0, self.noise.multiplier)
+
     def estimate_scale(self, image: int, others: list[int]) -> None:
         """Scale an image's prior so that it agrees with its points (paper eq. 1).
 
