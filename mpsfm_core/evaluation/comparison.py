@@ -109,7 +109,7 @@ def describe(
         cells = [d.scene, d.bucket, d.method, str(d.sets), d.unit]
         for t in THRESHOLDS_DEG:
             (a, b), (low, high) = d.auc[t], d.interval[t]
-            cells.append(f"{a:.1f} → {b:.1f} ({low:+.1f} .. {high:+.1f}, {d.p_value[t]:.3f})")
+            cells.append(f"{a:.1f} → {b:.1f} ({low:+.1f} .. {high:+.1f}, p {d.p_value[t]:.2g})")
         lines.append(cells)
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     return (
