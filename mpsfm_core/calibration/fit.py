@@ -14,6 +14,7 @@ sensitivity curves; the likelihood rewards both the ranking and the size of the 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,8 +128,7 @@ class _Problem:
 
     def reweighted(self, repeats: Int64) -> _Problem:
         """The same with each image counted this often."""
-        other = object.__new__(_Problem)
-        other.__dict__.update(self.__dict__)
+        other = copy(self)
         other._weights = self._weights * repeats[self._residuals.image]
         return other
 

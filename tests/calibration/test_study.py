@@ -76,3 +76,10 @@ def test_a_wide_interval_is_warned_of() -> None:
 def test_wrong_truth_is_suspected() -> None:
     warnings = run(12, replace(PRIOR, gross=0.4)).warnings
     assert any("is the truth of these images right?" in warning for warning in warnings)
+
+
+def test_a_prior_that_is_the_truth_is_declared_nearly_exact() -> None:
+    exact = tuple(replace(s, truth=s.prior * 1.3) for s in simulate(PRIOR, 4, pixels=100))
+    calibration = study(DepthData(exact), DECLARED, StudyOptions(bootstraps=5)).calibration
+    assert isinstance(calibration, DepthCalibration)
+    assert calibration.relative_std < 1e-6
