@@ -111,8 +111,9 @@ class DepthData:
         search = _Search()
         for alignment in self.alignments:
             model = _shift(self.samples, alignment)
-            attempt = _Attempt(model, self.residuals(model), ("relative_std", *floor))
-            search.offer(f"relative_std, aligned by {alignment}", [attempt])
+            names = ("relative_std", *floor)
+            attempt = _Attempt(model, self.residuals(model), names)
+            search.offer(f"{' + '.join(names)}, aligned by {alignment}", [attempt])
         if "std_scale" in search.best.residuals.names:
             for names in (("std_scale", *floor), ("std_scale", "relative_std", *floor)):
                 search.offer(" + ".join(names), [search.best._replace(names=names)])

@@ -22,7 +22,7 @@ _UNITS = {"depth": ("depth (m)", "log depth"), "normals": ("slant (degrees)", "r
 _METRICS = {
     "coverage": "within 1 / 2 / 3 std",
     "coverage_of_folds": "within 1 std, of each fold",
-    "coverage_without_scaling": "the same without a scale of each image",
+    "coverage_without_scaling": "within 1 / 2 / 3 std, without a scale of each image",
     "z_mad": "1.4826 MAD of error / std",
     "nll": "negative log density, normal",
     "nll_heavy": "negative log density, heavy tails",
