@@ -1,0 +1,1 @@
+"""Global image descriptors, by a network or without weights."""

@@ -1,0 +1,23 @@
+"""How the contract kit tests the network without weights: a stand-in that describes the colours
+of a coarse grid."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mpsfm_onnx.stand_in import save_model
+
+from mpsfm_core.testing import Setup
+
+_COARSE = """
+coarse (float[b,3,h,w] image) => (float[b,d] descriptor) {
+    small = AveragePool <kernel_shape = [64, 64], strides = [64, 64]> (image)
+    descriptor = Flatten (small)
+}
+"""
+
+
+def network(folder: Path) -> Setup:
+    """As EigenPlaces, with a fixed size."""
+    model = save_model(_COARSE, folder / "coarse.onnx")
+    return Setup(options={"model": str(model), "network": "eigenplaces"}, knows="seen")

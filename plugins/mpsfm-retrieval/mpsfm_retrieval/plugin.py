@@ -1,0 +1,34 @@
+"""Announces the providers. Imports neither onnxruntime nor OpenCV."""
+
+from __future__ import annotations
+
+from mpsfm_core import ProviderSpec, hookimpl
+from mpsfm_retrieval.options import DINOV2, AppearanceOptions, NetworkOptions
+
+
+@hookimpl
+def mpsfm_providers() -> list[ProviderSpec]:
+    """A network, and what goes without one."""
+    return [
+        ProviderSpec(
+            kind="retrieval",
+            name="global-onnx",
+            factory="mpsfm_retrieval.network:GlobalNetwork",
+            options=NetworkOptions,
+            summary="global descriptor of a network: DINOv2, EigenPlaces, NetVLAD",
+            requires=("onnxruntime",),
+            install_hint="pip install mpsfm-retrieval",
+            code_license="Apache-2.0",
+            weights_license=f"{DINOV2.license} (DINOv2), else of the chosen model",
+            weights=(DINOV2,),
+            contract="mpsfm_retrieval.contract:network",
+        ),
+        ProviderSpec(
+            kind="retrieval",
+            name="appearance",
+            factory="mpsfm_retrieval.appearance:Appearance",
+            options=AppearanceOptions,
+            summary="SIFT features and colours of the whole image; needs no weights",
+            code_license="Apache-2.0",
+        ),
+    ]
