@@ -99,6 +99,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             kind="matcher",
             name="loftr",
             factory="mpsfm_kornia.loftr:LoftrMatcher",
+            contract="mpsfm_kornia.contract:loftr",
             options=opt.LoftrOptions,
             capabilities=frozenset({"dense"}),
             summary="LoFTR: dense matches without a detector",

