@@ -1,0 +1,1 @@
+"""DSINE surface normals in an ONNX file."""

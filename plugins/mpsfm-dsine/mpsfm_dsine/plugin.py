@@ -1,0 +1,28 @@
+"""Announces the provider. Imports neither onnxruntime nor OpenCV."""
+
+from __future__ import annotations
+
+from mpsfm_core import ProviderSpec, hookimpl
+from mpsfm_core.calibration.model import NormalCalibration
+from mpsfm_dsine.options import DsineOptions
+
+
+@hookimpl
+def mpsfm_providers() -> list[ProviderSpec]:
+    """Normals."""
+    return [
+        ProviderSpec(
+            kind="normals",
+            name="dsine",
+            factory="mpsfm_dsine.provider:Dsine",
+            options=DsineOptions,
+            capabilities=frozenset({"variance", "intrinsics-aware"}),
+            summary="DSINE: normals with their angular variance, for known intrinsics",
+            requires=("onnxruntime",),
+            install_hint="pip install mpsfm-dsine",
+            code_license="Apache-2.0",
+            weights_license="of the authors' checkpoint (code MIT)",
+            calibration=NormalCalibration(std_scale=1.0, std_floor_deg=1.0),
+            contract="mpsfm_dsine.contract:setup",
+        )
+    ]

@@ -1,0 +1,26 @@
+"""DSINE as normals provider."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mpsfm_onnx.description import Description, SideSize, load_description
+from mpsfm_onnx.providers import DescribedNormals
+
+from mpsfm_core import ProviderContext
+from mpsfm_dsine.options import DsineOptions
+
+
+class Dsine(DescribedNormals):
+    """Normals with the variance of their concentration."""
+
+    def __init__(self, options: DsineOptions, context: ProviderContext) -> None:
+        super().__init__(describe(options), context, options.model, options.sha256)
+
+
+def describe(options: DsineOptions) -> Description:
+    """The description of the network at the size that the options name."""
+    general = load_description(str(Path(__file__).with_name("description.yaml")))
+    assert isinstance(general.input.size, SideSize)
+    size = general.input.size.model_copy(update={"side": options.size})
+    return general.model_copy(update={"input": general.input.model_copy(update={"size": size})})
