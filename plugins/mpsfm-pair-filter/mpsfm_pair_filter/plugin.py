@@ -1,0 +1,56 @@
+"""The hook: leaves out pairs that somebody else's classifier calls different places."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from mpsfm_core import hookimpl
+from mpsfm_core.errors import InputError
+
+SCORES_VARIABLE = "MPSFM_PAIR_SCORES"
+"""Environment variable: CSV file with image, image, score; without it every pair is kept."""
+THRESHOLD_VARIABLE = "MPSFM_PAIR_MIN_SCORE"
+"""Environment variable: pairs that score lower are left out."""
+DEFAULT_THRESHOLD = 0.8
+"""Probability that Doppelgangers (Cai et al., ICCV 2023) asks for before COLMAP."""
+
+Pair = tuple[str, str]
+
+
+@hookimpl
+def mpsfm_filter_pairs(pairs: Sequence[Pair]) -> Sequence[Pair] | None:
+    """The pairs whose score reaches the threshold, and those that have none."""
+    path = os.environ.get(SCORES_VARIABLE)
+    if not path:
+        return None
+    scores = read_scores(Path(path))
+    threshold = float(os.environ.get(THRESHOLD_VARIABLE, DEFAULT_THRESHOLD))
+    return [pair for pair in pairs if scores.get(frozenset(pair), math.inf) >= threshold]
+
+
+def read_scores(path: Path) -> Mapping[frozenset[str], float]:
+    """Scores by the two names, in any order; a pair that is there twice has its lower score.
+
+    Raises:
+        InputError: the file cannot be read, or a line has no two names and a number.
+    """
+    scores: dict[frozenset[str], float] = {}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            for number, row in enumerate(csv.reader(file, skipinitialspace=True), start=1):
+                if not row or row[0].startswith("#"):
+                    continue
+                try:
+                    first, second, score = row
+                    pair = frozenset((first.strip(), second.strip()))
+                    scores[pair] = min(float(score), scores.get(pair, math.inf))
+                except ValueError as error:
+                    text = f"{path}:{number}: expected image, image, score; got {','.join(row)!r}"
+                    raise InputError(text) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"${SCORES_VARIABLE}: {path} cannot be read: {error}") from error
+    return scores
