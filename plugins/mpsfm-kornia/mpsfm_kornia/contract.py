@@ -1,18 +1,21 @@
-"""How the contract kit tests LoFTR without its weights."""
+"""How the contract kit tests networks without their weights: on random ones.
+
+They detect and match, and it means nothing.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import torch
-from kornia.feature import LoFTR
+from kornia.feature import DeDoDe, LightGlue, LoFTR
 
 from mpsfm_core.testing import Setup
+from mpsfm_kornia.lightglue import LIGHTGLUE_256
 
 
 def loftr(folder: Path) -> Setup:
-    """A network of random weights, saved as the published ones are: it finds matches, and they
-    mean nothing."""
+    """Saved as the published weights are."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = LoFTR(pretrained=None).eval()
@@ -21,3 +24,25 @@ def loftr(folder: Path) -> Setup:
     torch.save({"state_dict": state}, path)
     options = {"weights": str(path), "resize": 128, "match_threshold": 0.0}
     return Setup(options=options, knows="nothing")
+
+
+def dedode(folder: Path) -> Setup:
+    """Detector and descriptor in files of their own, as the published ones are."""
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        network = DeDoDe("L", "B", amp_dtype=torch.float32).eval()
+    paths = folder / "dedode_detector.pth", folder / "dedode_descriptor.pth"
+    for path, module in zip(paths, (network.detector, network.descriptor), strict=True):
+        torch.save(module.state_dict(), path)
+    options = {"detector_weights": str(paths[0]), "weights": str(paths[1]), "resize": 96}
+    return Setup(options={**options, "max_keypoints": 200}, knows="nothing")
+
+
+def lightglue_dedode(folder: Path) -> Setup:
+    """LightGlue for 256 dimensions."""
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        network = LightGlue(None, **LIGHTGLUE_256, weights=None).eval()  # type: ignore[arg-type]
+    path = folder / "dedode_lightglue.pth"
+    torch.save(network.state_dict(), path)
+    return Setup(options={"weights": str(path), "filter_threshold": 0.0}, knows="nothing")

@@ -1,4 +1,4 @@
-"""XFeat, ALIKED and DISK as feature providers.
+"""XFeat, ALIKED, DISK and DeDoDe as feature providers.
 
 kornia reports keypoints in a frame whose pixel centres are integers, on the image it was given.
 Here they become COLMAP pixels of the view: half a pixel is added, then the size is scaled.
@@ -10,18 +10,24 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 import torch
-from kornia.feature import ALIKED, DISK, XFeat
+from kornia.feature import ALIKED, DISK, DeDoDe, XFeat
 
 from mpsfm_core import Features, ProviderContext, View
 from mpsfm_kornia.options import ALIKED as ALIKED_WEIGHTS
-from mpsfm_kornia.options import AlikedOptions, DiskOptions, FeatureOptions, XFeatOptions
+from mpsfm_kornia.options import (
+    AlikedOptions,
+    DedodeOptions,
+    DiskOptions,
+    FeatureOptions,
+    XFeatOptions,
+)
 from mpsfm_kornia.runtime import Grid, fill, inference, load_weights, usable, use_threads
 
 _Detections = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 class KorniaFeatures(ABC):
-    """What the three detectors share."""
+    """What the detectors share."""
 
     multiple = 1
     """The sides of the network's image are multiples of this."""
@@ -121,3 +127,21 @@ class DiskFeatures(KorniaFeatures):
         )[0]
         heat = found.detection_scores
         return found.keypoints, heat / (1 + heat), found.descriptors
+
+
+class DedodeFeatures(KorniaFeatures):
+    """DeDoDe. Its scores are probabilities of pixels, which are 1 together."""
+
+    def __init__(self, options: DedodeOptions, context: ProviderContext) -> None:
+        super().__init__(options, context)
+        self._network = DeDoDe("L", "B", amp_dtype=torch.float32)
+        for module, uri, sha256 in (
+            (self._network.detector, options.detector_weights, options.detector_sha256),
+            (self._network.descriptor, options.weights, options.sha256),
+        ):
+            fill(module, load_weights(context, uri, sha256), uri)
+        self._network.to(self._device)
+
+    def _detect(self, image: torch.Tensor) -> _Detections:
+        keypoints, scores, descriptors = self._network(image, n=self._options.max_keypoints)
+        return keypoints[0] - 0.5, scores[0], descriptors[0]

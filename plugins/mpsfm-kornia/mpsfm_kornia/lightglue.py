@@ -1,4 +1,4 @@
-"""LightGlue for ALIKED and DISK, and LighterGlue for XFeat, as sparse matchers."""
+"""LightGlue for ALIKED, DISK and DeDoDe, and LighterGlue for XFeat, as sparse matchers."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from mpsfm_kornia.runtime import fill, inference, load_weights, use_threads
 # Every key that shapes the network is named: kornia's defaults are a class attribute, which
 # other packages are known to overwrite.
 _LIGHTGLUE = {"input_dim": 128, "descriptor_dim": 256, "n_layers": 9, "num_heads": 4}
+LIGHTGLUE_256 = {**_LIGHTGLUE, "input_dim": 256}
 _LIGHTERGLUE = {"input_dim": 64, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1}
 _FIXED = {
     "name": "lightglue",
@@ -88,6 +89,12 @@ class LightGlueMatcher:
             key: torch.tensor(value, dtype=torch.float32, device=self._device)[None]
             for key, value in arrays.items()
         }
+
+
+class DedodeLightGlueMatcher(LightGlueMatcher):
+    """LightGlue with the architecture it has for 256-dimensional DeDoDe features."""
+
+    architecture = LIGHTGLUE_256
 
 
 class LighterGlueMatcher(LightGlueMatcher):

@@ -49,6 +49,14 @@ LOFTR = WeightsFile(
     "21f5bec5968178e8bc8b7633441836fe5de4f47d861dd2cd7dc38e271b0479ec",
     "Apache-2.0",
 )
+_DEDODE = "https://github.com/Parskatt/DeDoDe/releases/download"
+DEDODE_DETECTOR = WeightsFile(f"{_DEDODE}/v2/dedode_detector_L_v2.pth", license="MIT")
+DEDODE_DESCRIPTOR = WeightsFile(
+    f"{_DEDODE}/dedode_pretrained_models/dedode_descriptor_B.pth", license="MIT"
+)
+LIGHTGLUE_DEDODE = WeightsFile(
+    "https://cmp.felk.cvut.cz/~mishkdmy/models/dedodeb_lightglue.pth", license="Apache-2.0"
+)
 
 KNOWN_HASHES = {
     file.uri: file.sha256
@@ -107,6 +115,18 @@ class DiskOptions(FeatureOptions):
     weights: str = DISK.uri
 
 
+class DedodeOptions(FeatureOptions):
+    """DeDoDe v2 (2024) with the descriptor B, 256 dimensions; it has no threshold."""
+
+    resize: int | None = Field(784, ge=32)
+    """Longer side in pixels at which to detect, never enlarged (what it was trained with)."""
+    weights: str = DEDODE_DESCRIPTOR.uri
+    """Of the descriptor."""
+    detector_weights: str = DEDODE_DETECTOR.uri
+    detector_sha256: str | None = None
+    """Expected hash of ``detector_weights``."""
+
+
 class LightGlueOptions(Options):
     """LightGlue for one feature family."""
 
@@ -126,12 +146,34 @@ class DiskLightGlueOptions(LightGlueOptions):
     weights: str = LIGHTGLUE_DISK.uri
 
 
+class DedodeLightGlueOptions(LightGlueOptions):
+    """LightGlue for DeDoDe with the descriptor B."""
+
+    weights: str = LIGHTGLUE_DEDODE.uri
+
+
 class LighterGlueOptions(LightGlueOptions):
     """LighterGlue, the small LightGlue for XFeat."""
 
     width_confidence: float = Field(0.95, le=1)
     """Published default."""
     weights: str = LIGHTERGLUE.uri
+
+
+class AdalamOptions(Options):
+    """AdaLAM (ECCV 2020); unnamed sources are kornia's defaults."""
+
+    area_ratio: int = Field(100, ge=1)
+    """Area of the image over that of a neighbourhood."""
+    search_expansion: float = Field(4, gt=0)
+    """How much farther than that a seed looks for support."""
+    min_inliers: int = Field(6, ge=1)
+    """Matches that must agree in a neighbourhood."""
+    min_confidence: int = Field(200, ge=1)
+    """How much denser than by chance they must agree."""
+    scale_ratio: float | None = Field(1.5, gt=1)
+    """Largest ratio of the changes of scale in a neighbourhood; not used for features that have no
+    scale; null for none."""
 
 
 class LoftrOptions(Options):

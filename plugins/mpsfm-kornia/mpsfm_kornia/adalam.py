@@ -1,0 +1,95 @@
+"""AdaLAM as a sparse matcher: nearest neighbours that agree with those around them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from kornia.feature.adalam.adalam import AdalamFilter, get_adalam_default_config
+
+from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
+from mpsfm_core.errors import ProviderError
+from mpsfm_kornia.options import AdalamOptions
+from mpsfm_kornia.runtime import inference, use_threads
+
+_FEWEST = 2
+"""AdaLAM compares the nearest with the second nearest."""
+
+
+class AdalamMatcher:
+    """For features of any kind; without weights.
+
+    A neighbourhood of matches is kept when one affine map explains enough of them. Features carry
+    no orientation, so that is not compared; scales are, where they are known. The score of a match
+    is ``c / (c + min_confidence)`` of the confidence c of its neighbourhood.
+    """
+
+    def __init__(self, options: AdalamOptions, context: ProviderContext) -> None:
+        use_threads(context)
+        self._options = options
+        self._device = context.device
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """Matches that others around them support, each feature once."""
+        if features_a is None or features_b is None:
+            raise ProviderError("adalam matches features: choose a features provider")
+        if features_a.descriptors.shape[1] != features_b.descriptors.shape[1]:
+            raise ProviderError(
+                f"descriptors of {view_a.name!r} and {view_b.name!r} differ in dimension"
+            )
+        if min(len(features_a), len(features_b)) < _FEWEST:
+            return _matches(np.empty((0, 2)), np.empty(0))
+        use_scales = features_a.scales is not None and features_b.scales is not None
+        given = [self._tensors(f) for f in (features_a, features_b)]
+        with inference():
+            indices, inverse = self._filter(use_scales).match_and_filter(
+                given[0][0],
+                given[1][0],
+                given[0][1],
+                given[1][1],
+                im1shape=view_a.camera.size,
+                im2shape=view_b.camera.size,
+                s1=given[0][2] if use_scales else None,
+                s2=given[1][2] if use_scales else None,
+                return_dist=True,
+            )
+        chance = self._options.min_confidence * inverse.reshape(-1).double().cpu().numpy()
+        return _matches(indices.cpu().numpy(), 1 / (1 + chance))
+
+    def _filter(self, use_scales: bool) -> AdalamFilter:
+        options = self._options
+        config: dict[str, Any] = {
+            **get_adalam_default_config(),
+            "area_ratio": options.area_ratio,
+            "search_expansion": options.search_expansion,
+            "min_inliers": options.min_inliers,
+            "min_confidence": options.min_confidence,
+            "orientation_difference_threshold": None,
+            "scale_rate_threshold": options.scale_ratio if use_scales else None,
+            "device": torch.device(self._device),
+        }
+        return AdalamFilter(config)  # type: ignore[arg-type]  # None switches off, as documented
+
+    def _tensors(self, features: Features) -> tuple[torch.Tensor, ...]:
+        arrays = (features.keypoints, features.descriptors, features.scales)
+        return tuple(
+            torch.tensor(array, dtype=torch.float32, device=self._device)
+            for array in arrays
+            if array is not None
+        )
+
+
+def _matches(indices: Any, scores: Any) -> PairMatches:
+    """The best match of each feature; kornia may match one of the second view several times."""
+    order = np.argsort(-scores, kind="stable")
+    for column in (0, 1):
+        order = order[np.sort(np.unique(indices[order, column], return_index=True)[1])]
+    kept = SparseMatches(indices[order].astype(np.int64), scores[order].astype(np.float32))
+    return PairMatches(sparse=kept)
