@@ -257,26 +257,8 @@ class TestResult:
         with pytest.raises(ConfigError, match="unknown key"):
             load(text, "depth.options.scael=3", complete=False)
 
-    @pytest.mark.parametrize("name", sorted(shipped_configs()))
-    def test_shipped_configurations_fit_the_installed_plugins(self, name: str) -> None:
-        registry = Registry.discover()
-        missing = [d for d in ("mpsfm-onnx", "mpsfm-kornia") if not _installed(registry, d)]
-        if missing:
-            pytest.skip(f"needs {' and '.join(missing)}")
-        config = load_config(name, (), registry, complete=False)
-        assert config.description
-        load_config(name, [f"{p}.options.directory=d" for p in _file_backends(config)], registry)
-
     def test_the_shipped_files(self) -> None:
         assert {"default", "fast-cpu", "sensor-depth"} <= shipped_configs().keys()
-
-
-def _installed(registry: Registry, distribution: str) -> bool:
-    return any(line.distribution == distribution for line in registry.status())
-
-
-def _file_backends(config: Config) -> list[str]:
-    return [str(path[0]) for path, _, backend in config.backends() if backend.use == "files"]
 
 
 class TestYaml:

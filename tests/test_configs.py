@@ -1,0 +1,100 @@
+"""The shipped configurations: each loads, fits the plugins and is documented."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
+from mpsfm_core.config import Config, describe_shipped, load_config, shipped_configs
+from mpsfm_core.errors import ConfigError
+from mpsfm_core.options import SettingsError, dotted
+from mpsfm_core.registry import CORE, FIRST_PARTY, Registry
+
+NAMES = sorted(shipped_configs())
+GUIDE = Path(__file__).parents[1] / "docs" / "backends.md"
+
+
+@pytest.fixture(scope="module")
+def registry() -> Registry:
+    """All plugins; skips where one that a configuration names is not installed."""
+    registry = Registry.discover()
+    here = {line.distribution for line in registry.status()}
+    missing = {hint.partition("[")[0] for hint in FIRST_PARTY.values()} - here
+    if missing:
+        pytest.skip(f"needs {', '.join(sorted(missing))}")
+    return registry
+
+
+def required(config: Config, registry: Registry) -> list[str]:
+    """Options that only the user can know, as ``--set`` names them."""
+    found = []
+    for path, kind, backend in config.backends():
+        given = {key: value for key, value in backend.options.items() if value is not None}
+        try:
+            registry.validate_options(kind, backend.use, given)
+        except SettingsError as error:
+            found += [dotted((*path, "options", *problem.path[-1:])) for problem in error.problems]
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_loads_and_resolves(name: str, registry: Registry) -> None:
+    config = load_config(name, (), registry, complete=False)
+    assert describe_shipped()[name]
+    complete = load_config(name, [f"{o}=FILE" for o in required(config, registry)], registry)
+    for path, kind, backend in complete.backends():
+        chosen = [(kind, backend.use), *(("wrapper", w.use) for w in backend.wrap)]
+        for each in chosen:
+            spec = registry.spec(*each)
+            home = registry.version(*each).split()[0]
+            assert home == CORE or FIRST_PARTY[each].partition("[")[0] == home
+            assert spec.code_license != "unknown" and spec.summary, path
+    assert isinstance(registry.calibration("depth", complete.depth), DepthCalibration)
+    assert isinstance(registry.calibration("normals", complete.normals), NormalCalibration)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_says_what_it_has_to_be_told(name: str, registry: Registry) -> None:
+    """In a comment of the file, or of one that it extends."""
+    texts = {path.stem: path.read_text(encoding="utf-8") for path in shipped_configs().values()}
+    text, parent = "", name
+    while parent:
+        text += texts[parent]
+        parent = yaml.safe_load(texts[parent]).get("extends")
+    for option in required(load_config(name, (), registry, complete=False), registry):
+        assert f"--set {option}=" in text
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_tells_what_to_install(name: str, registry: Registry) -> None:
+    """Without any plugin the error names the package of the first thing that is missing."""
+    config = load_config(name, (), registry, complete=False)
+    wanted = [(kind, backend.use) for _, kind, backend in config.backends()]
+    hints = [f"pip install '{FIRST_PARTY[each]}'" for each in wanted if each in FIRST_PARTY]
+    with pytest.raises(ConfigError) as caught:
+        load_config(name, (), Registry(), complete=False)
+    assert all(hint in str(caught.value) for hint in hints)
+
+
+def test_one_pass_gives_depth_and_normals_where_nothing_wraps_them(registry: Registry) -> None:
+    for name in NAMES:
+        config = load_config(name, (), registry, complete=False)
+        joint = "joint-normals" in registry.spec("depth", config.depth.use).capabilities
+        if joint and config.depth.use == config.normals.use and not config.normals.wrap:
+            assert config.depth.options == config.normals.options
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_is_described_in_the_guide(name: str) -> None:
+    assert f"| `{name}` |" in GUIDE.read_text(encoding="utf-8")
+
+
+def test_the_guide_names_every_first_party_provider(registry: Registry) -> None:
+    text = GUIDE.read_text(encoding="utf-8")
+    for line in registry.status():
+        if line.distribution in FIRST_PARTY.values() and line.kind != "plugin":
+            short = line.name.removeprefix("metric3d-v2")
+            assert f"`{line.name}`" in text or f"`{short}`" in text, f"{line.kind} {line.name}"
