@@ -81,13 +81,14 @@ def ray_exponent(prior: DepthPrior, example: Example) -> float:
 def depth_shift(prior: DepthPrior, example: Example) -> Shift:
     """By how much the depth map is shifted, from where the true depth changes."""
     truth = example.truth(prior.shape)
-    where = comparable(prior.valid, truth)
+    moved = [
+        [example.truth(prior.shape, (s * x, s * y)).depth for s in (1, -1)]
+        for x, y in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX))
+    ]
+    # On a grid finer than the view half a pixel may lead beyond the border of a surface.
+    where = comparable(prior.valid, truth) & (np.min(moved, axis=(0, 1)) > 0)
     error = np.log(prior.depth[where].astype(np.float64) / truth.depth[where])
-    slopes = []
-    for step in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX)):
-        after = example.truth(prior.shape, step).depth[where]
-        before = example.truth(prior.shape, (-step[0], -step[1])).depth[where]
-        slopes.append(np.log(after / before)[:, None])
+    slopes = [np.log(after[where] / before[where])[:, None] for after, before in moved]
     return _shift(error[:, None], slopes, _places(prior.shape)[where])
 
 
