@@ -1,0 +1,88 @@
+"""What every first-party plugin has to be as a package, whatever it does."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    tomllib = pytest.importorskip("tomli")
+
+PLUGINS = sorted(path.parent for path in Path(__file__).parent.glob("*/pyproject.toml"))
+DISTRIBUTIONS = {"cv2": "opencv-python-headless"}
+"""Of imports that are called otherwise."""
+WITH_THE_CORE = {"mpsfm_core", "pydantic"}
+"""Options are pydantic models."""
+FOR_TESTS_ONLY = ("contract.py", "stand_in.py")
+HEAVY = {"torch", "onnxruntime", "kornia", "cv2", "scipy", "onnx"}
+
+each_plugin = pytest.mark.parametrize("folder", PLUGINS, ids=lambda folder: folder.name)
+
+
+def project_of(folder: Path) -> dict[str, Any]:
+    with (folder / "pyproject.toml").open("rb") as file:
+        project: dict[str, Any] = tomllib.load(file)["project"]
+    return project
+
+
+def package_of(folder: Path) -> Path:
+    return folder / folder.name.replace("-", "_")
+
+
+def imports_of(module: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.split(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module.split(".")[0]
+
+
+@each_plugin
+def test_project(folder: Path) -> None:
+    project = project_of(folder)
+    assert project["name"] == folder.name
+    assert project["license"] == "Apache-2.0"
+    assert project["entry-points"]["mpsfm.plugins"]
+    for dependency in project["dependencies"]:
+        assert re.fullmatch(r"[a-z0-9-]+>=[0-9.]+", dependency), "a lower bound and no other"
+    assert any(dependency.startswith("mpsfm-core>=") for dependency in project["dependencies"])
+
+
+@each_plugin
+def test_what_is_imported_is_declared(folder: Path) -> None:
+    project, package = project_of(folder), package_of(folder)
+    tests = project.get("optional-dependencies", {}).get("test", [])
+    for module in package.rglob("*.py"):
+        known = [*project["dependencies"], *(tests if module.name in FOR_TESTS_ONLY else [])]
+        declared = {re.split(r"[<>=]", dependency)[0] for dependency in known}
+        for name in set(imports_of(module)) - WITH_THE_CORE - {package.name}:
+            wanted = DISTRIBUTIONS.get(name, name.replace("_", "-"))
+            assert name in sys.stdlib_module_names or wanted in declared, f"{module.name}: {name}"
+
+
+@each_plugin
+def test_announcing_is_light(folder: Path) -> None:
+    modules = list(project_of(folder)["entry-points"]["mpsfm.plugins"].values())
+    code = (
+        f"import importlib, sys; [importlib.import_module(name) for name in {modules!r}]; "
+        f"sys.exit(', '.join({HEAVY!r} & set(sys.modules)) or None)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@each_plugin
+def test_readme(folder: Path) -> None:
+    text = (folder / "README.md").read_text(encoding="utf-8")
+    assert text.startswith(f"# {folder.name}\n")
+    assert f"pip install {folder.name}" in text or f"pip install '{folder.name}" in text
+    assert re.search(r"^## Licences?$", text, re.MULTILINE)
+    assert "```yaml" in text or "export " in text
