@@ -11,8 +11,10 @@ import importlib.util
 import inspect
 import logging
 import re
+import sys
 import threading
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
@@ -126,8 +128,9 @@ def _load(entry: metadata.EntryPoint, distribution: str, version: str, timeout_s
             outcome.append(error)
 
     thread = threading.Thread(target=work, name=f"mpsfm plugin {entry.name}", daemon=True)
-    thread.start()
-    thread.join(timeout_s)
+    with redirect_stdout(sys.stderr):  # what a plugin prints must not get into a command's output
+        thread.start()
+        thread.join(timeout_s)
     if not outcome:
         fault = f"did not load within {timeout_s:g} s"
         _log.warning("plugin %r of %s %s %s", entry.name, distribution, version, fault)

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-_PIPE_WIDTH = 240
+_PIPE_WIDTH = 2000
 """Columns when the output is not a terminal: lines then stay whole for grep."""
 
 

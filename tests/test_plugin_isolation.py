@@ -1,0 +1,160 @@
+"""Everything that can be wrong with installed plugins, at once: nobody else is affected, and the
+list says what is wrong with each and what to do."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mpsfm_core.errors import ProviderError
+from mpsfm_core.providers import API_VERSION, ProviderContext
+from mpsfm_core.registry import Registry
+
+ROOT = Path(__file__).resolve().parents[1]
+InstallPlugin = Callable[..., str]
+
+HEALTHY = """
+    from mpsfm_core import ProviderSpec, hookimpl
+    from mpsfm_core.testing.reference import PaintedDepth
+
+    @hookimpl
+    def mpsfm_providers():
+        return [ProviderSpec("depth", "healthy", PaintedDepth)]
+"""
+
+SPEC = """
+    from mpsfm_core import ProviderSpec, hookimpl
+
+    @hookimpl
+    def mpsfm_providers():
+        return [{}]
+"""
+
+BROKEN = {
+    "mpsfm-raises": "raise OSError('libnetwork.so.12: cannot open shared object file')",
+    "mpsfm-exits": "import os, sys\nsys.exit('no licence')",
+    "mpsfm-interrupts": "raise KeyboardInterrupt",
+    "mpsfm-talks": "print('Welcome to mpsfm-talks!')"
+    + SPEC.format("'depth'").replace("\n    ", "\n"),
+    "mpsfm-rubbish": SPEC.format("{'kind': 'depth'}, None, 7"),
+    "mpsfm-missing": SPEC.format(
+        "ProviderSpec('depth', 'missing', 'a:A', requires=('no_such_library',),"
+        " install_hint='pip install no-such-library')"
+    ),
+    "mpsfm-newer": SPEC.format(
+        f"ProviderSpec('depth', 'newer', 'a:A', api_version={API_VERSION + 1})"
+    ),
+    "mpsfm-twin-a": SPEC.format("ProviderSpec('depth', 'twin', 'a:A')"),
+    "mpsfm-twin-b": SPEC.format("ProviderSpec('depth', 'twin', 'b:B')"),
+    "mpsfm-imports": "import a_library_that_nobody_has",
+}
+
+EXPECTED = {
+    "mpsfm-raises": ("OSError: libnetwork.so.12", "reinstall or uninstall mpsfm-raises"),
+    "mpsfm-exits": ("SystemExit: no licence", "reinstall or uninstall mpsfm-exits"),
+    "mpsfm-interrupts": ("KeyboardInterrupt", "reinstall or uninstall mpsfm-interrupts"),
+    "mpsfm-talks": ("lists a str among its providers", ""),
+    "mpsfm-rubbish": ("among its providers", ""),
+    "mpsfm-missing": ("needs no_such_library, not installed", "pip install no-such-library"),
+    "mpsfm-newer": ("is made for plugin API", "pip install --upgrade mpsfm-core"),
+    "mpsfm-twin-a": ("is brought by mpsfm-twin-a and mpsfm-twin-b", "uninstall all but one"),
+    "mpsfm-twin-b": ("is brought by mpsfm-twin-a and mpsfm-twin-b", "uninstall all but one"),
+    "mpsfm-imports": ("No module named 'a_library_that_nobody_has'", "pip install the package of"),
+    "mpsfm-waits": ("did not load within 1 s", "pip uninstall mpsfm-waits"),
+}
+
+
+@pytest.fixture
+def silent_server() -> Iterator[tuple[str, int]]:
+    """Address of a server that accepts connections and never answers."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server.getsockname()
+
+
+@pytest.fixture
+def environment(
+    install_plugin: InstallPlugin,
+    silent_server: tuple[str, int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> dict[str, str]:
+    """All of them installed, and one that waits for the network: for processes and for us."""
+    for name, source in BROKEN.items():
+        install_plugin(name, source)
+    waiting = "import socket\nwith socket.create_connection({!r}) as server: server.recv(1)"
+    install_plugin("mpsfm-waits", waiting.format(silent_server))
+    install_plugin("mpsfm-healthy", HEALTHY)
+    monkeypatch.setenv("MPSFM_PLUGIN_TIMEOUT_S", "1")
+    path = os.pathsep.join([sys.path[0], str(ROOT), *sys.path])
+    return {**os.environ, "PYTHONPATH": path}
+
+
+def mpsfm(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from mpsfm_core.cli import main; main()", *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+
+
+def test_the_list_says_what_is_wrong_and_what_to_do(environment: dict[str, str]) -> None:
+    started = time.monotonic()
+    ended = mpsfm(environment, "plugins", "list", "--json")
+    assert time.monotonic() - started < 30
+    assert ended.returncode == 0
+    lines: dict[str, dict[str, Any]] = {p["distribution"]: p for p in json.loads(ended.stdout)}
+    for name, (reason, hint) in EXPECTED.items():
+        assert not lines[name]["available"], name
+        assert reason in lines[name]["reason"], name
+        assert hint in lines[name]["install_hint"], name
+    assert lines["mpsfm-healthy"]["available"]
+    assert "Welcome to mpsfm-talks!" in ended.stderr  # and not in between the JSON
+
+    table = mpsfm(environment, "plugins", "list").stdout.splitlines()
+    for name, (reason, hint) in EXPECTED.items():
+        (row,) = [" ".join(row.split()) for row in table if f" {name} 1.0 " in row]
+        assert "unavailable: " in row and reason in row and hint in row, name
+
+
+def test_the_others_work_and_the_broken_ones_raise_only_when_chosen(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
+    ended = mpsfm(environment, "plugins", "check", "healthy", "--only", "deterministic")
+    assert (ended.returncode, ended.stdout.splitlines()[-1]) == (0, "1 pass")
+
+    registry = Registry.discover()
+    context = ProviderContext(resolve_weights=lambda uri, sha256: Path(uri))
+    assert registry.create("depth", "healthy", None, context)
+    assert registry.create("features", "sift", None, context)
+    for name, message in (
+        ("missing", "pip install no-such-library"),
+        ("newer", "pip install --upgrade mpsfm-core"),
+        ("twin", "uninstall all but one of them"),
+    ):
+        with pytest.raises(ProviderError, match=message):
+            registry.create("depth", name, None, context)
+    with pytest.raises(ProviderError, match=r"did not load: .*mpsfm-imports \(fails to load"):
+        registry.create("depth", "of-a-broken-one", None, context)
+
+
+def test_a_broken_plugin_is_checked_with_a_reason(environment: dict[str, str]) -> None:
+    ended = mpsfm(environment, "plugins", "check", "mpsfm-imports")
+    assert ended.returncode == 2
+    assert "mpsfm-imports fails to load: ModuleNotFoundError" in ended.stderr
+    ended = mpsfm(environment, "plugins", "check", "missing")
+    assert ended.returncode == 2
+    assert "pip install no-such-library" in ended.stderr
+
+
+def test_metadata_without_a_name(install_plugin: InstallPlugin) -> None:
+    module = install_plugin("mpsfm-nameless", HEALTHY)
+    (info,) = Path(sys.path[0]).glob("mpsfm_nameless-*.dist-info")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\n")
+    (line,) = [p for p in Registry.discover().status() if p.name == "healthy"]
+    assert line.available
+    assert module in sys.modules
