@@ -42,8 +42,7 @@ caches of the interpreter grow by less than 4 kB."""
 
 
 def check_specification(case: Case) -> str:
-    """The specification is one the registry accepts; the factory and the options exist; code and
-    weights name a licence."""
+    """The registry accepts the specification, and the options of the setup are valid."""
     fault, hint = spec_fault(case.spec)
     if fault:
         raise CheckFailed(f"the specification {fault}; {hint}")
@@ -107,7 +106,8 @@ def check_no_state(case: Case) -> None:
 
 
 def check_inputs_unchanged(case: Case) -> None:
-    """The view that is handed in is the same afterwards: other providers see it too."""
+    """The view, and depth or features that come with it, are the same afterwards: other providers
+    see them too."""
     example = case.main.sized(*case.main.camera.size)
     image = np.array(example.view.image)
     view = View(example.name, image, example.camera, np.ones(image.shape[:2], np.bool_))

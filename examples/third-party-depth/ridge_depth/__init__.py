@@ -1,0 +1,1 @@
+"""Depth of indoor photos by ridge regression on random features."""

@@ -1,0 +1,48 @@
+import cv2
+import numpy as np
+
+from mpsfm_core import DepthPrior, Options
+
+COLUMNS, ROWS = 80, 60
+SCALES = (2, 8)
+
+
+class RidgeDepthOptions(Options):
+    weights: str = "package:ridge_depth/room.npz"
+    sha256: str | None = None
+
+
+class RidgeDepth:
+    def __init__(self, options, context):
+        with np.load(context.resolve_weights(options.weights, options.sha256)) as stored:
+            self._regression = Regression(**stored)
+
+    def predict(self, view):
+        depth = self._regression(features(view.image))  # metres along z, on a grid of 80 x 60
+        return DepthPrior.from_arrays(depth)
+
+
+class Regression:
+    """Linear in the features and in random cosines of them."""
+
+    def __init__(self, mean, scale, directions, phases, weights=None):
+        self._scaling, self._cosines, self._weights = (mean, scale), (directions, phases), weights
+
+    def __call__(self, x):
+        return self.expand(x) @ self._weights
+
+    def expand(self, x):
+        (mean, scale), (directions, phases) = self._scaling, self._cosines
+        cosines = np.cos((x - mean) / scale @ directions + phases)
+        return np.concatenate([x, np.ones_like(x[..., :1]), cosines], axis=-1)
+
+
+def features(rgb):
+    """Colour, place, and colour and contrast of two neighbourhoods, (60, 80, 13)."""
+    small = cv2.resize(rgb, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA) / np.float32(255)
+    place = np.meshgrid(np.linspace(-1, 1, COLUMNS), np.linspace(-1, 1, ROWS))
+    planes = [small, *(axis[..., None] for axis in place)]
+    for scale in SCALES:
+        blurred = cv2.GaussianBlur(small, (0, 0), scale)
+        planes += [blurred, cv2.GaussianBlur(abs(small - blurred), (0, 0), scale)[..., :1]]
+    return np.concatenate(planes, axis=-1, dtype=np.float32)

@@ -1,0 +1,96 @@
+"""The tutorial and the third-party package that it ends with."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from mpsfm_core.testing.contract import all_checks, id_of
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLE = ROOT / "examples" / "third-party-depth"
+SCENE = ROOT / "examples" / "sample_scene"
+TUTORIAL = ROOT / "docs" / "tutorial-plugin.md"
+
+
+def test_the_tutorial_shows_the_files_of_the_example() -> None:
+    pattern = r"`([\w./]+\.(?:py|yaml))`:\n\n```\w+\n(.*?)```"
+    shown = dict(re.findall(pattern, TUTORIAL.read_text(encoding="utf-8"), re.DOTALL))
+    assert len(shown) == 5
+    for name, text in shown.items():
+        assert text == (EXAMPLE / name).read_text(encoding="utf-8"), name
+
+
+def test_every_check_stands_in_the_documentation() -> None:
+    document = (ROOT / "docs" / "contract.md").read_text(encoding="utf-8")
+    shown = dict(re.findall(r"^\| `([a-z-]+)` \| (.*) \|$", document, re.MULTILINE))
+    for check in all_checks():
+        text = " ".join((inspect.getdoc(check) or "").replace("``", "`").split())
+        assert shown[id_of(check)] == text, f"docs/contract.md: | `{id_of(check)}` | {text} |"
+    assert f"by {len(all_checks())} small functions" in document
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
+    """The example, installed from its own folder; the environment that sees it."""
+    site = tmp_path_factory.mktemp("site")
+    source = tmp_path_factory.mktemp("source")
+    for path in (p for p in EXAMPLE.rglob("*") if p.is_file() and "__pycache__" not in p.parts):
+        copy = source / path.relative_to(EXAMPLE)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(path.read_bytes())  # building leaves folders behind
+    options = ("--no-deps", "--no-index", "--no-build-isolation", "--quiet")
+    run([sys.executable, "-m", "pip", "install", *options, "--target", site, source], os.environ)
+    path = os.pathsep.join(map(str, (site, ROOT, *sys.path)))
+    return {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+@pytest.mark.slow
+def test_it_keeps_its_contract(installed: Mapping[str, str], tmp_path: Path) -> None:
+    tests = EXAMPLE / "tests"
+    printed = run([sys.executable, "-m", "pytest", "-q", "--rootdir", tests, tests], installed)
+    assert " passed" in printed and "failed" not in printed
+
+
+@pytest.mark.slow
+def test_it_is_trained_as_said(installed: Mapping[str, str], tmp_path: Path) -> None:
+    weights = tmp_path / "room.npz"
+    printed = run([sys.executable, EXAMPLE / "train.py", SCENE, weights], installed)
+    errors = [float(line.rsplit(":", 1)[1]) for line in printed.splitlines()]
+    assert errors == pytest.approx([0.111, 0.068], abs=0.003)
+    assert weights.stat().st_size < 30_000
+
+
+@pytest.mark.slow
+def test_it_reconstructs_by_its_name(installed: Mapping[str, str], tmp_path: Path) -> None:
+    """The last step of the tutorial, with its result: AUC 67, 93 and 98 %, 0.5 cm."""
+    mpsfm = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+    cameras = ("--intrinsics", SCENE / "intrinsics.yaml", "--config", EXAMPLE / "config.yaml")
+    cache = ("--set", f"runtime.cache_dir={tmp_path / 'cache'}", "--set", "runtime.workers=1")
+    output = tmp_path / "out"
+    reconstruct = ("reconstruct", SCENE / "images", *cameras, *cache, "--output", output, "-q")
+    run([*mpsfm, *reconstruct], installed)
+    report = json.loads(run([*mpsfm, "evaluate", output, SCENE / "gt"], installed))
+    assert report["registered"] == 8
+    assert report["auc"]["1"] > 50 and report["auc"]["5"] > 88
+    assert report["trajectory"]["ate_median"] < 0.01
+    assert abs(report["trajectory"]["scale"] - 1) < 0.02
+    summary = json.loads((output / "summary.json").read_text())
+    (depth,) = [p for p in summary["providers"] if p["kind"] == "depth"]
+    assert (depth["name"], depth["from"]) == ("ridge-depth", "ridge-depth 0.1.0")
+
+
+def run(command: list[object], environment: Mapping[str, str]) -> str:
+    ended = subprocess.run(
+        list(map(str, command)), env=dict(environment), capture_output=True, text=True, timeout=300
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return ended.stdout
