@@ -149,7 +149,7 @@ def _poses(
     records = run_benchmark(plan, output, Registry.discover(), _tell)
     rows = {}
     for key, path in configs.items():
-        own = [replace(r, bucket="all") for r in records if r.config == path.stem]
+        own = [replace(r, bucket="all") for r in records if r.config == Path(path).stem]
         rows[key] = make_rows(own)[0]
     return rows
 
