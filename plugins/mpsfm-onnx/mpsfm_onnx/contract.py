@@ -39,12 +39,9 @@ outputs:
 """
 
 
-def depth(folder: Path) -> Setup:
-    """A network with a canonical camera, padding and a confidence."""
+def setup(folder: Path) -> Setup:
+    """A network with a canonical camera, padding, a confidence and a concentration."""
     return Setup(options=_tiny(folder), knows="painted")
-
-
-joint = normals = depth
 
 
 def stand_in(description: Description, folder: Path) -> Path:

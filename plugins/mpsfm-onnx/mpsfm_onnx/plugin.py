@@ -6,56 +6,29 @@ from pydantic import BaseModel
 
 from mpsfm_core import ProviderSpec, hookimpl
 from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers import Capability, Kind
 from mpsfm_onnx.description import load_description
 from mpsfm_onnx.options import OnnxOptions
-
-_REQUIRES = ("onnxruntime",)
-_HINT = "pip install mpsfm-onnx"
-_WEIGHTS_LICENSE = "of the chosen model"
 
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Depth, depth with normals in the same pass, and normals."""
+    """Depth, normals, and networks with both, chosen by one name for either kind."""
     return [
-        ProviderSpec(
-            kind="depth",
-            name="onnx",
-            factory="mpsfm_onnx.providers:OnnxDepth",
-            contract="mpsfm_onnx.contract:depth",
-            options=OnnxOptions,
-            capabilities=frozenset({"intrinsics-aware"}),
-            summary="any depth network in an ONNX file, described in YAML",
-            requires=_REQUIRES,
-            install_hint=_HINT,
-            code_license="Apache-2.0",
-            weights_license=_WEIGHTS_LICENSE,
+        _spec("depth", "onnx", "Depth", "any depth network in an ONNX file, described in YAML"),
+        _spec(
+            "depth",
+            "onnx-joint",
+            "Joint",
+            "any network in an ONNX file that predicts depth and normals together",
+            "joint-normals",
         ),
-        ProviderSpec(
-            kind="depth",
-            name="onnx-joint",
-            factory="mpsfm_onnx.providers:OnnxJoint",
-            contract="mpsfm_onnx.contract:joint",
-            options=OnnxOptions,
-            capabilities=frozenset({"joint-normals", "intrinsics-aware"}),
-            summary="any network in an ONNX file that predicts depth and normals together",
-            requires=_REQUIRES,
-            install_hint=_HINT,
-            code_license="Apache-2.0",
-            weights_license=_WEIGHTS_LICENSE,
-        ),
-        ProviderSpec(
-            kind="normals",
-            name="onnx",
-            factory="mpsfm_onnx.providers:OnnxNormals",
-            contract="mpsfm_onnx.contract:normals",
-            options=OnnxOptions,
-            capabilities=frozenset({"intrinsics-aware"}),
-            summary="any normal network in an ONNX file, described in YAML",
-            requires=_REQUIRES,
-            install_hint=_HINT,
-            code_license="Apache-2.0",
-            weights_license=_WEIGHTS_LICENSE,
+        _spec("normals", "onnx", "Normals", "any normals network in an ONNX file"),
+        _spec(
+            "normals",
+            "onnx-joint",
+            "Normals",
+            "normals of such a network, in the same pass as depth of the same options",
         ),
     ]
 
@@ -69,3 +42,21 @@ def mpsfm_calibration(
         return None
     description = load_description(options.description)
     return description.calibration if kind == "depth" else description.normals_calibration
+
+
+def _spec(
+    kind: Kind, name: str, factory: str, summary: str, *capabilities: Capability
+) -> ProviderSpec:
+    return ProviderSpec(
+        kind=kind,
+        name=name,
+        factory=f"mpsfm_onnx.providers:Onnx{factory}",
+        contract="mpsfm_onnx.contract:setup",
+        options=OnnxOptions,
+        capabilities=frozenset({"intrinsics-aware", *capabilities}),
+        summary=summary,
+        requires=("onnxruntime",),
+        install_hint="pip install mpsfm-onnx",
+        code_license="Apache-2.0",
+        weights_license="of the chosen model",
+    )

@@ -3,5 +3,6 @@
 from mpsfm_core.testing import contract_tests
 
 test_depth = contract_tests("depth", "onnx")
-test_joint = contract_tests("depth", "onnx-joint")
 test_normals = contract_tests("normals", "onnx")
+test_joint_depth = contract_tests("depth", "onnx-joint")
+test_joint_normals = contract_tests("normals", "onnx-joint")
