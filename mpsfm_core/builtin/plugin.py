@@ -67,8 +67,8 @@ def _depth() -> list[ProviderSpec]:
             summary="the depth that the matcher predicts for its pairs (pair-depth)",
             code_license=_LICENSE,
             contract="mpsfm_core.testing.builtin_contracts:depth_of_matcher",
-            # Reference: the scale of MASt3R's confidence, and nothing beside it.
-            calibration=DepthCalibration(std_scale=0.862, relative_std=0.0, std_floor=0.0),
+            # Reference: the scale of MASt3R's confidence, and no share of depth.
+            calibration=DepthCalibration(std_scale=0.862, relative_std=0.0),
         ),
     ]
 

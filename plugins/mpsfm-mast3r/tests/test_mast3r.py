@@ -9,6 +9,7 @@ from mpsfm_mast3r.neighbours import mutual, nearest, reciprocal
 from mpsfm_mast3r.options import DenseOptions, SparseOptions
 
 from mpsfm_core import Features, PinholeCamera, View
+from mpsfm_core.calibration.model import DepthCalibration
 from mpsfm_core.errors import ConfigError, ProviderError
 from mpsfm_core.options import Backend
 from mpsfm_core.registry import Registry
@@ -185,4 +186,4 @@ def test_another_model_is_told(write_onnx, context):
 
 def test_calibration_of_its_depth_is_the_references():
     calibration = Registry.discover().calibration("depth", Backend(use="matcher"))
-    assert calibration.std_scale == 0.862 and calibration.relative_std == 0
+    assert calibration == DepthCalibration(std_scale=0.862, relative_std=0, std_floor=0.02)
