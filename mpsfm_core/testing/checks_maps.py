@@ -1,4 +1,4 @@
-"""What the checks of depth and of normals share."""
+"""What the checks of maps share."""
 
 from __future__ import annotations
 

@@ -6,7 +6,9 @@ import numpy as np
 
 from mpsfm_core.testing.accuracy import MASK_TOLERANCE, judge
 from mpsfm_core.testing.case import Case
+from mpsfm_core.testing.checks_maps import painted_backwards
 from mpsfm_core.testing.outcome import CheckFailed
+from mpsfm_core.testing.painting import read_depth
 
 
 def check_mask_polarity(case: Case) -> str:
@@ -25,6 +27,18 @@ def check_mask_place(case: Case) -> str:
     return judge(case, case.main, case.ask(case.main))
 
 
+def check_mask_channel_order(case: Case) -> None:
+    """The network gets RGB, not BGR."""
+    case.needs("painted")
+    answer, truth = case.ask(case.main), case.main.truth()
+    swapped = read_depth(painted_backwards(case.main, answer.shape)) > 0
+    right, backwards = (
+        float((answer == expected)[truth.edge_free].mean()) for expected in (truth.valid, swapped)
+    )
+    if right < 1 - MASK_TOLERANCE <= backwards:
+        raise CheckFailed("follows the blue channel where it should follow the red one")
+
+
 def check_mask_flip(case: Case) -> str:
     """The mirrored view has the mirrored mask."""
     answer, mirrored = case.ask(case.main), case.ask(case.main.mirror())
@@ -35,4 +49,4 @@ def check_mask_flip(case: Case) -> str:
     return f"differs at {wrong:.1%} of the pixels"
 
 
-CHECKS = (check_mask_polarity, check_mask_place, check_mask_flip)
+CHECKS = (check_mask_polarity, check_mask_place, check_mask_channel_order, check_mask_flip)

@@ -298,6 +298,11 @@ class Displaced(PaintedMask):
         return np.roll(super().mask(view), view.camera.height // 2, axis=0)
 
 
+class Backwards(PaintedMask):
+    def mask(self, view: View) -> np.ndarray:
+        return super().mask(replace(view, image=view.image[..., ::-1]))
+
+
 class LeftHalf(PaintedMask):
     def mask(self, view: View) -> np.ndarray:
         mask = super().mask(view)
@@ -312,6 +317,7 @@ class LeftHalf(PaintedMask):
         (Reduced, "output-rules", "must have the view's shape"),
         (Grey, "output-rules", "2-dimensional bool"),
         (Displaced, "mask-place", "of the pixels have the wrong value"),
+        (Backwards, "mask-channel-order", "follows the blue channel"),
         (LeftHalf, "mask-flip", "of the pixels of the mirrored view"),
     ],
 )
