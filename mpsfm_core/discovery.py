@@ -139,11 +139,19 @@ def _load(entry: metadata.EntryPoint, distribution: str, version: str, timeout_s
     result = outcome[0]
     if isinstance(result, Plugin):
         return result
-    hint = f"reinstall or uninstall {distribution}"
-    if isinstance(result, ModuleNotFoundError) and result.name:
-        hint = f"pip install the package of module {result.name!r}, or uninstall {distribution}"
     fault = f"fails to load: {type(result).__name__}: {result}"
+    hint = _hint(result, distribution)
     return Plugin(entry.name, distribution, version, fault=fault, hint=hint)
+
+
+def _hint(error: BaseException, distribution: str) -> str:
+    """What to do about a plugin whose loading ended with an error."""
+    absent = (error.name or "") if isinstance(error, ImportError) else ""
+    if absent.partition(".")[0] == "mpsfm_core" or "ProviderSpec.__init__()" in str(error):
+        return f"pip install --upgrade mpsfm-core, or uninstall {distribution}"  # a newer API's
+    if absent and isinstance(error, ModuleNotFoundError):
+        return f"pip install the package of module {absent!r}, or uninstall {distribution}"
+    return f"reinstall or uninstall {distribution}"
 
 
 def _malformed(spec: ProviderSpec) -> str:

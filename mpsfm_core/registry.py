@@ -304,9 +304,9 @@ class Registry:
     def _add(self, plugin: Plugin) -> None:
         origin = (plugin.distribution, plugin.version)
         status = ProviderStatus("plugin", plugin.name, *origin, capabilities=plugin.hooks)
-        fault, hint = plugin.fault, plugin.hint
+        fault = plugin.fault
         if plugin.module is not None and self._manager.is_registered(plugin.module):
-            fault, hint = "is a second entry point of a plugin that is already loaded", ""
+            fault = "is a second entry point of a plugin that is already loaded"
         elif plugin.module is not None:
             self._manager.register(plugin.module, _label(plugin))
             for spec in plugin.specs:
@@ -315,6 +315,7 @@ class Registry:
                 else:
                     fault = f"lists a {type(spec).__name__} among its providers"
         if fault:
+            hint = plugin.hint or f"tell the author of {plugin.distribution}"
             self._plugins.append(replace(status, available=False, reason=fault, install_hint=hint))
         elif not plugin.specs:
             self._plugins.append(replace(status, summary="hooks only"))

@@ -53,6 +53,9 @@ BROKEN = {
     "mpsfm-newer": SPEC.format(
         f"ProviderSpec('depth', 'newer', 'a:A', api_version={API_VERSION + 1})"
     ),
+    "mpsfm-newer-name": "from mpsfm_core import WhatComesNextYear",
+    "mpsfm-newer-room": "import mpsfm_core.next_year",
+    "mpsfm-newer-field": SPEC.format("ProviderSpec('depth', 'field', 'a:A', next_year=1)"),
     "mpsfm-twin-a": SPEC.format("ProviderSpec('depth', 'twin', 'a:A')"),
     "mpsfm-twin-b": SPEC.format("ProviderSpec('depth', 'twin', 'b:B')"),
     "mpsfm-imports": "import a_library_that_nobody_has",
@@ -62,10 +65,14 @@ EXPECTED = {
     "mpsfm-raises": ("OSError: libnetwork.so.12", "reinstall or uninstall mpsfm-raises"),
     "mpsfm-exits": ("SystemExit: no licence", "reinstall or uninstall mpsfm-exits"),
     "mpsfm-interrupts": ("KeyboardInterrupt", "reinstall or uninstall mpsfm-interrupts"),
-    "mpsfm-talks": ("lists a str among its providers", ""),
-    "mpsfm-rubbish": ("among its providers", ""),
+    "mpsfm-talks": ("lists a str among its providers", "tell the author of mpsfm-talks"),
+    "mpsfm-rubbish": ("among its providers", "tell the author of mpsfm-rubbish"),
     "mpsfm-missing": ("needs no_such_library, not installed", "pip install no-such-library"),
     "mpsfm-newer": ("is made for plugin API", "pip install --upgrade mpsfm-core"),
+    "mpsfm-newer-name": ("cannot import name 'WhatComes", "pip install --upgrade mpsfm-core, or"),
+    "mpsfm-newer-room": ("'mpsfm_core.next_year'", "pip install --upgrade mpsfm-core, or uninstall"),
+    "mpsfm-newer-field": ("argument 'next_year'", "pip install --upgrade mpsfm-core, or uninstall"),
+    "mpsfm-twice": ("is a second entry point", "tell the author of mpsfm-twice"),
     "mpsfm-twin-a": ("is brought by mpsfm-twin-a and mpsfm-twin-b", "uninstall all but one"),
     "mpsfm-twin-b": ("is brought by mpsfm-twin-a and mpsfm-twin-b", "uninstall all but one"),
     "mpsfm-imports": ("No module named 'a_library_that_nobody_has'", "pip install the package of"),
@@ -92,6 +99,8 @@ def environment(
     waiting = "import socket\nwith socket.create_connection({!r}) as server: server.recv(1)"
     install_plugin("mpsfm-waits", waiting.format(silent_server))
     install_plugin("mpsfm-healthy", HEALTHY)
+    again = "[mpsfm.plugins]\nagain = mpsfm_healthy_plugin\n"
+    install_plugin("mpsfm-twice", "", entry_points=again)
     monkeypatch.setenv("MPSFM_PLUGIN_TIMEOUT_S", "1")
     path = os.pathsep.join([sys.path[0], str(ROOT), *sys.path])
     return {**os.environ, "PYTHONPATH": path}
