@@ -70,7 +70,7 @@ EXPECTED = {
     "mpsfm-missing": ("needs no_such_library, not installed", "pip install no-such-library"),
     "mpsfm-newer": ("is made for plugin API", "pip install --upgrade mpsfm-core"),
     "mpsfm-newer-name": ("cannot import name 'WhatComes", "pip install --upgrade mpsfm-core, or"),
-    "mpsfm-newer-room": ("'mpsfm_core.next_year'", "pip install --upgrade mpsfm-core, or uninstall"),
+    "mpsfm-newer-room": ("'mpsfm_core.next_year'", "pip install --upgrade mpsfm-core, or"),
     "mpsfm-newer-field": ("argument 'next_year'", "pip install --upgrade mpsfm-core, or uninstall"),
     "mpsfm-twice": ("is a second entry point", "tell the author of mpsfm-twice"),
     "mpsfm-twin-a": ("is brought by mpsfm-twin-a and mpsfm-twin-b", "uninstall all but one"),
