@@ -27,6 +27,7 @@ from mpsfm_core.discovery import (
     spec_fault,
 )
 from mpsfm_core.errors import InputError, MpsfmError, ProviderError, did_you_mean
+from mpsfm_core.first_party import requirement_for
 from mpsfm_core.options import Backend, Options, SettingPath, parse_settings
 from mpsfm_core.providers import (
     CAPABILITY_METHODS,
@@ -47,37 +48,6 @@ TIMEOUT_VARIABLE = "MPSFM_PLUGIN_TIMEOUT_S"
 
 DEFAULT_TIMEOUT_S = 10.0
 """A light plugin module loads in milliseconds; a cold network disk may take seconds."""
-
-FIRST_PARTY: Mapping[tuple[Kind, str], str] = {
-    ("features", "xfeat"): "mpsfm-kornia[weights]",
-    ("features", "aliked"): "mpsfm-kornia[weights]",
-    ("features", "disk"): "mpsfm-kornia[weights]",
-    ("features", "superpoint"): "mpsfm-lightglue-onnx",
-    ("matcher", "lightglue-aliked"): "mpsfm-kornia[weights]",
-    ("matcher", "lightglue-disk"): "mpsfm-kornia[weights]",
-    ("matcher", "lighterglue"): "mpsfm-kornia[weights]",
-    ("matcher", "lightglue-superpoint"): "mpsfm-lightglue-onnx",
-    ("matcher", "loftr"): "mpsfm-kornia",
-    ("matcher", "mast3r"): "mpsfm-mast3r",
-    ("matcher", "mast3r-sparse"): "mpsfm-mast3r",
-    ("matcher", "roma"): "mpsfm-roma",
-    ("matcher", "roma-sparse"): "mpsfm-roma",
-    ("depth", "onnx"): "mpsfm-onnx",
-    ("depth", "metric3d-v2-small"): "mpsfm-metric3d-onnx",
-    ("depth", "metric3d-v2-large"): "mpsfm-metric3d-onnx",
-    ("depth", "metric3d-v2-giant2"): "mpsfm-metric3d-onnx",
-    ("normals", "onnx"): "mpsfm-onnx",
-    ("normals", "dsine"): "mpsfm-dsine",
-    ("normals", "metric3d-v2-small"): "mpsfm-metric3d-onnx",
-    ("normals", "metric3d-v2-large"): "mpsfm-metric3d-onnx",
-    ("normals", "metric3d-v2-giant2"): "mpsfm-metric3d-onnx",
-    ("retrieval", "appearance"): "mpsfm-retrieval",
-    ("retrieval", "global-onnx"): "mpsfm-retrieval",
-    ("mask", "sky"): "mpsfm-sky",
-    ("mask", "sky-simple"): "mpsfm-sky",
-    ("wrapper", "flip-consistency"): "mpsfm-flip-consistency",
-}
-"""Where providers come from that the shipped configurations name: an install hint, no more."""
 
 Calibration = DepthCalibration | NormalCalibration
 
@@ -343,8 +313,7 @@ class Registry:
         return "", ""
 
     def _unknown(self, kind: Kind, name: str) -> str:
-        home = FIRST_PARTY.get((kind, name))
-        if home:
+        if home := requirement_for(kind, name):
             return f"{kind} provider {name!r} comes with a plugin: pip install '{home}'"
         known = self.names(kind)
         text = f"no {kind} provider {name!r}{did_you_mean(name, known)}"

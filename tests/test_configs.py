@@ -10,8 +10,9 @@ import yaml
 from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.config import Config, describe_shipped, load_config, shipped_configs
 from mpsfm_core.errors import ConfigError
+from mpsfm_core.first_party import FIRST_PARTY, requirement_for
 from mpsfm_core.options import SettingsError, dotted
-from mpsfm_core.registry import CORE, FIRST_PARTY, Registry
+from mpsfm_core.registry import CORE, Registry
 
 NAMES = sorted(shipped_configs())
 GUIDE = Path(__file__).parents[1] / "docs" / "backends.md"
@@ -22,7 +23,7 @@ def registry() -> Registry:
     """All plugins; skips where one that a configuration names is not installed."""
     registry = Registry.discover()
     here = {line.distribution for line in registry.status()}
-    missing = {hint.partition("[")[0] for hint in FIRST_PARTY.values()} - here
+    missing = {home.partition("[")[0] for home in FIRST_PARTY} - here
     if missing:
         pytest.skip(f"needs {', '.join(sorted(missing))}")
     return registry
@@ -50,7 +51,7 @@ def test_loads_and_resolves(name: str, registry: Registry) -> None:
         for each in chosen:
             spec = registry.spec(*each)
             home = registry.version(*each).split()[0]
-            assert home == CORE or FIRST_PARTY[each].partition("[")[0] == home
+            assert home == CORE or requirement_for(*each).partition("[")[0] == home
             assert spec.code_license != "unknown" and spec.summary, path
     assert isinstance(registry.calibration("depth", complete.depth), DepthCalibration)
     assert isinstance(registry.calibration("normals", complete.normals), NormalCalibration)
@@ -72,8 +73,8 @@ def test_says_what_it_has_to_be_told(name: str, registry: Registry) -> None:
 def test_tells_what_to_install(name: str, registry: Registry) -> None:
     """Without any plugin the error names the package of the first thing that is missing."""
     config = load_config(name, (), registry, complete=False)
-    wanted = [(kind, backend.use) for _, kind, backend in config.backends()]
-    hints = [f"pip install '{FIRST_PARTY[each]}'" for each in wanted if each in FIRST_PARTY]
+    homes = {requirement_for(kind, backend.use) for _, kind, backend in config.backends()}
+    hints = [f"pip install '{home}'" for home in homes if home]
     with pytest.raises(ConfigError) as caught:
         load_config(name, (), Registry(), complete=False)
     assert all(hint in str(caught.value) for hint in hints)
@@ -92,9 +93,14 @@ def test_is_described_in_the_guide(name: str) -> None:
     assert f"| `{name}` |" in GUIDE.read_text(encoding="utf-8")
 
 
-def test_the_guide_names_every_first_party_provider(registry: Registry) -> None:
+def test_every_first_party_provider_is_announced_and_in_the_guide(registry: Registry) -> None:
+    """What to install for it is known without its plugin."""
     text = GUIDE.read_text(encoding="utf-8")
+    homes = {home.partition("[")[0] for home in FIRST_PARTY}
+    found = set()
     for line in registry.status():
-        if line.distribution in FIRST_PARTY.values() and line.kind != "plugin":
+        if line.distribution in homes and line.kind != "plugin":
+            found.add(f"{line.kind}/{line.name}")
             short = line.name.removeprefix("metric3d-v2")
             assert f"`{line.name}`" in text or f"`{short}`" in text, f"{line.kind} {line.name}"
+    assert found == {provider for brought in FIRST_PARTY.values() for provider in brought}

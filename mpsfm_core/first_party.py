@@ -1,0 +1,48 @@
+"""Where the providers of this project's own plugins come from: install hints, no more."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+_METRIC3D = ("metric3d-v2-small", "metric3d-v2-large", "metric3d-v2-giant2")
+
+FIRST_PARTY: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "mpsfm-onnx": ("depth/onnx", "depth/onnx-joint", "normals/onnx", "normals/onnx-joint"),
+        "mpsfm-metric3d-onnx": tuple(f"{k}/{n}" for k in ("depth", "normals") for n in _METRIC3D),
+        "mpsfm-dsine": ("normals/dsine",),
+        "mpsfm-flip-consistency": ("wrapper/flip-consistency",),
+        "mpsfm-kornia[weights]": (
+            "features/xfeat",
+            "features/aliked",
+            "features/disk",
+            "matcher/lighterglue",
+            "matcher/lightglue-aliked",
+            "matcher/lightglue-disk",
+        ),
+        "mpsfm-kornia": (
+            "features/dedode",
+            "matcher/lightglue-dedode",
+            "matcher/adalam",
+            "matcher/loftr",
+        ),
+        "mpsfm-lightglue-onnx": (
+            "features/superpoint",
+            "features/disk-onnx",
+            "matcher/lightglue-superpoint",
+            "matcher/lightglue-disk-onnx",
+        ),
+        "mpsfm-mast3r": ("matcher/mast3r", "matcher/mast3r-sparse"),
+        "mpsfm-roma": ("matcher/roma", "matcher/roma-sparse"),
+        "mpsfm-retrieval": ("retrieval/appearance", "retrieval/global-onnx"),
+        "mpsfm-sky": ("mask/sky", "mask/sky-simple"),
+    }
+)
+"""Requirement for pip -> the providers that it brings, as ``kind/name``."""
+
+
+def requirement_for(kind: str, name: str) -> str:
+    """What to install for a provider, empty if it is none of ours."""
+    provider = f"{kind}/{name}"
+    return next((home for home, brought in FIRST_PARTY.items() if provider in brought), "")
