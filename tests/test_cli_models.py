@@ -64,7 +64,8 @@ def test_from_listed_to_fetched_to_verified(uri: str, install_plugin: Callable[.
     code, _, message = models("path", "tiny-depth")
     assert code == 2 and "mpsfm models fetch" in message
 
-    code, out, _ = models("fetch", "tiny-depth")
+    code, out, message = models("fetch", "tiny-depth")
+    assert message.startswith(f"licence of {uri}: MIT\n")
     path = Path(out.strip())
     assert code == 0 and path.read_bytes() == CONTENT
     assert models("path", "depth/tiny-depth")[1].strip() == str(path)
@@ -89,6 +90,16 @@ def test_uri_with_a_hash_of_ones_own(uri: str, tmp_path: Path) -> None:
     assert code == 0 and Path(out.strip()).is_relative_to(other)
     code, _, message = models("fetch", uri, "--sha256", "0" * 64)
     assert code == 2 and "expected 0000" in message
+
+
+def test_offline(
+    uri: str, install_plugin: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install_plugin("mpsfm-tiny", PLUGIN.format(uri=uri, sha256=SHA256))
+    monkeypatch.setenv("MPSFM_OFFLINE", "1")
+    code, out, message = models("fetch", "tiny-depth")
+    assert (code, out) == (2, "") and "downloads are switched off" in message
+    assert "to be fetched" in _line(models("list")[1], "depth/tiny-depth")
 
 
 def test_unknown_name(uri: str, install_plugin: Callable[..., str]) -> None:

@@ -62,12 +62,18 @@ def fetch(
     ] = None,
     cache: CacheDir = None,
 ) -> None:
-    """Download weights that are missing, check them, and print where they are."""
+    """Download weights that are missing, check them, and print where they are.
+
+    Their licences go to stderr.
+    """
     from mpsfm_core.weights import WeightStore
 
+    files = _select(targets)
+    for file in files:
+        typer.echo(f"licence of {file.uri}: {file.license}", err=True)
     with _progress_bars() as progress:
         store = WeightStore(cache, progress=progress)
-        paths = [store.resolve(file.uri, sha256 or file.sha256) for file in _select(targets)]
+        paths = [store.resolve(file.uri, sha256 or file.sha256) for file in files]
     for path in paths:
         typer.echo(path)
 
