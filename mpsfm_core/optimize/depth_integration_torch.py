@@ -299,7 +299,7 @@ def _interpolation(planes: dict[str, Tensor]) -> tuple[_Share, _Share, _Share]:
 
 def _shares(first: Tensor, second: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
     first, second = first.clamp(min=0), second.clamp(min=0)
-    total = first + second + mass.clamp(min=0)
+    total = first + second + mass.abs()
     inverse = torch.where(total > _TINY, 1 / total, 0.0)
     return first * inverse, second * inverse
 

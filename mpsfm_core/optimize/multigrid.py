@@ -56,7 +56,8 @@ class _Level(NamedTuple):
     mass. The pivots are the inverse ones of the smoother's lines. `weights` (8, ...) say how the
     pixels of the next finer grid are interpolated, a cell at a time: the pixel to the right of a
     coarse pixel from its (left, right) neighbours, the one below from (top, bottom), the one
-    diagonally below from the corners (top left, top right, bottom left, bottom right).
+    diagonally below from the corners (top left, top right, bottom left, bottom right). `lacks`
+    (3, ...) are what the weights of these three pixels lack of 1, free of cancellation.
     """
 
     east: Float32
@@ -71,6 +72,7 @@ class _Level(NamedTuple):
     rhs: Float32
     work: Float32
     weights: Float32
+    lacks: Float32
 
 
 class Multigrid:
@@ -141,8 +143,8 @@ class Multigrid:
 
 def _empty_level(height: int, width: int) -> _Level:
     # One block of memory: large enough for huge pages, which matters from about 300 000 pixels.
-    planes = np.zeros((19, height + 2, width + 2), np.float32)
-    return _Level._make([*planes[:11], planes[11:]])
+    planes = np.zeros((22, height + 2, width + 2), np.float32)
+    return _Level._make([*planes[:11], planes[11:19], planes[19:]])
 
 
 @_kernel
@@ -303,7 +305,7 @@ def _prolong(coarse: _Level, fine: _Level) -> None:
 def _derive_interpolation(fine: _Level, coarse: _Level) -> None:
     """Dendy's weights: each fine pixel solves its own equation, collapsed onto its line."""
     east, south, southeast, southwest = fine.east, fine.south, fine.southeast, fine.southwest
-    weights = coarse.weights
+    weights, lacks = coarse.weights, coarse.lacks
     rows, columns = fine.x.shape[0] - 2, fine.x.shape[1] - 2
     for i in range(1, coarse.x.shape[0] - 1):
         r = 2 * i - 1
@@ -312,11 +314,15 @@ def _derive_interpolation(fine: _Level, coarse: _Level) -> None:
             if c < columns:
                 left = east[r, c] + southwest[r, c + 1] + southeast[r - 1, c]
                 right = east[r, c + 1] + southeast[r, c + 1] + southwest[r - 1, c + 2]
-                weights[0, i, j], weights[1, i, j] = _shares(left, right, fine.mass[r, c + 1])
+                weights[0, i, j], weights[1, i, j], lacks[0, i, j] = _shares(
+                    left, right, fine.mass[r, c + 1]
+                )
             if r < rows:
                 top = south[r, c] + southeast[r, c - 1] + southwest[r, c + 1]
                 bottom = south[r + 1, c] + southwest[r + 1, c] + southeast[r + 1, c]
-                weights[2, i, j], weights[3, i, j] = _shares(top, bottom, fine.mass[r + 1, c])
+                weights[2, i, j], weights[3, i, j], lacks[1, i, j] = _shares(
+                    top, bottom, fine.mass[r + 1, c]
+                )
     for i in range(1, coarse.x.shape[0] - 1):
         r = 2 * i
         for j in range(1, coarse.x.shape[1] - 1):
@@ -345,36 +351,49 @@ def _derive_interpolation(fine: _Level, coarse: _Level) -> None:
                     + bottom * weights[1, i + 1, j]
                     + right * weights[3, i, j + 1]
                 )
+                lacks[2, i, j] = (
+                    fine.mass[r, c] * inverse
+                    + top * lacks[0, i, j]
+                    + bottom * lacks[0, i + 1, j]
+                    + left * lacks[1, i, j]
+                    + right * lacks[1, i, j + 1]
+                )
 
 
 @_kernel
 def _shares(
     first: np.float32, second: np.float32, mass: np.float32
-) -> tuple[np.float32, np.float32]:
-    """Interpolation weights of two neighbours; coarse couplings can be slightly negative."""
-    first, second = max(first, _ZERO), max(second, _ZERO)
-    inverse = _inverse(first + second + max(mass, _ZERO))
-    return first * inverse, second * inverse
+) -> tuple[np.float32, np.float32, np.float32]:
+    """Interpolation weights of two neighbours, and what they lack of 1.
+
+    Coarse couplings and masses can be negative. A negative mass keeps a pixel by itself like a
+    positive one: it belongs to strong couplings across.
+    """
+    first, second, mass = max(first, _ZERO), max(second, _ZERO), abs(mass)
+    inverse = _inverse(first + second + mass)
+    return first * inverse, second * inverse, mass * inverse if inverse > _ZERO else _ONE
 
 
 @_kernel
 def _coarsen(fine: _Level, coarse: _Level, nine_point: bool) -> None:
     """Galerkin product, cell by cell: each fine coupling and mass is a square of coarse values."""
-    weights = coarse.weights
+    weights, lacks = coarse.weights, coarse.lacks
     for plane in (coarse.east, coarse.south, coarse.southeast, coarse.southwest, coarse.mass):
         plane[:] = 0
     for i in range(1, coarse.x.shape[0] - 1):
         r = 2 * i - 1
         for j in range(1, coarse.x.shape[1] - 1):
             c = 2 * j - 1
-            # What the fine pixels of a cell are in terms of its four corners.
-            c00, c01 = (_ONE, _ZERO, _ZERO, _ZERO), (_ZERO, _ONE, _ZERO, _ZERO)
-            c10, c11 = (_ZERO, _ZERO, _ONE, _ZERO), (_ZERO, _ZERO, _ZERO, _ONE)
-            top = (weights[0, i, j], weights[1, i, j], _ZERO, _ZERO)
-            left = (weights[2, i, j], _ZERO, weights[3, i, j], _ZERO)
-            right = (_ZERO, weights[2, i, j + 1], _ZERO, weights[3, i, j + 1])
-            bottom = (_ZERO, _ZERO, weights[0, i + 1, j], weights[1, i + 1, j])
-            middle = (weights[4, i, j], weights[5, i, j], weights[6, i, j], weights[7, i, j])
+            # What the fine pixels of a cell are in terms of its four corners, and what lacks.
+            w, below = weights[:, i, j], weights[:, i + 1, j]
+            across = weights[:, i, j + 1]
+            c00, c01 = (_ONE, _ZERO, _ZERO, _ZERO, _ZERO), (_ZERO, _ONE, _ZERO, _ZERO, _ZERO)
+            c10, c11 = (_ZERO, _ZERO, _ONE, _ZERO, _ZERO), (_ZERO, _ZERO, _ZERO, _ONE, _ZERO)
+            top = (w[0], w[1], _ZERO, _ZERO, lacks[0, i, j])
+            left = (w[2], _ZERO, w[3], _ZERO, lacks[1, i, j])
+            right = (_ZERO, across[2], _ZERO, across[3], lacks[1, i, j + 1])
+            bottom = (_ZERO, _ZERO, below[0], below[1], lacks[0, i + 1, j])
+            middle = (w[4], w[5], w[6], w[7], lacks[2, i, j])
 
             q = _NO_SQUARES
             q = _add_mass(q, fine.mass[r, c], c00)
@@ -413,16 +432,26 @@ def _coarsen(fine: _Level, coarse: _Level, nine_point: bool) -> None:
 
 @_kernel
 def _add_mass(q, mass, a):  # type: ignore[no-untyped-def]
-    """Add mass * (a . corners)^2 to the couplings (6) and masses (4) `q` of a cell, lumped.
+    """Add mass * (a . corners)^2 to the couplings (6) and masses (4) `q` of a cell.
 
-    Lumping is an upper bound and keeps couplings from getting negative at isolated heavy pixels.
+    Positive masses are lumped: an upper bound, as a preconditioner may have it, that keeps
+    couplings from getting negative at isolated heavy pixels. Negative ones would get a lower bound.
     """
+    a0, a1, a2, a3 = a[0], a[1], a[2], a[3]
+    heavy, light = max(mass, _ZERO), min(mass, _ZERO)
+    lumped = heavy * (abs(a0) + abs(a1) + abs(a2) + abs(a3))
+    exact = light * (a0 + a1 + a2 + a3)
     return (
-        *q[:6],
-        q[6] + mass * a[0],
-        q[7] + mass * a[1],
-        q[8] + mass * a[2],
-        q[9] + mass * a[3],
+        q[0] - light * a0 * a1,
+        q[1] - light * a2 * a3,
+        q[2] - light * a0 * a2,
+        q[3] - light * a1 * a3,
+        q[4] - light * a0 * a3,
+        q[5] - light * a1 * a2,
+        q[6] + lumped * abs(a0) + exact * a0,
+        q[7] + lumped * abs(a1) + exact * a1,
+        q[8] + lumped * abs(a2) + exact * a2,
+        q[9] + lumped * abs(a3) + exact * a3,
     )
 
 
@@ -430,7 +459,7 @@ def _add_mass(q, mass, a):  # type: ignore[no-untyped-def]
 def _add_coupling(q, coupling, a, b):  # type: ignore[no-untyped-def]
     """Add coupling * ((a - b) . corners)^2 to a cell."""
     v0, v1, v2, v3 = a[0] - b[0], a[1] - b[1], a[2] - b[2], a[3] - b[3]
-    total = v0 + v1 + v2 + v3
+    total = b[4] - a[4]
     return (
         q[0] - coupling * v0 * v1,
         q[1] - coupling * v2 * v3,
