@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from mpsfm_core import ProviderContext
 from mpsfm_core.errors import ConfigError, WeightsError
 
+_log = logging.getLogger(__name__)
 _ERRORS_ONLY = 3
 _DTYPES: Mapping[str, type[np.generic]] = {
     "tensor(float)": np.float32,
@@ -89,7 +91,10 @@ def _open(path: Path, context: ProviderContext) -> onnxruntime.InferenceSession:
     available = onnxruntime.get_available_providers()
     providers = [p for p in [*wanted, "CPUExecutionProvider"] if p in available]
     try:
-        return onnxruntime.InferenceSession(str(path), settings, providers=providers)
+        session = onnxruntime.InferenceSession(str(path), settings, providers=providers)
     except Exception as error:  # onnxruntime's exceptions share no base class
         reason = str(error).strip().splitlines()[0]
         raise WeightsError(f"{path} cannot be opened as an ONNX model: {reason}") from error
+    if not set(wanted) <= set(session.get_providers()):  # it may be there and lack its libraries
+        _log.warning("%s runs on the CPU: onnxruntime cannot use the GPU here", path.name)
+    return session

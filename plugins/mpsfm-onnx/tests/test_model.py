@@ -1,0 +1,39 @@
+"""Where a model runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import onnxruntime
+import pytest
+from mpsfm_onnx.model import Model
+
+CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
+IDENTITY = "one (float[n] x) => (float[n] y) { y = Identity (x) }"
+
+
+@pytest.mark.parametrize(
+    ("device", "here", "asked"),
+    [
+        ("cuda", [CUDA, CPU], [CUDA, CPU]),
+        ("cuda", [CPU], [CPU]),
+        ("cpu", [CUDA, CPU], [CPU]),
+    ],
+)
+def test_on_the_gpu_where_it_is_wanted_and_there(
+    monkeypatch, caplog, write_onnx, context, device, here, asked
+):
+    """The session itself is made on the CPU: a GPU whose libraries do not load."""
+    found = []
+    session = onnxruntime.InferenceSession
+
+    def on_the_cpu(path, settings, providers):
+        found.extend(providers)
+        return session(path, settings, providers=[CPU])
+
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: here)
+    monkeypatch.setattr(onnxruntime, "InferenceSession", on_the_cpu)
+    model = Model(write_onnx(IDENTITY), replace(context, device=device))
+    assert found == asked
+    assert ("runs on the CPU" in caplog.text) == (device == "cuda")
+    assert model.run({"x": [1, 2]}, ["y"])[0].tolist() == [1, 2]
