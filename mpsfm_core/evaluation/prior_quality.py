@@ -1,8 +1,9 @@
 """Depth of a stated quality for a scene whose true depth is known.
 
 ``sensor``: the true depth, declared good to 1 %: an upper bound. ``degraded``: the true depth with
-the errors of :mod:`mpsfm_core.testing.degraded_depth`, declared honestly: stands for a good
-monocular network. ``config``: what the configuration's own provider predicts.
+the errors of :mod:`mpsfm_core.testing.degraded_depth`, declared honestly, which means as large as
+they are after the best scale of each image: stands for a good monocular network. ``config``: what
+the configuration's own provider predicts.
 """
 
 from __future__ import annotations
