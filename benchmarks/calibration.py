@@ -27,6 +27,7 @@ from mpsfm_core.calibration.model import DepthCalibration
 from mpsfm_core.calibration.study import judge
 from mpsfm_core.config import load_config
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
+from mpsfm_core.evaluation.pose_auc import CONVENTIONS
 from mpsfm_core.evaluation.prior_quality import prior_settings
 from mpsfm_core.evaluation.records import Record
 from mpsfm_core.evaluation.report import Row, make_rows
@@ -183,7 +184,11 @@ def _table(
     yield "Calibrated: " + ", ".join(f"{name} {value:g}" for name, value in values.items())
     yield ""
     sets = next(iter(rows.values())).sets
-    yield f"Pose AUC@1 / 5 / 20 deg in percent over {sets} sets; registered images in percent."
+    convention = CONVENTIONS["paper"]
+    yield (
+        f"Pose AUC at 1 / 5 / 20 degrees in percent over {sets} sets, convention "
+        f"`{convention.name}`: {convention.description}. Registered images in percent."
+    )
     yield ""
     yield (
         "| declared | within 1 std | within 2 std | 1.4826 MAD of z | nll (heavy) | AUC, noise "
