@@ -86,3 +86,5 @@ def test_readme(folder: Path) -> None:
     assert f"pip install {folder.name}" in text or f"pip install '{folder.name}" in text
     assert re.search(r"^## Licences?$", text, re.MULTILINE)
     assert "```yaml" in text or "export " in text
+    overview = folder.parents[1] / "README.md"
+    assert f"| [{folder.name}](plugins/{folder.name}) |" in overview.read_text(encoding="utf-8")

@@ -15,7 +15,8 @@ from mpsfm_core.options import SettingsError, dotted
 from mpsfm_core.registry import CORE, Registry
 
 NAMES = sorted(shipped_configs())
-GUIDE = Path(__file__).parents[1] / "docs" / "backends.md"
+ROOT = Path(__file__).parents[1]
+GUIDE = ROOT / "docs" / "backends.md"
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +90,9 @@ def test_one_pass_gives_depth_and_normals_where_nothing_wraps_them(registry: Reg
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_is_described_in_the_guide(name: str) -> None:
+def test_is_described(name: str) -> None:
     assert f"| `{name}` |" in GUIDE.read_text(encoding="utf-8")
+    assert f"`{name}`" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def test_every_first_party_provider_is_announced_and_in_the_guide(registry: Registry) -> None:
