@@ -27,6 +27,9 @@ def test_the_tutorial_shows_the_files_of_the_example() -> None:
     assert len(shown) == 5
     for name, text in shown.items():
         assert text == (EXAMPLE / name).read_text(encoding="utf-8"), name
+    changes = re.findall(r"```toml\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), re.DOTALL)
+    project = (EXAMPLE / "pyproject.toml").read_text(encoding="utf-8")
+    assert len(changes) == 2 and all(change in project for change in changes)
 
 
 def test_every_check_stands_in_the_documentation() -> None:
