@@ -207,8 +207,8 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
     """Kind and name of the providers that ``name`` means: a provider (``onnx``), one of a kind
     (``depth/onnx``) or all of a distribution (``mpsfm-onnx``).
 
-    Raises :class:`~mpsfm_core.errors.InputError` when there is none; the reason if it is there and
-    unavailable.
+    Raises :class:`~mpsfm_core.errors.InputError` when there is none, and
+    :class:`~mpsfm_core.errors.ProviderError` with the reason if the plugin is there and has none.
     """
     known = [line for line in registry.status() if line.kind != "plugin"]
     found = [
@@ -217,9 +217,11 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
         if name in (line.name, f"{line.kind}/{line.name}", line.distribution)
     ]
     if not found:
-        broken = [p for p in registry.status() if not p.available and name == p.distribution]
-        if broken:
-            raise ProviderError(f"{name} {broken[0].reason}; {broken[0].install_hint}")
+        plugin = next((line for line in registry.status() if line.distribution == name), None)
+        if plugin is not None and plugin.available:
+            raise ProviderError(f"{name} brings hooks and no providers to check")
+        if plugin is not None:
+            raise ProviderError(f"{name} {plugin.reason}; {plugin.install_hint}")
         candidates = {n for line in known for n in (line.name, line.distribution)}
         raise InputError(f"no provider or plugin {name!r}{did_you_mean(name, candidates)}")
     return [(kind, name) for kind, name in found if kind != "plugin"]

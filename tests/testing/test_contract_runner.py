@@ -134,6 +134,18 @@ def test_providers_by_name_kind_and_distribution() -> None:
         find_providers(registry, "hear")
 
 
+def test_a_plugin_without_providers_has_nothing_to_check(install_plugin: Any) -> None:
+    source = """
+        from mpsfm_core import hookimpl
+        @hookimpl
+        def mpsfm_filter_pairs(pairs):
+            return pairs
+    """
+    install_plugin("mpsfm-hooks", source)
+    with pytest.raises(ProviderError, match="mpsfm-hooks brings hooks and no providers to check"):
+        find_providers(Registry.discover(), "mpsfm-hooks")
+
+
 def test_an_unavailable_provider_says_why() -> None:
     registry = registry_of(ProviderSpec("depth", "needy", PaintedDepth, requires=("no_such_pkg",)))
     ((kind, name),) = find_providers(registry, "needy")
