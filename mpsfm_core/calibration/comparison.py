@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
+import numpy as np
+
 from mpsfm_core.calibration.file import CalibratedKind
 from mpsfm_core.calibration.fitting import Alignment, DepthData, NormalData
 from mpsfm_core.calibration.model import DepthCalibration
+from mpsfm_core.calibration.model_truth import drawn_evenly
 from mpsfm_core.calibration.samples import (
     MIN_SAMPLES,
     DepthSamples,
@@ -75,15 +78,22 @@ class Comparison:
         return self._depth_data(self._compare(known, depth), in_metres=True)
 
     def with_points(self, truth: Mapping[str, DepthTruth]) -> Data:
-        """Compare with depth at points of any unit, by image name.
+        """Compare with depth at points of any unit, by image name; each counts by its area.
 
         Raises:
             InputError: no image has enough of them.
         """
-        names = self._bench.images.names
-        known = [i for i, name in enumerate(names) if name in truth]
-        samples = self._compare(known, lambda i: self._depth(i, truth[names[i]]))
-        return self._depth_data(samples, in_metres=False)
+        names, sampling = self._bench.images.names, self._options
+        points = {i: truth[name] for i, name in enumerate(names) if name in truth}
+        known = [i for i, found in points.items() if len(found.xy) >= MIN_SAMPLES]
+
+        def depth(index: int) -> DepthSamples | None:
+            size = self._bench.images[index].pinhole.size
+            rng = np.random.default_rng([sampling.seed, index])
+            even = drawn_evenly(points[index], size, sampling.samples_per_image, rng)
+            return self._depth(index, even)
+
+        return self._depth_data(self._compare(known, depth), in_metres=False)
 
     def _compare(
         self, images: Sequence[int], compare: Callable[[int], Samples | None]
