@@ -1,4 +1,4 @@
-"""The plots of a calibration report, as one SVG. Needs matplotlib: ``mpsfm-core[report]``."""
+"""The plots of a calibration report as one drawing. Needs matplotlib: ``mpsfm-core[report]``."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ BEFORE, AFTER, IDEAL = "#b3561d", "#1f6f8b", "#888888"
 Metrics = Mapping[str, Any]
 
 
-def draw(metrics: Mapping[str, Metrics], place: str, error: str) -> str:
-    """Four plots of the metrics ``before`` and ``after``; an SVG element.
+def draw(metrics: Mapping[str, Metrics], place: str, error: str) -> tuple[str, bytes]:
+    """Four plots of the metrics ``before`` and ``after``: an SVG element, and a PNG file.
 
     ``place``: what errors are broken down by, ``error``: what they are, both with units.
     """
@@ -38,10 +38,11 @@ def draw(metrics: Mapping[str, Metrics], place: str, error: str) -> str:
         labels = figure.axes
         labels[1].set(xlabel=f"declared std ({error})", ylabel=f"actual spread ({error})")
         labels[3].set_xlabel(place)
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    text = buffer.getvalue()
-    return text[text.index("<svg") :]
+        svg, png = io.StringIO(), io.BytesIO()
+        figure.savefig(svg, format="svg", metadata={"Date": None})
+        figure.savefig(png, format="png", dpi=150)
+    text = svg.getvalue()
+    return text[text.index("<svg") :], png.getvalue()
 
 
 def _sensitivity(axes: Axes, metrics: Mapping[str, Metrics]) -> None:

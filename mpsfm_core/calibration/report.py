@@ -1,4 +1,5 @@
-"""The report of a calibration: one HTML page that needs nothing else, and its numbers as JSON."""
+"""The report of a calibration: one HTML page that needs nothing else, its plots as PNG, and its
+numbers as JSON."""
 
 from __future__ import annotations
 
@@ -16,9 +17,10 @@ table { border-collapse: collapse; margin: 0.5rem 0 1.5rem; }
 th, td { border-bottom: 1px solid #ddd; padding: 0.2rem 0.9rem 0.2rem 0; text-align: left; }
 td { font-variant-numeric: tabular-nums; }
 .warning { border-left: 4px solid #b3561d; padding-left: 0.8rem; }
+td { overflow-wrap: anywhere; }
 svg { max-width: 100%; height: auto; }
 """
-_UNITS = {"depth": ("depth (m)", "log depth"), "normals": ("slant (degrees)", "rad")}
+_ERRORS = {"depth": "log depth", "normals": "rad"}
 _METRICS = {
     "coverage": "within 1 / 2 / 3 std",
     "coverage_of_folds": "within 1 std, of each fold",
@@ -38,19 +40,22 @@ _IDEAL = {
 
 
 def write_report(calibration_file: Path, report: Mapping[str, Any]) -> tuple[Path, Path]:
-    """Write ``NAME.report.html`` and ``NAME.report.json`` beside ``NAME.yaml``.
+    """Write ``NAME.report.html``, ``.json`` and ``.png`` beside ``NAME.yaml``.
 
-    Plots need matplotlib; without it the page says so. Returns both paths.
+    The plots need matplotlib; without it there is no PNG, and the page says so. Returns the paths
+    of page and numbers.
     """
     page = calibration_file.with_suffix(".report.html")
     numbers = calibration_file.with_suffix(".report.json")
-    page.write_text(render(report), encoding="utf-8")
+    svg, png = _plots(report)
+    page.write_text(_page(report, svg), encoding="utf-8")
     numbers.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    if png is not None:
+        calibration_file.with_suffix(".report.png").write_bytes(png)
     return page, numbers
 
 
-def render(report: Mapping[str, Any]) -> str:
-    """The report as an HTML page."""
+def _page(report: Mapping[str, Any], plots: str) -> str:
     made = report["provenance"]
     title = f"Calibration of {report['kind']} by {made['provider']}"
     parts = [
@@ -61,8 +66,8 @@ def render(report: Mapping[str, Any]) -> str:
         _table(("", "before", "after", "95 % interval", "largest for"), _values(report)),
         f"<h2>On images held out ({report['folds']} folds)</h2>",
         _table(("", "before", "after", "ideal"), _metrics(report["metrics"])),
-        _plots(report),
-        f"<h2>By {escape(_UNITS[report['kind']][0])}</h2>",
+        plots,
+        f"<h2>By {escape(report['place'])}</h2>",
         _table(("from", "to", "pixels", "std", "before", "after", "z after"), _ranges(report)),
         "<h2>Models tried</h2>",
         "<p>A model is chosen when it explains the errors better than the one chosen before it by "
@@ -140,12 +145,13 @@ def _rounds(report: Mapping[str, Any]) -> Iterable[str]:
         yield _table(("round", "change of the median std", "values"), rows)
 
 
-def _plots(report: Mapping[str, Any]) -> str:
+def _plots(report: Mapping[str, Any]) -> tuple[str, bytes | None]:
+    """For the page, and as a PNG file."""
     try:
         from mpsfm_core.calibration.plots import draw
     except ImportError:
-        return "<p>The plots need matplotlib: pip install 'mpsfm-core[report]'</p>"
-    return draw(report["metrics"], *_UNITS[report["kind"]])
+        return "<p>The plots need matplotlib: pip install 'mpsfm-core[report]'</p>", None
+    return draw(report["metrics"], report["place"], _ERRORS[report["kind"]])
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

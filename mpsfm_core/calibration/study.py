@@ -86,6 +86,7 @@ def study(data: Data, declared: Calibration, options: StudyOptions) -> Study:
             "after": judge(held_out, fitted or [best.calibration]),
         },
         "scale": _scale(data, best.calibration),
+        "place": _place(data),
     }
     warnings = tuple(_warnings(len(data.samples), intervals, best.fit))
     return Study(best.calibration, {**report, "warnings": list(warnings)}, warnings)
@@ -123,6 +124,13 @@ def _apply(
 
 def _coverage(residuals: Residuals, std: Float64) -> list[float]:
     return coverage(residuals.error, np.hypot(std, residuals.noise), residuals.weights())
+
+
+def _place(data: Data) -> str:
+    """What errors are broken down by, with its unit."""
+    if isinstance(data, NormalData):
+        return "slant (degrees)"
+    return "depth (m)" if data.in_metres else "depth (unit of the model)"
 
 
 def _scale(data: Data, calibration: Calibration) -> dict[str, float] | None:

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from typer.testing import CliRunner
 
 from mpsfm_core.calibration.file import load_calibration
 from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
+from mpsfm_core.calibration.report import write_report
 from mpsfm_core.cli import build_app
 from mpsfm_core.config import load_config
 from mpsfm_core.yaml_text import parse_yaml
@@ -91,16 +93,44 @@ def test_the_report_has_plots_and_numbers(calibrated: Path) -> None:
     assert len(numbers["images"]) == 8
 
 
-def test_without_matplotlib_the_page_says_what_is_missing(
-    calibrated: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from mpsfm_core.calibration.report import render
+def test_every_plot_is_labelled_and_shows_both_calibrations(calibrated: Path) -> None:
+    pytest.importorskip("matplotlib")
+    page = calibrated.with_suffix(".report.html").read_text()
+    root = ElementTree.fromstring(page[page.index("<svg") : page.index("</svg>") + len("</svg>")])
+    groups = {g.get("id"): g for g in root.iter("{http://www.w3.org/2000/svg}g") if g.get("id")}
+    plots = [groups[f"axes_{number}"] for number in (1, 2, 3, 4)]
+    labels = [
+        {"Sensitivity", "share of pixels, most certain first", "RMSE / RMSE of all"},
+        {"declared std (log depth)", "actual spread (log depth)", "ideal"},
+        {"Coverage on held-out images", "standard deviations", "share of errors within"},
+        {"Coverage by range", "depth (m)", "share within 1 std"},
+    ]
+    for plot, expected in zip(plots, labels, strict=True):
+        texts = {"".join(t.itertext()) for t in plot.iter("{http://www.w3.org/2000/svg}text")}
+        assert expected <= texts
+        assert {"before", "after"} <= {text.split(" ")[0] for text in texts}
+    from mpsfm_core.calibration.plots import AFTER, BEFORE
 
+    picture = cv2.imread(str(calibrated.with_suffix(".report.png")))
+    for quarter in (
+        half for side in np.array_split(picture, 2) for half in np.array_split(side, 2, 1)
+    ):
+        for color in (BEFORE, AFTER):
+            bgr = [int(color[i : i + 2], 16) for i in (5, 3, 1)]
+            assert (quarter == bgr).all(axis=2).sum() > 100
+
+
+def test_without_matplotlib_the_page_says_what_is_missing(
+    calibrated: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.delitem(sys.modules, "mpsfm_core.calibration.plots", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    page = render(json.loads(calibrated.with_suffix(".report.json").read_text()))
+    report = json.loads(calibrated.with_suffix(".report.json").read_text())
+    path, _ = write_report(tmp_path / "again.yaml", report)
+    page = path.read_text()
     assert "mpsfm-core[report]" in page
     assert "<svg" not in page
+    assert not (tmp_path / "again.report.png").exists()
 
 
 def test_the_same_command_fits_the_same_values(calibrated: Path, tmp_path: Path) -> None:
@@ -192,6 +222,8 @@ def test_points_of_a_model(calibrated: Path, tmp_path: Path) -> None:
     found = provenance(tmp_path / "points.yaml")
     assert found["truth"] == "points of a model: model"
     assert "coverage_without_scaling" not in found["metrics"]["after"]
+    page = (tmp_path / "points.report.html").read_text()
+    assert "depth (unit of the model)" in page and "depth (m)" not in page
 
 
 @pytest.mark.slow
