@@ -167,11 +167,7 @@ def _table(rows: Sequence[Row]) -> str:
 def _curves(errors: Mapping[str, Float64]) -> str:
     """Recall over the error's threshold, a drawing in SVG."""
     width, height = _PLOT
-    shapes = [f"<rect width='{width}' height='{height}' fill='none' stroke='#999'/>"]
-    for degrees in range(0, _RANGE_DEG + 1, 5):
-        x = degrees / _RANGE_DEG * width
-        shapes.append(f"<path d='M{x} 0V{height}' stroke='#ddd'/>")
-        shapes.append(f"<text x='{x}' y='{height + 16}' text-anchor='middle'>{degrees}°</text>")
+    shapes = _axes()
     for number, (method, values) in enumerate(errors.items()):
         color = _COLORS[number % len(_COLORS)]
         below = np.sort(values[values <= _RANGE_DEG])
@@ -185,6 +181,25 @@ def _curves(errors: Mapping[str, Float64]) -> str:
         y = 16 + 16 * number
         shapes.append(f"<text x='{width + 12}' y='{y}' fill='{color}'>{html.escape(method)}</text>")
     return (
-        f"<svg viewBox='-20 -10 {width + 260} {height + 40}' width='{width + 260}' "
-        f"height='{height + 40}' font-size='12'>{''.join(shapes)}</svg>"
+        f"<svg viewBox='-60 -10 {width + 300} {height + 60}' width='{width + 300}' "
+        f"height='{height + 60}' font-size='12'>{''.join(shapes)}</svg>"
     )
+
+
+def _axes() -> list[str]:
+    """Frame, grid and labels of a plot of recall."""
+    width, height = _PLOT
+    shapes = [f"<rect width='{width}' height='{height}' fill='none' stroke='#999'/>"]
+    for degrees in range(0, _RANGE_DEG + 1, 5):
+        x = degrees / _RANGE_DEG * width
+        shapes.append(f"<path d='M{x:g} 0V{height}' stroke='#ddd'/>")
+        shapes.append(f"<text x='{x:g}' y='{height + 16}' text-anchor='middle'>{degrees}°</text>")
+    for percent in range(0, 101, 25):
+        y = height * (1 - percent / 100)
+        shapes.append(f"<path d='M0 {y:g}H{width}' stroke='#ddd'/>")
+        shapes.append(f"<text x='-6' y='{y + 4:g}' text-anchor='end'>{percent}%</text>")
+    middle = f"x='{width / 2:g}' y='{height + 36}' text-anchor='middle'"
+    beside = f"transform='translate(-46 {height / 2:g}) rotate(-90)' text-anchor='middle'"
+    shapes.append(f"<text {middle}>error of a pair up to</text>")
+    shapes.append(f"<text {beside}>share of pairs</text>")
+    return shapes

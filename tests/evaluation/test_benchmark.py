@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation import methods
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
 from mpsfm_core.evaluation.methods import Task, run_method, run_tasks
+from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.records import read_record, read_records
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.problems import mapping_problem
@@ -75,8 +77,26 @@ def test_the_report_has_all_methods_and_names_its_convention(output) -> None:
     assert (folder / "report.md").read_text() == out
     assert "convention `paper`: ordered pairs" in out
     assert "| all | 1 | ours-sensor |" in out
+    assert "ordered pairs" in (folder / "report.html").read_text()
+
+
+def test_the_recall_curves_are_labelled_and_those_of_the_errors(output) -> None:
+    folder, _, _ = output
     page = (folder / "report.html").read_text()
-    assert page.count("<polyline") == 3 and "ordered pairs" in page
+    drawing = ElementTree.fromstring(
+        page[page.index("<svg") : page.index("</svg>") + len("</svg>")]
+    )
+    texts = [element.text for element in drawing.iter("text")]
+    for text in ("share of pairs", "error of a pair up to", "0%", "100%", "20°", "colmap"):
+        assert texts.count(text) == 1
+    curves = [element.get("points", "").split() for element in drawing.iter("polyline")]
+    assert len(curves) == 3
+    record = read_record(folder / "runs" / "room" / "sift" / "all-00" / "ours-sensor.json")
+    errors = pose_errors_deg(record.estimated, record.truth, CONVENTIONS["paper"])
+    (first,) = (curve for curve, label in zip(curves, texts[-3:], strict=True) if "sensor" in label)
+    end = 260 * (1 - (errors <= 20).mean())
+    assert first[0] == "0.0,260.0" and first[-1] == f"440.0,{end:.1f}"
+    assert len(first) == 2 + 2 * (errors <= 20).sum()
 
 
 def test_records_hold_the_poses(output) -> None:
