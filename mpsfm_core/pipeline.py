@@ -16,6 +16,7 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.errors import InputError, ReconstructionError
 from mpsfm_core.evaluation.models import match_names, read_poses
 from mpsfm_core.evaluation.pose_auc import Pose
+from mpsfm_core.extraction.focal import estimate_focals
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.mapping import mapper
@@ -109,6 +110,7 @@ class _Run:
             images = load_images(folder, intrinsics, image_list, config.inputs)
             known = {} if poses is None else _known_poses(poses, images)
         with stage("extraction"):
+            images = estimate_focals(images, config, self._registry, self._stages)
             extraction = extract(images, config, self._registry, self._stages)
         problem = _with_poses(extraction.problem, known)
         with stage("mapping"):

@@ -92,6 +92,15 @@ class JointProvider(DepthProvider, Protocol):
 
 
 @runtime_checkable
+class FocalEstimator(DepthProvider, Protocol):
+    """A depth provider that can tell the focal length of a view (``estimates-focal``)."""
+
+    def estimate_focal(self, view: View) -> float | None:
+        """In pixels of the view, whatever its camera says; None where there is no telling."""
+        ...
+
+
+@runtime_checkable
 class NormalsProvider(Protocol):
     """Predicts normals of a view; ``depth`` is given when the spec says ``needs-depth``."""
 

@@ -36,6 +36,7 @@ from mpsfm_core.errors import DataError, MpsfmError, ProviderOutputError, Provid
 from mpsfm_core.providers import (
     DepthProvider,
     FeatureProvider,
+    FocalEstimator,
     JointProvider,
     MaskProvider,
     Matcher,
@@ -67,6 +68,17 @@ def run_joint(
         if not (isinstance(answer, tuple) and len(answer) == 2):
             raise DataError("output", f"must be (depth, normals), got {_type(answer)}")
         return validate_depth(spec, view, answer[0]), validate_normals(spec, view, answer[1])
+
+
+def run_focal(spec: ProviderSpec, provider: FocalEstimator, view: View) -> float | None:
+    """Estimate the focal length of a view in its pixels; None where the provider cannot tell."""
+    with provider_errors(spec, view.name):
+        focal = provider.estimate_focal(view)
+        if focal is None:
+            return None
+        if not (isinstance(focal, (int, float, np.number)) and 0 < focal < np.inf):
+            raise DataError("focal", f"must be a positive number of pixels, got {focal!r}")
+        return float(focal)
 
 
 def run_normals(

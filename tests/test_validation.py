@@ -30,6 +30,7 @@ from mpsfm_core.errors import (
 from mpsfm_core.validation import (
     run_depth,
     run_features,
+    run_focal,
     run_joint,
     run_mask,
     run_matcher,
@@ -93,7 +94,7 @@ class Provider:
         self.arguments = arguments
         return self.make()
 
-    predict = predict_joint = extract = match = describe = mask = _answer
+    predict = predict_joint = estimate_focal = extract = match = describe = mask = _answer
 
 
 def written_to_later() -> DepthPrior:
@@ -123,6 +124,9 @@ def written_to_later() -> DepthPrior:
         (run_depth, ("variance",), depth, "variance", "declares: 'variance'"),
         (run_joint, (), depth, "output", r"must be \(depth, normals\), got DepthPrior"),
         (run_joint, (), lambda: (depth(), depth()), "normals", "must be a NormalPrior"),
+        (run_focal, (), lambda: 0.0, "focal", "positive number of pixels, got 0.0"),
+        (run_focal, (), lambda: float("nan"), "focal", "positive number of pixels, got nan"),
+        (run_focal, (), lambda: "wide", "focal", "positive number of pixels, got 'wide'"),
         (run_normals, (), depth, "normals", "must be a NormalPrior, got DepthPrior"),
         (run_normals, ("variance",), normals, "variance", "declares: 'variance'"),
         (run_normals, (), lambda: normals(25.0), "variance", r"rad\^2, the median is 25"),
@@ -144,7 +148,7 @@ def test_an_answer_that_breaks_a_rule(
     field: str,
     rule: str,
 ) -> None:
-    kind = run.__name__.removeprefix("run_").replace("joint", "depth")
+    kind = run.__name__.removeprefix("run_").replace("joint", "depth").replace("focal", "depth")
     with pytest.raises(ProviderOutputError, match=rule) as caught:
         run(spec(kind, *capabilities), Provider(make), VIEW)
     assert (caught.value.provider, caught.value.image) == ("odd", "a.jpg")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -33,7 +33,7 @@ from mpsfm_core.inputs.undistortion import (
 
 _log = logging.getLogger(__name__)
 
-FocalSource = Literal["intrinsics", "exif", "default"]
+FocalSource = Literal["intrinsics", "exif", "provider", "default"]
 
 _CACHED_BYTES = 512 << 20
 """Decoded views that are kept: the matcher asks for each image many times."""
@@ -51,14 +51,14 @@ class SourceImage:
     ``name``: path below the images folder, forward slashes. ``camera``: the original camera, for
     the upright image; ``camera_id`` is the number in the intrinsics file, or counts distinct
     cameras. ``pinhole``: the camera of the undistorted (maybe reduced) view. ``focal_known``:
-    False when the focal length is the default guess. ``digest``: SHA-256 of the file.
+    False when the focal length is a guess, a provider's or the default. ``digest``: SHA-256 of the
+    file.
     """
 
     name: str
     path: Path
     camera: pycolmap.Camera
     pinhole: PinholeCamera
-    focal_known: bool
     focal_source: FocalSource
     digest: str
 
@@ -69,6 +69,11 @@ class SourceImage:
     def view_pixels(self, xy: Float64) -> Float64:
         """Pixels (n, 2) of the upright original image as pixels of the undistorted view."""
         return to_view(self.pinhole, self.camera, xy)
+
+    @property
+    def focal_known(self) -> bool:
+        """Whether the focal length need not be refined."""
+        return self.focal_source in ("intrinsics", "exif")
 
     @property
     def original_size(self) -> tuple[int, int]:
@@ -108,6 +113,22 @@ class ImageSet:
         Raises :class:`InputError` when the file (or its mask) is unreadable or has changed.
         """
         return self._views.get(index, lambda: self._load(self.images[index]))
+
+    def with_focals(self, focals: Mapping[int, float]) -> ImageSet:
+        """The same images, with other focal lengths where they are the default.
+
+        ``focals``: camera id -> pixels of the original image; still a guess.
+        """
+
+        def changed(image: SourceImage) -> SourceImage:
+            number = image.camera.camera_id
+            if image.focal_source != "default" or number not in focals:
+                return image
+            camera = _simple_camera(image.original_size, focals[number], number)
+            pinhole = _view_camera(camera, self._options)
+            return replace(image, camera=camera, pinhole=pinhole, focal_source="provider")
+
+        return ImageSet([changed(image) for image in self.images], self._options)
 
     def mask(self, index: int) -> Bool | None:
         """The mask of a view; does not decode the image when there is none."""
@@ -238,17 +259,12 @@ class _CameraGuesses:
 
     def camera(self, file: _File) -> tuple[pycolmap.Camera, FocalSource]:
         """A SIMPLE_PINHOLE camera with the principal point in the centre."""
-        width, height = file.size
         source: FocalSource = "exif"
-        focal = file.header.focal_px(width, height)
+        focal = file.header.focal_px(*file.size)
         if focal is None:
             source, focal = "default", self._options.default_focal_ratio * max(file.size)
         number = self._ids.setdefault((file.size, focal), len(self._ids) + 1)
-        params = [focal, width / 2, height / 2]
-        camera = pycolmap.Camera(
-            model="SIMPLE_PINHOLE", width=width, height=height, params=params, camera_id=number
-        )
-        return camera, source
+        return _simple_camera(file.size, focal, number), source
 
 
 def _source_image(
@@ -259,10 +275,24 @@ def _source_image(
     focal: FocalSource,
     options: InputOptions,
 ) -> SourceImage:
-    size = _reduced_size(file.size, options.max_image_size)
-    reduced = camera if size == file.size else resized_camera(camera, size)
-    pinhole = pinhole_camera(reduced, options.blank_pixels)
-    return SourceImage(name, path, camera, pinhole, focal != "default", focal, file.digest)
+    return SourceImage(name, path, camera, _view_camera(camera, options), focal, file.digest)
+
+
+def _simple_camera(size: tuple[int, int], focal: float, number: int) -> pycolmap.Camera:
+    """A SIMPLE_PINHOLE camera with the principal point in the centre."""
+    width, height = size
+    params = [focal, width / 2, height / 2]
+    return pycolmap.Camera(
+        model="SIMPLE_PINHOLE", width=width, height=height, params=params, camera_id=number
+    )
+
+
+def _view_camera(camera: pycolmap.Camera, options: InputOptions) -> PinholeCamera:
+    """The camera of the view that is made of an image."""
+    original = camera.width, camera.height
+    size = _reduced_size(original, options.max_image_size)
+    reduced = camera if size == original else resized_camera(camera, size)
+    return pinhole_camera(reduced, options.blank_pixels)
 
 
 def find_images(folder: Path) -> list[str]:

@@ -112,6 +112,16 @@ def test_default_focal_length_warns_once(folder: Path, caplog: pytest.LogCapture
     assert not found[0].focal_known and found[0].focal_source == "default"
 
 
+def test_other_focal_lengths_where_they_were_the_default(folder: Path, intrinsics: Path) -> None:
+    options = InputOptions(max_image_size=40)
+    found = load_images(folder, options=options).with_focals({1: 70.0, 2: 9.0})
+    assert all(image.focal_source == "provider" and not image.focal_known for image in found)
+    assert [image.camera.focal_length for image in found] == [70.0] * 3
+    assert found.view(0).camera.fx == found[0].pinhole.fx == 35.0
+    known = load_images(folder, intrinsics)
+    assert known.with_focals({1: 70.0})[0] is known[0]
+
+
 def test_rotated_photo_is_upright(tmp_path: Path, write_image, photo) -> None:
     for name in ("a.png", "b.png"):
         write_image(name, tags={0x0112: 6, 0xA405: 36})

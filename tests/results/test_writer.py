@@ -13,7 +13,7 @@ import pytest
 
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.geometry import project, transform
-from mpsfm_core.inputs.images import ImageSet, SourceImage
+from mpsfm_core.inputs.images import FocalSource, ImageSet, SourceImage
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.undistortion import pinhole_camera
 from mpsfm_core.results.options import ResultOptions
@@ -39,13 +39,14 @@ DISTORTED = pycolmap.Camera(
 
 
 def photos_of(solved, folder: Path, camera: pycolmap.Camera, known: bool = True) -> ImageSet:
+    source: FocalSource = "intrinsics" if known else "default"
     sources = []
     for name, view in solved.views.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), cv2.cvtColor(view.image, cv2.COLOR_RGB2BGR))
         pinhole = pinhole_camera(camera, 0.0)
-        sources.append(SourceImage(name, path, camera, pinhole, known, "intrinsics", "0"))
+        sources.append(SourceImage(name, path, camera, pinhole, source, "0"))
     return ImageSet(sources, InputOptions())
 
 

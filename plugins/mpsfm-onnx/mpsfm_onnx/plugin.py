@@ -15,12 +15,19 @@ from mpsfm_onnx.options import OnnxOptions
 def mpsfm_providers() -> list[ProviderSpec]:
     """Depth, normals, and networks with both, chosen by one name for either kind."""
     return [
-        _spec("depth", "onnx", "Depth", "any depth network in an ONNX file, described in YAML"),
+        _spec(
+            "depth",
+            "onnx",
+            "Depth",
+            "any depth network in an ONNX file, described in YAML",
+            "estimates-focal",
+        ),
         _spec(
             "depth",
             "onnx-joint",
             "Joint",
             "any network in an ONNX file that predicts depth and normals together",
+            "estimates-focal",
             "joint-normals",
         ),
         _spec("normals", "onnx", "Normals", "any normals network in an ONNX file"),

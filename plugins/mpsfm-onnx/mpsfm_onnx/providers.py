@@ -40,6 +40,14 @@ class DescribedDepth:
         """Depth on the network's own grid."""
         return self._depth(view, self._network.run(view))
 
+    def estimate_focal(self, view: View) -> float | None:
+        """The horizontal focal length that the network guesses, in pixels of the view; None for a
+        network that does not say."""
+        if self._rule.assumed_focal is None:
+            return None
+        answer = self._network.run(view)
+        return answer.numbers[self._rule.assumed_focal] * view.camera.width / answer.canvas.image[0]
+
     def _depth(self, view: View, answer: Answer) -> DepthPrior:
         rule, outputs = self._rule, self._network.description.outputs
         certainty = outputs.confidence

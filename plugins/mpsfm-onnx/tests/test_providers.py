@@ -58,6 +58,10 @@ def test_content_lies_where_it_lies_in_the_view(write_onnx, write_description, m
         assert centre == pytest.approx((start + stop) / 2, abs=0.05)
 
 
+def test_a_network_that_says_nothing_of_the_focal_length(red, make_view, context):
+    assert OnnxDepth(red, context).estimate_focal(make_view(4, 4)) is None
+
+
 def test_deterministic_and_leaves_the_view_alone(red, make_view, context):
     image = np.random.default_rng(0).integers(1, 255, (48, 64, 3), dtype=np.uint8)
     before = image.copy()
@@ -119,8 +123,9 @@ def test_guessed_focal_length_and_unit(write_onnx, write_description, make_view,
     )
     options = OnnxOptions(description=description, model=str(model))
     view = make_view(64, 16, colour=(8, 0, 0), focal=(120.0, 300.0))
-    prior = OnnxDepth(options, context).predict(view)
-    np.testing.assert_allclose(prior.depth, 8 * (120 * 32 / 64) / 50 * 0.25)
+    provider = OnnxDepth(options, context)
+    np.testing.assert_allclose(provider.predict(view).depth, 8 * (120 * 32 / 64) / 50 * 0.25)
+    assert provider.estimate_focal(view) == pytest.approx(100)  # 50 of 32 pixels, of 64
 
 
 def test_mask_applies_to_depth_and_normals(write_onnx, write_description, make_view, context):
