@@ -65,7 +65,8 @@ def reconstruct(
         images: folder of photos, subfolders included.
         output: folder to write (see :mod:`mpsfm_core.results.writer`), nothing is written if None.
         config: name of a shipped configuration, a YAML file, or a loaded one.
-        intrinsics: ``intrinsics.yaml`` or a COLMAP model; else EXIF, else a default focal length.
+        intrinsics: ``intrinsics.yaml`` or a COLMAP model; else EXIF, else what the depth provider
+            sees, else a default focal length.
         image_list: text file with one image name a line.
         poses: COLMAP model with known poses of some or all images; ``mapping.known_poses`` says
             whether they are a start or stay.
