@@ -1,32 +1,105 @@
-"""FastDepth in a real room, compared with the depth of a sensor."""
+"""FastDepth in a real room: calibrated with the depth of a sensor, and without."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from mpsfm_core.calibration.calibrate import Photos, calibrate
-from mpsfm_core.config import load_config
+from mpsfm_core.calibration.calibrate import Calibrated, Photos, calibrate, compare
+from mpsfm_core.calibration.fitting import std_of
+from mpsfm_core.calibration.model import DepthCalibration
+from mpsfm_core.config import Config, load_config
+from mpsfm_core.evaluation.peers import PEERS, write_database
+from mpsfm_core.extraction.runner import extract
+from mpsfm_core.inputs.images import load_images
+from mpsfm_core.registry import Registry
+from mpsfm_core.stages import Stages
 
 pytest.importorskip("mpsfm_onnx")
+pytest.importorskip("mpsfm_kornia")
+pytestmark = pytest.mark.slow
+
+FRAMES = 30
+"""The first of the room's 123: successive frames reconstruct well, and within minutes."""
 
 
-@pytest.mark.slow
-def test_one_std_covers_held_out_images(shared_data: Path, tmp_path: Path) -> None:
-    room = shared_data / "data" / "hololens_room"
+@dataclass(frozen=True)
+class Room:
+    """All photos and some successive ones, what reconstructs them, options of the sensor depth."""
+
+    photos: Photos
+    frames: Photos
+    config: Config
+    truth: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def room(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Room:
+    folder = shared_data / "data" / "hololens_room"
     model = shared_data / "models" / "fastdepth_224.onnx"
-    if not (room.is_dir() and model.is_file()):
+    if not (folder.is_dir() and model.is_file()):
         pytest.skip("no HoloLens room or no FastDepth among the shared data")
-    settings = ["depth.use=onnx", f"depth.options.model={model}", f"runtime.cache_dir={tmp_path}"]
-    truth = {"directory": room / "gt_depth", "scale": 0.001}
-    report = calibrate(
-        Photos(room / "images", room / "intrinsics.yaml"),
-        load_config("demo", settings, complete=False),
-        ground_truth=truth,
-    ).report
-    before, after = (report["metrics"][when] for when in ("before", "after"))
-    assert len(report["images"]) == 123
+    work = tmp_path_factory.mktemp("room")
+    settings = [f"depth.options.model={model}", f"runtime.cache_dir={work / 'cache'}"]
+    settings += ["pairs.mode=sequential", "pairs.overlap=4", "runtime.workers=2"]
+    names = sorted(path.name for path in (folder / "images").iterdir())
+    (work / "frames.txt").write_text("\n".join(names[:FRAMES]))
+    photos = Photos(folder / "images", folder / "intrinsics.yaml")
+    return Room(
+        photos,
+        replace(photos, image_list=work / "frames.txt"),
+        load_config("fast-cpu", settings),
+        {"directory": folder / "gt_depth", "scale": 0.001},
+    )
+
+
+@pytest.fixture(scope="module")
+def by_sensor(room: Room) -> Calibrated:
+    return calibrate(room.photos, room.config, ground_truth=room.truth)
+
+
+def assert_near(found: Calibrated, by_sensor: Calibrated, room: Room, values: float) -> None:
+    """The std of the pixels of all photos differs by at most 25 %, its parts by so many ``values``
+    (of a few frames they are less certain than what they make together)."""
+    own, true = found.file.calibration, by_sensor.file.calibration
+    assert isinstance(own, DepthCalibration) and isinstance(true, DepthCalibration)
+    assert not (own.use_network_variance or true.use_network_variance)
+    assert own.relative_std == pytest.approx(true.relative_std, rel=values)
+    assert own.std_floor == pytest.approx(true.std_floor, rel=values)
+    data = compare(room.photos, room.config, room.truth)
+    stds = [std_of(calibration, data.residuals(calibration)) for calibration in (own, true)]
+    assert 0.75 < np.median(stds[0] / stds[1]) < 1.25
+    # So different a std shows: the defaults, which are another network's, are not near.
+    other = DepthCalibration()
+    assert np.median(std_of(other, data.residuals(other)) / stds[1]) < 0.3
+
+
+def test_one_std_covers_held_out_images(by_sensor: Calibrated) -> None:
+    before, after = (by_sensor.report["metrics"][when] for when in ("before", "after"))
+    assert len(by_sensor.report["images"]) == 123
     assert 0.60 < after["coverage"][0] < 0.76
     assert after["ause"] < before["ause"]
     assert after["nll_heavy"] < before["nll_heavy"]
+
+
+def test_nothing_but_photos_leads_to_nearly_the_same(room: Room, by_sensor: Calibrated) -> None:
+    own = calibrate(room.frames, room.config)
+    assert len(own.report["rounds"]) > 1
+    assert_near(own, by_sensor, room, 0.25)
+
+
+def test_so_do_the_points_of_a_model_by_colmap(
+    room: Room, by_sensor: Calibrated, tmp_path: Path
+) -> None:
+    photos, registry = room.frames, Registry.discover()
+    images = load_images(photos.folder, photos.intrinsics, photos.image_list, room.config.inputs)
+    problem = extract(images, room.config, registry, Stages(registry)).problem
+    write_database(problem, tmp_path / "database.db")
+    models = PEERS["colmap"](tmp_path / "database.db", tmp_path)
+    largest = max(models, key=lambda number: models[number].num_reg_images())
+    found = calibrate(photos, room.config, model=tmp_path / str(largest))
+    assert_near(found, by_sensor, room, 0.35)
