@@ -46,10 +46,13 @@ def evaluate_cloud(
     """A cloud in the frame of ``estimated`` against a scan in that of ``truth``.
 
     The frames are aligned by the cameras' centres. Raises :class:`InputError` when that is not
-    possible or a file cannot be read.
+    possible, or a file cannot be read or has no points.
     """
     errors = trajectory_errors(estimated, truth)
     if errors is None:
         raise InputError("the cloud cannot be aligned: fewer than three common cameras")
-    points = errors.truth_from_estimate.apply(read_ply(cloud))
-    return cloud_accuracy(points, read_ply(scan))
+    points, true_points = read_ply(cloud), read_ply(scan)
+    for path, found in ((cloud, points), (scan, true_points)):
+        if not len(found):
+            raise InputError(f"{path} has no points, there is nothing to compare")
+    return cloud_accuracy(errors.truth_from_estimate.apply(points), true_points)

@@ -128,6 +128,9 @@ def test_the_command_compares_depth_and_cloud(scene_folder: Path, tmp_path: Path
     assert 0 < scaled["rmse_log"] < report["depth"]["raw"]["rmse_log"]
     assert report["cloud"]["f1"]["0.01"] == 1.0
     assert report["trajectory"]["rpe_rmse"] == pytest.approx(0, abs=1e-9)
+    write_ply(tmp_path / "dense.ply", cloud[:0], np.zeros((0, 3), dtype=np.uint8))
+    result = CliRunner().invoke(build_app(), arguments)
+    assert result.exit_code == 2 and "dense.ply has no points" in result.stderr
     write_depth(tmp_path / "other" / "x.png", flat)
     arguments[4] = str(tmp_path / "other")
     result = CliRunner().invoke(build_app(), arguments)
