@@ -1,8 +1,9 @@
 """Depth integration on torch: the steps of `integration_energy` and `multigrid`, array by array.
 
-Same energy, same preconditioner, same order of operations, so that results agree with the numpy
-kernels to rounding; lines are solved by parallel scans. Each level of the V-cycle is some hundred
-small operations, whose launch a GPU can only hide on large maps; on a CPU the kernels are faster.
+Same energy, same preconditioner, same steps, all in double precision, so that results agree with
+the compiled kernels to rounding; lines are solved by parallel scans. Each level of the V-cycle is
+some hundred small operations, whose launch a GPU can only hide on large maps; on a CPU the kernels
+are faster.
 
 Planes of a level are framed by zeros, one pixel at the top and left and two at the bottom and
 right, so that all strided neighbours of all pixels exist.
@@ -20,7 +21,7 @@ from torch.nn.functional import pad
 
 from mpsfm_core.data import Float64
 from mpsfm_core.optimize.integration_energy import EnergyTerms
-from mpsfm_core.optimize.multigrid import Solution
+from mpsfm_core.optimize.multigrid import SOLVED, Solution
 
 _TINY = 1e-30
 # Offset of a neighbour, and the plane and offset at which the coupling to it is stored.
@@ -71,7 +72,7 @@ class TorchSolver:
         )
         self._ahead = move(normals.link[inner])
         self._prior = move(terms.prior.log_depth)
-        self._precision = move(terms.prior.precision)
+        self._precision = move(terms.prior.precision).double()
         self._prior_weight = terms.prior.weight
         self._pixels = move(terms.points.rows * self._prior.shape[1] + terms.points.columns)
         self._targets = move(terms.points.log_depth)
@@ -131,18 +132,22 @@ class TorchSolver:
         levels = _build_levels(here.east, here.south, here.mass)
         residual = -here.gradient
         x, direction = torch.zeros_like(residual), torch.zeros_like(residual)
-        previous, done = 1.0, 0
+        first, previous, done = 0.0, 1.0, 0
         while done < iterations:
-            preconditioned = _v_cycle(levels, residual.float()).double()
+            preconditioned = _v_cycle(levels, residual)
             product = float((residual * preconditioned).sum())
-            if not product > 0:
+            first = first or product
+            if not product > SOLVED**2 * first:
                 break
             direction = preconditioned + product / previous * direction
             image = here.mass * direction
             for coupling, dim in ((here.east, 1), (here.south, 0)):
                 flux = coupling * _difference(direction, dim)
                 image += flux.roll(1, dim) - flux
-            length = product / float((direction * image).sum())
+            curvature = float((direction * image).sum())
+            if not curvature > 0:
+                break
+            length = product / curvature
             x, residual = x + length * direction, residual - length * image
             done, previous = done + 1, product
         return Solution(x.cpu().numpy(), done, float("nan"))
@@ -203,7 +208,7 @@ def _next(plane: Tensor, down: int, across: int) -> Tensor:
 
 def _build_levels(east: Tensor, south: Tensor, mass: Tensor) -> list[_Level]:
     fine = {"east": east, "south": south, "mass": mass}
-    planes = {name: _framed(plane.float()) for name, plane in fine.items()}
+    planes = {name: _framed(plane) for name, plane in fine.items()}
     planes["southeast"] = planes["southwest"] = torch.zeros_like(planes["mass"])
     levels = [_prepare(planes, _NEIGHBOURS[:4])]
     while max(levels[-1].diagonal.shape) > 1:
@@ -233,8 +238,7 @@ def _factor(before: Tensor, after: Tensor, rest: Tensor) -> _Lines:
     Pivots are p[j] + after[j] with p[j] = rest[j] + 1 / (1 / before[j] + 1 / p[j - 1]): a chain of
     linear fractions with positive coefficients, hence a scan over 2 x 2 matrices.
     """
-    before, after = before.double().clamp(min=0), after.double().clamp(min=0)
-    rest = rest.double().clamp(min=_TINY)
+    before, after, rest = before.clamp(min=0), after.clamp(min=0), rest.clamp(min=_TINY)
     matrix = torch.stack([rest + before, rest * before, torch.ones_like(rest), before], -1)
     matrix = matrix.reshape(*rest.shape, 2, 2)
     shift = 1
@@ -245,8 +249,7 @@ def _factor(before: Tensor, after: Tensor, rest: Tensor) -> _Lines:
         shift *= 2
     total = matrix[..., 0, 0] / matrix[..., 1, 0] + after
     pivot = torch.where(total > _TINY, 1 / total, 0.0)
-    forward, backward = (before * pivot).float(), (after * pivot).float()
-    return _Lines(pivot.float(), _powers(forward), _powers(backward.flip(1)))
+    return _Lines(pivot, _powers(before * pivot), _powers((after * pivot).flip(1)))
 
 
 def _powers(factor: Tensor) -> list[Tensor]:
@@ -315,23 +318,27 @@ def _coarsen(level: _Level) -> dict[str, Tensor]:
     nodes |= {(1, 2): right, (2, 0): corner[2], (2, 1): bottom, (2, 2): corner[3]}
     pairs = {(i, j): torch.zeros_like(one) for i in range(4) for j in range(i + 1, 4)}
     mass = [torch.zeros_like(one) for _ in range(4)]
+
+    def add_square(weight: Tensor, shares: dict[int, Tensor]) -> None:
+        total = torch.stack(list(shares.values())).sum(0)
+        for k, share in shares.items():
+            mass[k] += weight * share * total
+        for (i, j), plane in pairs.items():
+            if i in shares and j in shares:
+                plane -= weight * shares[i] * shares[j]
+
     for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        weight = _cells(level.planes["mass"], row, column)
-        for k, share in nodes[row, column].items():
-            mass[k] += weight * share
+        weight, shares = _cells(level.planes["mass"], row, column), nodes[row, column]
+        add_square(weight.clamp(max=0), shares)
+        lumped = weight.clamp(min=0) * torch.stack(list(shares.values())).abs().sum(0)
+        for k, share in shares.items():
+            mass[k] += lumped * share.abs()
         for (down, across), name, _ in level.neighbours[::2]:
             # Couplings to the lower left are those of the pixel to the right.
             start = (row, column - min(across, 0))
-            end = (row + down, start[1] + across)
-            coupling = _cells(level.planes[name], *start)
-            a, b = nodes[start], nodes[end]
-            square = {k: a.get(k, 0 * one) - b.get(k, 0 * one) for k in {*a, *b}}
-            total = torch.stack(list(square.values())).sum(0)
-            for k, value in square.items():
-                mass[k] += coupling * value * total
-            for (i, j), plane in pairs.items():
-                if i in square and j in square:
-                    plane -= coupling * square[i] * square[j]
+            a, b = nodes[start], nodes[row + down, start[1] + across]
+            ends = {k: a.get(k, 0 * one) - b.get(k, 0 * one) for k in {*a, *b}}
+            add_square(_cells(level.planes[name], *start), ends)
     planes = {
         "east": pairs[0, 1] + _next(pairs[2, 3], -1, 0),
         "south": pairs[0, 2] + _next(pairs[1, 3], 0, -1),
