@@ -186,7 +186,7 @@ def _table(
     sets = next(iter(rows.values())).sets
     convention = CONVENTIONS["paper"]
     yield (
-        f"Pose AUC at 1 / 5 / 20 degrees in percent over {sets} sets, convention "
+        f"Pose AUC at 1 / 5 / 20 degrees in percent, sets: {sets}; convention "
         f"`{convention.name}`: {convention.description}. Registered images in percent."
     )
     yield ""
