@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -36,8 +37,9 @@ class StudyOptions(Options):
     """Of the choice of pixels and of the bootstrap."""
     folds: int = Field(4, ge=2)
     """Each of so many groups of successive images is held out once: the model is chosen and fitted
-    on the others and judged on it. Successive, as neighbours in a video are nearly the same image.
-    The final values are fitted to all."""
+    on the others and judged on it. Successive, as neighbours in a video are nearly the same image;
+    if the images lie in several folders, each is a scene that is held out as a whole. The final
+    values are fitted to all."""
     bootstraps: int = Field(100, ge=0)
     """Fits on images drawn with replacement, for confidence intervals; 0 for none."""
     samples_per_image: int = Field(500, ge=20)
@@ -66,7 +68,7 @@ def study(data: Data, declared: Calibration, options: StudyOptions) -> Study:
     residuals = data.residuals(best.calibration)
     rng = np.random.default_rng(options.seed)
     intervals = _intervals(residuals, best.fit, options.bootstraps, rng)
-    folds = _folds(len(data.samples), options.folds)
+    folds = _folds([image.name for image in data.samples], options.folds)
     fitted = [winner(data.of(kept).fit()).calibration for kept, _ in folds]
     held_out = [data.of(left) for _, left in folds] or [data]
     report = {
@@ -92,13 +94,16 @@ def study(data: Data, declared: Calibration, options: StudyOptions) -> Study:
     return Study(best.calibration, {**report, "warnings": list(warnings)}, warnings)
 
 
-def _folds(count: int, wanted: int) -> list[tuple[Int64, Int64]]:
+def _folds(names: Sequence[str], wanted: int) -> list[tuple[Int64, Int64]]:
     """Images to fit on and images to judge on, for each fold; none for a single image."""
-    if count < 2:
+    if len(names) < 2:
         return []
-    everything = np.arange(count)
-    groups = np.array_split(everything, min(wanted, count))
-    return [(np.setdiff1d(everything, group), group) for group in groups]
+    folders, scene = np.unique([str(PurePosixPath(n).parent) for n in names], return_inverse=True)
+    unit = scene if len(folders) > 1 else np.arange(len(names))
+    count = int(unit.max()) + 1
+    groups = np.array_split(np.arange(count), min(wanted, count))
+    held_out = [np.isin(unit, group) for group in groups]
+    return [(np.flatnonzero(~left), np.flatnonzero(left)) for left in held_out]
 
 
 def judge(held_out: Sequence[Data], calibrations: Sequence[Calibration]) -> dict[str, Any]:

@@ -34,6 +34,19 @@ def test_coverage_on_held_out_images_before_and_after(twenty: Study) -> None:
     assert len(after["coverage_of_folds"]) == 4
 
 
+def test_scenes_are_held_out_as_a_whole() -> None:
+    """Of three scenes one has twice the errors: fitted to the others, its std covers less."""
+    easy = simulate(PRIOR, 16, pixels=300)
+    hard = simulate(replace(PRIOR, relative_std=0.2), 8, seed=1, pixels=300)
+    named = [replace(image, name=f"{'ab'[n // 8]}/{image.name}") for n, image in enumerate(easy)]
+    named += [replace(image, name=f"c/{image.name}") for image in hard]
+    found = study(DepthData(tuple(named)), DECLARED, StudyOptions(bootstraps=0))
+    assert found.report["folds"] == 3
+    *others, last = found.report["metrics"]["after"]["coverage_of_folds"]
+    assert last == pytest.approx(0.38, abs=0.05)
+    assert min(others) > 0.7
+
+
 def test_the_scale_of_each_image_is_told_and_not_part_of_the_std(twenty: Study) -> None:
     # Simulated images have scales with a log spread of 0.2, twice the std.
     assert twenty.report["scale"]["log_spread"] == pytest.approx(0.2, rel=0.5)
