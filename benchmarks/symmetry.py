@@ -121,12 +121,14 @@ def main() -> None:
         milliseconds = 1e3 * float(np.median([seconds for _, _, seconds in rows]))
         lines.append(f"| {name} | {shares([row[:2] for row in rows])} | {milliseconds:.1f} |")
     if not arguments.placed_only:
-        lines += ["", "Mapped:", "", HEADER_MAPPED]
+        convention = CONVENTIONS["paper"]
+        lines += ["", f"Mapped; pose AUC in percent, convention `{convention.name}`:"]
+        lines += [f"{convention.description}.", "", HEADER_MAPPED]
         for name, errors in PRIORS.items():
             cases = [twin_room_problem(seed, errors=errors) for seed in range(arguments.seeds)]
             for enabled in (False, True):
                 runs = [mapped(case, enabled) for case in cases]
-                area = pose_auc(np.concatenate([run[0] for run in runs]), CONVENTIONS["paper"])
+                area = pose_auc(np.concatenate([run[0] for run in runs]), convention)
                 auc = " / ".join(f"{100 * value:.1f}" for value in area.values())
                 size = sum(run[1] for run in runs) / sum(len(case.poses) for case in cases)
                 verdicts = [v for run in runs for v in run[2]] if enabled else []

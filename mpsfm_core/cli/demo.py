@@ -66,8 +66,8 @@ def _compare(estimated: dict[str, Pose], truth: dict[str, Pose]) -> None:
     auc, trajectory = report["auc"], report["trajectory"]
     typer.echo("compared with the truth:")
     typer.echo(
-        f"  registered {report['registered']} of {report['images']}, pose AUC "
-        f"@1/5/20 deg {auc['1']:.1f} / {auc['5']:.1f} / {auc['20']:.1f} %"
+        f"  registered {report['registered']} of {report['images']}, pose AUC @1/5/20 deg "
+        f"{auc['1']:.1f} / {auc['5']:.1f} / {auc['20']:.1f} % ({report['convention']} convention)"
     )
     if trajectory is not None:
         typer.echo(
