@@ -21,6 +21,7 @@ from mpsfm_core.geometry import pixel_centers, unproject
 from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.scene.depth_map import DepthMap
 from mpsfm_core.scene.scene import Scene
+from mpsfm_core.scene.thinning import thinned, thinned_camera, thinning_step
 
 WARP_NOISE_PX = 1.0
 """Std of a pixel's position in the lift (reference: 1 px)."""
@@ -131,14 +132,11 @@ class _Grid(NamedTuple):
     @staticmethod
     def of(depth_map: DepthMap, width: int, std_factor: float) -> _Grid:
         """Every n-th pixel, such that about ``width`` columns remain."""
-        step = max(1, round(depth_map.valid.shape[1] / width))
-        thin = (slice(step // 2, None, step),) * 2
-        fx, fy, cx, cy = depth_map.camera.params
-        offset = (step // 2 + 0.5) / step - 0.5
-        params = np.array([fx / step, fy / step, cx / step - offset, cy / step - offset])
-        depth = depth_map.depth[thin]
-        variance = (std_factor * depth_map.log_std[thin] * depth) ** 2
-        return _Grid(depth, variance, depth_map.valid[thin], params)
+        step = thinning_step(depth_map.valid.shape[1], width)
+        depth = thinned(depth_map.depth, step)
+        variance = (std_factor * thinned(depth_map.log_std, step) * depth) ** 2
+        params = np.array(thinned_camera(depth_map.camera, step).params)
+        return _Grid(depth, variance, thinned(depth_map.valid, step), params)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]

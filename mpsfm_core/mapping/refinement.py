@@ -17,6 +17,7 @@ from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
 from mpsfm_core.optimize.covariance import depth_variance_of_points, point_covariances
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
 from mpsfm_core.scene.scene import Scene
+from mpsfm_core.scene.thinning import thinned, thinned_camera, thinned_pixels, thinning_step
 
 LOCAL_MAX_TRACK_LENGTH = 15
 """Longer tracks stay fixed in local bundle adjustment (COLMAP, reference)."""
@@ -226,11 +227,12 @@ class Refiner:
         good = (angles[points] >= self.options.anchor_min_angle_deg) & (z > 0)
         good &= np.isfinite(variance) & (variance > 0)
         good &= ~depth_map.keypoint_valid[rows] | self._near(ratio)
-        integrator = self._integrator(image)
-        anchors = Anchors(depth_map.keypoints[rows][good], z[good], variance[good])
-        depth_map.set_refined(
-            integrator.refine(anchors, scale=depth_map.scale, start=depth_map.refined)
+        xy = thinned_pixels(depth_map.keypoints[rows][good], self._step(image))
+        anchors = Anchors(xy, z[good], variance[good])
+        refined = self._integrator(image).refine(
+            anchors, scale=depth_map.scale, start=depth_map.refined
         )
+        depth_map.set_refined(refined)
 
     def _guessed(self, images: Int64) -> Bool:
         """(m,) bool, images whose focal length is a guess."""
@@ -271,17 +273,38 @@ class Refiner:
     def _integrator(self, image: int) -> DepthIntegrator:
         """The integrator of an image; the measured noise scales what its depth prior is worth."""
         integrator = self._integrators.get(image)
-        if integrator is None:
-            depth_map, options = self.scene.maps[image], self.options.integration
-            prior, noise = depth_map.prior, self._assumed
-            worth = noise.independent_pixels(prior.depth.size)
-            integrator = self._integrators[image] = DepthIntegrator(
-                replace(prior, variance=prior.variance * np.float32(noise.multiplier**2)),
-                depth_map.normals,
-                depth_map.camera,
-                replace(options, independent_depths=max(worth, options.independent_depths)),
-            )
+        if integrator is not None:
+            return integrator
+        depth_map, options, step = (
+            self.scene.maps[image],
+            self.options.integration,
+            self._step(image),
+        )
+        prior, normals, noise = depth_map.prior, depth_map.normals, self._assumed
+        assert prior.variance is not None and normals.variance is not None  # MappingImage checks it
+        depth = replace(
+            prior,
+            depth=thinned(prior.depth, step),
+            variance=thinned(prior.variance, step) * np.float32(noise.multiplier**2),
+            valid=thinned(prior.valid, step),
+        )
+        worth = max(noise.independent_pixels(depth.depth.size), options.independent_depths)
+        integrator = self._integrators[image] = DepthIntegrator(
+            depth,
+            replace(
+                normals,
+                normals=thinned(normals.normals, step),
+                variance=thinned(normals.variance, step),
+                valid=thinned(normals.valid, step),
+            ),
+            thinned_camera(depth_map.camera, step),
+            replace(options, independent_depths=worth),
+        )
         return integrator
+
+    def _step(self, image: int) -> int:
+        """How far apart the pixels are on which an image's depth is refined."""
+        return thinning_step(self.scene.maps[image].prior.shape[1], self.options.map_width)
 
     def _observed_depth(self, image: int) -> tuple[Int64, Float64]:
         """Keypoints of an image that observe points, and the points' depth in the image."""

@@ -7,6 +7,7 @@ import numpy as np
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage, PinholeCamera
 from mpsfm_core.geometry import sample_bilinear, scale_pixels
 from mpsfm_core.optimize.depth_integration import RefinedDepth
+from mpsfm_core.scene.thinning import thickened, thinned
 
 
 class DepthMap:
@@ -71,9 +72,18 @@ class DepthMap:
         self._factor = scale / self.refined.scale if self.refined else scale
 
     def set_refined(self, refined: RefinedDepth) -> None:
-        """Let a refined map stand for the prior."""
+        """Let a refined map stand for the prior.
+
+        Of a map refined on a thinned grid, the change of the prior is interpolated.
+        """
         self.refined = refined
         self._best = refined.depth
+        if refined.log_depth.shape != self.prior.shape:
+            step = round(self.prior.shape[1] / refined.log_depth.shape[1])
+            depth, valid = thinned(self.prior.depth, step), thinned(self.prior.valid, step)
+            change = refined.log_depth - np.log(refined.scale * np.where(valid, depth, 1.0))
+            factor = np.exp(thickened(change, valid, self.prior.shape))
+            self._best = self.prior.depth * np.float32(refined.scale) * factor
         self._best_at = self._sample(self._best)[0]
         self.set_scale(refined.scale)
 

@@ -1,0 +1,61 @@
+"""Every n-th pixel of a map: coarser grids for work that needs no more, and the way back."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+def thinning_step(columns: int, wanted: int) -> int:
+    """n such that every n-th of so many columns leaves about the wanted number."""
+    return max(1, round(columns / wanted))
+
+
+def thinned(values: NDArray[Scalar], step: int) -> NDArray[Scalar]:
+    """(h, w, ...): every ``step``-th row and column, from the middle of the first ``step``."""
+    return values[step // 2 :: step, step // 2 :: step]
+
+
+def thinned_camera(camera: PinholeCamera, step: int) -> PinholeCamera:
+    """The camera of the grid that :func:`thinned` leaves of a map."""
+    columns, rows = (len(range(step // 2, size, step)) for size in camera.size)
+    fx, fy, cx, cy = camera.params
+    offset = _offset(step)
+    return PinholeCamera(
+        columns, rows, fx / step, fy / step, cx / step - offset, cy / step - offset
+    )
+
+
+def thinned_pixels(xy: Float64, step: int) -> Float64:
+    """Pixels (n, 2) of a map in its thinned grid."""
+    pixels: Float64 = xy / step - _offset(step)
+    return pixels
+
+
+def thickened(values: Float64, valid: Bool, shape: tuple[int, int]) -> Float32:
+    """Bilinear interpolation of a thinned map back to the grid ``shape`` (h, w) it came from.
+
+    Pixels that are not valid count nothing; 0 where nothing valid is near.
+    """
+    rows, columns = shape
+    step = max(1, round(columns / values.shape[1]))
+    x = (np.arange(columns) + 0.5) / step - _offset(step) - 0.5
+    y = (np.arange(rows) + 0.5) / step - _offset(step) - 0.5
+    at_x, at_y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+    known = np.stack([np.where(valid, values, 0), valid], axis=-1).astype(np.float32)
+    total, share = cv2.split(
+        cv2.remap(known, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    )
+    return np.where(share > 1e-3, total / np.maximum(share, 1e-3), 0).astype(np.float32)
+
+
+def _offset(step: int) -> float:
+    """Where pixel coordinate 0 of a thinned grid's own scale lies, in its pixels."""
+    return (step // 2 + 0.5) / step - 0.5
