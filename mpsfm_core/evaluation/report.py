@@ -111,11 +111,19 @@ def markdown(rows: Sequence[Row], convention: PoseConvention = CONVENTIONS["pape
     return "\n\n".join(parts) + "\n"
 
 
+def failures(records: Iterable[Record]) -> list[str]:
+    """A line for each run that raised, with its reason."""
+    return [f"{' / '.join(record.name)}: {record.error}" for record in records if record.error]
+
+
 def write_report(output: Path, records: Sequence[Record]) -> None:
     """Write ``report.md``, ``report.json`` and ``report.html``; the JSON has all conventions."""
     convention = CONVENTIONS["paper"]
-    rows = make_rows(records)
-    (output / "report.md").write_text(markdown(rows, convention), encoding="utf-8")
+    rows, failed = make_rows(records), failures(records)
+    text = markdown(rows, convention)
+    if failed:
+        text += "\n### Failed\n\n" + "".join(f"- {line}\n" for line in failed)
+    (output / "report.md").write_text(text, encoding="utf-8")
     content = {
         name: {
             "description": other.description,
@@ -154,6 +162,9 @@ def _page(rows: Sequence[Row], records: Sequence[Record], convention: PoseConven
         for row in here:
             curves[row.method] = errors_of(groups[row.place], convention)
         parts.append(_curves(curves))
+    if failed := failures(records):
+        lines = "".join(f"<li>{html.escape(line)}</li>" for line in failed)
+        parts.append(f"<h3>Failed</h3><ul>{lines}</ul>")
     return "\n".join(parts) + "\n"
 
 

@@ -13,7 +13,7 @@ from mpsfm_core.cli import build_app
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.comparison import compare, read_side
 from mpsfm_core.evaluation.records import Record, write_record
-from mpsfm_core.evaluation.report import ALL_SCENES, make_rows, markdown
+from mpsfm_core.evaluation.report import ALL_SCENES, make_rows, markdown, write_report
 
 
 def records(
@@ -108,3 +108,14 @@ def test_rows_pool_errors_and_several_scenes() -> None:
     assert rows[2].auc[5] == pytest.approx(pooled)
     text = markdown(rows)
     assert "### all scenes, configuration `c`" in text and "| 67% | 1.00 | 1 |" in text
+
+
+def test_what_failed_is_listed_with_its_reason(tmp_path: Path) -> None:
+    good, other = records(1.0, sets=2)
+    lost = Record(**{**vars(other), "estimated": {}, "error": "RuntimeError: 3 < 5 points"})
+    write_report(tmp_path, [good, lost])
+    line = "room / c / leq10-01 / ours: RuntimeError: 3 < 5 points"
+    assert f"### Failed\n\n- {line}\n" in (tmp_path / "report.md").read_text()
+    assert f"<li>{line.replace('<', '&lt;')}</li>" in (tmp_path / "report.html").read_text()
+    write_report(tmp_path, [good, other])
+    assert "### Failed" not in (tmp_path / "report.md").read_text()
