@@ -1,17 +1,19 @@
 """Time and accuracy of depth integration and of its marginal variances.
 
-    python -m benchmarks.depth_integration [--repeats 5] [--ablation] [--json]
+    python -m benchmarks.depth_integration [SECTION ...] [--repeats 5] [--ablation] [--json]
 
 The reference is the same re-weighted least squares in scipy with a Jacobi-CG solve to 1e-3 before
 each re-weighting, as published (`tests/optimize/integration_reference.py`); it runs until its
 energy is within 1e-4 of ours or below. Runs are interleaved and ratios are of medians; wall clock,
-and CPU time where said. Real data ($MPSFM_SHARED or ../shared) are used when they are there. The
-last line of ``--json`` is one JSON object.
+and CPU time where said. Real data ($MPSFM_SHARED or ../shared) are used when they are there.
+Sections, all by default: analytic, hololens_room, variance, scaling, torch, and the race at 387x258
+and 768x512. The last line of ``--json`` is one JSON object.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import statistics
@@ -225,27 +227,58 @@ def bench_warm(problem: Problem, repeats: int) -> float:
     return median_time(partial(integrator.refine, moved, start=before), repeats)
 
 
-def bench_scaling(repeats: int) -> dict[str, float]:
-    """Exponents of the growth of time with the number of pixels; CPU time of one thread."""
-    pixels, whole, single = [], [], []
+def bench_torch(size: tuple[int, int]) -> dict[str, Any] | None:
+    """How far the torch version ends from the kernels; None without torch."""
+    if importlib.util.find_spec("torch") is None:
+        return None
+    import torch
+
+    torch.set_num_threads(1)  # the operations are too small for more
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    problem = analytic_problem(size, seed=0)
+    tensors = DepthIntegrator(problem.depth, problem.normals, problem.camera, torch_device=device)
+    ours = problem.integrator().refine(problem.anchors)
+    seconds, theirs = timed(partial(tensors.refine, problem.anchors))
+    difference = theirs.log_depth - ours.log_depth
+    return {
+        "device": device,
+        "first_call_ms": 1e3 * seconds,
+        "relative_energy": abs(theirs.energy / ours.energy - 1),
+        "rms_log_depth": float(np.sqrt(np.mean(difference**2))),
+        "reweightings": [ours.iterations, theirs.iterations],
+    }
+
+
+def bench_scaling(repeats: int) -> dict[str, Any]:
+    """Exponents of the growth of time with the number of pixels; CPU time of one thread.
+
+    Re-weightings and errors tell whether the work was the same.
+    """
+    pixels, whole, single, steps, errors = [], [], [], [], []
     for size in SCALING_SIZES:
         pixels.append(size[0] * size[1])
         problems = [analytic_problem(size, seed) for seed in range(2)]
         runs = [partial(problem.integrator().refine, problem.anchors) for problem in problems]
-        iterations = sum(run().iterations for run in runs)
+        refined = [run() for run in runs]
+        steps.append(sum(result.iterations for result in refined))
+        errors.append([p.errors(r.log_depth)[1] for p, r in zip(problems, refined, strict=True)])
         whole.append(sum(median_time(run, repeats, time.thread_time) for run in runs))
-        single.append(whole[-1] / iterations)
+        single.append(whole[-1] / steps[-1])
     grid = np.log(pixels)
     return {
         "refinement_exponent": float(np.polyfit(grid, np.log(whole), 1)[0]),
         "reweighting_exponent": float(np.polyfit(grid, np.log(single), 1)[0]),
         "reweighting_ms_at_387": 1e3 * single[SCALING_SIZES.index(SIZES[0])],
         "reweighting_ms_at_1536": 1e3 * single[-1],
+        "reweightings": steps,
+        "median_errors": [float(np.mean(of_size)) for of_size in errors],
     }
 
 
-def bench_accuracy(problems: list[Problem], options: IntegrationOptions) -> dict[str, float]:
-    """Means over images of the errors before and after."""
+def bench_accuracy(problems: list[Problem], options: IntegrationOptions) -> dict[str, float] | None:
+    """Means over images of the errors before and after; None without images."""
+    if not problems:
+        return None
     rows = []
     for problem in problems:
         refined = problem.integrator(options).refine(problem.anchors)
@@ -322,38 +355,50 @@ def ablation(analytic: list[Problem], real: list[Problem]) -> dict[str, Any]:
         name = ", ".join(f"{key} {value:g}" for key, value in change.items()) or "default"
         row = {}
         for kind, problems in kinds.items():
-            if problems:
-                errors = bench_accuracy(problems, options)
+            if errors := bench_accuracy(problems, options):
                 row[kind] = (round(errors["refined_rms"], 4), round(errors["refined_median"], 4))
         report[name] = row
         print(f"{name:48s} {row}", flush=True)
     return report
 
 
+def analytic_problems(count: int) -> list[Problem]:
+    return [analytic_problem(SIZES[0], seed) for seed in range(count)]
+
+
+def real_problems(shared: Path) -> list[Problem]:
+    """Those of hololens_room; none where it is not there."""
+    return list(room_problems(shared)) if (shared / "data" / "hololens_room").is_dir() else []
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help="run these only")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--ablation", action="store_true", help="only this")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     shared = Path(os.environ.get("MPSFM_SHARED", Path(__file__).resolve().parents[2] / "shared"))
-    analytic = [analytic_problem(SIZES[0], seed) for seed in range(SCENES)]
-    real = list(room_problems(shared)) if (shared / "data" / "hololens_room").is_dir() else []
+    analytic = partial(analytic_problems, SCENES)
+    real = partial(real_problems, shared)
     sections: dict[str, Callable[[], Any]] = {
-        "analytic": lambda: bench_accuracy(analytic, DEFAULT_OPTIONS),
-        "hololens_room": lambda: bench_accuracy(real, DEFAULT_OPTIONS) if real else None,
+        "analytic": lambda: bench_accuracy(analytic(), DEFAULT_OPTIONS),
+        "hololens_room": lambda: bench_accuracy(real(), DEFAULT_OPTIONS),
         "variance": lambda: bench_variance(arguments.repeats),
         "scaling": lambda: bench_scaling(arguments.repeats),
+        "torch": lambda: {f"{size[0]}x{size[1]}": bench_torch(size) for size in SIZES},
         **{
             f"{size[0]}x{size[1]}": lambda size=size: bench_speed(size, arguments.repeats)
             for size in SIZES
         },
     }
     if arguments.ablation:
-        sections = {"ablation": lambda: ablation(analytic, real)}
+        sections = {"ablation": lambda: ablation(analytic(), real())}
+    if unknown := set(arguments.sections) - set(sections):
+        parser.error(f"no such section: {', '.join(sorted(unknown))}")
     report = {}
-    for name, run in sections.items():
-        report[name] = run()
+    for name in arguments.sections or sections:
+        report[name] = sections[name]()
         print(name, json.dumps(report[name]), flush=True)
     if arguments.json:
         print(json.dumps(report))

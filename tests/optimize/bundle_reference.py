@@ -78,24 +78,30 @@ def without_depth(problem: BundleProblem) -> BundleProblem:
 
 
 def to_pycolmap(problem: BundleProblem) -> pycolmap.Reconstruction:
-    """The same scene as a reconstruction with one camera (ids are indices plus 1)."""
+    """The same scene as a reconstruction (ids are indices plus 1).
+
+    Cameras are PINHOLE if their focal lengths differ, else SIMPLE_PINHOLE.
+    """
     rec = pycolmap.Reconstruction()
-    focal, _, *center = problem.intrinsics[0]
-    rec.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            model="SIMPLE_PINHOLE",
-            width=SIZE[0],
-            height=SIZE[1],
-            params=[focal, *center],
-            camera_id=1,
+    for number, (fx, fy, *center) in enumerate(problem.intrinsics, start=1):
+        rec.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                model="SIMPLE_PINHOLE" if fx == fy else "PINHOLE",
+                width=SIZE[0],
+                height=SIZE[1],
+                params=[fx, *center] if fx == fy else [fx, fy, *center],
+                camera_id=number,
+            )
         )
-    )
     row = np.empty(len(problem.obs_image), dtype=np.int64)
     for i in range(len(problem.rotations)):
         mine = np.flatnonzero(problem.obs_image == i)
         row[mine] = np.arange(len(mine))
         image = pycolmap.Image(
-            name=str(i), keypoints=problem.obs_xy[mine], camera_id=1, image_id=i + 1
+            name=str(i),
+            keypoints=problem.obs_xy[mine],
+            camera_id=int(problem.camera_of_image[i]) + 1,
+            image_id=i + 1,
         )
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(problem.rotations[i]), problem.translations[i])
         rec.add_image_with_trivial_frame(image, pose)

@@ -48,7 +48,8 @@ def assert_same_optimum(start: BundleProblem, *, refine_focal: bool = False) -> 
         centers = [(c - c[0]) / np.linalg.norm(c[1] - c[0]) for c in centers]
     np.testing.assert_allclose(*centers, atol=1e-5)
     if refine_focal:
-        np.testing.assert_allclose(result.intrinsics[0, 0], rec.cameras[1].params[0], rtol=1e-5)
+        theirs = [rec.cameras[k + 1].params[0] for k in range(len(start.intrinsics))]
+        np.testing.assert_allclose(result.intrinsics[:, 0], theirs, rtol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -73,6 +74,26 @@ def test_same_optimum_as_ceres_with_focal_length(depth: bool) -> None:
     start = replace(start, variable_focal=np.array([True]))
     start = replace(start, intrinsics=start.intrinsics * [1.05, 1.05, 1, 1])
     assert_same_optimum(start if depth else without_depth(start), refine_focal=True)
+
+
+@pytest.mark.parametrize("depth", [True, False])
+@pytest.mark.parametrize("aspect", [1.0, 1.25])
+def test_same_optimum_as_ceres_with_two_cameras(depth: bool, aspect: float) -> None:
+    """SIMPLE_PINHOLE beside SIMPLE_PINHOLE, both focal lengths refined, or beside PINHOLE."""
+    one = perturb(make_problem(8, 120, 5), 0)
+    fx, fy, cx, cy = one.intrinsics[0]
+    other = np.array([0.8 * fx, 0.8 * fy * aspect, cx + 30, cy - 20])
+    camera_of_image = np.arange(8) % 2
+    scaled = (one.obs_xy - (cx, cy)) / (fx, fy) * other[:2] + other[2:]
+    seen_by_other = (camera_of_image[one.obs_image] == 1)[:, None]
+    start = replace(
+        one,
+        intrinsics=np.stack([one.intrinsics[0], other]),
+        camera_of_image=camera_of_image,
+        obs_xy=np.where(seen_by_other, scaled, one.obs_xy),
+        variable_focal=np.full(2, aspect == 1),
+    )
+    assert_same_optimum(start if depth else without_depth(start), refine_focal=aspect == 1)
 
 
 def test_focal_length_per_camera() -> None:
