@@ -224,7 +224,7 @@ class DepthIntegrator:
         """Marginal variance of the refined log depth, (h, w) float32; infinite where not valid.
 
         The true diagonal of the inverse Hessian under these anchors, with the robust weights as
-        they are; times depth^2 it is the variance of depth. Costs about ten refinements.
+        they are; times depth^2 it is the variance of depth. Costs 10 to 15 refinements.
         """
         terms = self._terms(anchors, refined.scale)
         here = majorise(refined.log_depth, terms)
