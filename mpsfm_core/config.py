@@ -18,7 +18,7 @@ from mpsfm_core.calibration.file import CALIBRATIONS, read_values
 from mpsfm_core.errors import ConfigError, ProviderError, did_you_mean
 from mpsfm_core.extraction.options import ExtractionOptions, PairOptions, VerificationOptions
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.options import MapperOptions, MappingOptions
 from mpsfm_core.options import (
     Backend,
     Options,
@@ -41,7 +41,7 @@ class RuntimeOptions(Options):
     threads: int = Field(1, ge=1)
     """Threads that each worker's provider may use."""
     seed: int = Field(0, ge=0)
-    """Seed of everything random."""
+    """Seed of everything random: providers, verification, mapper, pixels of ``dense.ply``."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where providers compute; ``auto`` takes a GPU when there is one."""
     cache_dir: Path | None = None
@@ -69,7 +69,7 @@ class Config(Options):
     """A pixel is used when all masks allow it."""
     verification: VerificationOptions = Field(default_factory=VerificationOptions)
     extraction: ExtractionOptions = Field(default_factory=ExtractionOptions)
-    mapping: MapperOptions = Field(default_factory=MapperOptions)
+    mapping: MappingOptions = Field(default_factory=MappingOptions)
     results: ResultOptions = Field(default_factory=ResultOptions)
     runtime: RuntimeOptions = Field(default_factory=RuntimeOptions)
 
@@ -81,6 +81,10 @@ class Config(Options):
                 yield (name,), kind, backend
         for index, backend in enumerate(self.masks):
             yield ("masks", index), "mask", backend
+
+    def mapper_options(self) -> MapperOptions:
+        """The settings of the mapper, with the seed of the run."""
+        return MapperOptions(**dict(self.mapping), seed=self.runtime.seed)
 
     def to_yaml(self) -> str:
         """The configuration with all defaults; loading it gives the same configuration."""

@@ -115,7 +115,7 @@ class _Run:
             extraction = extract(images, config, self._registry, self._stages)
         problem = _with_poses(extraction.problem, known)
         with stage("mapping"):
-            mapping = mapper.reconstruct(problem, config.mapping, self._stages)
+            mapping = mapper.reconstruct(problem, config.mapper_options(), self._stages)
         if not mapping.reconstructions:
             self._give_up(images, extraction, mapping)
         summary: dict[str, Any] = {}

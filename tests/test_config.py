@@ -164,6 +164,7 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
+            ("mapping:\n  seed: 1\n", ":3: mapping.seed: unknown key"),
             ("runtime:\n  sed: 1\n", ":3: runtime.sed: unknown key; did you mean 'seed'?"),
             ("runtme: {}\n", ":2: runtme: unknown key; did you mean 'runtime'?"),
             ("runtime:\n  device: gpu\n", ":3: runtime.device: Input should be 'auto'"),

@@ -156,7 +156,7 @@ class _SceneRuns:
         listed.write_text("\n".join(names) + "\n", encoding="utf-8")
         images = load_images(scene.images, scene.intrinsics, listed, config.inputs)
         extraction = extract(images, config, self._registry, Stages(self._registry))
-        return extraction.problem, config.mapping
+        return extraction.problem, config.mapper_options()
 
     def _known(self, item: EvaluationSet, label: str, key: str) -> Record | None:
         path = self._output / record_file(self._scene.name, self._config_name, item.name, label)

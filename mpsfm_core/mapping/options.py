@@ -56,6 +56,8 @@ class RegistrationOptions(Options):
     """Attempts at an image after which no more halves are tried (ours)."""
     num_polished: int = Field(3, ge=1)
     """Best supported distinct poses that are bundle-adjusted before one is chosen (ours)."""
+    polishing: int = Field(10, ge=1)
+    """Iterations of that bundle adjustment (ours)."""
     min_inlier_ratio: float = Field(0.25, gt=0, le=1)
     """Reference and COLMAP: used for RANSAC's number of trials."""
     lifting: bool = True
@@ -156,11 +158,9 @@ class ConsistencyOptions(Options):
     """Columns that maps are thinned out to (ours)."""
 
 
-class MapperOptions(Options):
-    """Settings of :func:`mpsfm_core.mapping.mapper.reconstruct`."""
+class MappingOptions(Options):
+    """What a configuration says of the mapper."""
 
-    seed: int = 0
-    """Seed of every random choice (RANSAC)."""
     known_poses: Literal["start", "fixed"] = "start"
     """Of images that come with a pose: "start" refines them and adds the others, "fixed" keeps
     them, their world and its unit, and leaves images without a pose out."""
@@ -173,3 +173,10 @@ class MapperOptions(Options):
     triangulation: TriangulationOptions = TriangulationOptions()
     refinement: RefinementOptions = RefinementOptions()
     consistency: ConsistencyOptions = ConsistencyOptions()
+
+
+class MapperOptions(MappingOptions):
+    """Settings of :func:`mpsfm_core.mapping.mapper.reconstruct`."""
+
+    seed: int = 0
+    """Seed of every random choice (RANSAC); a configuration has one for the whole run."""

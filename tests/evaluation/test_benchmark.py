@@ -130,7 +130,7 @@ def test_what_changed_or_broke_is_computed_again(output, scene_folder: Path, con
         ("all",),
         ("sensor",),
         ("colmap",),
-        ("mapping.seed=7",),
+        ("mapping.max_components=9",),
     )
     run_benchmark(plan, folder, done=lambda record, old: known.update({record.label: old}))
     assert known == {"ours-sensor": False, "colmap": False}

@@ -13,6 +13,7 @@ import pytest
 import mpsfm_core
 from mpsfm_core.errors import ReconstructionError
 from mpsfm_core.evaluation import evaluate, read_poses, reconstruction_poses
+from mpsfm_core.scene.reconstruction import MappingReport, MappingResult
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +109,24 @@ def test_a_setting_reaches_the_run(photo_scene, mpsfm, tmp_path: Path) -> None:
     )
     assert ended.code == 0, ended.err
     assert not (tmp_path / "out" / "dense.ply").exists()
+
+
+def test_the_seed_of_the_run_is_that_of_the_mapper(
+    photo_scene, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MPSFM_CACHE", str(cache))
+    seeds = []
+
+    def observed(problem, options, events):
+        seeds.append(options.seed)
+        return MappingResult((), MappingReport())
+
+    monkeypatch.setattr("mpsfm_core.pipeline.mapper.reconstruct", observed)
+    with pytest.raises(ReconstructionError):
+        mpsfm_core.reconstruct(
+            photo_scene.images, config=photo_scene.config, overrides=["runtime.seed=11"]
+        )
+    assert seeds == [11]
 
 
 def test_known_poses_stay_and_give_consistent_depth(photo_scene, mpsfm, tmp_path: Path) -> None:
