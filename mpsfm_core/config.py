@@ -37,9 +37,9 @@ class RuntimeOptions(Options):
     """Where and how a run computes; nothing here changes what it computes but the seed."""
 
     workers: int | None = Field(None, ge=1)
-    """Worker processes of the extraction, null for one a core."""
+    """Images or pairs that the extraction works on at once, null for one a core."""
     threads: int = Field(1, ge=1)
-    """Threads that each worker's provider may use."""
+    """Threads that a provider may use for each of them."""
     seed: int = Field(0, ge=0)
     """Seed of everything random: providers, verification, mapper, pixels of ``dense.ply``."""
     device: Literal["auto", "cpu", "cuda"] = "auto"

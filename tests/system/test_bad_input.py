@@ -149,7 +149,7 @@ def test_a_full_disk(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
     check(ended, 1, str(output), "the disk is full", "earlier results are unchanged")
 
 
-@pytest.mark.parametrize("stage", ["inputs", "extraction"])
+@pytest.mark.parametrize("stage", ["inputs", "extraction", "mapping"])
 def test_ctrl_c(photo_scene, interrupted, output: Path, stage: str, cache: Path) -> None:
     ended = interrupted(*photo_scene.arguments, "--output", output, after=stage)
     check(ended, 130, "interrupted")
