@@ -87,7 +87,7 @@ def test_preconditioner_is_symmetric_and_never_overshoots(shape):
     assert spectrum(random_planes(shape, 3, 2.0)).max() < 1 + 1e-6
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [1, 26, 33, 38])
 def test_firmly_held_pixels_between_strips_do_not_make_it_overshoot(seed):
     # They give coarse grids negative masses.
     values = spectrum(heavy_planes((17, 16), seed))
