@@ -250,27 +250,22 @@ def bench_torch(size: tuple[int, int]) -> dict[str, Any] | None:
 
 
 def bench_scaling(repeats: int) -> dict[str, Any]:
-    """Exponents of the growth of time with the number of pixels; CPU time of one thread.
+    """Exponent of the growth of time with the number of pixels; CPU time of one thread.
 
-    Re-weightings and errors tell whether the work was the same.
+    Errors tell whether the work was as good.
     """
-    pixels, whole, single, steps, errors = [], [], [], [], []
+    pixels, seconds, errors = [], [], []
     for size in SCALING_SIZES:
         pixels.append(size[0] * size[1])
-        problems = [analytic_problem(size, seed) for seed in range(2)]
+        problems = [analytic_problem(size, seed) for seed in range(SCENES)]
         runs = [partial(problem.integrator().refine, problem.anchors) for problem in problems]
         refined = [run() for run in runs]
-        steps.append(sum(result.iterations for result in refined))
         errors.append([p.errors(r.log_depth)[1] for p, r in zip(problems, refined, strict=True)])
-        whole.append(sum(median_time(run, repeats, time.thread_time) for run in runs))
-        single.append(whole[-1] / steps[-1])
-    grid = np.log(pixels)
+        times = [median_time(run, repeats, time.thread_time) for run in runs]
+        seconds.append(statistics.mean(times))
     return {
-        "refinement_exponent": float(np.polyfit(grid, np.log(whole), 1)[0]),
-        "reweighting_exponent": float(np.polyfit(grid, np.log(single), 1)[0]),
-        "reweighting_ms_at_387": 1e3 * single[SCALING_SIZES.index(SIZES[0])],
-        "reweighting_ms_at_1536": 1e3 * single[-1],
-        "reweightings": steps,
+        "exponent": float(np.polyfit(np.log(pixels), np.log(seconds), 1)[0]),
+        "ms": [1e3 * of_size for of_size in seconds],
         "median_errors": [float(np.mean(of_size)) for of_size in errors],
     }
 

@@ -19,9 +19,9 @@ from numba import njit
 from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.geometry import pixel_centers, unproject
 from mpsfm_core.mapping.options import ConsistencyOptions
+from mpsfm_core.optimize.thinning import thinned, thinned_camera, thinning_step
 from mpsfm_core.scene.depth_map import DepthMap
 from mpsfm_core.scene.scene import Scene
-from mpsfm_core.scene.thinning import thinned, thinned_camera, thinning_step
 
 WARP_NOISE_PX = 1.0
 """Std of a pixel's position in the lift (reference: 1 px)."""

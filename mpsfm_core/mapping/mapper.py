@@ -6,6 +6,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,6 +57,13 @@ def reconstruct(
     )
 
 
+class _Failure(NamedTuple):
+    """What an attempt to register an image saw, and the best pose that it found."""
+
+    references: list[int]
+    pose: AbsolutePose | None
+
+
 class Mapper:
     """State of one run; :meth:`components` is the loop."""
 
@@ -97,6 +105,7 @@ class Mapper:
         self.refiner = Refiner(self.scene, self.options, self.scores)
         self.ladder = FailureLadder(self.options.registration)
         self.attempts: dict[int, int] = defaultdict(int)
+        self.failures: dict[int, _Failure] = {}
         self.refuted = np.zeros(self.scores.shape, dtype=np.bool_)
         self._last_size = (0, 0)
 
@@ -171,7 +180,10 @@ class Mapper:
             trusted = np.where(self.refuted, 0, self.scores)
             ranked = rank_next_images(self.scene, trusted, available, options)
             for image, reference in ranked:
-                reason = self._try_image(image, reference)
+                references = self._references(image, reference)
+                if self._known_to_fail(image, references):
+                    continue
+                reason = self._try_image(image, references)
                 if reason is None:
                     self.ladder.reset()
                     self._accept(image)
@@ -180,19 +192,56 @@ class Mapper:
             if not ranked or not self.ladder.relax():
                 return False
 
-    def _try_image(self, image: int, reference: int) -> str | None:
-        """Register an image with the first of its possible poses that holds; None, or why not."""
-        scene, options = self.scene, self.options.registration
-        with self._timed("registration"):
-            references = local_bundle(scene, reference, options.num_neighbors, self.scores)
-            references = [other for other in references if not self.refuted[image, other]]
-            found = correspondences(scene, image, references, options)
+    def _references(self, image: int, reference: int) -> list[int]:
+        """The registered images by whose points an image is posed."""
+        options = self.options.registration
+        nearby = local_bundle(self.scene, reference, options.num_neighbors, self.scores)
+        return [other for other in nearby if not self.refuted[image, other]]
+
+    def _known_to_fail(self, image: int, references: list[int]) -> bool:
+        """Whether even the best pose of the same attempt before lacks support still."""
+        if not self._searched(image, references):
+            return False
+        best = self.failures[image].pose
+        return best is None or self._lacks_support(best) is not None
+
+    def _searched(self, image: int, references: list[int]) -> bool:
+        """Whether another search for the pose of an image would only repeat an earlier one.
+
+        A few are different in any case: they take other halves of the matches.
+        """
+        known = self.failures.get(image)
+        several = self.attempts[image] >= self.options.registration.resampled_attempts
+        return several and known is not None and known.references == references
+
+    def _find_poses(
+        self, image: int, references: list[int], found: Correspondences, snapshot: Snapshot
+    ) -> list[AbsolutePose]:
+        """Possible poses of an image, best first, that of earlier attempts among them."""
+        options = self.options.registration
+        poses = []
+        known = self.failures.get(image)
+        if known and known.pose:
+            pose = known.pose
+            poses.append(
+                rate_pose(self.scene, found, pose.rotation, pose.translation, pose.source, options)
+            )
+        if not self._searched(image, references):
             attempt, seed = self.attempts[image], self.options.seed
+            new = find_poses(self.scene, image, found, options, seed=seed, attempt=attempt)
+            poses += [self._polished(image, pose, found, snapshot) for pose in new]
             self.attempts[image] += 1
-            poses = find_poses(scene, image, found, options, seed=seed, attempt=attempt)
+        poses.sort(key=lambda pose: -pose.support)
+        self.failures[image] = _Failure(references, poses[0] if poses else None)
+        return poses
+
+    def _try_image(self, image: int, references: list[int]) -> str | None:
+        """Register an image with the first of its possible poses that holds; None, or why not."""
+        scene = self.scene
+        with self._timed("registration"):
+            found = correspondences(scene, image, references, self.options.registration)
             snapshot = scene.snapshot()
-            poses = [self._polished(image, pose, found, snapshot) for pose in poses]
-            poses.sort(key=lambda pose: -pose.support)
+            poses = self._find_poses(image, references, found, snapshot)
         reason: str | None = "neither PnP nor an essential matrix gives a pose"
         for pose in poses:
             reason = self._lacks_support(pose) or self._try_pose(image, pose, found)
@@ -209,7 +258,7 @@ class Mapper:
         scene, options = self.scene, self.options
         scene.register(image, pose.rotation, pose.translation)
         triangulate_image(scene, image, options.triangulation)
-        self.refiner.adjust([image], local=True)
+        self.refiner.adjust([image], local=True, max_iterations=options.registration.polishing)
         rotation, translation = scene.rotations[image].copy(), scene.translations[image].copy()
         scene.restore(snapshot)
         polished = rate_pose(scene, found, rotation, translation, pose.source, options.registration)
@@ -281,6 +330,7 @@ class Mapper:
             self.refiner.refine_globally(final=final)
             self.scene.tracks.compact()
         self.refuted[:] = False  # the scene may be right where it was wrong
+        self.failures.clear()
         self._last_size = int(self.scene.registered.sum()), len(self.scene.tracks)
         self._drop(lost_images(self.scene), "lost its points in global refinement")
 

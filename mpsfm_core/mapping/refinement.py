@@ -16,8 +16,13 @@ from mpsfm_core.mapping.view_selection import local_bundle
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
 from mpsfm_core.optimize.covariance import depth_variance_of_points, point_covariances
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
+from mpsfm_core.optimize.thinning import (
+    thinned_camera,
+    thinned_pixels,
+    thinned_prior,
+    thinning_step,
+)
 from mpsfm_core.scene.scene import Scene
-from mpsfm_core.scene.thinning import thinned, thinned_camera, thinned_pixels, thinning_step
 
 LOCAL_MAX_TRACK_LENGTH = 15
 """Longer tracks stay fixed in local bundle adjustment (COLMAP, reference)."""
@@ -122,11 +127,13 @@ class Refiner:
         local: bool = False,
         focal: bool = False,
         depth_scale: float = 1.0,
+        max_iterations: int | None = None,
     ) -> None:
         """Bundle-adjust the poses of some images and the points they see.
 
         ``local``: long tracks stay. ``focal``: guessed focal lengths
         are refined too. ``depth_scale`` multiplies the scale of the depth loss.
+        ``max_iterations``: at most, instead of the options'.
         """
         scene, tracks = self.scene, self.scene.tracks
         observations = tracks.observations()
@@ -168,7 +175,12 @@ class Refiner:
                 scale_anchor=int(np.argmax(moving)) if free_scale else None,
                 variable_focal=self._guessed(images)[first] if focal else None,
             ),
-            options.model_copy(update={"depth_scale": scale}),
+            options.model_copy(
+                update={
+                    "depth_scale": scale,
+                    "max_iterations": max_iterations or options.max_iterations,
+                }
+            ),
         )
         scene.rotations[images] = result.rotations
         scene.translations[images] = result.translations
@@ -280,23 +292,12 @@ class Refiner:
             self.options.integration,
             self._step(image),
         )
-        prior, normals, noise = depth_map.prior, depth_map.normals, self._assumed
-        assert prior.variance is not None and normals.variance is not None  # MappingImage checks it
-        depth = replace(
-            prior,
-            depth=thinned(prior.depth, step),
-            variance=thinned(prior.variance, step) * np.float32(noise.multiplier**2),
-            valid=thinned(prior.valid, step),
-        )
-        worth = max(noise.independent_pixels(depth.depth.size), options.independent_depths)
+        prior, noise = thinned_prior(depth_map.prior, step), self._assumed
+        assert prior.variance is not None  # MappingImage checks it
+        worth = max(noise.independent_pixels(prior.depth.size), options.independent_depths)
         integrator = self._integrators[image] = DepthIntegrator(
-            depth,
-            replace(
-                normals,
-                normals=thinned(normals.normals, step),
-                variance=thinned(normals.variance, step),
-                valid=thinned(normals.valid, step),
-            ),
+            replace(prior, variance=prior.variance * np.float32(noise.multiplier**2)),
+            thinned_prior(depth_map.normals, step),
             thinned_camera(depth_map.camera, step),
             replace(options, independent_depths=worth),
         )

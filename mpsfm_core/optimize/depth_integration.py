@@ -2,6 +2,7 @@
 
 The energy and why its minimisation descends: `integration_energy`. Each re-weighting gives a linear
 system with a five-point stencil; a few multigrid-preconditioned CG iterations lower it far enough.
+Large maps are refined on every second pixel first.
 """
 
 from __future__ import annotations
@@ -27,10 +28,20 @@ from mpsfm_core.optimize.integration_energy import (
     normal_terms,
 )
 from mpsfm_core.optimize.multigrid import Multigrid, Solution
+from mpsfm_core.optimize.thinning import (
+    thickened,
+    thinned_camera,
+    thinned_pixels,
+    thinned_prior,
+)
 
 # Where there are normals but no prior, the filled-in depth is a prior of this variance (log depth):
 # it says next to nothing, but nothing is left undetermined.
 _FILLED_LOG_VARIANCE = 1.0
+# Maps of twice so many columns are refined on every second pixel first, and then at most so many
+# times re-weighted. Ours: at 768 x 512 an energy lower than without, at two thirds of the time.
+_COARSE_COLUMNS = 300
+_FINE_ITERATIONS = 3
 # Weight that holds known depth fixed, against couplings below 1e12.
 _FIXED = 1e15
 
@@ -105,8 +116,9 @@ class RefinedDepth:
     bool, False where neither prior says anything (the value there is the prior's median).
     `initial_energy` is that of the map the refinement started from, under the same anchors;
     `energy` never exceeds it, and `point_energy` is the mean of its points' share. `converged`:
-    stopped by the tolerance. `skipped`: the points agree with the start as well as those it was
-    refined with; its map is returned, and `point_energy` remains that of the last solve.
+    stopped by the tolerance. `iterations` and `cg_iterations` count those on the whole map.
+    `skipped`: the points agree with the start as well as those it was refined with; its map is
+    returned, and `point_energy` remains that of the last solve.
     """
 
     log_depth: Float64
@@ -188,6 +200,10 @@ class DepthIntegrator:
         holes = self._active & ~depth.valid
         if holes.any():
             self._log_depth[holes] = self._integrate_from(depth.valid)[holes]
+        self._coarse: DepthIntegrator | None = None
+        if camera.width >= 2 * _COARSE_COLUMNS:
+            parts = thinned_prior(depth, 2), thinned_prior(normals, 2), thinned_camera(camera, 2)
+            self._coarse = DepthIntegrator(*parts, options, torch_device=torch_device)
 
     def refine(
         self,
@@ -205,7 +221,7 @@ class DepthIntegrator:
         solver = self._solver(terms)
         if start is None:
             z = terms.prior.log_depth
-            return self._descend(z, solver.majorise(z), solver, scale)
+            return self._descend_from_prior(z, solver.majorise(z), solver, anchors, scale)
         z = start.log_depth + np.log(scale / start.scale)
         here = solver.majorise(z)
         change = abs(here.point_energy - start.point_energy)
@@ -237,13 +253,39 @@ class DepthIntegrator:
 
         return TorchSolver(terms, self._torch_device)
 
-    def _descend(self, z: Float64, here: Any, solver: _Solver, scale: float) -> RefinedDepth:
+    def _descend_from_prior(
+        self, prior: Float64, here: Any, solver: _Solver, anchors: Anchors, scale: float
+    ) -> RefinedDepth:
+        """Descend from the scaled prior, or from what every second pixel makes of it."""
+        if self._coarse is None:
+            return self._descend(prior, here, solver, scale)
+        coarse = self._coarse.refine(
+            anchors._replace(xy=thinned_pixels(np.asarray(anchors.xy), 2)), scale=scale
+        )
+        change = coarse.log_depth - self._coarse._log_depth - np.log(scale)
+        z = prior + thickened(change, coarse.valid, prior.shape)
+        there = solver.majorise(z)
+        if not there.energy < here.energy:
+            return self._descend(prior, here, solver, scale)
+        limit = min(_FINE_ITERATIONS, self.options.max_iterations)
+        fine = self._descend(z, there, solver, scale, limit)
+        return replace(fine, initial_energy=here.energy)
+
+    def _descend(
+        self,
+        z: Float64,
+        here: Any,
+        solver: _Solver,
+        scale: float,
+        max_iterations: int | None = None,
+    ) -> RefinedDepth:
         """Re-weighted least squares from z; every accepted step lowers the energy."""
         options = self.options
+        limit = options.max_iterations if max_iterations is None else max_iterations
         initial_energy = here.energy
         iterations = cg_iterations = 0
         converged = False
-        while iterations < options.max_iterations and not converged:
+        while iterations < limit and not converged:
             step = solver.step(here, options.cg_iterations)
             further = z + (options.over_relaxation if iterations else 1.0) * step.x
             there = solver.majorise(further)

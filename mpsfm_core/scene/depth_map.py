@@ -7,7 +7,7 @@ import numpy as np
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage, PinholeCamera
 from mpsfm_core.geometry import sample_bilinear, scale_pixels
 from mpsfm_core.optimize.depth_integration import RefinedDepth
-from mpsfm_core.scene.thinning import thickened, thinned
+from mpsfm_core.optimize.thinning import thickened, thinned
 
 
 class DepthMap:

@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera
 from mpsfm_core.errors import DataError
+from mpsfm_core.optimize import depth_integration
 from mpsfm_core.optimize.depth_integration import (
     NO_ANCHORS,
     Anchors,
@@ -272,6 +274,24 @@ def test_a_warm_start_is_cheaper_and_as_good():
     cold, warm = eager.refine(anchors), eager.refine(anchors, start=before)
     assert warm.iterations < cold.iterations
     assert warm.energy < 1.05 * cold.energy
+
+
+def test_large_maps_profit_from_a_coarse_start(monkeypatch):
+    camera = PinholeCamera(640, 480, 560.0, 560.0, 320.0, 240.0)
+    depth, normals = rendered(room_scene(), arc_poses(1, 0.0)[0], camera)
+    rng = np.random.default_rng(0)
+    field = cv2.resize(rng.normal(0, 0.05, (8, 10)), camera.size, interpolation=cv2.INTER_CUBIC)
+    parts = depth_prior(depth * np.exp(field)), normal_prior(normals), camera
+    anchors = exact_anchors(depth, 200)
+    started = DepthIntegrator(*parts).refine(anchors)
+    monkeypatch.setattr(depth_integration, "_COARSE_COLUMNS", 10_000)
+    alone = DepthIntegrator(*parts).refine(anchors)
+
+    errors = [rms(refined.log_depth - np.log(depth)) for refined in (started, alone)]
+    assert started.iterations <= 3 < alone.iterations
+    assert errors[0] < 1.1 * errors[1]
+    assert started.energy < 1.05 * alone.energy
+    assert started.initial_energy == alone.initial_energy > started.energy
 
 
 def test_variance_is_the_diagonal_of_the_inverse_hessian():

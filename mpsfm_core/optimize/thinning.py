@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from dataclasses import fields, replace
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera
+from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, NormalPrior, PinholeCamera
 
 Scalar = TypeVar("Scalar", bound=np.generic)
+Prior = TypeVar("Prior", DepthPrior, NormalPrior)
 
 
 def thinning_step(columns: int, wanted: int) -> int:
@@ -21,6 +23,16 @@ def thinning_step(columns: int, wanted: int) -> int:
 def thinned(values: NDArray[Scalar], step: int) -> NDArray[Scalar]:
     """(h, w, ...): every ``step``-th row and column, from the middle of the first ``step``."""
     return values[step // 2 :: step, step // 2 :: step]
+
+
+def thinned_prior(prior: Prior, step: int) -> Prior:
+    """A depth or normal prior on the grid that :func:`thinned` leaves."""
+    maps: dict[str, Any] = {
+        field.name: thinned(value, step)
+        for field in fields(prior)
+        if isinstance(value := getattr(prior, field.name), np.ndarray)
+    }
+    return replace(prior, **maps)
 
 
 def thinned_camera(camera: PinholeCamera, step: int) -> PinholeCamera:
