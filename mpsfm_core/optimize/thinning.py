@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,14 +57,21 @@ def thickened(values: Float64, valid: Bool, shape: tuple[int, int]) -> Float32:
     """
     rows, columns = shape
     step = max(1, round(columns / values.shape[1]))
-    x = (np.arange(columns) + 0.5) / step - _offset(step) - 0.5
-    y = (np.arange(rows) + 0.5) / step - _offset(step) - 0.5
-    at_x, at_y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
     known = np.stack([np.where(valid, values, 0), valid], axis=-1).astype(np.float32)
-    total, share = cv2.split(
-        cv2.remap(known, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    )
+    known = _stretched(_stretched(known, rows, step).swapaxes(0, 1), columns, step)
+    total, share = np.moveaxis(known.swapaxes(0, 1), -1, 0)
     return np.where(share > 1e-3, total / np.maximum(share, 1e-3), 0).astype(np.float32)
+
+
+def _stretched(values: Float32, size: int, step: int) -> Float32:
+    """Linear interpolation along the first axis; the outermost values continue."""
+    at = (np.arange(size) + 0.5) / step - _offset(step) - 0.5
+    at = np.clip(at, 0, len(values) - 1)
+    low = np.minimum(at.astype(np.int64), max(len(values) - 2, 0))
+    share = (at - low).astype(np.float32).reshape(-1, *[1] * (values.ndim - 1))
+    high = np.minimum(low + 1, len(values) - 1)
+    stretched: Float32 = (1 - share) * values[low] + share * values[high]
+    return stretched
 
 
 def _offset(step: int) -> float:
