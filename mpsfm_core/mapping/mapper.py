@@ -32,6 +32,10 @@ from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Recons
 from mpsfm_core.scene.scene import Scene, Snapshot
 
 
+MIN_CONTRADICTED = 2
+"""Newcomers that contradict a view before it is the one to go (ours)."""
+
+
 def reconstruct(
     problem: MappingProblem,
     options: MapperOptions | None = None,
@@ -106,6 +110,8 @@ class Mapper:
         self.ladder = FailureLadder(self.options.registration)
         self.attempts: dict[int, int] = defaultdict(int)
         self.failures: dict[int, _Failure] = {}
+        self.contradicted: dict[int, set[int]] = defaultdict(set)
+        self.displaced: set[int] = set()
         self.refuted = np.zeros(self.scores.shape, dtype=np.bool_)
         self._last_size = (0, 0)
 
@@ -189,8 +195,31 @@ class Mapper:
                     self._accept(image)
                     return True
                 self._reject(image, reason)
+            if self._displace():
+                continue
             if not ranked or not self.ladder.relax():
                 return False
+
+    def _displace(self) -> bool:
+        """Take out the image that most newcomers contradicted, if several did; each image once.
+
+        The check blames the newcomer, but several of them may be right and the one view wrong.
+        """
+        blamed = {
+            image: len(by)
+            for image, by in self.contradicted.items()
+            if self.scene.registered[image] and len(by) >= MIN_CONTRADICTED
+        }
+        self.contradicted.clear()
+        candidates = [image for image in blamed if image not in self.displaced]
+        if not candidates or self.scene.registered.sum() <= 2:
+            return False
+        worst = max(candidates, key=lambda image: blamed[image])
+        self.displaced.add(worst)
+        self._drop([worst], f"{blamed[worst]} other images contradict its depth")
+        self.refuted[:] = False
+        self.failures.clear()
+        return True
 
     def _references(self, image: int, reference: int) -> list[int]:
         """The registered images by whose points an image is posed."""
@@ -316,6 +345,7 @@ class Mapper:
             check = check_image(self.scene, image, options, self.refiner.std_factor)
         if check.share <= limit:
             return None
+        self.contradicted[check.other].add(image)
         other = self.problem.images[check.other].name
         return f"{check.share:.0%} of the pixels contradict the depth of {other}"
 
