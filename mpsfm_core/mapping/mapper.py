@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
+from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.depth_consistency import check_image, conflicting_images
 from mpsfm_core.mapping.events import MappingEvents, Silent
 from mpsfm_core.mapping.failure_ladder import FailureLadder
@@ -31,7 +32,8 @@ from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, r
 from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
 from mpsfm_core.scene.scene import Scene, Snapshot
 
-
+JUMP_DEG = 3.0
+"""A camera that turns more in a global refinement may have found a wrong minimum (ours)."""
 MIN_CONTRADICTED = 2
 """Newcomers that contradict a view before it is the one to go (ours)."""
 
@@ -356,13 +358,36 @@ class Mapper:
         return images > growth * self._last_size[0] or points > growth * self._last_size[1]
 
     def _refine_globally(self, *, final: bool = False) -> None:
+        before = self.scene.snapshot()
         with self._timed("global refinement"):
             self.refiner.refine_globally(final=final)
             self.scene.tracks.compact()
+        self._undo_jump(before)
         self.refuted[:] = False  # the scene may be right where it was wrong
         self.failures.clear()
         self._last_size = int(self.scene.registered.sum()), len(self.scene.tracks)
         self._drop(lost_images(self.scene), "lost its points in global refinement")
+
+    def _undo_jump(self, before: Snapshot) -> None:
+        """Return to an earlier state if cameras jumped and their depth contradicts since then.
+
+        A robust loss has many minima; where few matches hold images, the next one may be wrong.
+        """
+        images = self.scene.registered_images()
+        turns = self.scene.rotations[images] @ before.rotations[images].transpose(0, 2, 1)
+        if not len(images) or rotation_angle_deg(turns).max() < JUMP_DEG:
+            return
+        after, worse = self.scene.snapshot(), len(self._conflicts())
+        self.scene.restore(before)
+        if not worse > len(self._conflicts()):
+            self.scene.restore(after)
+
+    def _conflicts(self) -> list[tuple[int, float]]:
+        """Images to leave out so that no two views contradict each other, and how much each did."""
+        if not self.options.consistency.enabled:
+            return []
+        with self._timed("depth check"):
+            return conflicting_images(self.scene, self.options.consistency, self.refiner.std_factor)
 
     def _finish(self) -> None:
         """Last refinements, and the depth check once more for every image."""
@@ -375,9 +400,7 @@ class Mapper:
 
     def _check_all(self) -> None:
         """Deregister images until no two views contradict each other."""
-        options, noise = self.options.consistency, self.refiner.std_factor
-        with self._timed("depth check"):
-            conflicting = conflicting_images(self.scene, options, noise)
+        conflicting = self._conflicts()
         for image, share in conflicting:
             self._drop([image], f"at the end {share:.0%} of the pixels contradict another view's")
         if conflicting:
