@@ -1,9 +1,9 @@
 """Pose accuracy on the shared scenes, our mapper beside COLMAP's on the same matches.
 
-    python -m benchmarks.accuracy [--scenes rendered_kitchen ...] [--output DIR] [--workers 1]
+    python -m benchmarks.accuracy [--tables rendered_kitchen ...] [--output DIR] [--workers 1]
 
 Runs ``mpsfm benchmark`` (resumable: --output keeps what is done) and writes one Markdown file for
-each scene to benchmarks/results/. Scenes are in $MPSFM_SHARED or ../shared. For rendered_kitchen
+each table to benchmarks/results/. Scenes are in $MPSFM_SHARED or ../shared. For rendered_kitchen
 the figures are held against the bars below; the exit code is 1 when one is missed.
 """
 
@@ -12,19 +12,45 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks._scenes import RESULTS, shared_folder
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
 from mpsfm_core.evaluation.records import Record
 from mpsfm_core.evaluation.report import Row, make_rows, markdown, write_report
+from mpsfm_core.yaml_text import write_yaml
 
-LOW_OVERLAP = ("minimal", "leq5", "leq10", "leq30", "all")
-SCENES: Mapping[str, tuple[tuple[str, ...] | None, tuple[str, ...]]] = {
-    "rendered_kitchen": (None, ("sensor", "degraded")),
-    "hololens_room": (LOW_OVERLAP, ("sensor", "config")),
+PRIORS = ("sensor", "degraded", "config")
+"""``config`` is FastDepth."""
+WINDOWS, FRAMES = 6, 5
+"""Low parallax: so many windows, evenly spaced, of so many consecutive frames."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One table: a scene, its buckets (None: all) and priors, and the features and matcher."""
+
+    scene: str
+    buckets: tuple[str, ...] | None = None
+    priors: tuple[str, ...] = PRIORS
+    matching: str = ""
+    low_parallax: bool = False
+
+
+ALIKED = """\
+features: {use: aliked, options: {max_keypoints: 1500}}
+matcher: {use: lightglue-aliked}
+"""
+COMPARISONS: Mapping[str, Comparison] = {
+    "rendered_kitchen": Comparison("rendered_kitchen"),
+    "hololens_room": Comparison("hololens_room"),
+    "hololens_room-low_parallax": Comparison("hololens_room", low_parallax=True),
+    "hololens_room-aliked": Comparison(
+        "hololens_room", ("minimal", "leq5", "leq10"), ("sensor", "config"), ALIKED
+    ),
 }
-"""Scene -> buckets (None: all) and priors; ``config`` is FastDepth."""
+"""Name of the table -> what is in it."""
 BARS: Mapping[tuple[str, str], tuple[float, float, float]] = {
     ("minimal", "ours-sensor"): (35, 70, 80),
     ("leq10", "ours-sensor"): (35, 70, 80),
@@ -35,7 +61,7 @@ BARS: Mapping[tuple[str, str], tuple[float, float, float]] = {
     ("all", "ours-degraded"): (45, 80, 92),
 }
 """Bucket and method on rendered_kitchen -> AUC@1, 5, 20 that are wanted."""
-FASTDEPTH = """\
+CONFIG = """\
 extends: benchmark
 depth:
   use: onnx
@@ -46,25 +72,26 @@ depth:
 def main() -> int:
     """Run the scenes; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
+    parser.add_argument("--tables", nargs="+", default=list(COMPARISONS), choices=COMPARISONS)
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
     shared, missed = shared_folder(), 0
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    config = arguments.output / "fastdepth.yaml"
-    config.write_text(FASTDEPTH.format(model=shared / "models" / "fastdepth_224.onnx"))
-    for name in arguments.scenes:
-        buckets, priors = SCENES[name]
+    for name in arguments.tables:
+        comparison, output = COMPARISONS[name], arguments.output / name
+        output.mkdir(parents=True, exist_ok=True)
+        config = output / ("aliked.yaml" if comparison.matching else "xfeat.yaml")
+        text = CONFIG.format(model=shared / "models" / "fastdepth_224.onnx")
+        config.write_text(text + comparison.matching)
+        scene = shared / "data" / comparison.scene
         plan = Plan(
-            (shared / "data" / name,),
-            (str(config) if "config" in priors else "benchmark",),
-            buckets,
-            priors,
+            (_low_parallax(scene, output / name) if comparison.low_parallax else scene,),
+            (str(config),),
+            comparison.buckets,
+            comparison.priors,
             overrides=("runtime.workers=1",),
             workers=arguments.workers,
         )
-        output = arguments.output / name
         records = run_benchmark(plan, output, done=_tell)
         write_report(output, records)
         rows = make_rows(records)
@@ -75,6 +102,19 @@ def main() -> int:
         (RESULTS / f"accuracy-{name}.md").write_text(text.rstrip() + "\n", encoding="utf-8")
         print(text)
     return missed > 0
+
+
+def _low_parallax(scene: Path, folder: Path) -> Path:
+    """The scene once more, with windows of consecutive frames as its sets."""
+    folder.mkdir(exist_ok=True)
+    for item in scene.iterdir():
+        if item.name != "testsets.yaml" and not (folder / item.name).exists():
+            (folder / item.name).symlink_to(item.resolve())
+    frames = sorted(path.stem for path in (scene / "images").iterdir())
+    starts = [k * (len(frames) - FRAMES) // (WINDOWS - 1) for k in range(WINDOWS)]
+    sets = [{"images": frames[start : start + FRAMES]} for start in starts]
+    write_yaml({"low_parallax": sets}, folder / "testsets.yaml")
+    return folder
 
 
 def _against_bars(rows: Sequence[Row]) -> list[str]:
