@@ -113,7 +113,7 @@ def _low_parallax(scene: Path, folder: Path) -> Path:
     frames = sorted(path.stem for path in (scene / "images").iterdir())
     starts = [k * (len(frames) - FRAMES) // (WINDOWS - 1) for k in range(WINDOWS)]
     sets = [{"images": frames[start : start + FRAMES]} for start in starts]
-    write_yaml({"low_parallax": sets}, folder / "testsets.yaml")
+    (folder / "testsets.yaml").write_text(write_yaml({"low_parallax": sets}), encoding="utf-8")
     return folder
 
 
