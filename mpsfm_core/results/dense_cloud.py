@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -23,6 +23,9 @@ from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
 
 _NEIGHBORS = 8
 """Images that vote on the points of one image: those that share most points with it."""
+_WORSE = 1.5
+"""Pixels of so many times the median std stay in any case: a network that promises little still
+gives a cloud (ours)."""
 
 
 def fuse_depth_maps(
@@ -37,7 +40,8 @@ def fuse_depth_maps(
     Above ``options.dense_max_points`` a random share of each map's pixels is taken.
     """
     images = reconstruction.images
-    usable = [_certain(image, options.dense_max_relative_std) for image in images]
+    limit = max(options.dense_max_relative_std, _WORSE * _median_relative_std(images))
+    usable = [_certain(image, limit) for image in images]
     share = min(1.0, options.dense_max_points / max(1, sum(int(mask.sum()) for mask in usable)))
     neighbors = _neighbors(reconstruction)
     rng = np.random.default_rng(seed)
@@ -52,6 +56,16 @@ def fuse_depth_maps(
         clouds.append(points[kept])
         colors.append(_colors(view_of(image.name), image, pixels[kept]))
     return np.concatenate(clouds), np.concatenate(colors)
+
+
+def _median_relative_std(images: Sequence[RegisteredImage]) -> float:
+    """Over the images, of the median over the pixels."""
+    spreads = [
+        np.median(np.sqrt(_variance(image)[valid]) / image.depth.depth[valid])
+        for image in images
+        if (valid := image.depth.valid).any()
+    ]
+    return float(np.median(spreads)) if spreads else 0.0
 
 
 def _certain(image: RegisteredImage, max_relative_std: float) -> Bool:

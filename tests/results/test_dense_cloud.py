@@ -54,6 +54,18 @@ def test_uncertain_pixels_are_left_out(solved) -> None:
     assert 0.9 * old.valid[:30].sum() < lost <= 1.1 * old.valid[:30].sum()
 
 
+def test_a_network_that_promises_little_gives_a_cloud_too(solved) -> None:
+    images = tuple(
+        replace(image, depth=replace(old, variance=(0.25 * old.depth) ** 2))
+        for image in solved.best.images
+        if (old := image.depth)
+    )
+    vague = replace(solved.best, images=images)
+    points, _ = fuse_depth_maps(vague, solved.views.__getitem__, ResultOptions())
+    total = sum(image.depth.valid.sum() for image in solved.best.images)
+    assert len(points) > 0.95 * total
+
+
 def test_a_wall_in_free_space_is_left_out(solved) -> None:
     depth = solved.best.images[1].depth.depth.copy()
     depth[20:40, 30:50] = 1.0  # other images see right through

@@ -133,13 +133,15 @@ def environment(cache: Path) -> Mapping[str, str]:
 def mpsfm(environment: Mapping[str, str]) -> Mpsfm:
     """Runs ``mpsfm ARGUMENTS`` in a process of its own."""
 
-    def run(*arguments: object, extra: Mapping[str, str] | None = None, **options) -> Ended:
+    def run(
+        *arguments: object, extra: Mapping[str, str] | None = None, timeout: float = 300, **options
+    ) -> Ended:
         ended = subprocess.run(
             [*COMMAND, *map(str, arguments)],
             env={**environment, **(extra or {})},
             capture_output=True,
             text=True,
-            timeout=300,
+            timeout=timeout,
             **options,
         )
         return Ended(ended.returncode, ended.stdout, ended.stderr)
