@@ -11,6 +11,7 @@ from mpsfm_core.data import Float64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.optimize import bundle_problem
 from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.testing.problems import Noise, mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, look_at, room_scene
@@ -80,16 +81,24 @@ def test_the_scale_is_metric(
     assert found == pytest.approx(np.linalg.norm(truth[0] - truth[-1]), rel=0.01)
 
 
-def test_the_result_is_the_same_bit_for_bit() -> None:
+def test_the_result_is_the_same_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run by run, and with one thread or two."""
+    monkeypatch.setattr(bundle_problem, "RANGE_SIZE", 300)  # several ranges, so several threads
     poses = arc_poses(4, 12.0)
     noise = Noise(keypoints_px=0.7, scale=0.05, depth=0.02)
     problem = mapping_problem(room_scene(), CAMERA, poses, noise=noise, declared_depth_std=0.03)
-    one, two = reconstruct(problem), reconstruct(problem)
-    first, second = one.reconstructions[0], two.reconstructions[0]
-    assert np.array_equal(first.points, second.points)
-    for a, b in zip(first.images, second.images, strict=True):
-        assert np.array_equal(a.rotation, b.rotation)
-        assert np.array_equal(a.depth.depth, b.depth.depth)
+    defaults = MapperOptions().refinement
+    runs = []
+    for threads in (1, 2, 2):
+        bundle = defaults.bundle.model_copy(update={"threads": threads})
+        refinement = defaults.model_copy(update={"bundle": bundle})
+        runs.append(reconstruct(problem, MapperOptions(refinement=refinement)).reconstructions[0])
+    first = runs[0]
+    for other in runs[1:]:
+        assert np.array_equal(first.points, other.points)
+        for a, b in zip(first.images, other.images, strict=True):
+            assert np.array_equal(a.rotation, b.rotation)
+            assert np.array_equal(a.depth.depth, b.depth.depth)
 
 
 def test_a_chain_of_two_view_links_is_registered_by_lifting() -> None:

@@ -1,0 +1,69 @@
+"""How the mapper takes back what went wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mpsfm_core.data import PinholeCamera
+from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.mapper import Mapper
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.testing.problems import mapping_problem
+from mpsfm_core.testing.scenes import arc_poses, room_scene
+
+CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
+
+
+@pytest.fixture
+def mapper() -> Mapper:
+    """All of an exact scene is registered."""
+    mapper = Mapper(
+        mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0)), MapperOptions(), Silent()
+    )
+    next(mapper.components())
+    assert mapper.scene.registered.all()
+    return mapper
+
+
+def turned(mapper: Mapper, image: int, degrees: float) -> None:
+    """Turn a camera about its own centre."""
+    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    mapper.scene.rotations[image] = turn @ mapper.scene.rotations[image]
+    mapper.scene.translations[image] = turn @ mapper.scene.translations[image]
+
+
+def test_the_view_that_several_newcomers_contradict_goes_once(mapper: Mapper) -> None:
+    mapper.contradicted[3] = {7, 8}
+    mapper.contradicted[1] = {7}
+    assert mapper._displace()
+    assert np.flatnonzero(~mapper.scene.registered).tolist() == [3]
+    assert "2 other images contradict" in mapper.image_reasons["view_3.png"]
+    mapper._register_next(np.ones(5, dtype=np.bool_))
+    assert mapper.scene.registered[3], "it may come back"
+    mapper.contradicted[3] = {7, 8}
+    assert not mapper._displace(), "but goes only once"
+
+
+def test_one_newcomer_is_not_believed(mapper: Mapper) -> None:
+    mapper.contradicted[3] = {7}
+    assert not mapper._displace()
+    assert mapper.scene.registered.all()
+
+
+def test_a_jump_that_contradicts_is_undone(mapper: Mapper) -> None:
+    before = mapper.scene.snapshot()
+    turned(mapper, 2, 25.0)
+    mapper._undo_jump(before)
+    assert np.array_equal(mapper.scene.rotations, before.rotations)
+
+
+def test_a_jump_to_a_better_state_stays(mapper: Mapper) -> None:
+    right = mapper.scene.rotations.copy()
+    turned(mapper, 2, 25.0)
+    before = mapper.scene.snapshot()
+    turned(mapper, 2, -25.0)
+    mapper._undo_jump(before)
+    assert rotation_angle_deg(mapper.scene.rotations @ right.transpose(0, 2, 1)).max() < 1e-6
