@@ -153,10 +153,12 @@ class DedodeLightGlueOptions(LightGlueOptions):
 
 
 class LighterGlueOptions(LightGlueOptions):
-    """LighterGlue, the small LightGlue for XFeat."""
+    """LighterGlue, the small LightGlue for XFeat.
 
-    width_confidence: float = Field(0.95, le=1)
-    """Published default."""
+    Its published ``width_confidence`` is 0.95, for speed. Without, 3 % more matches are verified on
+    rendered_kitchen, and pose AUC at 1 degree of all its images is 75 instead of 68 % (ours).
+    """
+
     weights: str = LIGHTERGLUE.uri
 
 
