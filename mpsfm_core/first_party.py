@@ -23,6 +23,7 @@ FIRST_PARTY: Mapping[str, tuple[str, ...]] = MappingProxyType(
         ),
         "mpsfm-kornia": (
             "features/dedode",
+            "features/kornia-sift",
             "matcher/lightglue-dedode",
             "matcher/adalam",
             "matcher/loftr",

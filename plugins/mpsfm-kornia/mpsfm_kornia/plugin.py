@@ -68,6 +68,17 @@ def mpsfm_providers() -> list[ProviderSpec]:
             tags=("dedode",),
         ),
         ProviderSpec(
+            kind="features",
+            name="kornia-sift",
+            factory="mpsfm_kornia.features:SiftFeatures",
+            options=opt.SiftOptions,
+            summary="RootSIFT on the GPU, where there is one; without weights",
+            requires=_REQUIRES,
+            install_hint="pip install mpsfm-kornia",
+            code_license="Apache-2.0",
+            tags=("sift",),
+        ),
+        ProviderSpec(
             kind="matcher",
             name="lighterglue",
             factory="mpsfm_kornia.lightglue:LighterGlueMatcher",

