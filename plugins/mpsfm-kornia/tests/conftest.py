@@ -33,7 +33,7 @@ def make(context: ProviderContext) -> Callable[..., Any]:
 
     def make(kind: str, name: str, **options: Any) -> Any:
         spec = SPECS[kind, name]
-        uri = options.get("weights") or spec.weights[0].uri
+        uri = options.get("weights") or next((file.uri for file in spec.weights), "")
         if uri.startswith("package:"):
             package = uri.removeprefix("package:").split("/")[0]
             if importlib.util.find_spec(package) is None:
