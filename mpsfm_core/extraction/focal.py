@@ -35,9 +35,11 @@ def estimate_focals(
         ProviderRunError, ProviderOutputError: it failed or broke its contract.
     """
     guessed = [index for index, image in enumerate(images) if image.focal_source == "default"]
+    if not guessed:
+        return images
     bench = Workbench(images, config, registry, events or Silent())
     provider = bench.provider("depth", config.depth.model_copy(update={"wrap": ()}))
-    if not guessed or not provider.can("estimates-focal"):
+    if not provider.can("estimates-focal"):
         return images
 
     def estimate(index: int) -> float:

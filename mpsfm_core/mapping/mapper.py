@@ -207,21 +207,24 @@ class Mapper:
 
         The check blames the newcomer, but several of them may be right and the one view wrong.
         """
-        blamed = {
+        blame = {
             image: len(by)
             for image, by in self.contradicted.items()
-            if self.scene.registered[image] and len(by) >= MIN_CONTRADICTED
+            if self.scene.registered[image] and image not in self.displaced
         }
         self.contradicted.clear()
-        candidates = [image for image in blamed if image not in self.displaced]
-        if not candidates or self.scene.registered.sum() <= 2:
+        worst = max(blame, key=lambda image: blame[image], default=-1)
+        if blame.get(worst, 0) < MIN_CONTRADICTED or self.scene.registered.sum() <= 2:
             return False
-        worst = max(candidates, key=lambda image: blamed[image])
         self.displaced.add(worst)
-        self._drop([worst], f"{blamed[worst]} other images contradict its depth")
+        self._drop([worst], f"{blame[worst]} other images contradict its depth")
+        self._forget_failures()
+        return True
+
+    def _forget_failures(self) -> None:
+        """Try everything again: the scene may be right now where it was wrong."""
         self.refuted[:] = False
         self.failures.clear()
-        return True
 
     def _references(self, image: int, reference: int) -> list[int]:
         """The registered images by whose points an image is posed."""
@@ -363,8 +366,7 @@ class Mapper:
             self.refiner.refine_globally(final=final)
             self.scene.tracks.compact()
         self._undo_jump(before)
-        self.refuted[:] = False  # the scene may be right where it was wrong
-        self.failures.clear()
+        self._forget_failures()
         self._last_size = int(self.scene.registered.sum()), len(self.scene.tracks)
         self._drop(lost_images(self.scene), "lost its points in global refinement")
 

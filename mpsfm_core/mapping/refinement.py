@@ -270,7 +270,6 @@ class Refiner:
                 continue
             for image in np.flatnonzero(scene.camera_of == scene.camera_of[images[row]]):
                 scene.set_focal(int(image), fx, fy)
-                self._integrators.pop(int(image), None)
 
     def _measure_noise(self) -> None:
         """Measure how good the priors are; integrators that assumed much else are made anew."""
@@ -284,21 +283,19 @@ class Refiner:
 
     def _integrator(self, image: int) -> DepthIntegrator:
         """The integrator of an image; the measured noise scales what its depth prior is worth."""
+        depth_map, step = self.scene.maps[image], self._step(image)
+        camera = thinned_camera(depth_map.camera, step)
         integrator = self._integrators.get(image)
-        if integrator is not None:
+        if integrator is not None and integrator.camera == camera:
             return integrator
-        depth_map, options, step = (
-            self.scene.maps[image],
-            self.options.integration,
-            self._step(image),
-        )
         prior, noise = thinned_prior(depth_map.prior, step), self._assumed
         assert prior.variance is not None  # MappingImage checks it
+        options = self.options.integration
         worth = max(noise.independent_pixels(prior.depth.size), options.independent_depths)
         integrator = self._integrators[image] = DepthIntegrator(
             replace(prior, variance=prior.variance * np.float32(noise.multiplier**2)),
             thinned_prior(depth_map.normals, step),
-            thinned_camera(depth_map.camera, step),
+            camera,
             replace(options, independent_depths=worth),
         )
         return integrator

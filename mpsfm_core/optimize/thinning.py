@@ -56,7 +56,7 @@ def thickened(values: Float64, valid: Bool, shape: tuple[int, int]) -> Float32:
     Pixels that are not valid count nothing; 0 where nothing valid is near.
     """
     rows, columns = shape
-    step = max(1, round(columns / values.shape[1]))
+    step = thinning_step(columns, values.shape[1])
     known = np.stack([np.where(valid, values, 0), valid], axis=-1).astype(np.float32)
     known = _stretched(_stretched(known, rows, step).swapaxes(0, 1), columns, step)
     total, share = np.moveaxis(known.swapaxes(0, 1), -1, 0)

@@ -7,7 +7,7 @@ import numpy as np
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage, PinholeCamera
 from mpsfm_core.geometry import sample_bilinear, scale_pixels
 from mpsfm_core.optimize.depth_integration import RefinedDepth
-from mpsfm_core.optimize.thinning import thickened, thinned
+from mpsfm_core.optimize.thinning import thickened, thinned, thinning_step
 
 
 class DepthMap:
@@ -79,7 +79,7 @@ class DepthMap:
         self.refined = refined
         self._best = refined.depth
         if refined.log_depth.shape != self.prior.shape:
-            step = round(self.prior.shape[1] / refined.log_depth.shape[1])
+            step = thinning_step(self.prior.shape[1], refined.log_depth.shape[1])
             depth, valid = thinned(self.prior.depth, step), thinned(self.prior.valid, step)
             change = refined.log_depth - np.log(refined.scale * np.where(valid, depth, 1.0))
             factor = np.exp(thickened(change, valid, self.prior.shape))

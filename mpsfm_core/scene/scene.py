@@ -22,6 +22,7 @@ class Snapshot(NamedTuple):
     rotations: Float64
     translations: Float64
     registered: Bool
+    intrinsics: Float64
     xyz: Float64
     point_of: Int64
     maps: Sequence[tuple[float, bool, RefinedDepth | None]]
@@ -146,6 +147,7 @@ class Scene:
             self.rotations.copy(),
             self.translations.copy(),
             self.registered.copy(),
+            self.intrinsics.copy(),
             self.tracks.xyz.copy(),
             self.tracks.point_of.copy(),
             maps,
@@ -156,6 +158,8 @@ class Scene:
         self.rotations = snapshot.rotations.copy()
         self.translations = snapshot.translations.copy()
         self.registered = snapshot.registered.copy()
+        for image in np.flatnonzero((self.intrinsics != snapshot.intrinsics).any(axis=1)):
+            self.set_focal(int(image), *map(float, snapshot.intrinsics[image, :2]))
         self.tracks.xyz = snapshot.xyz.copy()
         self.tracks.point_of = snapshot.point_of.copy()
         for depth_map, (scale, active, refined) in zip(self.maps, snapshot.maps, strict=True):

@@ -67,3 +67,17 @@ def test_a_jump_to_a_better_state_stays(mapper: Mapper) -> None:
     turned(mapper, 2, -25.0)
     mapper._undo_jump(before)
     assert rotation_angle_deg(mapper.scene.rotations @ right.transpose(0, 2, 1)).max() < 1e-6
+
+
+def test_an_undone_jump_takes_its_focal_lengths_with_it(mapper: Mapper) -> None:
+    before = mapper.scene.snapshot()
+    mapper.refiner.integrate([2])
+    refined = mapper.scene.maps[2].depth.copy()
+    turned(mapper, 2, 25.0)
+    mapper.scene.set_focal(2, 300.0, 300.0)
+    mapper.refiner.integrate([2])
+    mapper._undo_jump(before)
+    assert mapper.scene.intrinsics[2].tolist() == [260.0, 260.0, 160.0, 120.0]
+    assert mapper.scene.maps[2].camera == CAMERA.resized(*mapper.scene.maps[2].camera.size)
+    mapper.refiner.integrate([2])
+    np.testing.assert_allclose(mapper.scene.maps[2].depth, refined, rtol=1e-4)
