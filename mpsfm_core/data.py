@@ -260,6 +260,20 @@ class SparseMatches:
             if len(np.unique(column)) != len(column):
                 raise DataError("indices", "must use each feature at most once")
 
+    @classmethod
+    def from_arrays(cls, indices: NDArray[Any], scores: NDArray[Any]) -> SparseMatches:
+        """Build from raw arrays of any number type; scores are clipped to [0, 1]."""
+        certain = np.clip(scores, 0, 1).astype(np.float32)
+        return cls(indices.astype(np.int64), certain)
+
+    @classmethod
+    def best_first(cls, indices: NDArray[Any], scores: NDArray[Any]) -> SparseMatches:
+        """As :meth:`from_arrays`; of several matches of one feature the most certain stays."""
+        order = np.argsort(-scores, kind="stable")
+        for column in (0, 1):
+            order = order[np.sort(np.unique(indices[order, column], return_index=True)[1])]
+        return cls.from_arrays(indices[order], scores[order])
+
     def __len__(self) -> int:
         return len(self.indices)
 

@@ -35,6 +35,7 @@ from mpsfm_core.data import (
     PairMatches,
     View,
 )
+from mpsfm_core.errors import ProviderError
 from mpsfm_core.options import Options
 
 API_VERSION = 1
@@ -125,6 +126,19 @@ class Matcher(Protocol):
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches: ...
+
+
+def required_features(
+    purpose: str, features_a: Features | None, features_b: Features | None
+) -> tuple[Features, Features]:
+    """The features of both views, for a matcher that cannot do without.
+
+    ``purpose``: beginning of the message, as "mutual-nearest matches features". Raises
+    ProviderError when there are none.
+    """
+    if features_a is None or features_b is None:
+        raise ProviderError(f"{purpose}: choose a features provider")
+    return features_a, features_b
 
 
 @runtime_checkable

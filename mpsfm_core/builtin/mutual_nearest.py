@@ -7,7 +7,7 @@ import numpy as np
 from mpsfm_core.builtin.options import MutualNearestOptions
 from mpsfm_core.data import Features, Float32, Int64, PairMatches, SparseMatches, View
 from mpsfm_core.errors import ProviderError
-from mpsfm_core.providers import ProviderContext
+from mpsfm_core.providers import ProviderContext, required_features
 
 _BLOCK = 1024
 """Rows compared at once: 32 MB for 8192 features on the other side."""
@@ -34,8 +34,9 @@ class MutualNearest:
         features_b: Features | None = None,
     ) -> PairMatches:
         """Sparse matches, each feature in at most one."""
-        if features_a is None or features_b is None:
-            raise ProviderError("mutual-nearest matches features: choose a features provider")
+        features_a, features_b = required_features(
+            "mutual-nearest matches features", features_a, features_b
+        )
         a, b = features_a.descriptors, features_b.descriptors
         if a.shape[1] != b.shape[1] and len(a) and len(b):
             raise ProviderError(

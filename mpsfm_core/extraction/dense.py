@@ -29,11 +29,9 @@ def snap(
     """
     distance_a, row_a = _nearest(keypoints_a, dense.points_a)
     distance_b, row_b = _nearest(keypoints_b, dense.points_b)
-    near = np.flatnonzero((distance_a <= radius_px) & (distance_b <= radius_px))
-    order = near[np.argsort(-dense.scores[near], kind="stable")]
-    order = order[np.sort(np.unique(row_a[order], return_index=True)[1])]
-    order = order[np.sort(np.unique(row_b[order], return_index=True)[1])]
-    return SparseMatches(np.stack([row_a[order], row_b[order]], axis=1), dense.scores[order])
+    near = (distance_a <= radius_px) & (distance_b <= radius_px)
+    rows = np.stack([row_a[near], row_b[near]], axis=1)
+    return SparseMatches.best_first(rows, dense.scores[near])
 
 
 def sample(

@@ -10,6 +10,7 @@ from kornia.feature.adalam.adalam import AdalamFilter, get_adalam_default_config
 
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
 from mpsfm_core.errors import ProviderError
+from mpsfm_core.providers import required_features
 from mpsfm_kornia.options import AdalamOptions
 from mpsfm_kornia.runtime import inference, use_threads
 
@@ -38,8 +39,9 @@ class AdalamMatcher:
         features_b: Features | None = None,
     ) -> PairMatches:
         """Matches that others around them support, each feature once."""
-        if features_a is None or features_b is None:
-            raise ProviderError("adalam matches features: choose a features provider")
+        features_a, features_b = required_features(
+            "adalam matches features", features_a, features_b
+        )
         if features_a.descriptors.shape[1] != features_b.descriptors.shape[1]:
             raise ProviderError(
                 f"descriptors of {view_a.name!r} and {view_b.name!r} differ in dimension"
@@ -88,8 +90,4 @@ class AdalamMatcher:
 
 def _matches(indices: Any, scores: Any) -> PairMatches:
     """The best match of each feature; kornia may match one of the second view several times."""
-    order = np.argsort(-scores, kind="stable")
-    for column in (0, 1):
-        order = order[np.sort(np.unique(indices[order, column], return_index=True)[1])]
-    kept = SparseMatches(indices[order].astype(np.int64), scores[order].astype(np.float32))
-    return PairMatches(sparse=kept)
+    return PairMatches(sparse=SparseMatches.best_first(indices, scores))

@@ -10,6 +10,7 @@ from kornia.feature import LightGlue
 
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
 from mpsfm_core.errors import ProviderError
+from mpsfm_core.providers import required_features
 from mpsfm_kornia.options import LightGlueOptions
 from mpsfm_kornia.runtime import fill, inference, load_weights, use_threads
 
@@ -61,8 +62,9 @@ class LightGlueMatcher:
         Raises:
             ProviderError: the descriptors are not of the family this network was trained for.
         """
-        if features_a is None or features_b is None:
-            raise ProviderError("LightGlue matches features: choose a features provider")
+        features_a, features_b = required_features(
+            "LightGlue matches features", features_a, features_b
+        )
         if not len(features_a) or not len(features_b):
             return _matches(np.empty((0, 2)), np.empty(0))
         data = {
@@ -104,9 +106,7 @@ class LighterGlueMatcher(LightGlueMatcher):
 
 
 def _matches(indices: Any, scores: Any) -> PairMatches:
-    return PairMatches(
-        sparse=SparseMatches(indices.astype(np.int64), np.clip(scores, 0, 1).astype(np.float32))
-    )
+    return PairMatches(sparse=SparseMatches.from_arrays(indices, scores))
 
 
 def _renamed(state: dict[str, Any]) -> dict[str, Any]:

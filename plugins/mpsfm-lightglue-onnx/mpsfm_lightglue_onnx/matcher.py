@@ -7,8 +7,8 @@ from mpsfm_onnx.model import Model, fetch
 from numpy.typing import NDArray
 
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
-from mpsfm_core.data import Float32, Float64, Int64
-from mpsfm_core.errors import ProviderError
+from mpsfm_core.data import Float64, Int64
+from mpsfm_core.providers import required_features
 from mpsfm_lightglue_onnx.options import LightGlueOptions
 
 _INPUTS = ("kpts0", "kpts1", "desc0", "desc1")
@@ -36,10 +36,11 @@ class LightGlue:
         features_b: Features | None = None,
     ) -> PairMatches:
         """Mutual matches with their confidence."""
-        if features_a is None or features_b is None:
-            raise ProviderError("LightGlue matches features: choose a features provider")
+        features_a, features_b = required_features(
+            "LightGlue matches features", features_a, features_b
+        )
         if not (len(features_a) and len(features_b)):
-            return PairMatches(sparse=_matches(np.empty((0, 2)), np.empty(0)))
+            return PairMatches(sparse=SparseMatches.from_arrays(np.empty((0, 2)), np.empty(0)))
         feed = {
             "kpts0": _normalised(view_a, features_a)[np.newaxis],
             "kpts1": _normalised(view_b, features_b)[np.newaxis],
@@ -48,7 +49,7 @@ class LightGlue:
         }
         pairs, scores = _listed(*self._model.run(feed, _OUTPUTS))
         sure = scores >= self._min_score
-        return PairMatches(sparse=_matches(pairs[sure], scores[sure]))
+        return PairMatches(sparse=SparseMatches.from_arrays(pairs[sure], scores[sure]))
 
 
 def _normalised(view: View, features: Features) -> Float64:
@@ -68,8 +69,3 @@ def _listed(
     there, scores = matches[0], scores[0]
     rows = np.flatnonzero(there >= 0)
     return np.stack([rows, there[rows]], axis=1), scores[rows]
-
-
-def _matches(pairs: NDArray[np.generic], scores: NDArray[np.generic]) -> SparseMatches:
-    certain: Float32 = np.clip(scores.astype(np.float32), 0, 1)
-    return SparseMatches(pairs.astype(np.int64), certain)

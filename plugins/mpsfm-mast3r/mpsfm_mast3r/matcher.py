@@ -18,8 +18,8 @@ from mpsfm_core import (
     View,
 )
 from mpsfm_core.data import Float32, Int64
-from mpsfm_core.errors import ProviderError
 from mpsfm_core.geometry import inside
+from mpsfm_core.providers import required_features
 from mpsfm_mast3r.neighbours import mutual, reciprocal
 from mpsfm_mast3r.network import PairNetwork, Seen
 from mpsfm_mast3r.options import DenseOptions, SparseOptions
@@ -83,8 +83,9 @@ class SparseMatcher:
         features_b: Features | None = None,
     ) -> PairMatches:
         """Matches of keypoints by the mean similarity of both passes."""
-        if features_a is None or features_b is None:
-            raise ProviderError("mast3r-sparse matches keypoints: choose a features provider")
+        features_a, features_b = required_features(
+            "mast3r-sparse matches keypoints", features_a, features_b
+        )
         passes = self._network.both(view_a, view_b)
         a, b = passes[0]
         cells_a, cells_b = a.cells(features_a.keypoints), b.cells(features_b.keypoints)

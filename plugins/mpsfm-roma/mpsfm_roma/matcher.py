@@ -14,7 +14,7 @@ from mpsfm_core import (
     View,
 )
 from mpsfm_core.data import Float32, Float64, Int64
-from mpsfm_core.errors import ProviderError
+from mpsfm_core.providers import required_features
 from mpsfm_roma.network import Warp, WarpNetwork
 from mpsfm_roma.options import DenseOptions, SparseOptions
 
@@ -66,8 +66,9 @@ class SparseMatcher:
         features_b: Features | None = None,
     ) -> PairMatches:
         """The most certain ones first, each keypoint once."""
-        if features_a is None or features_b is None:
-            raise ProviderError("roma-sparse matches keypoints: choose a features provider")
+        features_a, features_b = required_features(
+            "roma-sparse matches keypoints", features_a, features_b
+        )
         there, back = self._network.warps(view_a, view_b)
         xy_a, xy_b = features_a.keypoints, features_b.keypoints
         pairs, scores = self._snapped(there, xy_a, xy_b)
@@ -75,10 +76,7 @@ class SparseMatcher:
             more, certain = self._snapped(back, xy_b, xy_a)
             pairs = np.concatenate([pairs, more[:, ::-1]])
             scores = np.concatenate([scores, certain])
-        order = np.argsort(-scores, kind="stable")
-        for column in (0, 1):
-            order = order[np.sort(np.unique(pairs[order, column], return_index=True)[1])]
-        return PairMatches(sparse=SparseMatches(pairs[order], scores[order]))
+        return PairMatches(sparse=SparseMatches.best_first(pairs, scores))
 
     def _snapped(self, warp: Warp, xy: Float64, others: Float64) -> tuple[Int64, Float32]:
         """Pairs (m, 2) of a keypoint and the other view's nearest to where the warp sends it, if
