@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -287,3 +287,22 @@ class TestYaml:
     @pytest.mark.parametrize("value", ["1e-3", "no", "null", "", "12", "a: b", "é", 1e-9, None])
     def test_what_is_written_reads_back(self, value: object) -> None:
         assert parse_yaml(write_yaml({"key": value}), "test") == {"key": value}
+
+
+def sections(options: type[Options]) -> Iterator[tuple[str, type[Options], object]]:
+    """Every section below a group of settings that has a default: its name, type and default."""
+    for name, field in options.model_fields.items():
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, Options) and not field.is_required():
+            yield f"{options.__name__}.{name}", kind, field.get_default(call_default_factory=True)
+            yield from sections(kind)
+
+
+@pytest.mark.parametrize(
+    ("kind", "default"),
+    [pytest.param(kind, default, id=name) for name, kind, default in sections(Config)],
+)
+def test_a_section_set_in_part_keeps_its_other_defaults(
+    kind: type[Options], default: object
+) -> None:
+    assert kind() == default

@@ -1,27 +1,30 @@
-"""The first two images: relative pose from rays or, at low parallax, from lifted depth."""
+"""The first two images: which pairs to start from, and how one image lies beside the other.
+
+With lifting, the pose is found as that of any next image, beside a scene of one view. Without, it
+is that of the verified pair's essential matrix.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import Float64, Int64, VerifiedPair
+from mpsfm_core.data import VerifiedPair
 from mpsfm_core.geometry import triangulation_angle_deg
-from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.registration import estimate_absolute_pose
+from mpsfm_core.mapping.options import InitializationOptions
+from mpsfm_core.mapping.registration import AbsolutePose
 from mpsfm_core.mapping.triangulation import midpoints
 from mpsfm_core.scene.scene import Scene
 
 
-@dataclass(frozen=True, eq=False)
-class InitialPose:
-    """``cam_b_from_cam_a`` in units of the first image's prior, and where it comes from."""
+class Start(NamedTuple):
+    """Pose of ``image`` in a world whose origin is the camera of ``reference``, and whose unit is
+    that of its prior."""
 
-    rotation: Float64
-    translation: Float64
-    source: str
-    num_inliers: int
+    reference: int
+    image: int
+    pose: AbsolutePose
 
 
 def rank_initial_pairs(scene: Scene) -> list[VerifiedPair]:
@@ -29,67 +32,37 @@ def rank_initial_pairs(scene: Scene) -> list[VerifiedPair]:
     return sorted(scene.problem.pairs, key=lambda pair: (not pair.calibrated, -len(pair)))
 
 
-def initial_pose(scene: Scene, pair: VerifiedPair, options: MapperOptions) -> InitialPose | str:
-    """Pose of a pair, or in words why it has none.
-
-    The essential matrix wins if it triangulates more points at a safe angle than PnP on the
-    depth-lifted keypoints of the first image has inliers (paper section 3.1).
-    """
-    lifted = _pose_from_lift(scene, pair, options) if options.registration.lifting else None
-    triangulated = _pose_from_rays(scene, pair, options)
-    best = triangulated
-    if lifted and (best is None or best.num_inliers <= lifted.num_inliers):
-        best = lifted
-    if best is None:
-        return "neither the essential matrix nor lifted depth gives a pose"
-    if best.num_inliers < options.initialization.min_inliers:
-        return f"only {best.num_inliers} inliers support the pose from {best.source}"
-    return best
-
-
-def _pose_from_lift(scene: Scene, pair: VerifiedPair, options: MapperOptions) -> InitialPose | None:
-    image = scene.problem.images[pair.image_b]
-    keypoints_a, keypoints_b = _global_keypoints(scene, pair)
-    depth_map = scene.maps[pair.image_a]
-    rows = pair.matches[:, 0]
-    valid = depth_map.keypoint_valid[rows]
-    points = scene.rays(keypoints_a) * depth_map.prior_at_keypoints(rows)[:, None]
-    xy = scene.keypoints[keypoints_b]
-    pose = estimate_absolute_pose(
-        image.camera, xy[valid], points[valid], options.registration, options.seed
-    )
-    if pose is None:
-        return None
-    return InitialPose(pose[0], pose[1], "lifted depth", int(pose[2].sum()))
-
-
-def _pose_from_rays(scene: Scene, pair: VerifiedPair, options: MapperOptions) -> InitialPose | None:
+def start_from_rays(
+    scene: Scene, pair: VerifiedPair, options: InitializationOptions
+) -> Start | None:
     """Pose of the essential matrix, its length chosen such that points agree with the prior."""
     length = np.linalg.norm(pair.translation)
     if not pair.calibrated or length < 1e-12:
         return None
     rotation, translation = pair.rotation, pair.translation / length
-    keypoints_a, keypoints_b = _global_keypoints(scene, pair)
+    offsets = scene.graph.offsets
+    rays_a = scene.rays(pair.matches[:, 0] + offsets[pair.image_a])
+    rays_b = scene.rays(pair.matches[:, 1] + offsets[pair.image_b])
     center_a, center_b = np.zeros(3), -rotation.T @ translation
-    points = midpoints(
-        center_a, scene.rays(keypoints_a), center_b, scene.rays(keypoints_b) @ rotation
-    )
+    points = midpoints(center_a, rays_a, center_b, rays_b @ rotation)
     depth_b = (points @ rotation.T + translation)[:, 2]
     with np.errstate(invalid="ignore"):
         angles = triangulation_angle_deg(center_a, center_b, points)
         safe = (points[:, 2] > 0) & (depth_b > 0)
-        safe &= angles >= options.initialization.high_parallax_deg
+        safe &= angles >= options.high_parallax_deg
     depth_map = scene.maps[pair.image_a]
     rows = pair.matches[:, 0]
     known = safe & depth_map.keypoint_valid[rows]
     if not known.any():
         return None
     ratio = depth_map.prior_at_keypoints(rows)[known] / points[known, 2]
-    return InitialPose(
-        rotation, translation * float(np.median(ratio)), "the essential matrix", int(safe.sum())
+    count = int(safe.sum())
+    pose = AbsolutePose(
+        rotation,
+        translation * float(np.median(ratio)),
+        "essential matrix",
+        support=float(count),
+        num_inliers=count,
+        inlier_share=1.0,  # all verified matches agree with it
     )
-
-
-def _global_keypoints(scene: Scene, pair: VerifiedPair) -> tuple[Int64, Int64]:
-    offsets = scene.graph.offsets
-    return pair.matches[:, 0] + offsets[pair.image_a], pair.matches[:, 1] + offsets[pair.image_b]
+    return Start(pair.image_a, pair.image_b, pose)

@@ -17,7 +17,7 @@ from mpsfm_core.mapping.events import MappingEvents, Silent
 from mpsfm_core.mapping.failure_ladder import FailureLadder
 from mpsfm_core.mapping.filtering import disconnected_images, filter_points, lost_images
 from mpsfm_core.mapping.finishing import finished
-from mpsfm_core.mapping.initialization import initial_pose, rank_initial_pairs
+from mpsfm_core.mapping.initialization import Start, rank_initial_pairs, start_from_rays
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement import Refiner
 from mpsfm_core.mapping.registration import (
@@ -83,6 +83,7 @@ class Mapper:
             image.name: "no verified match with a registered image" for image in problem.images
         }
         self.pair_reasons: dict[str, str] = {}
+        self.starts: dict[VerifiedPair, Start | str] = {}
         self.seconds: dict[str, float] = defaultdict(float)
         self.counts: dict[str, int] = defaultdict(int)
 
@@ -144,28 +145,66 @@ class Mapper:
             for pair in rank_initial_pairs(self.scene)
             if available[pair.image_a] and available[pair.image_b]
         ]
-        for pair in pairs[: self.options.initialization.max_pairs]:
-            with self._timed("initialization"):
-                reason = self._try_pair(pair)
-            if reason is None:
-                self._accept(pair.image_a)
-                self._accept(pair.image_b)
-                self._refine_globally()
-                return True
-            names = [self.problem.images[i].name for i in (pair.image_a, pair.image_b)]
-            self.pair_reasons[" ".join(names)] = reason
-            self._begin()
-        return False
+        pairs = pairs[: self.options.initialization.max_pairs]
+        snapshot = self.scene.snapshot()
+        while True:
+            for pair in pairs:
+                with self._timed("initialization"):
+                    reason = self._try_pair(pair)
+                if reason is None:
+                    self.ladder.reset()
+                    self._accept(pair.image_a)
+                    self._accept(pair.image_b)
+                    self._refine_globally()
+                    return True
+                names = [self.problem.images[i].name for i in (pair.image_a, pair.image_b)]
+                self.pair_reasons[" ".join(names)] = reason
+                self.scene.restore(snapshot)
+            if not pairs or not self.ladder.relax():
+                return False
+
+    def _find_start(self, pair: VerifiedPair) -> Start | None:
+        """The better supported pose of one image of a pair beside the other."""
+        scene, options = self.scene, self.options
+        if not options.registration.lifting:
+            return start_from_rays(scene, pair, options.initialization)
+        starts = []
+        empty = scene.snapshot()
+        for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
+            self._place_first(reference)
+            found = correspondences(scene, image, [reference], options.registration)
+            alone = scene.snapshot()
+            for pose in find_poses(
+                scene, image, found, options.registration, seed=options.seed, attempt=0
+            ):
+                starts.append(Start(reference, image, self._polished(image, pose, found, alone)))
+            scene.restore(empty)
+        return max(starts, key=lambda start: start.pose.support, default=None)
+
+    def _place_first(self, image: int) -> None:
+        """Let the world begin with an image."""
+        self.scene.register(image, np.eye(3), np.zeros(3))
+        self.scene.maps[image].set_scale(1.0)
 
     def _try_pair(self, pair: VerifiedPair) -> str | None:
-        """Start with a pair; None, or why it cannot be the first."""
-        pose = initial_pose(self.scene, pair, self.options)
-        if isinstance(pose, str):
-            return pose
-        a, b = pair.image_a, pair.image_b
-        self.scene.register(a, np.eye(3), np.zeros(3))
-        self.scene.maps[a].set_scale(1.0)
-        self.scene.register(b, pose.rotation, pose.translation)
+        """Start with a pair; None, or why it cannot be the first (remembered if that is final)."""
+        if pair not in self.starts:
+            self.starts[pair] = self._find_start(pair) or "nothing gives a pose"
+        start = self.starts[pair]
+        if isinstance(start, str):
+            return start
+        reason = self._lacks_support(start.pose)
+        if reason is None:
+            reason = self._grow_start(start)
+            if reason:
+                self.starts[pair] = reason
+        return reason
+
+    def _grow_start(self, start: Start) -> str | None:
+        """Refine the first two images and their points; None, or why they are rejected."""
+        a, b = start.reference, start.image
+        self._place_first(a)
+        self.scene.register(b, start.pose.rotation, start.pose.translation)
         triangulate_image(self.scene, b, self.options.triangulation)
         self.refiner.estimate_scale(b, [])
         self.refiner.adjust([a, b])

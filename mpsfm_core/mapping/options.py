@@ -22,10 +22,8 @@ class InitializationOptions(Options):
 
     max_pairs: int = Field(50, ge=1)
     """How many pairs are tried, best first."""
-    min_inliers: int = Field(30, ge=3)
-    """PnP inliers a first pair needs (reference: abs_pose_min_num_inliers)."""
     high_parallax_deg: float = Field(1.5, gt=0)
-    """A point triangulated with at least this angle counts for the essential matrix's pose."""
+    """Without lifting, a point triangulated with at least this angle supports the pose."""
     max_error_px: float = Field(4.0, gt=0)
     """Essential matrix inlier threshold (COLMAP)."""
 
@@ -82,6 +80,17 @@ class TriangulationOptions(Options):
     """For refined images: complete, merge, filter (COLMAP; times the keypoints' std)."""
 
 
+class MapperBundleOptions(BundleOptions):
+    """Bundle adjustment inside the mapper.
+
+    Ours: learned keypoints have heavier tails than the reference's SOFT_L1 at 1.5 expects
+    (``benchmarks/ablation.py``).
+    """
+
+    reprojection_loss: Loss = Loss.CAUCHY
+    reprojection_scale: float = Field(0.7, gt=0)
+
+
 class RefinementOptions(Options):
     """Alternation of depth integration and bundle adjustment (paper section 3.3)."""
 
@@ -128,9 +137,7 @@ class RefinementOptions(Options):
     """Multiplies the depth loss scale then (reference: final_robustification)."""
     anchor_min_angle_deg: float = Field(2.0, ge=0)
     """Points of at least this angle anchor the integration (reference: robust_triangles)."""
-    bundle: BundleOptions = BundleOptions(reprojection_loss=Loss.CAUCHY, reprojection_scale=0.7)
-    """Ours: learned keypoints have heavier tails than the reference's SOFT_L1 at 1.5 expects
-    (``benchmarks/ablation.py``)."""
+    bundle: MapperBundleOptions = MapperBundleOptions()
     integration: IntegrationOptions = IntegrationOptions()
 
 

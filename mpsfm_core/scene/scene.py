@@ -163,7 +163,8 @@ class Scene:
         self.tracks.xyz = snapshot.xyz.copy()
         self.tracks.point_of = snapshot.point_of.copy()
         for depth_map, (scale, active, refined) in zip(self.maps, snapshot.maps, strict=True):
-            if depth_map.refined is not refined or depth_map.scale != scale:
+            now = depth_map.scale, depth_map.active, depth_map.refined
+            if now[:2] != (scale, active) or now[2] is not refined:
                 depth_map.reset()
                 if refined is not None:
                     depth_map.set_refined(refined)
