@@ -17,6 +17,7 @@ from pathlib import Path
 
 from benchmarks._scenes import RESULTS, shared_folder
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
+from mpsfm_core.evaluation.pose_auc import CONVENTIONS
 from mpsfm_core.evaluation.records import Record
 from mpsfm_core.evaluation.report import Row, make_rows, markdown, write_report
 from mpsfm_core.yaml_text import write_yaml
@@ -97,7 +98,10 @@ def main() -> int:
         rows = make_rows(records)
         held = _against_bars(rows) if name == "rendered_kitchen" else []
         missed += sum("missed" in line for line in held)
-        text = f"# {name}\n\n{markdown(rows)}" + "".join(f"\n{line}" for line in held)
+        every = CONVENTIONS["models"]
+        parts = [f"# {name}", markdown(rows), "\n".join(held)]
+        parts.append(f"## Every model\n\n{markdown(make_rows(records, every), every)}")
+        text = "\n\n".join(part.strip() for part in parts if part)
         RESULTS.mkdir(exist_ok=True)
         (RESULTS / f"accuracy-{name}.md").write_text(text.rstrip() + "\n", encoding="utf-8")
         print(text)

@@ -37,7 +37,9 @@ def benchmark(
     ] = "config",
     peers: Annotated[
         str | None,
-        typer.Option(metavar="A,B", help="COLMAP's mappers on the same matches; or none."),
+        typer.Option(
+            metavar="A,B", help="Other methods on the same matches (default: all), or none."
+        ),
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Sets mapped at the same time.")] = 1,
     overrides: Overrides = None,
@@ -64,7 +66,7 @@ def benchmark(
         raise InputError("benchmark needs scene folders and --output DIR, or --compare A B")
     from mpsfm_core.cli.progress import showing_progress
     from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
-    from mpsfm_core.evaluation.peers import PEERS
+    from mpsfm_core.evaluation.methods import OTHERS
     from mpsfm_core.evaluation.report import make_rows, markdown, write_report
     from mpsfm_core.registry import Registry
 
@@ -73,7 +75,7 @@ def benchmark(
         tuple(configs or ("benchmark",)),
         None if sets is None else _listed(sets),
         _listed(prior),
-        tuple(PEERS) if peers is None else () if peers == "none" else _listed(peers),
+        OTHERS if peers is None else () if peers == "none" else _listed(peers),
         tuple(overrides or ()),
         workers,
     )

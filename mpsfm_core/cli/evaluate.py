@@ -19,7 +19,7 @@ def evaluate(
         Path | None, typer.Option(metavar="FILE", help="The same, one name a line.")
     ] = None,
     convention: Annotated[
-        str, typer.Option(metavar="NAME", help="Of the pose AUC: paper, colmap or vggt.")
+        str, typer.Option(metavar="NAME", help="Of the pose AUC: paper, models, colmap or vggt.")
     ] = "paper",
     gt_depth: Annotated[
         Path | None,

@@ -17,8 +17,14 @@ import pycolmap
 from mpsfm_core.config import load_config
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.errors import InputError, did_you_mean
-from mpsfm_core.evaluation.methods import OURS, Outcome, Task, run_tasks
-from mpsfm_core.evaluation.peers import PEERS
+from mpsfm_core.evaluation.methods import (
+    OTHERS,
+    OURS,
+    USING_PRIORS,
+    Outcome,
+    Task,
+    run_tasks,
+)
 from mpsfm_core.evaluation.prior_quality import QUALITIES, prior_settings
 from mpsfm_core.evaluation.records import Record, read_record, record_file, write_record
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
@@ -40,7 +46,7 @@ class Plan:
 
     ``configs``: names or files. ``buckets``: None for all. ``priors``: of
     :data:`~mpsfm_core.evaluation.prior_quality.QUALITIES`, our mapper runs with each. ``peers``:
-    of :data:`~mpsfm_core.evaluation.peers.PEERS`. ``overrides``: settings ``KEY=VALUE`` of all
+    of :data:`~mpsfm_core.evaluation.methods.OTHERS`. ``overrides``: settings ``KEY=VALUE`` of all
     configurations. ``workers``: sets that are mapped at the same time.
     """
 
@@ -48,7 +54,7 @@ class Plan:
     configs: tuple[str, ...] = ("benchmark",)
     buckets: tuple[str, ...] | None = None
     priors: tuple[str, ...] = ("config",)
-    peers: tuple[str, ...] = tuple(PEERS)
+    peers: tuple[str, ...] = OTHERS
     overrides: tuple[str, ...] = ()
     workers: int = 1
 
@@ -63,7 +69,7 @@ def run_benchmark(
     """
     registry = registry or Registry.discover()
     _check_names("prior", plan.priors, QUALITIES)
-    _check_names("peer", plan.peers, PEERS)
+    _check_names("peer", plan.peers, OTHERS)
     scenes = [read_scene(path) for path in plan.scenes]
     if len({scene.name for scene in scenes}) < len(scenes):
         raise InputError("two scene folders have the same name, as their results would")
@@ -124,9 +130,11 @@ class _SceneRuns:
         """Records and whether they were there already."""
         for number, prior in enumerate(self._plan.priors):
             problem, options = self._problem(prior)
-            methods = {f"{OURS}-{prior}": OURS}
-            if number == 0:  # peers see no prior
-                methods |= {peer: peer for peer in self._plan.peers}
+            methods = {
+                _label(method, prior): method
+                for method in (OURS, *self._plan.peers)
+                if method in USING_PRIORS or number == 0
+            }
             places: dict[Task, tuple[EvaluationSet, str]] = {}
             for item in self._sets:
                 subset = problem.subset(list(item.images))
@@ -176,20 +184,25 @@ class _SceneRuns:
             item.name,
             task.label,
             key,
-            outcome.poses,
+            outcome.models[0] if outcome.models else {},
             {name: self._scene.truth[name] for name in item.images},
             len(task.problem.pairs),
             outcome.seconds,
             outcome.cpu_seconds,
             outcome.error,
+            outcome.models[1:],
         )
 
 
 def _order(sets: Sequence[EvaluationSet], plan: Plan) -> Callable[[Record], tuple[int, int]]:
     """Sorts records by set, then ours before the peers: runs end in no particular order."""
     places = {item.name: number for number, item in enumerate(sets)}
-    labels = [*(f"{OURS}-{prior}" for prior in plan.priors), *plan.peers]
+    labels = [_label(m, prior) for m in (OURS, *plan.peers) for prior in plan.priors]
     return lambda record: (places[record.set_name], labels.index(record.label))
+
+
+def _label(method: str, prior: str) -> str:
+    return f"{method}-{prior}" if method in USING_PRIORS else method
 
 
 def _key(task: Task) -> str:
@@ -197,6 +210,7 @@ def _key(task: Task) -> str:
     parts: list[object] = [task.method, core_version(), pycolmap.__version__]
     if task.method == OURS:
         parts.append(task.options.model_dump(mode="json"))
+    if task.method in USING_PRIORS:
         parts += [digest(image) for image in task.problem.images]
     else:
         parts += [

@@ -24,7 +24,6 @@ from mpsfm_core.evaluation.pose_auc import (
     THRESHOLDS_DEG,
     PoseConvention,
     pose_auc,
-    pose_errors_deg,
 )
 from mpsfm_core.evaluation.records import Record, read_records
 
@@ -144,7 +143,7 @@ def _name(method: str, pair: tuple[Record, Record]) -> str:
 
 def _unordered(record: Record, convention: PoseConvention) -> Float64:
     """Errors (pairs, orders): those of both orders of a pair in one row."""
-    errors = pose_errors_deg(record.estimated, record.truth, convention)
+    errors = record.errors_deg(convention)
     count = len(record.truth)
     if not convention.ordered:
         return errors[:, None]

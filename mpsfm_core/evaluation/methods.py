@@ -11,13 +11,14 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import pycolmap
 from threadpoolctl import threadpool_limits
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
-from mpsfm_core.evaluation.peers import run_peer
+from mpsfm_core.evaluation.chained_pnp import chained_poses
+from mpsfm_core.evaluation.peers import PEERS, run_peer
 from mpsfm_core.evaluation.pose_auc import Pose
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
@@ -25,18 +26,24 @@ from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 
 OURS = "ours"
+CHAIN = "chained-pnp"
+"""A reference point without a mapper (:mod:`~mpsfm_core.evaluation.chained_pnp`)."""
+USING_PRIORS = (OURS, CHAIN)
+"""Methods that run once with each prior."""
+OTHERS = (CHAIN, *PEERS)
+"""All that ours is compared with."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """What a method made of a set.
 
-    ``poses``: of its largest model, by image name. ``seconds``: wall clock; ``cpu_seconds``: of
-    the process, which other jobs on the machine do not stretch. ``error``: why it failed, empty
-    if it did not.
+    ``models``: poses by image name, of the largest model first. ``seconds``: wall clock;
+    ``cpu_seconds``: of the process, which other jobs on the machine do not stretch. ``error``: why
+    it failed, empty if it did not.
     """
 
-    poses: dict[str, Pose] = field(default_factory=dict)
+    models: Sequence[dict[str, Pose]] = ()
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     error: str = ""
@@ -44,7 +51,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One run: ``method`` is :data:`OURS` or the name of a peer."""
+    """One run: ``method`` is :data:`OURS`, :data:`CHAIN` or the name of a peer."""
 
     label: str
     method: str
@@ -68,22 +75,26 @@ def run_tasks(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, Outco
 def run_method(method: str, problem: MappingProblem, options: MapperOptions) -> Outcome:
     """Run a method here and now; what it raises becomes the outcome's error."""
     started, cpu_started = time.perf_counter(), time.process_time()
-    poses: dict[str, Pose] = {}
+    models: list[dict[str, Pose]] = []
     error = ""
     try:
         with threadpool_limits(1):
-            poses = _ours(problem, options) if method == OURS else run_peer(method, problem)
+            models = _models(method, problem, options)
     except Exception as raised:  # whatever a mapper raises is its result
         error = f"{type(raised).__name__}: {raised}"
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
-    return Outcome(poses, seconds, cpu_seconds, error)
+    return Outcome(models, seconds, cpu_seconds, error)
 
 
-def _ours(problem: MappingProblem, options: MapperOptions) -> dict[str, Pose]:
-    models = mapper.reconstruct(problem, options).reconstructions
-    if not models:
-        return {}
-    return {image.name: (image.rotation, image.translation) for image in models[0].images}
+def _models(method: str, problem: MappingProblem, options: MapperOptions) -> list[dict[str, Pose]]:
+    if method == CHAIN:
+        return chained_poses(problem, options.seed)
+    if method != OURS:
+        return run_peer(method, problem)
+    return [
+        {image.name: (image.rotation, image.translation) for image in model.images}
+        for model in mapper.reconstruct(problem, options).reconstructions
+    ]
 
 
 class _Lanes:

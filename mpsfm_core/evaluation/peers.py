@@ -76,16 +76,14 @@ PEERS: Mapping[str, Callable[[Path, Path], Models]] = MappingProxyType(
 """Name -> ``run(database, output)``. ``colmap-structureless`` is pycolmap 4.2's default."""
 
 
-def run_peer(name: str, problem: MappingProblem) -> dict[str, Pose]:
-    """Poses of the largest model that a peer makes of a problem, by image name."""
+def run_peer(name: str, problem: MappingProblem) -> list[dict[str, Pose]]:
+    """Poses by image name of the models that a peer makes of a problem, the largest first."""
     with tempfile.TemporaryDirectory(prefix="mpsfm-peer-") as folder:
         output = Path(folder)
         database = output / "database.db"
         write_database(problem, database)
-        models = list(PEERS[name](database, output).values())
-        if not models:
-            return {}
-        return reconstruction_poses(max(models, key=lambda model: int(model.num_reg_images())))
+        models = [reconstruction_poses(model) for model in PEERS[name](database, output).values()]
+        return sorted(models, key=lambda model: -len(model))
 
 
 def write_database(problem: MappingProblem, path: Path) -> None:

@@ -33,6 +33,8 @@ class PoseConvention:
     ``ordered``: (a, b) and (b, a) both count, their translation errors differ. ``folded``: the
     translation's sign is free, its error is at most 90 deg. ``area(errors, threshold)``: area
     under the recall curve from 0 to the threshold, divided by the threshold, in [0, 1].
+    ``every_model``: a pair counts as registered if both images are in one model, whichever; else
+    only those of the largest model count.
     """
 
     name: str
@@ -40,6 +42,7 @@ class PoseConvention:
     ordered: bool
     folded: bool
     area: Callable[[Float64, int], float]
+    every_model: bool = False
 
 
 def exact_area(errors: Float64, threshold: int) -> float:
@@ -81,6 +84,14 @@ CONVENTIONS: Mapping[str, PoseConvention] = MappingProxyType(
                 ordered=True,
                 folded=True,
                 area=exact_area,
+            ),
+            PoseConvention(
+                "models",
+                "as `paper`, but pairs within any one model count, not only within the largest",
+                ordered=True,
+                folded=True,
+                area=exact_area,
+                every_model=True,
             ),
             PoseConvention(
                 "colmap",

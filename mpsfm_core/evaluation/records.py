@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mpsfm_core.data import Float64
 from mpsfm_core.errors import InputError
-from mpsfm_core.evaluation.pose_auc import Pose
+from mpsfm_core.evaluation.pose_auc import Pose, PoseConvention, pose_errors_deg
 
 RUNS = "runs"
 """Folder of the records below a benchmark's output folder."""
@@ -27,7 +28,8 @@ class Record:
 
     ``label``: the method, ours with its prior. ``key``: names all it depends on. ``estimated``,
     ``truth``: ``cam_from_world`` by image name; images that only ``truth`` has are unregistered.
-    ``pairs``: number of verified pairs. ``error``: why it failed, empty if it did not.
+    ``estimated`` is the largest model, ``others`` are further ones. ``pairs``: number of verified
+    pairs. ``error``: why it failed, empty if it did not.
     """
 
     scene: str
@@ -42,6 +44,14 @@ class Record:
     seconds: float
     cpu_seconds: float
     error: str = ""
+    others: Sequence[Mapping[str, Pose]] = ()
+
+    def errors_deg(self, convention: PoseConvention) -> Float64:
+        """Errors of all pairs, see :func:`~mpsfm_core.evaluation.pose_auc.pose_errors_deg`."""
+        models = (self.estimated, *(self.others if convention.every_model else ()))
+        errors = [pose_errors_deg(model, self.truth, convention) for model in models]
+        best: Float64 = np.min(errors, axis=0)
+        return best
 
     @property
     def file(self) -> Path:
@@ -65,6 +75,7 @@ def write_record(output: Path, record: Record) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     content = asdict(record)
     content["estimated"] = _packed(record.estimated)
+    content["others"] = [_packed(model) for model in record.others]
     content["truth"] = _packed(record.truth)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
@@ -76,6 +87,7 @@ def read_record(path: Path) -> Record:
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         content["estimated"] = _unpacked(content["estimated"])
+        content["others"] = [_unpacked(model) for model in content["others"]]
         content["truth"] = _unpacked(content["truth"])
         return Record(**content)
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -16,7 +16,6 @@ from mpsfm_core.evaluation.pose_auc import (
     THRESHOLDS_DEG,
     PoseConvention,
     pose_auc,
-    pose_errors_deg,
 )
 from mpsfm_core.evaluation.records import Record
 
@@ -58,9 +57,7 @@ class Row:
 
 def errors_of(records: Iterable[Record], convention: PoseConvention) -> Float64:
     """Errors in degrees of all image pairs of some records, one after the other."""
-    return np.concatenate(
-        [pose_errors_deg(record.estimated, record.truth, convention) for record in records]
-    )
+    return np.concatenate([record.errors_deg(convention) for record in records])
 
 
 def grouped(records: Iterable[Record]) -> dict[Group, list[Record]]:

@@ -67,7 +67,7 @@ def arguments(scene: Path, config: Path, folder: Path) -> list[str]:
 def test_the_report_has_all_methods_and_names_its_convention(output) -> None:
     folder, out, _ = output
     report = json.loads((folder / "report.json").read_text())["conventions"]
-    assert set(report) == {"paper", "colmap", "vggt"}
+    assert set(report) == {"paper", "models", "colmap", "vggt"}
     rows = {row["method"]: row for row in report["paper"]["rows"]}
     assert set(rows) == {"ours-sensor", "ours-degraded", "colmap"}
     for row in rows.values():
@@ -186,14 +186,14 @@ def test_what_a_method_raises_is_its_outcome(monkeypatch: pytest.MonkeyPatch) ->
     task = small_task("colmap")
     monkeypatch.setattr(methods, "run_peer", fails)
     outcome = run_method(task.method, task.problem, task.options)
-    assert outcome.error == "RuntimeError: no memory" and outcome.poses == {}
+    assert outcome.error == "RuntimeError: no memory" and not outcome.models
 
 
 def test_a_method_that_kills_its_process_is_recorded_and_the_rest_goes_on() -> None:
     dies = Task("dies", "ours", Deadly(), MapperOptions())  # type: ignore[arg-type]
     outcomes = {task.label: outcome for task, outcome in run_tasks([dies, small_task("colmap")], 1)}
     assert outcomes["dies"].error == "its process died"
-    assert len(outcomes["colmap"].poses) == 3
+    assert len(outcomes["colmap"].models[0]) == 3
 
 
 class Deadly:

@@ -47,7 +47,7 @@ def test_the_database_holds_the_problem(problem: MappingProblem, tmp_path) -> No
 
 @pytest.mark.parametrize("name", PEERS)
 def test_every_peer_reconstructs_an_easy_scene(name: str, problem: MappingProblem) -> None:
-    estimated = run_peer(name, problem)
+    (estimated,) = run_peer(name, problem)
     truth = {f"view_{i}.png": (pose[:, :3], pose[:, 3]) for i, pose in enumerate(POSES)}
     errors = pose_errors_deg(estimated, truth, CONVENTIONS["paper"])
     assert set(estimated) == set(truth)
@@ -57,4 +57,4 @@ def test_every_peer_reconstructs_an_easy_scene(name: str, problem: MappingProble
 def test_without_matches_no_peer_has_a_pose(problem: MappingProblem) -> None:
     empty = MappingProblem(problem.images)
     for name in ("colmap", "colmap-global"):
-        assert run_peer(name, empty) == {}
+        assert run_peer(name, empty) == []
