@@ -313,6 +313,9 @@ class Mapper:
         scene = self.scene
         with self._timed("registration"):
             found = correspondences(scene, image, references, self.options.registration)
+            most = int(np.bincount(found.references, minlength=1).max())
+            if most < self.ladder.min_inliers:
+                return f"{most} matches have a 3D point, {self.ladder.min_inliers} are needed"
             snapshot = scene.snapshot()
             poses = self._find_poses(image, references, found, snapshot)
         reason: str | None = "neither PnP nor an essential matrix gives a pose"

@@ -1,0 +1,62 @@
+"""Which depth counts when a prior is held against points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import Float64, PinholeCamera
+from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.mapper import Mapper
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.testing.problems import mapping_problem
+from mpsfm_core.testing.scenes import arc_poses, room_scene
+
+CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
+
+
+def mapped(declared_depth_std: float) -> Mapper:
+    """A mapper that has registered three images, in metres."""
+    problem = mapping_problem(
+        room_scene(), CAMERA, arc_poses(3, 14.0), declared_depth_std=declared_depth_std
+    )
+    mapper = Mapper(problem, MapperOptions(), Silent())
+    next(mapper.components())
+    assert mapper.scene.registered.all()
+    mapper.refiner.noise = mapper.refiner.noise._replace(multiplier=1.0)
+    return mapper
+
+
+def push(mapper: Mapper, image: int, factor: float, share: float) -> None:
+    """Move a share of the points an image sees along its rays, as wrong matches do."""
+    scene = mapper.scene
+    seen = np.unique(scene.tracks.point_of[scene.graph.keypoints_of(image)])
+    seen = seen[seen >= 0]
+    chosen = np.random.default_rng(0).permutation(seen)[: round(share * len(seen))]
+    center: Float64 = scene.centers()[image]
+    scene.tracks.xyz[chosen] = center + factor * (scene.tracks.xyz[chosen] - center)
+
+
+@pytest.mark.parametrize(("declared_std", "scale_holds"), [(0.01, True), (0.3, False)])
+def test_certain_depth_outvotes_points_at_another_depth(
+    declared_std: float, scale_holds: bool
+) -> None:
+    mapper = mapped(declared_std)
+    before = mapper.scene.maps[2].scale
+    push(mapper, 2, 1.3, share=0.7)
+    mapper.refiner.estimate_scale(2, [0, 1])
+    changed = mapper.scene.maps[2].scale / before
+    assert changed == pytest.approx(1.0 if scale_holds else 1.3, abs=0.03)
+
+
+def test_depth_far_from_a_point_does_not_pull_it() -> None:
+    mapper = mapped(0.01)
+    scene = mapper.scene
+    push(mapper, 2, 1.3, share=0.3)
+    observations = scene.tracks.observations()
+    mine = scene.graph.image_of[observations] == 2
+    used = np.isfinite(mapper.refiner._depth_observations(observations)[0][mine])
+    assert used.mean() == pytest.approx(0.7, abs=0.05)
+    mapper.refiner.noise = mapper.refiner.noise._replace(multiplier=10.0)
+    used = np.isfinite(mapper.refiner._depth_observations(observations)[0][mine])
+    assert used.mean() > 0.95, "nothing is far when depth is measured to be that uncertain"
