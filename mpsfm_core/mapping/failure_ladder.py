@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core.mapping.options import RegistrationOptions
+from mpsfm_core.mapping.registration import AbsolutePose
 
 
 class FailureLadder:
@@ -29,6 +30,15 @@ class FailureLadder:
     def min_inlier_share(self) -> float:
         """Share of the correspondences that must be inliers."""
         return self._options.min_inlier_share / 1.2**self._relaxations
+
+    def objection(self, pose: AbsolutePose) -> str | None:
+        """Why too few matches agree with a pose, if so."""
+        needed, share = self.min_inliers, self.min_inlier_share
+        if pose.num_inliers < needed:
+            return f"{pose.num_inliers} matches support its pose, {needed} are needed"
+        if pose.inlier_share < share:
+            return f"{pose.inlier_share:.0%} of the matches support its pose, not {share:.0%}"
+        return None
 
     def relax(self) -> bool:
         """One step down; False at the bottom."""

@@ -6,12 +6,12 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
 
 import numpy as np
 
 from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
 from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.mapping.attempts import Attempts
 from mpsfm_core.mapping.depth_consistency import check_image, conflicting_images
 from mpsfm_core.mapping.events import MappingEvents, Silent
 from mpsfm_core.mapping.failure_ladder import FailureLadder
@@ -34,8 +34,6 @@ from mpsfm_core.scene.scene import Scene, Snapshot
 
 JUMP_DEG = 3.0
 """A camera that turns more in a global refinement may have found a wrong minimum (ours)."""
-MIN_CONTRADICTED = 2
-"""Newcomers that contradict a view before it is the one to go (ours)."""
 
 
 def reconstruct(
@@ -61,13 +59,6 @@ def reconstruct(
             mapper.image_reasons, mapper.pair_reasons, dict(mapper.seconds), dict(mapper.counts)
         ),
     )
-
-
-class _Failure(NamedTuple):
-    """What an attempt to register an image saw, and the best pose that it found."""
-
-    references: list[int]
-    pose: AbsolutePose | None
 
 
 class Mapper:
@@ -111,11 +102,7 @@ class Mapper:
         self.scores = pair_score_matrix(self.scene, self.options.registration.next_view)
         self.refiner = Refiner(self.scene, self.options, self.scores)
         self.ladder = FailureLadder(self.options.registration)
-        self.attempts: dict[int, int] = defaultdict(int)
-        self.failures: dict[int, _Failure] = {}
-        self.contradicted: dict[int, set[int]] = defaultdict(set)
-        self.displaced: set[int] = set()
-        self.refuted = np.zeros(self.scores.shape, dtype=np.bool_)
+        self.attempts = Attempts(self.scene.num_images, self.options.registration)
         self._last_size = (0, 0)
 
     def _start_from_known_poses(self, available: Bool) -> bool:
@@ -193,7 +180,7 @@ class Mapper:
         start = self.starts[pair]
         if isinstance(start, str):
             return start
-        reason = self._lacks_support(start.pose)
+        reason = self.ladder.objection(start.pose)
         if reason is None:
             reason = self._grow_start(start)
             if reason:
@@ -224,7 +211,7 @@ class Mapper:
         """Register one more image, relaxing step by step; False when none can be."""
         options = self.options.registration
         while True:
-            trusted = np.where(self.refuted, 0, self.scores)
+            trusted = np.where(self.attempts.refuted, 0, self.scores)
             ranked = rank_next_images(self.scene, trusted, available, options)
             for image, reference in ranked:
                 references = self._references(image, reference)
@@ -242,70 +229,45 @@ class Mapper:
                 return False
 
     def _displace(self) -> bool:
-        """Take out the image that most newcomers contradicted, if several did; each image once.
-
-        The check blames the newcomer, but several of them may be right and the one view wrong.
-        """
-        blame = {
-            image: len(by)
-            for image, by in self.contradicted.items()
-            if self.scene.registered[image] and image not in self.displaced
-        }
-        self.contradicted.clear()
-        worst = max(blame, key=lambda image: blame[image], default=-1)
-        if blame.get(worst, 0) < MIN_CONTRADICTED or self.scene.registered.sum() <= 2:
+        """Take out the image that most newcomers contradicted, if several did; each image once."""
+        culprit = self.attempts.take_culprit(self.scene.registered)
+        if culprit is None or self.scene.registered.sum() <= 2:
             return False
-        self.displaced.add(worst)
-        self._drop([worst], f"{blame[worst]} other images contradict its depth")
-        self._forget_failures()
+        image, count = culprit
+        self._drop([image], f"{count} other images contradict its depth")
+        self.attempts.forget()
         return True
-
-    def _forget_failures(self) -> None:
-        """Try everything again: the scene may be right now where it was wrong."""
-        self.refuted[:] = False
-        self.failures.clear()
 
     def _references(self, image: int, reference: int) -> list[int]:
         """The registered images by whose points an image is posed."""
         options = self.options.registration
         nearby = local_bundle(self.scene, reference, options.num_neighbors, self.scores)
-        return [other for other in nearby if not self.refuted[image, other]]
+        return [other for other in nearby if not self.attempts.refuted[image, other]]
 
     def _known_to_fail(self, image: int, references: list[int]) -> bool:
         """Whether even the best pose of the same attempt before lacks support still."""
-        if not self._searched(image, references):
+        if not self.attempts.exhausted(image, references):
             return False
-        best = self.failures[image].pose
-        return best is None or self._lacks_support(best) is not None
-
-    def _searched(self, image: int, references: list[int]) -> bool:
-        """Whether another search for the pose of an image would only repeat an earlier one.
-
-        A few are different in any case: they take other halves of the matches.
-        """
-        known = self.failures.get(image)
-        several = self.attempts[image] >= self.options.registration.resampled_attempts
-        return several and known is not None and known.references == references
+        best = self.attempts.best_pose(image)
+        return best is None or self.ladder.objection(best) is not None
 
     def _find_poses(
         self, image: int, references: list[int], found: Correspondences, snapshot: Snapshot
     ) -> list[AbsolutePose]:
         """Possible poses of an image, best first, that of earlier attempts among them."""
-        options = self.options.registration
+        options, attempts = self.options.registration, self.attempts
         poses = []
-        known = self.failures.get(image)
-        if known and known.pose:
-            pose = known.pose
-            poses.append(
-                rate_pose(self.scene, found, pose.rotation, pose.translation, pose.source, options)
-            )
-        if not self._searched(image, references):
-            attempt, seed = self.attempts[image], self.options.seed
+        known = attempts.best_pose(image)
+        if known:
+            pose = known.rotation, known.translation, known.source
+            poses.append(rate_pose(self.scene, found, *pose, options))
+        search = not attempts.exhausted(image, references)
+        if search:
+            attempt, seed = attempts.searches(image), self.options.seed
             new = find_poses(self.scene, image, found, options, seed=seed, attempt=attempt)
             poses += [self._polished(image, pose, found, snapshot) for pose in new]
-            self.attempts[image] += 1
         poses.sort(key=lambda pose: -pose.support)
-        self.failures[image] = _Failure(references, poses[0] if poses else None)
+        attempts.remember(image, references, poses[0] if poses else None, searched=search)
         return poses
 
     def _try_image(self, image: int, references: list[int]) -> str | None:
@@ -320,7 +282,7 @@ class Mapper:
             poses = self._find_poses(image, references, found, snapshot)
         reason: str | None = "neither PnP nor an essential matrix gives a pose"
         for pose in poses:
-            reason = self._lacks_support(pose) or self._try_pose(image, pose, found)
+            reason = self.ladder.objection(pose) or self._try_pose(image, pose, found)
             if reason is None:
                 return None
             scene.restore(snapshot)
@@ -339,15 +301,6 @@ class Mapper:
         scene.restore(snapshot)
         polished = rate_pose(scene, found, rotation, translation, pose.source, options.registration)
         return max(pose, polished, key=lambda candidate: candidate.support)
-
-    def _lacks_support(self, pose: AbsolutePose) -> str | None:
-        """Why too few matches agree with a pose, if so."""
-        needed, share = self.ladder.min_inliers, self.ladder.min_inlier_share
-        if pose.num_inliers < needed:
-            return f"{pose.num_inliers} matches support its pose, {needed} are needed"
-        if pose.inlier_share < share:
-            return f"{pose.inlier_share:.0%} of the matches support its pose, not {share:.0%}"
-        return None
 
     def _try_pose(self, image: int, pose: AbsolutePose, found: Correspondences) -> str | None:
         """Grow and refine the scene around a new pose; None, or why it is rejected."""
@@ -381,7 +334,7 @@ class Mapper:
             alone = Correspondences(*(part[found.references == other] for part in found))
             options = self.options.registration
             led = rate_pose(self.scene, alone, pose.rotation, pose.translation, "", options)
-            self.refuted[image, other] |= led.inlier_share >= options.min_inlier_share
+            self.attempts.refuted[image, other] |= led.inlier_share >= options.min_inlier_share
 
     def _contradiction(self, image: int, limit: float) -> str | None:
         """Why the depth of an image contradicts that of another view, if it does."""
@@ -392,7 +345,7 @@ class Mapper:
             check = check_image(self.scene, image, options, self.refiner.std_factor)
         if check.share <= limit:
             return None
-        self.contradicted[check.other].add(image)
+        self.attempts.blame(check.other, image)
         other = self.problem.images[check.other].name
         return f"{check.share:.0%} of the pixels contradict the depth of {other}"
 
@@ -408,7 +361,7 @@ class Mapper:
             self.refiner.refine_globally(final=final)
             self.scene.tracks.compact()
         self._undo_jump(before)
-        self._forget_failures()
+        self.attempts.forget()
         self._last_size = int(self.scene.registered.sum()), len(self.scene.tracks)
         self._drop(lost_images(self.scene), "lost its points in global refinement")
 

@@ -36,19 +36,21 @@ def turned(mapper: Mapper, image: int, degrees: float) -> None:
 
 
 def test_the_view_that_several_newcomers_contradict_goes_once(mapper: Mapper) -> None:
-    mapper.contradicted[3] = {7, 8}
-    mapper.contradicted[1] = {7}
+    mapper.attempts.blame(3, 7)
+    mapper.attempts.blame(3, 8)
+    mapper.attempts.blame(1, 7)
     assert mapper._displace()
     assert np.flatnonzero(~mapper.scene.registered).tolist() == [3]
     assert "2 other images contradict" in mapper.image_reasons["view_3.png"]
     mapper._register_next(np.ones(5, dtype=np.bool_))
     assert mapper.scene.registered[3], "it may come back"
-    mapper.contradicted[3] = {7, 8}
+    mapper.attempts.blame(3, 7)
+    mapper.attempts.blame(3, 8)
     assert not mapper._displace(), "but goes only once"
 
 
 def test_one_newcomer_is_not_believed(mapper: Mapper) -> None:
-    mapper.contradicted[3] = {7}
+    mapper.attempts.blame(3, 7)
     assert not mapper._displace()
     assert mapper.scene.registered.all()
 
