@@ -91,7 +91,9 @@ class Refiner:
     def rescale(self, images: list[int]) -> None:
         """Estimate all scales anew from points that rays determine.
 
-        Their mean stays, which holds the scale of the world, unless fixed poses hold it.
+        Their mean stays, which holds the scale of the world, unless fixed poses hold it. Those of
+        metric priors stay near their median: a group of images that few matches hold to the rest
+        agrees with its own points at any scale.
         """
         scene, tracks = self.scene, self.scene.tracks
         stable = scene.track_angles_deg() >= self.options.anchor_min_angle_deg
@@ -110,8 +112,20 @@ class Refiner:
                 updated[position] = np.median(np.log(z[good] / prior[good]))
         if not self.fixed.any():
             updated += log_scales.mean() - updated.mean()
+        center = np.median(updated)
+        limits = [self._scale_slack(image) for image in images]
+        updated = center + np.clip(updated - center, np.negative(limits), limits)
         for image, log_scale in zip(images, updated, strict=True):
             scene.maps[image].set_scale(float(np.exp(log_scale)))
+
+    def _scale_slack(self, image: int) -> float:
+        """How far the logarithm of an image's scale may be from that of the others."""
+        depth_map = self.scene.maps[image]
+        log_std = depth_map.keypoint_log_std[depth_map.keypoint_valid]
+        if not depth_map.prior.metric or not len(log_std):
+            return np.inf
+        std = self.noise.multiplier * float(np.median(log_std))
+        return self.options.max_scale_deviations * std
 
     def integrate(self, images: list[int]) -> None:
         """Refine the depth maps of some images against the current points."""

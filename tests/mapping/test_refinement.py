@@ -60,3 +60,26 @@ def test_depth_far_from_a_point_does_not_pull_it() -> None:
     mapper.refiner.noise = mapper.refiner.noise._replace(multiplier=10.0)
     used = np.isfinite(mapper.refiner._depth_observations(observations)[0][mine])
     assert used.mean() > 0.95, "nothing is far when depth is measured to be that uncertain"
+
+
+@pytest.mark.parametrize(("declared_std", "scale_holds"), [(0.01, True), (0.3, False)])
+def test_a_certain_metric_prior_keeps_its_scale_beside_the_others(
+    declared_std: float, scale_holds: bool
+) -> None:
+    """A view and its points, 20 % larger together, look as right as before to that view alone."""
+    mapper = mapped(declared_std)
+    scene = mapper.scene
+    seen = scene.tracks.point_of[scene.graph.keypoints_of(2)]
+    for image in (0, 1):  # leave the view alone with its points
+        shared = np.arange(*scene.graph.offsets[image : image + 2])
+        shared = shared[np.isin(scene.tracks.point_of[shared], seen[seen >= 0])]
+        scene.tracks.remove_observations(shared, min_length=1)
+    push(mapper, 2, 1.2, share=1.0)
+    scene.maps[2].set_scale(1.2 * scene.maps[2].scale)
+    mapper.refiner.options = mapper.refiner.options.model_copy(
+        update={"anchor_min_angle_deg": 0.0}
+    )
+    mapper.refiner.rescale([0, 1, 2])
+    others = np.sqrt(scene.maps[0].scale * scene.maps[1].scale)
+    apart = scene.maps[2].scale / others
+    assert apart == pytest.approx(1.02 if scale_holds else 1.2, abs=0.01)
