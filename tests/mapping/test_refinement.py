@@ -76,9 +76,7 @@ def test_a_certain_metric_prior_keeps_its_scale_beside_the_others(
         scene.tracks.remove_observations(shared, min_length=1)
     push(mapper, 2, 1.2, share=1.0)
     scene.maps[2].set_scale(1.2 * scene.maps[2].scale)
-    mapper.refiner.options = mapper.refiner.options.model_copy(
-        update={"anchor_min_angle_deg": 0.0}
-    )
+    mapper.refiner.options = mapper.refiner.options.model_copy(update={"anchor_min_angle_deg": 0.0})
     mapper.refiner.rescale([0, 1, 2])
     others = np.sqrt(scene.maps[0].scale * scene.maps[1].scale)
     apart = scene.maps[2].scale / others

@@ -153,6 +153,10 @@ def mpsfm(environment: Mapping[str, str]) -> Mpsfm:
 def interrupted(environment: Mapping[str, str]) -> Mpsfm:
     """Runs ``mpsfm ARGUMENTS`` and presses Ctrl-C when a line on stderr starts with ``after``."""
 
+    def heed_interrupts() -> None:
+        # A shell lets what it starts in the background ignore Ctrl-C, these tests with it.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
     def run(*arguments: object, after: str) -> Ended:
         process = subprocess.Popen(
             [*COMMAND, *map(str, arguments)],
@@ -161,6 +165,7 @@ def interrupted(environment: Mapping[str, str]) -> Mpsfm:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
+            preexec_fn=heed_interrupts,
         )
         assert process.stderr is not None
         lines = []
