@@ -38,6 +38,7 @@ VARIANTS: Mapping[str, Mapping[str, object]] = {
     "next view by visible points": {"registration": {"next_view": "visible-points"}},
     "declared depth noise": {"refinement": {"measure_depth_noise": False}},
     "no rescaling of priors": {"refinement": {"rescale": False}},
+    "metric scales free of each other": {"refinement": {"max_scale_deviations": 1000.0}},
     "reprojection loss of the reference": {
         "refinement": {
             "bundle": {"reprojection_loss": int(Loss.SOFT_L1), "reprojection_scale": 1.5}

@@ -133,11 +133,6 @@ class RefinementOptions(Options):
     (ours; COLMAP accepts ratios of 0.1 to 10 of the image size)."""
     max_depth_ratio: float = Field(1.5, gt=1)
     """Depth observations off by more than this factor are ignored (reference: scale_filter)."""
-    max_depth_deviations: float = Field(6.0, gt=0)
-    """The same in standard deviations, by the measured noise (ours): a match that is wrong along
-    its epipolar line has a point that reprojects well, at a depth which the map contradicts."""
-    min_depth_ratio: float = Field(1.05, gt=1)
-    """A depth observation off by less is not ignored, however certain depth is (ours)."""
     final_robust: bool = False
     """End with a global refinement of sharper depth loss (paper, robust reconstruction). Ours:
     off; once the noise of depth is measured it costs accuracy (``benchmarks/ablation.py``)."""

@@ -71,7 +71,7 @@ class Refiner:
         log_scales = np.log(z[valid] / depth_map.prior_at_keypoints(rows)[valid])
         if depth_map.prior.metric and others:
             mean = float(np.mean([np.log(scene.maps[other].scale) for other in others]))
-            near = self._near(np.exp(log_scales - mean), depth_map.keypoint_log_std[rows][valid])
+            near = self._near(np.exp(log_scales - mean))
             log_scales = log_scales[near] if near.any() else np.array([mean])
         if len(log_scales):
             depth_map.set_scale(float(np.exp(np.median(log_scales))))
@@ -106,8 +106,7 @@ class Refiner:
             prior = depth_map.prior_at_keypoints(rows)
             good = depth_map.keypoint_valid[rows] & (z > 0) & (prior > 0)
             good &= stable[tracks.point_of[keypoints]]
-            ratio = z[good] / (depth_map.scale * prior[good])
-            good[good] &= self._near(ratio, depth_map.keypoint_log_std[rows[good]])
+            good[good] &= self._near(z[good] / (depth_map.scale * prior[good]))
             if good.sum() >= MIN_SCALE_POINTS:
                 updated[position] = np.median(np.log(z[good] / prior[good]))
         if not self.fixed.any():
@@ -253,9 +252,7 @@ class Refiner:
         ratio = z / np.maximum(depth_map.scale * depth_map.prior_at_keypoints(rows), 1e-12)
         good = (angles[points] >= self.options.anchor_min_angle_deg) & (z > 0)
         good &= np.isfinite(variance) & (variance > 0)
-        good &= ~depth_map.keypoint_valid[rows] | self._near(
-            ratio, depth_map.keypoint_log_std[rows]
-        )
+        good &= ~depth_map.keypoint_valid[rows] | self._near(ratio)
         xy = thinned_pixels(depth_map.keypoints[rows][good], self._step(image))
         anchors = Anchors(xy, z[good], variance[good])
         refined = self._integrator(image).refine(
@@ -342,19 +339,14 @@ class Refiner:
             rows = observations[mine] - scene.graph.offsets[image]
             depth = scene.maps[image].at_keypoints(rows)
             usable = scene.maps[image].keypoint_valid[rows] & (depth > 0) & (z[mine] > 0)
-            stds = scene.maps[image].keypoint_log_std[rows]
-            usable[usable] &= self._near(z[mine][usable] / depth[usable], stds[usable])
+            usable[usable] &= self._near(z[mine][usable] / depth[usable])
             log_depth[mine[usable]] = np.log(depth[usable])
-            log_std[mine[usable]] = stds[usable]
+            log_std[mine[usable]] = scene.maps[image].keypoint_log_std[rows][usable]
         return log_depth, np.maximum(log_std, 1e-6)
 
-    def _near(self, ratio: Float64, log_std: Float64) -> Bool:
-        """(m,) bool, whether depths of points and of a map of that std may be of the same thing."""
-        options = self.options
-        limit = options.max_depth_deviations * self.noise.multiplier * log_std
-        limit = np.clip(limit, *np.log([options.min_depth_ratio, options.max_depth_ratio]))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            near: Bool = np.abs(np.log(ratio)) < limit
+    def _near(self, ratio: Float64) -> Bool:
+        limit = self.options.max_depth_ratio
+        near: Bool = (ratio > 1 / limit) & (ratio < limit)
         return near
 
     def _covariances(self, seen_by: list[int]) -> tuple[Float64, Float64]:

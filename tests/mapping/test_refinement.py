@@ -1,4 +1,4 @@
-"""Which depth counts when a prior is held against points."""
+"""How the scales of priors hold together."""
 
 from __future__ import annotations
 
@@ -27,39 +27,13 @@ def mapped(declared_depth_std: float) -> Mapper:
     return mapper
 
 
-def push(mapper: Mapper, image: int, factor: float, share: float) -> None:
-    """Move a share of the points an image sees along its rays, as wrong matches do."""
+def push(mapper: Mapper, image: int, factor: float) -> None:
+    """Move the points an image sees along its rays."""
     scene = mapper.scene
     seen = np.unique(scene.tracks.point_of[scene.graph.keypoints_of(image)])
     seen = seen[seen >= 0]
-    chosen = np.random.default_rng(0).permutation(seen)[: round(share * len(seen))]
     center: Float64 = scene.centers()[image]
-    scene.tracks.xyz[chosen] = center + factor * (scene.tracks.xyz[chosen] - center)
-
-
-@pytest.mark.parametrize(("declared_std", "scale_holds"), [(0.01, True), (0.3, False)])
-def test_certain_depth_outvotes_points_at_another_depth(
-    declared_std: float, scale_holds: bool
-) -> None:
-    mapper = mapped(declared_std)
-    before = mapper.scene.maps[2].scale
-    push(mapper, 2, 1.3, share=0.7)
-    mapper.refiner.estimate_scale(2, [0, 1])
-    changed = mapper.scene.maps[2].scale / before
-    assert changed == pytest.approx(1.0 if scale_holds else 1.3, abs=0.03)
-
-
-def test_depth_far_from_a_point_does_not_pull_it() -> None:
-    mapper = mapped(0.01)
-    scene = mapper.scene
-    push(mapper, 2, 1.3, share=0.3)
-    observations = scene.tracks.observations()
-    mine = scene.graph.image_of[observations] == 2
-    used = np.isfinite(mapper.refiner._depth_observations(observations)[0][mine])
-    assert used.mean() == pytest.approx(0.7, abs=0.05)
-    mapper.refiner.noise = mapper.refiner.noise._replace(multiplier=10.0)
-    used = np.isfinite(mapper.refiner._depth_observations(observations)[0][mine])
-    assert used.mean() > 0.95, "nothing is far when depth is measured to be that uncertain"
+    scene.tracks.xyz[seen] = center + factor * (scene.tracks.xyz[seen] - center)
 
 
 @pytest.mark.parametrize(("declared_std", "scale_holds"), [(0.01, True), (0.3, False)])
@@ -74,7 +48,7 @@ def test_a_certain_metric_prior_keeps_its_scale_beside_the_others(
         shared = np.arange(*scene.graph.offsets[image : image + 2])
         shared = shared[np.isin(scene.tracks.point_of[shared], seen[seen >= 0])]
         scene.tracks.remove_observations(shared, min_length=1)
-    push(mapper, 2, 1.2, share=1.0)
+    push(mapper, 2, 1.2)
     scene.maps[2].set_scale(1.2 * scene.maps[2].scale)
     mapper.refiner.options = mapper.refiner.options.model_copy(update={"anchor_min_angle_deg": 0.0})
     mapper.refiner.rescale([0, 1, 2])
