@@ -13,12 +13,12 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-from mpsfm_core.data import Float64, Int64, MappingImage, MappingProblem, VerifiedPair
+from mpsfm_core.data import Int64, MappingProblem, VerifiedPair
 from mpsfm_core.evaluation.pose_auc import Pose
-from mpsfm_core.geometry import compose, invert, rays
+from mpsfm_core.geometry import compose, invert
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration import estimate_absolute_pose
-from mpsfm_core.scene.depth_map import DepthMap
+from mpsfm_core.scene.scene import Scene
 
 
 class _Link(NamedTuple):
@@ -31,9 +31,12 @@ class _Link(NamedTuple):
 def chained_poses(problem: MappingProblem, seed: int = 0) -> list[dict[str, Pose]]:
     """Poses by image name, one dictionary for each connected group of images, largest first."""
     options = RegistrationOptions()
+    scene = Scene(problem)  # no image has a pose: lifts are in the frame of their camera
+    for depth_map in scene.maps:
+        depth_map.set_scale(1.0)
     links: dict[tuple[int, int], _Link] = {}
     for pair in problem.pairs:
-        link = _best_link(problem, pair, options, seed)
+        link = _best_link(scene, pair, options, seed)
         if link:
             links[pair.image_a, pair.image_b] = link
     count = len(problem.images)
@@ -50,9 +53,7 @@ def chained_poses(problem: MappingProblem, seed: int = 0) -> list[dict[str, Pose
     return sorted(models, key=lambda model: -len(model))
 
 
-def _chain(
-    tree: coo_array, root: int, links: dict[tuple[int, int], _Link]
-) -> dict[int, tuple[Float64, Float64]]:
+def _chain(tree: coo_array, root: int, links: dict[tuple[int, int], _Link]) -> dict[int, Pose]:
     """``cam_from_world`` of all images that the tree connects with the root, where the world is."""
     order, before = breadth_first_order(tree, root, directed=False)
     poses: dict[int, Pose] = {root: (np.eye(3), np.zeros(3))}
@@ -67,11 +68,11 @@ def _chain(
 
 
 def _best_link(
-    problem: MappingProblem, pair: VerifiedPair, options: RegistrationOptions, seed: int
+    scene: Scene, pair: VerifiedPair, options: RegistrationOptions, seed: int
 ) -> _Link | None:
-    first, second = problem.images[pair.image_a], problem.images[pair.image_b]
-    there = _link(first, second, pair.matches, options, seed)
-    back = _link(second, first, pair.matches[:, ::-1], options, seed)
+    a, b = (pair.matches + scene.graph.offsets[[pair.image_a, pair.image_b]]).T
+    there = _link(scene, a, pair.image_b, b, options, seed)
+    back = _link(scene, b, pair.image_a, a, options, seed)
     if back:
         back = _Link(invert(*back.pose), back.num_inliers)
     found = [link for link in (there, back) if link]
@@ -79,18 +80,15 @@ def _best_link(
 
 
 def _link(
-    source: MappingImage,
-    target: MappingImage,
-    matches: Int64,
+    scene: Scene,
+    source: Int64,
+    image: int,
+    target: Int64,
     options: RegistrationOptions,
     seed: int,
 ) -> _Link | None:
-    """PnP of the target on the source's lifted keypoints."""
-    depth_map = DepthMap(source)
-    rows = matches[:, 0]
-    points = rays(source.camera, source.keypoints[rows])
-    points *= depth_map.prior_at_keypoints(rows)[:, None]
-    valid = depth_map.keypoint_valid[rows]
-    xy = target.keypoints[matches[valid, 1]]
-    found = estimate_absolute_pose(target.camera, xy, points[valid], options, seed)
+    """PnP of an image's keypoints (m,) on the lifts of those they match in another image."""
+    points, valid = scene.lift(source)
+    xy = scene.keypoints[target[valid]]
+    found = estimate_absolute_pose(scene.camera(image), xy, points[valid], options, seed)
     return _Link(found[:2], int(found[2].sum())) if found else None

@@ -160,11 +160,8 @@ class Mapper:
         for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
             self._place_first(reference)
             found = correspondences(scene, image, [reference], options.registration)
-            alone = scene.snapshot()
-            for pose in find_poses(
-                scene, image, found, options.registration, seed=options.seed, attempt=0
-            ):
-                starts.append(Start(reference, image, self._polished(image, pose, found, alone)))
+            poses = self._search(image, found, scene.snapshot(), attempt=0)
+            starts += [Start(reference, image, pose) for pose in poses]
             scene.restore(empty)
         return max(starts, key=lambda start: start.pose.support, default=None)
 
@@ -263,9 +260,7 @@ class Mapper:
             poses.append(rate_pose(self.scene, found, *pose, options))
         search = not attempts.exhausted(image, references)
         if search:
-            attempt, seed = attempts.searches(image), self.options.seed
-            new = find_poses(self.scene, image, found, options, seed=seed, attempt=attempt)
-            poses += [self._polished(image, pose, found, snapshot) for pose in new]
+            poses += self._search(image, found, snapshot, attempts.searches(image))
         poses.sort(key=lambda pose: -pose.support)
         attempts.remember(image, references, poses[0] if poses else None, searched=search)
         return poses
@@ -288,6 +283,14 @@ class Mapper:
             scene.restore(snapshot)
             self.refiner.forget(image)
         return reason
+
+    def _search(
+        self, image: int, found: Correspondences, snapshot: Snapshot, attempt: int
+    ) -> list[AbsolutePose]:
+        """Possible poses of an image; the scene is as in the snapshot, and is left so."""
+        options, seed = self.options.registration, self.options.seed
+        poses = find_poses(self.scene, image, found, options, seed=seed, attempt=attempt)
+        return [self._polished(image, pose, found, snapshot) for pose in poses]
 
     def _polished(
         self, image: int, pose: AbsolutePose, found: Correspondences, snapshot: Snapshot

@@ -24,8 +24,6 @@ class InitializationOptions(Options):
     """How many pairs are tried, best first."""
     high_parallax_deg: float = Field(1.5, gt=0)
     """Without lifting, a point triangulated with at least this angle supports the pose."""
-    max_error_px: float = Field(4.0, gt=0)
-    """Essential matrix inlier threshold (COLMAP)."""
 
 
 class RegistrationOptions(Options):

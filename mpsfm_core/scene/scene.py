@@ -163,8 +163,8 @@ class Scene:
         self.tracks.xyz = snapshot.xyz.copy()
         self.tracks.point_of = snapshot.point_of.copy()
         for depth_map, (scale, active, refined) in zip(self.maps, snapshot.maps, strict=True):
-            now = depth_map.scale, depth_map.active, depth_map.refined
-            if now[:2] != (scale, active) or now[2] is not refined:
+            same = (depth_map.scale, depth_map.active) == (scale, active)
+            if not same or depth_map.refined is not refined:
                 depth_map.reset()
                 if refined is not None:
                     depth_map.set_refined(refined)
