@@ -39,6 +39,8 @@ VARIANTS: Mapping[str, Mapping[str, object]] = {
     "declared depth noise": {"refinement": {"measure_depth_noise": False}},
     "no rescaling of priors": {"refinement": {"rescale": False}},
     "metric scales free of each other": {"refinement": {"max_scale_deviations": 1000.0}},
+    "matches count the same": {"weigh_by_score": False},
+    "new images with the final loss": {"refinement": {"first_reprojection_scale": 1.0}},
     "reprojection loss of the reference": {
         "refinement": {
             "bundle": {"reprojection_loss": int(Loss.SOFT_L1), "reprojection_scale": 1.5}

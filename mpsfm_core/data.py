@@ -244,7 +244,7 @@ class SparseMatches:
     """Matches between the features of two views.
 
     ``indices``: (m, 2) int64, rows of the two feature sets, each used at most once.
-    ``scores``: (m,) float32 in [0, 1], confidence of each match.
+    ``scores``: (m,) float32 in [0, 1], confidence of each match; mapping weighs matches by it.
     """
 
     indices: Int64

@@ -98,7 +98,7 @@ class Mapper:
                 return
 
     def _begin(self) -> None:
-        self.scene = Scene(self.problem)
+        self.scene = Scene(self.problem, weigh_by_score=self.options.weigh_by_score)
         self.scores = pair_score_matrix(self.scene, self.options.registration.next_view)
         self.refiner = Refiner(self.scene, self.options, self.scores)
         self.ladder = FailureLadder(self.options.registration)
@@ -313,7 +313,8 @@ class Mapper:
             triangulate_image(scene, image, options.triangulation)
             bundle = local_bundle(scene, image, options.refinement.local_images - 1, self.scores)
             self.refiner.estimate_scale(image, bundle[1:])
-            self.refiner.adjust([image], local=True)
+            wide = options.refinement.first_reprojection_scale
+            self.refiner.adjust([image], local=True, reprojection_scale=wide)
             filter_points(scene, options.triangulation)
             if image in lost_images(scene):
                 return "too few points are left after refinement"

@@ -44,7 +44,7 @@ class RegistrationOptions(Options):
     max_error)."""
     depth_deviations: float = Field(2.0, ge=0)
     """Half length of that segment in standard deviations of log depth (ours)."""
-    confident_share: float = Field(0.9, ge=0, le=1)
+    confident_share: float = Field(0.85, ge=0, le=1)
     """Support above which a pose needs no rivals from resampled matches (ours)."""
     num_resamples: int = Field(16, ge=0)
     """Random halves of the matches that are tried otherwise, others at each attempt (ours)."""
@@ -86,7 +86,7 @@ class MapperBundleOptions(BundleOptions):
     """
 
     reprojection_loss: Loss = Loss.CAUCHY
-    reprojection_scale: float = Field(0.7, gt=0)
+    reprojection_scale: float = Field(0.5, gt=0)
 
 
 class RefinementOptions(Options):
@@ -114,6 +114,9 @@ class RefinementOptions(Options):
     """Reference and COLMAP: ba_local_max_refinements."""
     local_max_change: float = Field(0.001, ge=0)
     """Reference and COLMAP: ba_local_max_refinement_change."""
+    first_reprojection_scale: float = Field(5.0, ge=1)
+    """Multiplies the scale of the reprojection loss in the first bundle adjustment of a new image,
+    whose pose from lifted points may miss by pixels (ours)."""
     global_iterations: int = Field(5, ge=1)
     """Reference and COLMAP: ba_global_max_refinements."""
     global_max_change: float = Field(0.0005, ge=0)
@@ -174,6 +177,9 @@ class MappingOptions(Options):
     them, their world and its unit, and leaves images without a pose out."""
     min_model_size: int = Field(2, ge=2)
     """Smallest component that is kept."""
+    weigh_by_score: bool = True
+    """Let matches count by the matcher's scores: in the support of poses, and as weights of squared
+    reprojection errors (ours)."""
     max_components: int = Field(10, ge=1)
     """Largest number of disconnected components."""
     initialization: InitializationOptions = InitializationOptions()

@@ -140,13 +140,14 @@ class Refiner:
         *,
         local: bool = False,
         focal: bool = False,
+        reprojection_scale: float = 1.0,
         depth_scale: float = 1.0,
         max_iterations: int | None = None,
     ) -> None:
         """Bundle-adjust the poses of some images and the points they see.
 
         ``local``: long tracks stay. ``focal``: guessed focal lengths
-        are refined too. ``depth_scale`` multiplies the scale of the depth loss.
+        are refined too. ``reprojection_scale``, ``depth_scale`` multiply the scales of the losses.
         ``max_iterations``: at most, instead of the options'.
         """
         scene, tracks = self.scene, self.scene.tracks
@@ -167,7 +168,8 @@ class Refiner:
         regularized = self.options.depth_regularization and bool(np.isfinite(log_depth).any())
         free_scale = not regularized and moving.any() and np.count_nonzero(~moving) == 1
         options = self.options.bundle
-        scale = options.depth_scale * depth_scale / np.sqrt(self.noise.design_effect)
+        depth_scale *= options.depth_scale / np.sqrt(self.noise.design_effect)
+        weight = scene.graph.keypoint_weight[observations]
         _, first, camera_rows = np.unique(
             scene.camera_of[images], return_index=True, return_inverse=True
         )
@@ -181,7 +183,7 @@ class Refiner:
                 obs_image=image_rows,
                 obs_point=point_rows,
                 obs_xy=scene.keypoints[observations],
-                obs_std_px=scene.keypoint_std_px[images][image_rows],
+                obs_std_px=scene.keypoint_std_px[images][image_rows] / np.sqrt(weight),
                 obs_log_depth=log_depth if regularized else None,
                 obs_std_log_depth=log_std * self.noise.std_factor,
                 variable_pose=moving,
@@ -191,7 +193,8 @@ class Refiner:
             ),
             options.model_copy(
                 update={
-                    "depth_scale": scale,
+                    "reprojection_scale": options.reprojection_scale * reprojection_scale,
+                    "depth_scale": depth_scale,
                     "max_iterations": max_iterations or options.max_iterations,
                 }
             ),

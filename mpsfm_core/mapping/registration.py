@@ -45,6 +45,7 @@ class Correspondences(NamedTuple):
     ``near``, ``far``: (m, 3) world points that bound where the
     point may lie along the ray of the matched keypoint (the same point twice when triangulated);
     ``points`` (m, 3): the best guess. ``references`` (m,): the image the match comes from.
+    ``scores`` (m,): of the matches, in (0, 1].
     """
 
     keypoints: Int64
@@ -53,13 +54,15 @@ class Correspondences(NamedTuple):
     near: Float64
     far: Float64
     references: Int64
+    scores: Float64
 
 
 @dataclass(frozen=True, eq=False)
 class AbsolutePose:
     """``cam_from_world``, its source, and the support of the reference image with most of it.
 
-    ``support`` is the truncated quadratic score (MSAC) by which hypotheses are compared.
+    ``support`` is the truncated quadratic score (MSAC) by which hypotheses are compared, weighted
+    by the scores of the matches, as is ``inlier_share``.
     """
 
     rotation: Float64
@@ -131,15 +134,16 @@ def correspondences(
     """
     graph, tracks = scene.graph, scene.tracks
     edges = graph.edges_of(image)
-    source, target = graph.source[edges], graph.target[edges]
+    source, target, scores = graph.source[edges], graph.target[edges], graph.score[edges]
     chosen = np.isin(graph.image_of[target], references)
-    source, target = source[chosen], target[chosen]
+    source, target, scores = source[chosen], target[chosen], scores[chosen]
     point = tracks.point_of[target]
     angle = np.append(scene.track_angles_deg(), 0.0)[point]
     stable = (point >= 0) & (angle >= options.min_point_angle_deg)
     lifted, valid = scene.lift(target)
     use = stable | (valid & options.lifting)
-    source, target, stable, point = source[use], target[use], stable[use], point[use]
+    source, target, scores = source[use], target[use], scores[use]
+    stable, point = stable[use], point[use]
     points = lifted[use]
     points[stable] = tracks.xyz[point[stable]]
     log_std = np.concatenate([m.keypoint_log_std for m in scene.maps])[target]
@@ -148,7 +152,7 @@ def correspondences(
     along = points - centers
     near = centers + along * np.maximum(np.exp(-slack), MIN_DEPTH_SHARE)[:, None]
     far = centers + along * np.exp(slack)[:, None]
-    return Correspondences(source, target, points, near, far, graph.image_of[target])
+    return Correspondences(source, target, points, near, far, graph.image_of[target], scores)
 
 
 def find_poses(
@@ -199,17 +203,22 @@ def rate_pose(
 ) -> AbsolutePose:
     """A pose with the support that the correspondences give it."""
     misfit = _misfits(scene, found, rotation, translation, options)
-    support = np.bincount(found.references, 1 - misfit**2, minlength=scene.num_images)
-    matches = np.bincount(found.references, minlength=scene.num_images)
-    inliers = np.bincount(found.references[misfit < 1], minlength=scene.num_images)
+    inlier = misfit < 1
+
+    def per_reference(values: Float64) -> Float64:
+        sums = np.bincount(found.references, values, minlength=scene.num_images)
+        return sums.astype(np.float64)
+
+    support = per_reference(found.scores * (1 - misfit**2))
     best = int(np.argmax(support))
+    total = per_reference(found.scores)[best]
     return AbsolutePose(
         rotation,
         translation,
         source,
         float(support[best]),
-        int(inliers[best]),
-        float(inliers[best] / max(matches[best], 1)),
+        int(inlier[found.references == best].sum()),
+        float(per_reference(found.scores * inlier)[best] / total) if total else 0.0,
     )
 
 
@@ -250,15 +259,20 @@ def _hypotheses(
 def _resampled_hypotheses(
     scene: Scene, image: int, found: Correspondences, options: RegistrationOptions, seed: int
 ) -> Iterator[Hypothesis]:
-    """Poses from random halves of the matches to the image that has most of them."""
+    """Poses from random halves of the matches to the image that has most of them.
+
+    A match is drawn in proportion to its score.
+    """
     if len(found.keypoints) < MIN_CORRESPONDENCES:
         return
     rng = np.random.default_rng(seed)
     reference = int(np.bincount(found.references).argmax())
     world = scene.rotations[reference], scene.translations[reference]
     mine = np.flatnonzero(found.references == reference)
+    half_size = min(max(len(mine) // 2, MIN_CORRESPONDENCES), len(mine))
+    odds = found.scores[mine] / found.scores[mine].sum()
     for trial in range(options.num_resamples):
-        chosen = rng.permutation(mine)[: max(len(mine) // 2, MIN_CORRESPONDENCES)]
+        chosen = rng.choice(mine, half_size, replace=False, p=odds)
         half = Correspondences(*(values[np.sort(chosen)] for values in found))
         factor = PNP_ERROR_FACTORS[trial % len(PNP_ERROR_FACTORS)]
         xy = scene.keypoints[half.keypoints]

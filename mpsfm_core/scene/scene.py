@@ -31,6 +31,8 @@ class Snapshot(NamedTuple):
 class Scene:
     """Everything the mapper changes.
 
+    ``weigh_by_score``: matches count by their scores, else all the same.
+
     Attributes:
         rotations: (n, 3, 3), translations: (n, 3) float64, ``cam_from_world`` of each image.
         registered: (n,) bool.
@@ -41,9 +43,9 @@ class Scene:
         maps: the depth map of each image.
     """
 
-    def __init__(self, problem: MappingProblem) -> None:
+    def __init__(self, problem: MappingProblem, *, weigh_by_score: bool = True) -> None:
         self.problem = problem
-        self.graph = CorrespondenceGraph(problem)
+        self.graph = CorrespondenceGraph(problem, weigh_by_score=weigh_by_score)
         count = len(problem.images)
         self.keypoints: Float64 = np.concatenate(
             [np.zeros((0, 2)), *(image.keypoints for image in problem.images)]

@@ -1,0 +1,115 @@
+"""Matches count by the scores that the matcher gives them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
+from mpsfm_core.mapping.mapper import reconstruct
+from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
+from mpsfm_core.mapping.registration import Correspondences, rate_pose
+from mpsfm_core.scene.graph import MIN_SCORE, CorrespondenceGraph
+from mpsfm_core.scene.scene import Scene
+from mpsfm_core.testing.problems import Noise, mapping_problem
+from mpsfm_core.testing.scenes import arc_poses, room_scene
+
+CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
+POSES = arc_poses(3, 14.0)
+
+
+def problem_with_doubtful_matches(seed: int = 0) -> MappingProblem:
+    """Each match sees a point of its own. Of four keypoints three are off by 2 px (standard
+    deviation), and their matches have a low score."""
+    problem = mapping_problem(
+        room_scene(), CAMERA, POSES, noise=Noise(keypoints_px=0.1), two_view_tracks=True, seed=seed
+    )
+    rng = np.random.default_rng(seed)
+    doubtful = [np.arange(len(image.keypoints)) % 4 > 0 for image in problem.images]
+    images = []
+    for image, off in zip(problem.images, doubtful, strict=True):
+        keypoints = image.keypoints.copy()
+        keypoints[off] += rng.normal(0, 2, (off.sum(), 2))
+        images.append(replace(image, keypoints=keypoints, keypoint_std_px=1.0))
+    pairs = []
+    for pair in problem.pairs:
+        off = (
+            doubtful[pair.image_a][pair.matches[:, 0]] | doubtful[pair.image_b][pair.matches[:, 1]]
+        )
+        pairs.append(replace(pair, scores=np.where(off, 0.1, 1.0).astype(np.float32)))
+    return MappingProblem(tuple(images), tuple(pairs))
+
+
+def pose_errors_deg(problem: MappingProblem, *, weigh_by_score: bool) -> list[float]:
+    """Of the views after the first, relative to it."""
+    result = reconstruct(problem, MapperOptions(weigh_by_score=weigh_by_score))
+    first, *others = result.reconstructions[0].images
+    assert len(others) == len(POSES) - 1
+    errors = []
+    for image, pose in zip(others, POSES[1:], strict=True):
+        rotation = image.rotation @ first.rotation.T
+        true_rotation = pose[:, :3] @ POSES[0][:, :3].T
+        direction = image.translation - rotation @ first.translation
+        true_direction = pose[:, 3] - true_rotation @ POSES[0][:, 3]
+        turn = float(rotation_angle_deg(rotation @ true_rotation.T))
+        errors += [turn, float(angle_between_deg(direction, true_direction))]
+    return errors
+
+
+def test_matches_that_the_matcher_doubts_hardly_bend_the_poses() -> None:
+    weighed: list[float] = []
+    alike: list[float] = []
+    for seed in range(4):
+        problem = problem_with_doubtful_matches(seed)
+        weighed += pose_errors_deg(problem, weigh_by_score=True)
+        alike += pose_errors_deg(problem, weigh_by_score=False)
+    assert np.mean(weighed) < 0.7 * np.mean(alike)
+
+
+def test_keypoints_weigh_by_their_best_match_relative_to_the_mean() -> None:
+    problem = problem_with_doubtful_matches()
+    graph = CorrespondenceGraph(problem)
+    best = np.zeros(len(graph.image_of))
+    for pair in problem.pairs:
+        for image, rows in ((pair.image_a, pair.matches[:, 0]), (pair.image_b, pair.matches[:, 1])):
+            keypoints = graph.offsets[image] + rows
+            best[keypoints] = np.maximum(best[keypoints], pair.scores)
+    mean = np.concatenate([pair.scores for pair in problem.pairs]).mean()
+    np.testing.assert_allclose(graph.keypoint_weight, best / mean, rtol=1e-6)
+
+
+@pytest.mark.parametrize("score", [0.0, 0.3, 1.0])
+def test_equal_scores_are_as_good_as_none(score: float) -> None:
+    problem = mapping_problem(room_scene(), CAMERA, POSES)
+    equal = MappingProblem(
+        problem.images,
+        tuple(
+            replace(pair, scores=np.full(len(pair), score, dtype=np.float32))
+            for pair in problem.pairs
+        ),
+    )
+    weighed = CorrespondenceGraph(equal)
+    alike = CorrespondenceGraph(equal, weigh_by_score=False)
+    assert (weighed.score >= MIN_SCORE).all()
+    np.testing.assert_allclose(weighed.keypoint_weight, alike.keypoint_weight, rtol=1e-6)
+
+
+def test_support_and_inlier_share_count_scores_and_inliers_count_matches() -> None:
+    problem = mapping_problem(room_scene(), CAMERA, POSES)
+    scene = Scene(problem)
+    count = 10
+    keypoints = np.arange(count) + scene.graph.offsets[1]
+    points = scene.rays(keypoints) * 2.0  # view 1 is at the origin and sees them where they are
+    points[6:, 0] += 1.0  # but for the last four
+    scores = np.where(np.arange(count) < 6, 0.9, 0.1)
+    found = Correspondences(
+        keypoints, keypoints, points, points, points, np.zeros(count, dtype=np.int64), scores
+    )
+    options = RegistrationOptions(depth_deviations=1e6)
+    pose = rate_pose(scene, found, np.eye(3), np.zeros(3), "PnP", options)
+    assert pose.num_inliers == 6
+    assert pose.support == pytest.approx(5.4)
+    assert pose.inlier_share == pytest.approx(5.4 / 5.8)
