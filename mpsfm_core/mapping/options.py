@@ -46,7 +46,7 @@ class RegistrationOptions(Options):
     """Half length of that segment in standard deviations of log depth (ours)."""
     confident_share: float = Field(0.85, ge=0, le=1)
     """Support above which a pose needs no rivals from resampled matches (ours)."""
-    num_resamples: int = Field(16, ge=0)
+    num_resamples: int = Field(8, ge=0)
     """Random halves of the matches that are tried otherwise, others at each attempt (ours)."""
     resampled_attempts: int = Field(3, ge=0)
     """Attempts at an image after which no more halves are tried (ours)."""
