@@ -10,9 +10,10 @@ the figures are held against the bars below; the exit code is 1 when one is miss
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks._scenes import RESULTS, shared_folder
@@ -24,6 +25,9 @@ from mpsfm_core.yaml_text import write_yaml
 
 PRIORS = ("sensor", "degraded", "config")
 """``config`` is FastDepth."""
+SEEDS = 6
+"""Of degraded depth on rendered_kitchen: its sets have few images, and their AUC depends on the
+errors that these happen to have by several points."""
 WINDOWS, FRAMES = 6, 5
 """Low parallax: so many windows, evenly spaced, of so many consecutive frames."""
 
@@ -44,7 +48,9 @@ features: {use: aliked, options: {max_keypoints: 1500}}
 matcher: {use: lightglue-aliked}
 """
 COMPARISONS: Mapping[str, Comparison] = {
-    "rendered_kitchen": Comparison("rendered_kitchen"),
+    "rendered_kitchen": Comparison(
+        "rendered_kitchen", priors=(*PRIORS, *(f"degraded-{seed}" for seed in range(1, SEEDS)))
+    ),
     "hololens_room": Comparison("hololens_room"),
     "hololens_room-low_parallax": Comparison("hololens_room", low_parallax=True),
     "hololens_room-aliked": Comparison(
@@ -95,17 +101,25 @@ def main() -> int:
         )
         records = run_benchmark(plan, output, done=_tell)
         write_report(output, records)
+        records = [_pooled(record) for record in records]
         rows = make_rows(records)
         held = _against_bars(rows) if name == "rendered_kitchen" else []
         missed += sum("missed" in line for line in held)
         every = CONVENTIONS["models"]
         parts = [f"# {name}", markdown(rows), "\n".join(held)]
+        if len(comparison.priors) > len(PRIORS):
+            parts.insert(1, f"Degraded depth: errors of {SEEDS} seeds, each counted as a set.")
         parts.append(f"## Every model\n\n{markdown(make_rows(records, every), every)}")
         text = "\n\n".join(part.strip() for part in parts if part)
         RESULTS.mkdir(exist_ok=True)
         (RESULTS / f"accuracy-{name}.md").write_text(text.rstrip() + "\n", encoding="utf-8")
         print(text)
     return missed > 0
+
+
+def _pooled(record: Record) -> Record:
+    """The record under a label that all seeds of degraded depth share."""
+    return replace(record, label=re.sub(r"degraded-\d+$", "degraded", record.label))
 
 
 def _low_parallax(scene: Path, folder: Path) -> Path:

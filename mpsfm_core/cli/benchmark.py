@@ -31,8 +31,8 @@ def benchmark(
         str,
         typer.Option(
             metavar="A,B",
-            help="Depth: sensor (gt_depth), degraded (gt_depth with errors of a network) or "
-            "config (the configuration's provider).",
+            help="Depth: sensor (gt_depth), degraded (gt_depth with errors of a network, "
+            "degraded-1, ... with others) or config (the configuration's provider).",
         ),
     ] = "config",
     peers: Annotated[

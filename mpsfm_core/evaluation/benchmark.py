@@ -25,7 +25,7 @@ from mpsfm_core.evaluation.methods import (
     Task,
     run_tasks,
 )
-from mpsfm_core.evaluation.prior_quality import QUALITIES, prior_settings
+from mpsfm_core.evaluation.prior_quality import QUALITIES, error_seed, prior_settings
 from mpsfm_core.evaluation.records import Record, read_record, record_file, write_record
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
 from mpsfm_core.extraction.cache import content_key, digest
@@ -45,7 +45,8 @@ class Plan:
     """What to run.
 
     ``configs``: names or files. ``buckets``: None for all. ``priors``: of
-    :data:`~mpsfm_core.evaluation.prior_quality.QUALITIES`, our mapper runs with each. ``peers``:
+    :data:`~mpsfm_core.evaluation.prior_quality.QUALITIES` or ``degraded-N``, our mapper runs with
+    each. ``peers``:
     of :data:`~mpsfm_core.evaluation.methods.OTHERS`. ``overrides``: settings ``KEY=VALUE`` of all
     configurations. ``workers``: sets that are mapped at the same time.
     """
@@ -68,7 +69,7 @@ def run_benchmark(
     :class:`~mpsfm_core.errors.MpsfmError` of the extraction) for what no run could do without.
     """
     registry = registry or Registry.discover()
-    _check_names("prior", plan.priors, QUALITIES)
+    _check_names("prior", [p for p in plan.priors if error_seed(p) is None], QUALITIES)
     _check_names("peer", plan.peers, OTHERS)
     scenes = [read_scene(path) for path in plan.scenes]
     if len({scene.name for scene in scenes}) < len(scenes):
@@ -155,7 +156,7 @@ class _SceneRuns:
         """Verified matches and priors of all images of the sets."""
         scene, work = self._scene, self._output / "work" / self._scene.name
         names = sorted({name for item in self._sets for name in item.images})
-        settings = prior_settings(prior, scene, names, work / "degraded-depth")
+        settings = prior_settings(prior, scene, names, work / f"{prior}-depth")
         config = load_config(
             self._config, (*settings, *self._plan.overrides), registry=self._registry
         )

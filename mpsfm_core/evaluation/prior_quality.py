@@ -2,13 +2,15 @@
 
 ``sensor``: the true depth, declared good to 1 %: an upper bound. ``degraded``: the true depth with
 the errors of :mod:`mpsfm_core.testing.degraded_depth`, declared honestly, which means as large as
-they are after the best scale of each image: stands for a good monocular network. ``config``: what
-the configuration's own provider predicts.
+they are after the best scale of each image: stands for a good monocular network; ``degraded-N`` is
+the same with the errors of seed N, which is 0 otherwise. ``config``: what the configuration's own
+provider predicts.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
@@ -26,6 +28,12 @@ SENSOR_STD = 0.01
 _MILLIMETRE = 0.001
 
 
+def error_seed(quality: str) -> int | None:
+    """Seed of the errors of degraded depth; None for other qualities."""
+    found = re.fullmatch(r"degraded(?:-(\d+))?", quality)
+    return int(found[1] or 0) if found else None
+
+
 def prior_settings(
     quality: str, scene: SceneFolder, images: Iterable[str], work: Path
 ) -> tuple[str, ...]:
@@ -36,6 +44,7 @@ def prior_settings(
     """
     if quality == "config":
         return ()
+    seed = error_seed(quality)
     if scene.depth is None:
         raise InputError(f"{scene.path}: prior {quality!r} needs true depth in gt_depth/")
     if quality == "sensor":
@@ -45,8 +54,8 @@ def prior_settings(
         stem = PurePosixPath(image).with_suffix("")
         target = work / f"{stem}.png"
         if not target.is_file():
-            degraded = degrade_depth(read_depth(scene.depth / f"{stem}.png"), str(stem), errors)
-            write_depth(target, degraded)
+            depth = read_depth(scene.depth / f"{stem}.png")
+            write_depth(target, degrade_depth(depth, str(stem), errors, seed or 0))
     return _from_files(work, round(errors.std, 3))
 
 

@@ -86,7 +86,7 @@ class MapperBundleOptions(BundleOptions):
     """
 
     reprojection_loss: Loss = Loss.CAUCHY
-    reprojection_scale: float = Field(0.5, gt=0)
+    reprojection_scale: float = Field(0.65, gt=0)
 
 
 class RefinementOptions(Options):
@@ -105,7 +105,7 @@ class RefinementOptions(Options):
     declared variance alone."""
     rescale: bool = True
     """Estimate the scales of all priors anew in global refinement (reference: regular_resc)."""
-    max_scale_deviations: float = Field(2.0, gt=0)
+    max_scale_deviations: float = Field(1.0, gt=0)
     """Standard deviations of a metric prior, by the measured noise, that its scale may differ from
     the median of all then (ours)."""
     local_images: int = Field(5, ge=2)
