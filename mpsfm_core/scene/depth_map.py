@@ -92,10 +92,16 @@ class DepthMap:
         rows, columns = self.prior.shape
         self.camera = camera.resized(columns, rows)
 
+    def forget_refined(self) -> None:
+        """Let the scaled prior stand for itself again."""
+        self.refined = None
+        self._use_prior()
+        self._factor = self.scale
+
     def reset(self) -> None:
         """Forget scale and refinement."""
-        self.scale, self.active, self.refined = 1.0, False, None
-        self._use_prior()
+        self.scale, self.active = 1.0, False
+        self.forget_refined()
 
     def _use_prior(self) -> None:
         self._best, self._best_at, self._factor = self.prior.depth, self._prior_at, 1.0

@@ -210,7 +210,7 @@ def test_a_guessed_focal_length_is_refined_and_shared() -> None:
     reconstruction = reconstruct(guessed).reconstructions[0]
     focal = {image.camera.fx for image in reconstruction.images}
     assert len(focal) == 1
-    assert focal.pop() == pytest.approx(CAMERA.fx, rel=0.02)
+    assert focal.pop() == pytest.approx(CAMERA.fx, rel=0.002)
 
     kept = MapperOptions.model_validate({"refinement": {"refine_focal": False}})
     for image in reconstruct(guessed, kept).reconstructions[0].images:
