@@ -46,9 +46,8 @@ class Plan:
 
     ``configs``: names or files. ``buckets``: None for all. ``priors``: of
     :data:`~mpsfm_core.evaluation.prior_quality.QUALITIES` or ``degraded-N``, our mapper runs with
-    each. ``peers``:
-    of :data:`~mpsfm_core.evaluation.methods.OTHERS`. ``overrides``: settings ``KEY=VALUE`` of all
-    configurations. ``workers``: sets that are mapped at the same time.
+    each. ``peers``: of :data:`~mpsfm_core.evaluation.methods.OTHERS`. ``overrides``: settings
+    ``KEY=VALUE`` of all configurations. ``workers``: sets that are mapped at the same time.
     """
 
     scenes: tuple[Path, ...]

@@ -96,7 +96,6 @@ class DepthMap:
         """Let the scaled prior stand for itself again."""
         self.refined = None
         self._use_prior()
-        self._factor = self.scale
 
     def reset(self) -> None:
         """Forget scale and refinement."""
@@ -104,7 +103,7 @@ class DepthMap:
         self.forget_refined()
 
     def _use_prior(self) -> None:
-        self._best, self._best_at, self._factor = self.prior.depth, self._prior_at, 1.0
+        self._best, self._best_at, self._factor = self.prior.depth, self._prior_at, self.scale
 
     def _sample(self, values: Float32) -> tuple[Float64, Bool]:
         return sample_bilinear(values, self.prior.valid, self.keypoints)

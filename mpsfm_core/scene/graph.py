@@ -20,8 +20,8 @@ class CorrespondenceGraph:
     Attributes:
         offsets: (n + 1,) int64, first global keypoint of each image.
         source, target: (e,) int64, global keypoints.
-        pair: (e,) int64, row of the match's pair in the problem.
         score: (e,) float64 in [0.05, 1], what the matcher thinks of the match.
+        pair_scores: (p,) float64, summed match scores of each pair.
         keypoint_weight: (k,) float64, score of a keypoint's best match in terms of the mean score
             of all matches: the weight of its squared reprojection error. Of XFeat + LighterGlue's
             matches the fifth of lowest score misses the true epipolar line by 2.3 px in the median
@@ -33,25 +33,23 @@ class CorrespondenceGraph:
         self.offsets: Int64 = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         self.num_images = len(problem.images)
         self.image_of: Int64 = np.repeat(np.arange(self.num_images), counts)
-        source, target, pair_row, score = [], [], [], []
-        for row, pair in enumerate(problem.pairs):
+        source, target, score = [], [], []
+        for pair in problem.pairs:
             a = pair.matches[:, 0] + self.offsets[pair.image_a]
             b = pair.matches[:, 1] + self.offsets[pair.image_b]
             source += [a, b]
             target += [b, a]
-            pair_row.append(np.full(2 * len(pair), row))
             score += [pair.scores, pair.scores]
         empty = np.zeros(0, dtype=np.int64)
         self.source: Int64 = np.concatenate([empty, *source])
         self.target: Int64 = np.concatenate([empty, *target])
-        self.pair: Int64 = np.concatenate([empty, *pair_row])
         self.score: Float64 = np.concatenate([np.zeros(0), *score])
         if not weigh_by_score:
             self.score[:] = 1.0
         self.score = np.maximum(self.score, MIN_SCORE)
         order = np.lexsort((self.target, self.source))
         self.source, self.target = self.source[order], self.target[order]
-        self.pair, self.score = self.pair[order], self.score[order]
+        self.score = self.score[order]
         self._first_edge = np.searchsorted(self.source, self.offsets)
         self.pair_scores: Float64 = np.array(
             [pair.scores.sum(dtype=np.float64) for pair in problem.pairs]
