@@ -26,6 +26,7 @@ from mpsfm_core.yaml_text import write_yaml
 VARIANTS: Mapping[str, Mapping[str, object]] = {
     "default": {},
     "no lifting": {"registration": {"lifting": False}},
+    "bundle adjustment beside refined depth": {"refinement": {"bundle_depth": "refined"}},
     "no depth refinement": {"refinement": {"integrate": False}},
     "no depth regularisation": {"refinement": {"depth_regularization": False}},
     "no refinement, no regularisation": {

@@ -43,7 +43,7 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
     pairs = tuple(p for p, false in zip(case.problem.pairs, case.false, strict=True) if not false)
     options = MapperOptions(known_poses="fixed")
     mapper = Mapper(MappingProblem(images, pairs), options, Silent())
-    next(mapper.components())
+    mapper.reconstruct_next()
     scene, room, noise = mapper.scene, np.array(case.room), mapper.refiner.noise.multiplier
     everything = scene.registered.copy()
     for image in np.flatnonzero(room >= 0):

@@ -98,6 +98,10 @@ class RefinementOptions(Options):
     """Columns that maps are thinned out to for that; the change is interpolated. Ours: beside whole
     maps of 387 columns mapping takes half the time and ends with the same poses, and the error of
     refined depth is 0.033 instead of 0.035 on rendered_kitchen with 5 % of error."""
+    bundle_depth: Literal["prior", "refined"] = "prior"
+    """Depth that regularises bundle adjustment. "refined": the refined maps, in turn with depth
+    integration (paper). "prior": the scaled priors; maps are refined on what comes out (ours: a map
+    refined on points holds them where they are, see ``benchmarks/ablation.py``)."""
     depth_regularization: bool = True
     """C_reg in bundle adjustment; off for ablation."""
     measure_depth_noise: bool = True

@@ -1,4 +1,9 @@
-"""Local and global refinement: depth integration and bundle adjustment in turn (section 3.3)."""
+"""Local and global refinement: bundle adjustment beside depth, and depth integration (section 3.3).
+
+The paper does both in turn, each beside what the other made. A map refined on points agrees with
+them, and holds them where they are; so, unless ``bundle_depth`` says otherwise, bundle adjustment
+works beside the scaled priors and maps are refined on what comes out.
+"""
 
 from __future__ import annotations
 
@@ -48,6 +53,11 @@ class Refiner:
         self.noise = DepthNoise()
         self._assumed = DepthNoise()
         self._integrators: dict[int, DepthIntegrator] = {}
+
+    @property
+    def _alternates(self) -> bool:
+        """Whether maps are refined before each bundle adjustment, and not after the last."""
+        return self.options.bundle_depth == "refined"
 
     @property
     def std_factor(self) -> float:
@@ -164,7 +174,7 @@ class Refiner:
         if moving.all():
             moving[0] = False
         long_track = np.bincount(point_rows) >= LOCAL_MAX_TRACK_LENGTH
-        log_depth, log_std = self._depth_observations(observations)
+        log_depth, log_std = self._depth_observations(observations, self._alternates and not focal)
         regularized = self.options.depth_regularization and bool(np.isfinite(log_depth).any())
         free_scale = not regularized and moving.any() and np.count_nonzero(~moving) == 1
         options = self.options.bundle
@@ -212,12 +222,15 @@ class Refiner:
         complete_and_merge(self.scene, self.triangulation, images=bundle)
         for _ in range(options.local_iterations):
             bundle = local_bundle(self.scene, image, options.local_images - 1, self.scores)
-            self.integrate([image])
+            if self._alternates:
+                self.integrate([image])
             self.adjust(bundle, local=True)
             changed = filter_points(self.scene, self.triangulation)
             changed += complete_and_merge(self.scene, self.triangulation, images=bundle)
             if changed < options.local_max_change * max(self._num_observations(), 1):
                 break
+        if not self._alternates:
+            self.integrate([image])
 
     def refine_globally(self, *, final: bool = False) -> None:
         """Refine everything until little changes; ``final`` sharpens the depth loss."""
@@ -226,17 +239,20 @@ class Refiner:
         complete_and_merge(self.scene, self.triangulation, create=True)
         lift_low_parallax(self.scene, self.triangulation)
         if self._focal_is_stable():
-            self._refine_focal(images)
+            self.adjust(images, focal=True)
         for _ in range(options.global_iterations):
             if options.rescale:
                 self.rescale(images)
             self._measure_noise()
-            self.integrate(images)
+            if self._alternates:
+                self.integrate(images)
             self.adjust(images, depth_scale=options.final_depth_scale if final else 1.0)
             changed = filter_points(self.scene, self.triangulation)
             changed += complete_and_merge(self.scene, self.triangulation)
             if changed < options.global_max_change * max(self._num_observations(), 1):
                 break
+        if not self._alternates:
+            self.integrate(images)
 
     def forget(self, image: int) -> None:
         """Drop what is remembered of an image that left the scene."""
@@ -274,16 +290,6 @@ class Refiner:
         angles = self.scene.track_angles_deg()[self.scene.tracks.lengths() > 0]
         wide = len(angles) > 0 and float(np.median(angles)) >= options.focal_min_angle_deg
         return wide and bool(self._guessed(images).any())
-
-    def _refine_focal(self, images: list[int]) -> None:
-        """Refine guessed focal lengths beside the priors themselves.
-
-        Depth refined under a wrong focal length agrees with it, and would hold a quarter of its
-        error (measured: tests/mapping/test_mapper.py, a guess 8 % too long ended 2 % too long).
-        """
-        for image in images:
-            self.scene.maps[image].forget_refined()
-        self.adjust(images, focal=True)
 
     def _take_focal(self, images: Int64, intrinsics: Float64) -> None:
         """Use refined focal lengths, also for images not yet registered, unless they ran away."""
@@ -338,7 +344,7 @@ class Refiner:
         z = points @ scene.rotations[image][2] + scene.translations[image, 2]
         return keypoints, z
 
-    def _depth_observations(self, observations: Int64) -> tuple[Float64, Float64]:
+    def _depth_observations(self, observations: Int64, refined: bool) -> tuple[Float64, Float64]:
         """Log depth of the maps at observations (NaN where not to be used) and its std."""
         scene, tracks = self.scene, self.scene.tracks
         _, z = scene.project(observations, tracks.xyz[tracks.point_of[observations]])
@@ -348,7 +354,10 @@ class Refiner:
         for image in np.unique(images):
             mine = np.flatnonzero(images == image)
             rows = observations[mine] - scene.graph.offsets[image]
-            depth = scene.maps[image].at_keypoints(rows)
+            depth_map = scene.maps[image]
+            depth = depth_map.prior_at_keypoints(rows) * depth_map.scale
+            if refined:
+                depth = depth_map.at_keypoints(rows)
             usable = scene.maps[image].keypoint_valid[rows] & (depth > 0) & (z[mine] > 0)
             usable[usable] &= self._near(z[mine][usable] / depth[usable])
             log_depth[mine[usable]] = np.log(depth[usable])

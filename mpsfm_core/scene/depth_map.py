@@ -92,15 +92,10 @@ class DepthMap:
         rows, columns = self.prior.shape
         self.camera = camera.resized(columns, rows)
 
-    def forget_refined(self) -> None:
-        """Let the scaled prior stand for itself again."""
-        self.refined = None
-        self._use_prior()
-
     def reset(self) -> None:
         """Forget scale and refinement."""
-        self.scale, self.active = 1.0, False
-        self.forget_refined()
+        self.scale, self.active, self.refined = 1.0, False, None
+        self._use_prior()
 
     def _use_prior(self) -> None:
         self._best, self._best_at, self._factor = self.prior.depth, self._prior_at, self.scale

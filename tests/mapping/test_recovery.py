@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mpsfm_core.data import PinholeCamera
+from mpsfm_core.data import Bool, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.events import Silent
 from mpsfm_core.mapping.mapper import Mapper
@@ -23,7 +23,7 @@ def mapper() -> Mapper:
     mapper = Mapper(
         mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0)), MapperOptions(), Silent()
     )
-    next(mapper.components())
+    mapper.reconstruct_next()
     assert mapper.scene.registered.all()
     return mapper
 
@@ -83,3 +83,27 @@ def test_an_undone_jump_takes_its_focal_lengths_with_it(mapper: Mapper) -> None:
     assert mapper.scene.maps[2].camera == CAMERA.resized(*mapper.scene.maps[2].camera.size)
     mapper.refiner.integrate([2])
     np.testing.assert_allclose(mapper.scene.maps[2].depth, refined, rtol=1e-4)
+
+
+class Limited(Mapper):
+    """A mapper that registers so many images beside the first pair in its next groups."""
+
+    limit = 0
+
+    def _register_next(self, available: Bool) -> bool:
+        self.limit -= 1
+        return self.limit >= 0 and super()._register_next(available)
+
+
+@pytest.mark.parametrize(("second_limit", "sizes"), [(9, [6]), (2, [4, 2])])
+def test_the_larger_of_two_groups_gets_the_images(second_limit: int, sizes: list[int]) -> None:
+    problem = mapping_problem(room_scene(), CAMERA, arc_poses(6, 14.0))
+    mapper = Limited(problem, MapperOptions(), Silent())
+    mapper.limit = 2
+    mapper.reconstruct_next()
+    assert [len(model.images) for model in mapper.models] == [4]
+    mapper.limit = second_limit
+    mapper.reconstruct_next()
+    assert [len(model.images) for model in mapper.models] == sizes
+    images = [image.index for model in mapper.models for image in model.images]
+    assert len(images) == len(set(images)) == 6 - mapper.left.sum()

@@ -21,7 +21,7 @@ def mapped(declared_depth_std: float) -> Mapper:
         room_scene(), CAMERA, arc_poses(3, 14.0), declared_depth_std=declared_depth_std
     )
     mapper = Mapper(problem, MapperOptions(), Silent())
-    next(mapper.components())
+    mapper.reconstruct_next()
     assert mapper.scene.registered.all()
     mapper.refiner.noise = mapper.refiner.noise._replace(multiplier=1.0)
     return mapper
