@@ -17,7 +17,7 @@ from mpsfm_core.data import Int64, MappingProblem, VerifiedPair
 from mpsfm_core.evaluation.pose_auc import Pose
 from mpsfm_core.geometry import compose, invert
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.registration import estimate_absolute_pose
+from mpsfm_core.mapping.pose_hypotheses import estimate_absolute_pose
 from mpsfm_core.scene.scene import Scene
 
 

@@ -35,6 +35,7 @@ class Attempts:
         self._searches: dict[int, int] = defaultdict(int)
         self._last: dict[int, _Attempt] = {}
         self._contradicted: dict[int, set[int]] = defaultdict(set)
+        self._refused: dict[tuple[int, bytes], str] = {}
         self._displaced: set[int] = set()
 
     def searches(self, image: int) -> int:
@@ -65,24 +66,41 @@ class Attempts:
         self._contradicted[view].add(newcomer)
 
     def take_culprit(self, registered: Bool) -> tuple[int, int] | None:
-        """The view that most newcomers contradicted since the last call, and their number.
+        """The view that most newcomers contradict who are not registered yet, and their number.
 
         The check blames the newcomer, but several of them may be right and the one view wrong.
-        Each view is named once; None when no registered one was contradicted by several.
+        Each view is named once; None when no registered one is contradicted by several.
         """
         blame = {
-            view: len(newcomers)
+            view: int((~registered[list(newcomers)]).sum())
             for view, newcomers in self._contradicted.items()
             if registered[view] and view not in self._displaced
         }
-        self._contradicted.clear()
         worst = max(blame, key=lambda view: blame[view], default=-1)
         if blame.get(worst, 0) < MIN_CONTRADICTED:
             return None
+        self._contradicted.clear()
         self._displaced.add(worst)
         return worst, blame[worst]
+
+    def refusal(self, image: int, pose: AbsolutePose) -> str | None:
+        """Why this very pose of an image was refused in the present scene, if it was."""
+        return self._refused.get(_key(image, pose))
+
+    def refuse(self, image: int, pose: AbsolutePose, reason: str) -> None:
+        """Note that the scene around a pose of an image did not hold."""
+        self._refused[_key(image, pose)] = reason
+
+    def scene_changed(self) -> None:
+        """Let refused poses be tried again."""
+        self._refused.clear()
 
     def forget(self) -> None:
         """Let everything be tried again: the scene may be right now where it was wrong."""
         self.refuted[:] = False
         self._last.clear()
+        self.scene_changed()
+
+
+def _key(image: int, pose: AbsolutePose) -> tuple[int, bytes]:
+    return image, pose.rotation.tobytes() + pose.translation.tobytes()

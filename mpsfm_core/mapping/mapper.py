@@ -12,6 +12,7 @@ import numpy as np
 from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.attempts import Attempts
+from mpsfm_core.mapping.correspondences import Correspondences, correspondences
 from mpsfm_core.mapping.depth_consistency import check_image, conflicting_images
 from mpsfm_core.mapping.events import MappingEvents, Silent
 from mpsfm_core.mapping.failure_ladder import FailureLadder
@@ -19,14 +20,9 @@ from mpsfm_core.mapping.filtering import disconnected_images, filter_points, los
 from mpsfm_core.mapping.finishing import finished
 from mpsfm_core.mapping.initialization import Start, rank_initial_pairs, start_from_rays
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.pose_hypotheses import Hypothesis
 from mpsfm_core.mapping.refinement import Refiner
-from mpsfm_core.mapping.registration import (
-    AbsolutePose,
-    Correspondences,
-    correspondences,
-    find_poses,
-    rate_pose,
-)
+from mpsfm_core.mapping.registration import AbsolutePose, find_poses, rate_pose
 from mpsfm_core.mapping.triangulation import complete_and_merge, triangulate_image
 from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
 from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
@@ -34,6 +30,8 @@ from mpsfm_core.scene.scene import Scene, Snapshot
 
 JUMP_DEG = 3.0
 """A camera that turns more in a global refinement may have found a wrong minimum (ours)."""
+CONTENDER_SHARE = 0.25
+"""Of the number of images of the largest group, with which another contends for them (ours)."""
 
 
 def reconstruct(
@@ -47,7 +45,7 @@ def reconstruct(
     result is the same bit for bit for the same problem, options and machine.
     """
     mapper = Mapper(problem, options or MapperOptions(), events or Silent())
-    components = list(mapper.components())
+    components = mapper.components()
     components.sort(key=lambda component: -len(component.images))
     if components:
         for component in components:
@@ -62,7 +60,10 @@ def reconstruct(
 
 
 class Mapper:
-    """State of one run; :meth:`components` is the loop."""
+    """State of one run; :meth:`components` is the loop.
+
+    ``scene`` is that of the last group; ``models`` are the groups, ``left`` the images in none.
+    """
 
     def __init__(
         self, problem: MappingProblem, options: MapperOptions, events: MappingEvents
@@ -75,27 +76,61 @@ class Mapper:
         }
         self.pair_reasons: dict[str, str] = {}
         self.starts: dict[VerifiedPair, Start | str] = {}
+        self.models: list[Reconstruction] = []
+        self.left: Bool = np.ones(len(problem.images), dtype=np.bool_)
         self.seconds: dict[str, float] = defaultdict(float)
         self.counts: dict[str, int] = defaultdict(int)
 
-    def components(self) -> Iterator[Reconstruction]:
+    def components(self) -> list[Reconstruction]:
         """Reconstruct one group of images after the other."""
-        available = np.ones(len(self.problem.images), dtype=np.bool_)
         for _ in range(self.options.max_components):
-            self._begin()
-            known = self._start_from_known_poses(available)
-            if not known and not self._initialize(available):
-                return
-            fixed = known and self.options.known_poses == "fixed"
-            while not fixed and self._register_next(available):
-                if self._grown():
-                    self._refine_globally()
-            self._finish()
-            available &= ~self.scene.registered
-            if self.scene.registered.sum() >= self.options.min_model_size:
-                yield finished(self.scene, keep_units=known)
-            if fixed:
-                return
+            if not self.reconstruct_next():
+                break
+        return self.models
+
+    def reconstruct_next(self) -> bool:
+        """Reconstruct a group among the images that are left; False when there is none."""
+        self._begin()
+        known = self._start_from_known_poses()
+        if not known and not self._initialize():
+            return False
+        fixed = known and self.options.known_poses == "fixed"
+        if not fixed:
+            self._grow(self.left)
+        if not known:
+            self._outgrow()
+        self._finish()
+        self.left &= ~self.scene.registered
+        if self.scene.registered.sum() >= self.options.min_model_size:
+            self.models.append(finished(self.scene, keep_units=known))
+        return not fixed
+
+    def _grow(self, available: Bool) -> None:
+        """Register images until none of the available ones can be."""
+        while self._register_next(available):
+            if self._grown():
+                self._refine_globally()
+
+    def _outgrow(self) -> None:
+        """Take images of earlier groups, if that makes this the largest; those are dissolved then.
+
+        A bad start holds few images, and would keep them from a good one that comes after it.
+        Images that came with a pose stay where they are.
+        """
+        largest = max((len(model.images) for model in self.models), default=0)
+        if not largest or self.scene.registered.sum() < CONTENDER_SHARE * largest:
+            return
+        before = self.scene.snapshot()
+        self.attempts.forget()
+        self._grow(np.array([image.known_pose is None for image in self.problem.images]))
+        if self.scene.registered.sum() <= largest:
+            self.scene.restore(before)
+            return
+        for model in list(self.models):
+            images = [image.index for image in model.images]
+            if self.scene.registered[images].any():
+                self.models.remove(model)
+                self.left[images] = True
 
     def _begin(self) -> None:
         self.scene = Scene(self.problem, weigh_by_score=self.options.weigh_by_score)
@@ -105,12 +140,12 @@ class Mapper:
         self.attempts = Attempts(self.scene.num_images, self.options.registration)
         self._last_size = (0, 0)
 
-    def _start_from_known_poses(self, available: Bool) -> bool:
+    def _start_from_known_poses(self) -> bool:
         """Register all images that came with a pose; False when there are fewer than two."""
         known = {
             index: image.known_pose
             for index, image in enumerate(self.problem.images)
-            if image.known_pose is not None and available[index]
+            if image.known_pose is not None and self.left[index]
         }
         if len(known) < 2:
             return False
@@ -125,14 +160,9 @@ class Mapper:
             self._accept(image)
         return True
 
-    def _initialize(self, available: Bool) -> bool:
-        """Find the first pair among the available images and refine it."""
-        pairs = [
-            pair
-            for pair in rank_initial_pairs(self.scene)
-            if available[pair.image_a] and available[pair.image_b]
-        ]
-        pairs = pairs[: self.options.initialization.max_pairs]
+    def _initialize(self) -> bool:
+        """Find the first pair among the images that are left and refine it."""
+        pairs = self._starting_pairs()
         snapshot = self.scene.snapshot()
         while True:
             for pair in pairs:
@@ -149,6 +179,24 @@ class Mapper:
                 self.scene.restore(snapshot)
             if not pairs or not self.ladder.relax():
                 return False
+
+    def _starting_pairs(self) -> list[VerifiedPair]:
+        """Pairs to start from: of those with most matches, the best supported poses first."""
+        options = self.options.initialization
+        left = self.left
+        pairs = [p for p in rank_initial_pairs(self.scene) if left[p.image_a] and left[p.image_b]]
+        first = pairs[: options.num_compared]
+        with self._timed("initialization"):
+            starts = {pair: self._start(pair) for pair in first}
+        support = {k: v.pose.support for k, v in starts.items() if isinstance(v, Start)}
+        first.sort(key=lambda pair: -support.get(pair, 0.0))
+        return first + pairs[options.num_compared : options.max_pairs]
+
+    def _start(self, pair: VerifiedPair) -> Start | str:
+        """The pose to start a pair with, or why it cannot be the first; found once."""
+        if pair not in self.starts:
+            self.starts[pair] = self._find_start(pair) or "nothing gives a pose"
+        return self.starts[pair]
 
     def _find_start(self, pair: VerifiedPair) -> Start | None:
         """The better supported pose of one image of a pair beside the other."""
@@ -172,9 +220,7 @@ class Mapper:
 
     def _try_pair(self, pair: VerifiedPair) -> str | None:
         """Start with a pair; None, or why it cannot be the first (remembered if that is final)."""
-        if pair not in self.starts:
-            self.starts[pair] = self._find_start(pair) or "nothing gives a pose"
-        start = self.starts[pair]
+        start = self._start(pair)
         if isinstance(start, str):
             return start
         reason = self.ladder.objection(start.pose)
@@ -256,8 +302,7 @@ class Mapper:
         poses = []
         known = attempts.best_pose(image)
         if known:
-            pose = known.rotation, known.translation, known.source
-            poses.append(rate_pose(self.scene, found, *pose, options))
+            poses.append(rate_pose(self.scene, found, known.hypothesis, options))
         search = not attempts.exhausted(image, references)
         if search:
             poses += self._search(image, found, snapshot, attempts.searches(image))
@@ -277,11 +322,14 @@ class Mapper:
             poses = self._find_poses(image, references, found, snapshot)
         reason: str | None = "neither PnP nor an essential matrix gives a pose"
         for pose in poses:
-            reason = self.ladder.objection(pose) or self._try_pose(image, pose, found)
+            reason = self.ladder.objection(pose) or self.attempts.refusal(image, pose)
             if reason is None:
-                return None
-            scene.restore(snapshot)
-            self.refiner.forget(image)
+                reason = self._try_pose(image, pose, found)
+                if reason is None:
+                    return None
+                self.attempts.refuse(image, pose, reason)
+                scene.restore(snapshot)
+                self.refiner.forget(image)
         return reason
 
     def _search(
@@ -302,7 +350,8 @@ class Mapper:
         self.refiner.adjust([image], local=True, max_iterations=options.registration.polishing)
         rotation, translation = scene.rotations[image].copy(), scene.translations[image].copy()
         scene.restore(snapshot)
-        polished = rate_pose(scene, found, rotation, translation, pose.source, options.registration)
+        adjusted = Hypothesis(rotation, translation, pose.source)
+        polished = rate_pose(scene, found, adjusted, options.registration)
         return max(pose, polished, key=lambda candidate: candidate.support)
 
     def _try_pose(self, image: int, pose: AbsolutePose, found: Correspondences) -> str | None:
@@ -335,9 +384,9 @@ class Mapper:
     def _refute(self, image: int, pose: AbsolutePose, found: Correspondences) -> None:
         """Try an image no more beside those whose matches led to a contradicted pose."""
         for other in map(int, np.unique(found.references)):
-            alone = Correspondences(*(part[found.references == other] for part in found))
+            alone = found.select(found.references == other)
             options = self.options.registration
-            led = rate_pose(self.scene, alone, pose.rotation, pose.translation, "", options)
+            led = rate_pose(self.scene, alone, pose.hypothesis, options)
             self.attempts.refuted[image, other] |= led.inlier_share >= options.min_inlier_share
 
     def _contradiction(self, image: int, limit: float) -> str | None:
@@ -409,6 +458,7 @@ class Mapper:
             self._drop(apart, "held to the rest only by an image that was dropped at the end")
 
     def _accept(self, image: int) -> None:
+        self.attempts.scene_changed()
         registered, total = int(self.scene.registered.sum()), len(self.problem.images)
         self.events.image_registered(self.problem.images[image].name, registered, total)
 
@@ -424,6 +474,7 @@ class Mapper:
                 continue
             self.scene.deregister(image)
             self.refiner.forget(image)
+            self.attempts.scene_changed()
             self._reject(image, reason)
 
     @contextmanager

@@ -9,9 +9,11 @@ import pytest
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
+from mpsfm_core.mapping.correspondences import Correspondences
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
-from mpsfm_core.mapping.registration import Correspondences, rate_pose
+from mpsfm_core.mapping.pose_hypotheses import Hypothesis
+from mpsfm_core.mapping.registration import rate_pose
 from mpsfm_core.scene.graph import MIN_SCORE, CorrespondenceGraph
 from mpsfm_core.scene.scene import Scene
 from mpsfm_core.testing.problems import Noise, mapping_problem
@@ -109,7 +111,7 @@ def test_support_and_inlier_share_count_scores_and_inliers_count_matches() -> No
         keypoints, keypoints, points, points, points, np.zeros(count, dtype=np.int64), scores
     )
     options = RegistrationOptions(depth_deviations=1e6)
-    pose = rate_pose(scene, found, np.eye(3), np.zeros(3), "PnP", options)
+    pose = rate_pose(scene, found, Hypothesis(np.eye(3), np.zeros(3), "PnP"), options)
     assert pose.num_inliers == 6
     assert pose.support == pytest.approx(5.4)
     assert pose.inlier_share == pytest.approx(5.4 / 5.8)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -11,6 +13,7 @@ from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.events import Silent
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.registration import AbsolutePose
 from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 
@@ -35,24 +38,49 @@ def turned(mapper: Mapper, image: int, degrees: float) -> None:
     mapper.scene.translations[image] = turn @ mapper.scene.translations[image]
 
 
+def take_out(mapper: Mapper, *images: int) -> None:
+    for image in images:
+        mapper.scene.deregister(image)
+
+
 def test_the_view_that_several_newcomers_contradict_goes_once(mapper: Mapper) -> None:
-    mapper.attempts.blame(3, 7)
-    mapper.attempts.blame(3, 8)
-    mapper.attempts.blame(1, 7)
+    take_out(mapper, 0, 4)
+    mapper.attempts.blame(3, 0)
+    mapper.attempts.blame(3, 4)
+    mapper.attempts.blame(1, 4)
     assert mapper._displace()
-    assert np.flatnonzero(~mapper.scene.registered).tolist() == [3]
+    assert np.flatnonzero(~mapper.scene.registered).tolist() == [0, 3, 4]
     assert "2 other images contradict" in mapper.image_reasons["view_3.png"]
-    mapper._register_next(np.ones(5, dtype=np.bool_))
+    while mapper._register_next(np.ones(5, dtype=np.bool_)):
+        pass
     assert mapper.scene.registered[3], "it may come back"
-    mapper.attempts.blame(3, 7)
-    mapper.attempts.blame(3, 8)
+    take_out(mapper, 0, 4)
+    mapper.attempts.blame(3, 0)
+    mapper.attempts.blame(3, 4)
     assert not mapper._displace(), "but goes only once"
 
 
 def test_one_newcomer_is_not_believed(mapper: Mapper) -> None:
-    mapper.attempts.blame(3, 7)
+    take_out(mapper, 4)
+    mapper.attempts.blame(3, 4)
     assert not mapper._displace()
-    assert mapper.scene.registered.all()
+    assert mapper.scene.registered[3]
+
+
+def test_newcomers_that_were_registered_since_blame_no_more(mapper: Mapper) -> None:
+    mapper.attempts.blame(3, 0)
+    mapper.attempts.blame(3, 4)
+    assert not mapper._displace()
+
+
+def test_a_refused_pose_is_tried_again_only_in_another_scene(mapper: Mapper) -> None:
+    pose = AbsolutePose(np.eye(3), np.zeros(3), "PnP", 1.0, 30, 1.0)
+    mapper.attempts.refuse(2, pose, "it floats")
+    assert mapper.attempts.refusal(2, replace(pose, support=2.0)) == "it floats"
+    assert mapper.attempts.refusal(2, replace(pose, translation=np.ones(3))) is None
+    assert mapper.attempts.refusal(1, pose) is None
+    mapper._drop([4], "to change the scene")
+    assert mapper.attempts.refusal(2, pose) is None
 
 
 def test_a_jump_that_contradicts_is_undone(mapper: Mapper) -> None:

@@ -1,0 +1,230 @@
+"""Possible poses of a new image: hypotheses, each to be judged by all matches.
+
+Lifted points of an uncertain depth miss by many pixels over a wide baseline, so one PnP is not
+enough. Hypotheses come from PnP on the points of the scene, from PnP the other way round (the new
+image's own lifts seen in a registered image), and from the essential matrices of verified pairs
+with the length that depth gives them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import Bool, Float64, PinholeCamera
+from mpsfm_core.geometry import compose, invert
+from mpsfm_core.mapping.correspondences import Correspondences
+from mpsfm_core.mapping.options import RegistrationOptions
+from mpsfm_core.mapping.triangulation import midpoints
+from mpsfm_core.scene.scene import Scene
+
+MIN_CORRESPONDENCES = 4
+"""PnP needs three; the fourth chooses among the solutions."""
+PNP_ERROR_FACTORS = (1.0, 4.0)
+"""PnP is tried with the allowed error and with this multiple of it, for lifts that miss widely over
+a wide baseline (ours)."""
+
+Pose = tuple[Float64, Float64]
+"""Rotation (3, 3) and translation (3,)."""
+
+
+class Hypothesis(NamedTuple):
+    """``cam_from_world`` of an image, and where it comes from."""
+
+    rotation: Float64
+    translation: Float64
+    source: str
+
+
+Estimate = Callable[[], Hypothesis | None]
+"""Makes a hypothesis; COLMAP's estimators let other threads work meanwhile."""
+
+
+def colmap_camera(camera: PinholeCamera) -> pycolmap.Camera:
+    """The camera as COLMAP's estimators want it."""
+    return pycolmap.Camera(
+        model="PINHOLE", width=camera.width, height=camera.height, params=camera.params
+    )
+
+
+def estimate_absolute_pose(
+    camera: PinholeCamera,
+    xy: Float64,
+    points: Float64,
+    options: RegistrationOptions,
+    seed: int,
+    error_factor: float = 1.0,
+    *,
+    refine: bool = True,
+) -> tuple[Float64, Float64, Bool] | None:
+    """Robust PnP of pixels (m, 2) and world points (m, 3).
+
+    Returns rotation, translation and inliers (m,), or None when it fails. ``refine``: also
+    minimise the reprojection error of the inliers; RANSAC alone takes a fifth of the time.
+    """
+    if len(xy) < MIN_CORRESPONDENCES:
+        return None
+    ransac = pycolmap.RANSACOptions(
+        max_error=options.max_error_px * error_factor,
+        min_inlier_ratio=options.min_inlier_ratio,
+        confidence=0.99999,  # COLMAP, reference
+        min_num_trials=100,
+        max_num_trials=10_000,
+        random_seed=seed,
+    )
+    estimate = (
+        pycolmap.estimate_and_refine_absolute_pose if refine else pycolmap.estimate_absolute_pose
+    )
+    result = estimate(
+        xy,
+        points,
+        colmap_camera(camera),
+        pycolmap.AbsolutePoseEstimationOptions(ransac=ransac),
+    )
+    if result is None:
+        return None
+    pose = result["cam_from_world"]
+    return (
+        np.asarray(pose.rotation.matrix(), dtype=np.float64),
+        np.asarray(pose.translation, dtype=np.float64),
+        np.asarray(result["inlier_mask"], dtype=np.bool_),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """The estimators of an image's pose on some correspondences.
+
+    ``refine``: PnP minimises the reprojection error of its inliers at last.
+    """
+
+    scene: Scene
+    image: int
+    found: Correspondences
+    options: RegistrationOptions
+    seed: int
+    refine: bool = True
+
+    def of_all(self) -> Iterator[Estimate]:
+        """From all correspondences, and from each reference image alone."""
+        for factor in PNP_ERROR_FACTORS:
+            yield partial(self._forward, factor)
+        if not self.options.lifting:
+            return
+        references = set(self.found.references.tolist())
+        for pair in self.scene.problem.pairs:
+            if self.image not in (pair.image_a, pair.image_b):
+                continue
+            reference = pair.image_a if self.image == pair.image_b else pair.image_b
+            if reference not in references:
+                continue
+            for factor in PNP_ERROR_FACTORS:
+                yield partial(self._reverse, reference, factor)
+            if pair.calibrated:
+                relative = pair.rotation, pair.translation
+                if self.image == pair.image_a:
+                    relative = invert(*relative)
+                yield partial(self._scaled, self.found, reference, relative)
+
+    def of_halves(self) -> Iterator[Estimate]:
+        """From random halves of the matches to the image that has most of them.
+
+        A match is drawn in proportion to its score.
+        """
+        found = self.found
+        if len(found.keypoints) < MIN_CORRESPONDENCES:
+            return
+        rng = np.random.default_rng(self.seed)
+        reference = int(np.bincount(found.references).argmax())
+        mine = np.flatnonzero(found.references == reference)
+        half_size = min(max(len(mine) // 2, MIN_CORRESPONDENCES), len(mine))
+        odds = found.scores[mine] / found.scores[mine].sum()
+        for trial in range(self.options.num_resamples):
+            chosen = np.sort(rng.choice(mine, half_size, replace=False, p=odds))
+            half = replace(self, found=found.select(chosen), refine=False)
+            factor = PNP_ERROR_FACTORS[trial % len(PNP_ERROR_FACTORS)]
+            yield partial(half._forward, factor)
+            yield partial(half._reverse, reference, factor)
+            yield partial(half._essential, found, reference)
+
+    def _forward(self, error_factor: float) -> Hypothesis | None:
+        """PnP on the points of the scene."""
+        xy = self.scene.keypoints[self.found.keypoints]
+        pose = self._pnp(self.image, xy, self.found.points, error_factor)
+        return Hypothesis(*pose, "PnP") if pose else None
+
+    def _reverse(self, reference: int, error_factor: float) -> Hypothesis | None:
+        """PnP of the reference on the image's own lifts, at the reference's scale."""
+        scene, found = self.scene, self.found
+        depth_map = scene.maps[self.image]
+        rows = found.keypoints - scene.graph.offsets[self.image]
+        use = (found.references == reference) & depth_map.keypoint_valid[rows]
+        if use.sum() < MIN_CORRESPONDENCES or not depth_map.prior.metric:
+            return None
+        depth = depth_map.prior_at_keypoints(rows[use]) * scene.maps[reference].scale
+        points = scene.rays(found.keypoints[use]) * depth[:, None]
+        xy = scene.keypoints[found.matched[use]]
+        pose = self._pnp(reference, xy, points, error_factor)
+        return self._placed(reference, invert(*pose), "reverse PnP") if pose else None
+
+    def _essential(self, judges: Correspondences, reference: int) -> Hypothesis | None:
+        """The essential matrix of the matches, its length by the depth of the ``judges``."""
+        scene, found = self.scene, self.found
+        result = pycolmap.estimate_essential_matrix(
+            scene.keypoints[found.matched],
+            scene.keypoints[found.keypoints],
+            colmap_camera(scene.camera(reference)),
+            colmap_camera(scene.camera(self.image)),
+            pycolmap.RANSACOptions(
+                max_error=0.5 * self.options.max_support_error_px,
+                min_inlier_ratio=self.options.min_inlier_ratio,
+                min_num_trials=50,
+                max_num_trials=500,  # a half without a good sample is followed by another half
+                random_seed=self.seed,
+            ),
+        )
+        if result is None:
+            return None
+        pose = result["cam2_from_cam1"]
+        relative = np.array(pose.rotation.matrix()), np.array(pose.translation)
+        return self._scaled(judges, reference, relative)
+
+    def _scaled(self, judges: Correspondences, reference: int, relative: Pose) -> Hypothesis | None:
+        """A pose relative to a reference, known up to its length."""
+        length = _baseline(self.scene, judges, reference, relative)
+        if not length:
+            return None
+        return self._placed(reference, (relative[0], relative[1] * length), "essential matrix")
+
+    def _placed(self, reference: int, relative: Pose, source: str) -> Hypothesis:
+        """A pose relative to a reference as one in the world."""
+        world = self.scene.rotations[reference], self.scene.translations[reference]
+        return Hypothesis(*compose(relative, world), source)
+
+    def _pnp(self, image: int, xy: Float64, points: Float64, error_factor: float) -> Pose | None:
+        camera, options = self.scene.camera(image), self.options
+        pose = estimate_absolute_pose(
+            camera, xy, points, options, self.seed, error_factor, refine=self.refine
+        )
+        return (pose[0], pose[1]) if pose else None
+
+
+def _baseline(
+    scene: Scene, found: Correspondences, reference: int, relative: tuple[Float64, Float64]
+) -> float | None:
+    """Factor of a relative translation that brings triangulated points to the known depth."""
+    mine = found.references == reference
+    rotation, translation = relative
+    known = found.points[mine] @ scene.rotations[reference].T + scene.translations[reference]
+    rays_a = known / known[:, 2:]
+    rays_b = scene.rays(found.keypoints[mine]) @ rotation
+    center_b = -rotation.T @ translation
+    z = midpoints(np.zeros(3), rays_a, center_b, rays_b)[:, 2]
+    with np.errstate(invalid="ignore"):
+        good = (z > 0) & (known[:, 2] > 0)
+    return float(np.median(known[good, 2] / z[good])) if good.any() else None
