@@ -49,7 +49,7 @@ def correspondences(
     graph, tracks = scene.graph, scene.tracks
     edges = graph.edges_of(image)
     source, target, scores = graph.source[edges], graph.target[edges], graph.score[edges]
-    chosen = np.isin(graph.image_of[target], references)
+    chosen = scene.mask(references)[graph.image_of[target]]
     source, target, scores = source[chosen], target[chosen], scores[chosen]
     point = tracks.point_of[target]
     angle = np.append(scene.track_angles_deg(), 0.0)[point]
@@ -60,8 +60,7 @@ def correspondences(
     stable, point = stable[use], point[use]
     points = lifted[use]
     points[stable] = tracks.xyz[point[stable]]
-    log_std = np.concatenate([m.keypoint_log_std for m in scene.maps])[target]
-    slack = np.where(stable, 0.0, options.depth_deviations * log_std)
+    slack = np.where(stable, 0.0, options.depth_deviations * scene.keypoint_log_std[target])
     centers = scene.centers()[graph.image_of[target]]
     along = points - centers
     near = centers + along * np.maximum(np.exp(-slack), MIN_DEPTH_SHARE)[:, None]

@@ -57,11 +57,12 @@ def check_image(
 
 
 def conflicting_images(
-    scene: Scene, options: ConsistencyOptions, std_factor: float = 1.0
+    scene: Scene, limit: float, options: ConsistencyOptions, std_factor: float = 1.0
 ) -> list[tuple[int, float]]:
     """Registered images to leave out so that no two contradict each other, and how much each did.
 
-    The one with most conflicts goes first.
+    ``limit``: share of contradicting pixels above which two do. The image with most conflicts goes
+    first.
     """
     shares = np.zeros((scene.num_images, scene.num_images))
     for image in map(int, scene.registered_images()):
@@ -70,8 +71,8 @@ def conflicting_images(
                 share = contradiction(scene, image, other, options, std_factor)
                 shares[image, other] = shares[other, image] = share
     removed = []
-    while (shares > options.max_violations).any():
-        conflicts = (shares > options.max_violations).sum(axis=1)
+    while (shares > limit).any():
+        conflicts = (shares > limit).sum(axis=1)
         worst = int(np.lexsort((shares.sum(axis=1), conflicts))[-1])
         removed.append((worst, float(shares[worst].max())))
         shares[worst] = shares[:, worst] = 0

@@ -73,9 +73,8 @@ def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
     origin = np.einsum("nj,nj->n", scene.rotations[b, 2], centers[a]) + scene.translations[b, 2]
     front = carried > 1e-9
     source, target, carried, origin = source[front], target[front], carried[front], origin[front]
-    log_std = np.concatenate([m.keypoint_log_std for m in maps])
     gain = (carried - origin) / carried
-    variance = (gain * log_std[source]) ** 2 + log_std[target] ** 2
+    variance = (gain * scene.keypoint_log_std[source]) ** 2 + scene.keypoint_log_std[target] ** 2
     residuals = np.log(carried / prior[target]) / np.sqrt(np.maximum(variance, 1e-12))
     size = np.array([image.camera.size for image in scene.problem.images])
     place = np.floor(CELLS * scene.keypoints[source] / size[graph.image_of[source]])

@@ -427,17 +427,19 @@ class Mapper:
         turns = self.scene.rotations[images] @ before.rotations[images].transpose(0, 2, 1)
         if not len(images) or rotation_angle_deg(turns).max() < JUMP_DEG:
             return
-        after, worse = self.scene.snapshot(), len(self._conflicts())
+        limit = self.options.consistency.max_violations
+        after, worse = self.scene.snapshot(), len(self._conflicts(limit))
         self.scene.restore(before)
-        if not worse > len(self._conflicts()):
+        if not worse > len(self._conflicts(limit)):
             self.scene.restore(after)
 
-    def _conflicts(self) -> list[tuple[int, float]]:
+    def _conflicts(self, limit: float) -> list[tuple[int, float]]:
         """Images to leave out so that no two views contradict each other, and how much each did."""
-        if not self.options.consistency.enabled:
+        options = self.options.consistency
+        if not options.enabled:
             return []
         with self._timed("depth check"):
-            return conflicting_images(self.scene, self.options.consistency, self.refiner.std_factor)
+            return conflicting_images(self.scene, limit, options, self.refiner.std_factor)
 
     def _finish(self) -> None:
         """Last refinements, and the depth check once more for every image."""
@@ -450,7 +452,7 @@ class Mapper:
 
     def _check_all(self) -> None:
         """Deregister images until no two views contradict each other."""
-        conflicting = self._conflicts()
+        conflicting = self._conflicts(self.options.consistency.max_violations_final)
         for image, share in conflicting:
             self._drop([image], f"at the end {share:.0%} of the pixels contradict another view's")
         if conflicting:

@@ -165,6 +165,9 @@ class ConsistencyOptions(Options):
     0.01. Unrefined depth of rendered_kitchen with 5 % of error, declared so, reaches 0.058."""
     max_violations_initial: float = Field(0.03, gt=0)
     """The same for the first pair (the reference's ratio of both, 0.6)."""
+    max_violations_final: float = Field(0.08, gt=0)
+    """The same at the end. Ours: an image that was accepted, and those it holds, should go on
+    clearer evidence only (``benchmarks/symmetry.py`` ends the same up to 0.1)."""
     max_deviation: float = Field(2.7, gt=0)
     """Standard deviations in front of the seen surface that make a violation (paper gamma; the
     reference's 0.6 x 15 / 3.33 in terms of the calibrated std)."""

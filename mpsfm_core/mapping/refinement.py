@@ -164,13 +164,13 @@ class Refiner:
         observations = tracks.observations()
         image_of = scene.graph.image_of[observations]
         seen = np.zeros(len(tracks.xyz), dtype=np.bool_)
-        seen[tracks.point_of[observations[np.isin(image_of, variable)]]] = True
+        seen[tracks.point_of[observations[scene.mask(variable)[image_of]]]] = True
         observations = observations[seen[tracks.point_of[observations]]]
         if not len(observations):
             return
         images, image_rows = np.unique(scene.graph.image_of[observations], return_inverse=True)
         points, point_rows = np.unique(tracks.point_of[observations], return_inverse=True)
-        moving = np.isin(images, variable) & ~self.fixed[images]
+        moving = (scene.mask(variable) & ~self.fixed)[images]
         if moving.all():
             moving[0] = False
         long_track = np.bincount(point_rows) >= LOCAL_MAX_TRACK_LENGTH
@@ -361,7 +361,7 @@ class Refiner:
             usable = scene.maps[image].keypoint_valid[rows] & (depth > 0) & (z[mine] > 0)
             usable[usable] &= self._near(z[mine][usable] / depth[usable])
             log_depth[mine[usable]] = np.log(depth[usable])
-            log_std[mine[usable]] = scene.maps[image].keypoint_log_std[rows][usable]
+            log_std[mine[usable]] = scene.keypoint_log_std[observations[mine[usable]]]
         return log_depth, np.maximum(log_std, 1e-6)
 
     def _near(self, ratio: Float64) -> Bool:
@@ -378,7 +378,7 @@ class Refiner:
         observations = tracks.observations()
         images = scene.graph.image_of[observations]
         wanted = np.zeros(len(tracks.xyz), dtype=np.bool_)
-        wanted[tracks.point_of[observations[np.isin(images, seen_by)]]] = True
+        wanted[tracks.point_of[observations[scene.mask(seen_by)[images]]]] = True
         observations = observations[wanted[tracks.point_of[observations]]]
         images = scene.graph.image_of[observations]
         covariances = point_covariances(

@@ -155,15 +155,8 @@ def _depth_misfits(
     known = scene.maps[image].keypoint_valid[rows] & (depth > 0)
     if (known & near).any():
         log_ratio = np.log(depth[known] / scene.maps[image].prior_at_keypoints(rows[known]))
-        own, other = scene.maps[image].keypoint_log_std[rows[known]], _log_std(scene, found, known)
+        own = scene.keypoint_log_std[found.keypoints[known]]
+        other = scene.keypoint_log_std[found.matched[known]]
         limit = options.depth_deviations * np.hypot(own, other)
         misfits[known] = np.abs(log_ratio - np.median(log_ratio[near[known]])) / limit
     return misfits
-
-
-def _log_std(scene: Scene, found: Correspondences, chosen: Bool) -> Float64:
-    """Std of log depth at the matches in the registered images."""
-    matched = found.matched[chosen]
-    log_std = np.concatenate([m.keypoint_log_std for m in scene.maps])
-    at_matches: Float64 = log_std[matched]
-    return at_matches

@@ -18,7 +18,7 @@ def triangulate_image(scene: Scene, image: int, options: TriangulationOptions) -
     """Continue tracks into a newly posed image and create new ones with its neighbours."""
     edges = _registered_edges(scene, image)
     max_error = _angle_error_px(scene, image, options)
-    extend_tracks(scene, edges, max_error)
+    extend_tracks(scene, image, edges, max_error)
     create_tracks(scene, edges, max_error, options)
 
 
@@ -39,28 +39,29 @@ def complete_and_merge(
     for image in scene.registered_images() if images is None else images:
         edges = _registered_edges(scene, image)
         max_error = options.max_error_px * scene.keypoint_std_px[image]
-        extend_tracks(scene, edges, max_error)
+        extend_tracks(scene, image, edges, max_error)
         if create:
             create_tracks(scene, edges, max_error, options)
     merge_tracks(scene, options)
     return int((before != scene.tracks.point_of).sum())
 
 
-def extend_tracks(scene: Scene, edges: tuple[Int64, Int64], max_error_px: float) -> None:
-    """Let keypoints without a point observe the points of the keypoints they match."""
+def extend_tracks(
+    scene: Scene, image: int, edges: tuple[Int64, Int64], max_error_px: float
+) -> None:
+    """Let an image's keypoints without a point observe the points of the keypoints they match."""
     tracks = scene.tracks
     source, target = edges
     keep = (tracks.point_of[source] < 0) & (tracks.point_of[target] >= 0)
     keypoints, points = source[keep], tracks.point_of[target[keep]]
     errors, _ = scene.project(keypoints, tracks.xyz[points])
-    place = points * scene.num_images + scene.graph.image_of[keypoints]
-    observed = np.flatnonzero(tracks.point_of >= 0)
-    taken = tracks.point_of[observed] * scene.num_images + scene.graph.image_of[observed]
-    fits = (errors <= max_error_px) & ~np.isin(place, taken)
-    order = np.flatnonzero(fits)
+    observed = tracks.point_of[scene.graph.keypoints_of(image)]
+    seen = np.zeros(len(tracks.xyz), dtype=np.bool_)
+    seen[observed[observed >= 0]] = True
+    order = np.flatnonzero((errors <= max_error_px) & ~seen[points])
     order = order[np.lexsort((points[order], errors[order]))]
     order = order[_first_of_each(keypoints[order])]
-    order = order[_first_of_each(place[order])]
+    order = order[_first_of_each(points[order])]
     tracks.point_of[keypoints[order]] = points[order]
 
 
@@ -166,7 +167,7 @@ def lift_low_parallax(scene: Scene, options: TriangulationOptions) -> None:
     low = (scene.track_angles_deg() < options.min_angle_deg)[points]
     observations, points = observations[low], points[low]
     lifted, valid = scene.lift(observations)
-    log_std = np.concatenate([m.keypoint_log_std for m in scene.maps])[observations]
+    log_std = scene.keypoint_log_std[observations]
     order = np.flatnonzero(valid)
     order = order[np.lexsort((log_std[order], points[order]))]
     order = order[_first_of_each(points[order])]

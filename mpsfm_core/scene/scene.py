@@ -41,6 +41,7 @@ class Scene:
             length is a guess, and the same guess.
         keypoints: (k, 2) float64, of all images, numbered as in :attr:`graph`.
         maps: the depth map of each image.
+        keypoint_log_std: (k,) float64, std of the priors' log depth at the keypoints.
     """
 
     def __init__(self, problem: MappingProblem, *, weigh_by_score: bool = True) -> None:
@@ -54,6 +55,9 @@ class Scene:
         self.intrinsics: Float64 = np.array([image.camera.params for image in problem.images])
         self.camera_of: Int64 = _shared_cameras(problem)
         self.maps = [DepthMap(image) for image in problem.images]
+        self.keypoint_log_std: Float64 = np.concatenate(
+            [np.zeros(0), *(depth_map.keypoint_log_std for depth_map in self.maps)]
+        )
         self.rotations: Float64 = np.tile(np.eye(3), (count, 1, 1))
         self.translations: Float64 = np.zeros((count, 3))
         self.registered: Bool = np.zeros(count, dtype=np.bool_)
@@ -67,6 +71,12 @@ class Scene:
     def registered_images(self) -> Int64:
         """Registered images in ascending order."""
         return np.flatnonzero(self.registered)
+
+    def mask(self, images: Sequence[int] | Int64) -> Bool:
+        """(n,) bool, true for the images."""
+        chosen = np.zeros(self.num_images, dtype=np.bool_)
+        chosen[images] = True
+        return chosen
 
     def register(self, image: int, rotation: Float64, translation: Float64) -> None:
         """Give an image a pose."""

@@ -179,6 +179,6 @@ def test_a_view_in_the_twin_room_is_told_by_what_differs() -> None:
 
 def test_the_image_with_most_conflicts_goes() -> None:
     scene = posed_scene([wall(4.0), wall(4.0), wall(2.0), wall(4.0)], [HERE] * 4, SMALL)
-    removed = conflicting_images(scene, OPTIONS)
+    removed = conflicting_images(scene, OPTIONS.max_violations, OPTIONS)
     assert [image for image, _ in removed] == [2]
     assert removed[0][1] == pytest.approx(1.0)
