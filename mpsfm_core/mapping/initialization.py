@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import VerifiedPair
+from mpsfm_core.data import Bool, VerifiedPair
 from mpsfm_core.geometry import triangulation_angle_deg
-from mpsfm_core.mapping.options import InitializationOptions
-from mpsfm_core.mapping.registration import AbsolutePose
+from mpsfm_core.mapping.correspondences import correspondences
+from mpsfm_core.mapping.options import InitializationOptions, MapperOptions, RegistrationOptions
+from mpsfm_core.mapping.registration import AbsolutePose, PoseSearch
 from mpsfm_core.mapping.triangulation import midpoints
 from mpsfm_core.scene.scene import Scene
 
@@ -27,9 +28,65 @@ class Start(NamedTuple):
     pose: AbsolutePose
 
 
+class Starts:
+    """First pairs and the poses they start with; each is found once."""
+
+    def __init__(self, options: MapperOptions) -> None:
+        self._options = options
+        self._found: dict[VerifiedPair, Start | str] = {}
+
+    def ranked(self, search: PoseSearch, left: Bool) -> list[VerifiedPair]:
+        """Pairs to start from: of those with most matches, the best supported poses first.
+
+        ``left``: (n,) bool, the images that may be in one.
+        """
+        options = self._options.initialization
+        pairs = [p for p in rank_initial_pairs(search.scene) if left[p.image_a] and left[p.image_b]]
+        first = pairs[: options.num_compared]
+        starts = {pair: self.find(search, pair) for pair in first}
+        support = {k: v.pose.support for k, v in starts.items() if isinstance(v, Start)}
+        first.sort(key=lambda pair: -support.get(pair, 0.0))
+        return first + pairs[options.num_compared : options.max_pairs]
+
+    def find(self, search: PoseSearch, pair: VerifiedPair) -> Start | str:
+        """The best supported pose of one image beside the other, or why the pair is no start."""
+        if pair not in self._found:
+            scene, options = search.scene, self._options
+            if options.registration.lifting:
+                start = _start_from_depth(search, pair, options.registration)
+            else:
+                start = start_from_rays(scene, pair, options.initialization)
+            self._found[pair] = start or "nothing gives a pose"
+        return self._found[pair]
+
+    def refuse(self, pair: VerifiedPair, reason: str) -> None:
+        """Remember why a pair is no start."""
+        self._found[pair] = reason
+
+
+def place_first(scene: Scene, image: int) -> None:
+    """Let the world begin with an image."""
+    scene.register(image, np.eye(3), np.zeros(3))
+    scene.maps[image].set_scale(1.0)
+
+
 def rank_initial_pairs(scene: Scene) -> list[VerifiedPair]:
     """Pairs to start from: calibrated configurations first, then by number of inliers."""
     return sorted(scene.problem.pairs, key=lambda pair: (not pair.calibrated, -len(pair)))
+
+
+def _start_from_depth(
+    search: PoseSearch, pair: VerifiedPair, options: RegistrationOptions
+) -> Start | None:
+    """Pose found as that of any next image, for each of both images."""
+    scene, starts = search.scene, []
+    empty = scene.snapshot()
+    for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
+        place_first(scene, reference)
+        found = correspondences(scene, image, [reference], options)
+        starts += [Start(reference, image, p) for p in search.poses(image, found, attempt=0)]
+        scene.restore(empty)
+    return max(starts, key=lambda start: start.pose.support, default=None)
 
 
 def start_from_rays(

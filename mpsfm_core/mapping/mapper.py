@@ -18,11 +18,10 @@ from mpsfm_core.mapping.events import MappingEvents, Silent
 from mpsfm_core.mapping.failure_ladder import FailureLadder
 from mpsfm_core.mapping.filtering import disconnected_images, filter_points, lost_images
 from mpsfm_core.mapping.finishing import finished
-from mpsfm_core.mapping.initialization import Start, rank_initial_pairs, start_from_rays
+from mpsfm_core.mapping.initialization import Start, Starts, place_first
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.pose_hypotheses import Hypothesis
 from mpsfm_core.mapping.refinement import Refiner
-from mpsfm_core.mapping.registration import AbsolutePose, find_poses, rate_pose
+from mpsfm_core.mapping.registration import AbsolutePose, PoseSearch, rate_pose
 from mpsfm_core.mapping.triangulation import complete_and_merge, triangulate_image
 from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
 from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
@@ -75,7 +74,7 @@ class Mapper:
             image.name: "no verified match with a registered image" for image in problem.images
         }
         self.pair_reasons: dict[str, str] = {}
-        self.starts: dict[VerifiedPair, Start | str] = {}
+        self.starts = Starts(options)
         self.models: list[Reconstruction] = []
         self.left: Bool = np.ones(len(problem.images), dtype=np.bool_)
         self.seconds: dict[str, float] = defaultdict(float)
@@ -136,6 +135,7 @@ class Mapper:
         self.scene = Scene(self.problem, weigh_by_score=self.options.weigh_by_score)
         self.scores = pair_score_matrix(self.scene, self.options.registration.next_view)
         self.refiner = Refiner(self.scene, self.options, self.scores)
+        self.search = PoseSearch(self.scene, self.refiner, self.options)
         self.ladder = FailureLadder(self.options.registration)
         self.attempts = Attempts(self.scene.num_images, self.options.registration)
         self._last_size = (0, 0)
@@ -162,7 +162,8 @@ class Mapper:
 
     def _initialize(self) -> bool:
         """Find the first pair among the images that are left and refine it."""
-        pairs = self._starting_pairs()
+        with self._timed("initialization"):
+            pairs = self.starts.ranked(self.search, self.left)
         snapshot = self.scene.snapshot()
         while True:
             for pair in pairs:
@@ -180,60 +181,22 @@ class Mapper:
             if not pairs or not self.ladder.relax():
                 return False
 
-    def _starting_pairs(self) -> list[VerifiedPair]:
-        """Pairs to start from: of those with most matches, the best supported poses first."""
-        options = self.options.initialization
-        left = self.left
-        pairs = [p for p in rank_initial_pairs(self.scene) if left[p.image_a] and left[p.image_b]]
-        first = pairs[: options.num_compared]
-        with self._timed("initialization"):
-            starts = {pair: self._start(pair) for pair in first}
-        support = {k: v.pose.support for k, v in starts.items() if isinstance(v, Start)}
-        first.sort(key=lambda pair: -support.get(pair, 0.0))
-        return first + pairs[options.num_compared : options.max_pairs]
-
-    def _start(self, pair: VerifiedPair) -> Start | str:
-        """The pose to start a pair with, or why it cannot be the first; found once."""
-        if pair not in self.starts:
-            self.starts[pair] = self._find_start(pair) or "nothing gives a pose"
-        return self.starts[pair]
-
-    def _find_start(self, pair: VerifiedPair) -> Start | None:
-        """The better supported pose of one image of a pair beside the other."""
-        scene, options = self.scene, self.options
-        if not options.registration.lifting:
-            return start_from_rays(scene, pair, options.initialization)
-        starts = []
-        empty = scene.snapshot()
-        for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
-            self._place_first(reference)
-            found = correspondences(scene, image, [reference], options.registration)
-            poses = self._search(image, found, scene.snapshot(), attempt=0)
-            starts += [Start(reference, image, pose) for pose in poses]
-            scene.restore(empty)
-        return max(starts, key=lambda start: start.pose.support, default=None)
-
-    def _place_first(self, image: int) -> None:
-        """Let the world begin with an image."""
-        self.scene.register(image, np.eye(3), np.zeros(3))
-        self.scene.maps[image].set_scale(1.0)
-
     def _try_pair(self, pair: VerifiedPair) -> str | None:
         """Start with a pair; None, or why it cannot be the first (remembered if that is final)."""
-        start = self._start(pair)
+        start = self.starts.find(self.search, pair)
         if isinstance(start, str):
             return start
         reason = self.ladder.objection(start.pose)
         if reason is None:
             reason = self._grow_start(start)
             if reason:
-                self.starts[pair] = reason
+                self.starts.refuse(pair, reason)
         return reason
 
     def _grow_start(self, start: Start) -> str | None:
         """Refine the first two images and their points; None, or why they are rejected."""
         a, b = start.reference, start.image
-        self._place_first(a)
+        place_first(self.scene, a)
         self.scene.register(b, start.pose.rotation, start.pose.translation)
         triangulate_image(self.scene, b, self.options.triangulation)
         self.refiner.estimate_scale(b, [])
@@ -295,7 +258,7 @@ class Mapper:
         return best is None or self.ladder.objection(best) is not None
 
     def _find_poses(
-        self, image: int, references: list[int], found: Correspondences, snapshot: Snapshot
+        self, image: int, references: list[int], found: Correspondences
     ) -> list[AbsolutePose]:
         """Possible poses of an image, best first, that of earlier attempts among them."""
         options, attempts = self.options.registration, self.attempts
@@ -305,7 +268,7 @@ class Mapper:
             poses.append(rate_pose(self.scene, found, known.hypothesis, options))
         search = not attempts.exhausted(image, references)
         if search:
-            poses += self._search(image, found, snapshot, attempts.searches(image))
+            poses += self.search.poses(image, found, attempt=attempts.searches(image))
         poses.sort(key=lambda pose: -pose.support)
         attempts.remember(image, references, poses[0] if poses else None, searched=search)
         return poses
@@ -318,8 +281,8 @@ class Mapper:
             most = int(np.bincount(found.references, minlength=1).max())
             if most < self.ladder.min_inliers:
                 return f"{most} matches have a 3D point, {self.ladder.min_inliers} are needed"
-            snapshot = scene.snapshot()
-            poses = self._find_poses(image, references, found, snapshot)
+            poses = self._find_poses(image, references, found)
+        snapshot = scene.snapshot()
         reason: str | None = "neither PnP nor an essential matrix gives a pose"
         for pose in poses:
             reason = self.ladder.objection(pose) or self.attempts.refusal(image, pose)
@@ -331,28 +294,6 @@ class Mapper:
                 scene.restore(snapshot)
                 self.refiner.forget(image)
         return reason
-
-    def _search(
-        self, image: int, found: Correspondences, snapshot: Snapshot, attempt: int
-    ) -> list[AbsolutePose]:
-        """Possible poses of an image; the scene is as in the snapshot, and is left so."""
-        options, seed = self.options.registration, self.options.seed
-        poses = find_poses(self.scene, image, found, options, seed=seed, attempt=attempt)
-        return [self._polished(image, pose, found, snapshot) for pose in poses]
-
-    def _polished(
-        self, image: int, pose: AbsolutePose, found: Correspondences, snapshot: Snapshot
-    ) -> AbsolutePose:
-        """A pose after bundle adjustment beside its neighbours, if that finds more support."""
-        scene, options = self.scene, self.options
-        scene.register(image, pose.rotation, pose.translation)
-        triangulate_image(scene, image, options.triangulation)
-        self.refiner.adjust([image], local=True, max_iterations=options.registration.polishing)
-        rotation, translation = scene.rotations[image].copy(), scene.translations[image].copy()
-        scene.restore(snapshot)
-        adjusted = Hypothesis(rotation, translation, pose.source)
-        polished = rate_pose(scene, found, adjusted, options.registration)
-        return max(pose, polished, key=lambda candidate: candidate.support)
 
     def _try_pose(self, image: int, pose: AbsolutePose, found: Correspondences) -> str | None:
         """Grow and refine the scene around a new pose; None, or why it is rejected."""

@@ -16,9 +16,11 @@ import numpy as np
 from mpsfm_core.data import Bool, Float64
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.correspondences import Correspondences
-from mpsfm_core.mapping.options import RegistrationOptions
+from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
 from mpsfm_core.mapping.pose_hypotheses import Estimate, Hypotheses, Hypothesis
-from mpsfm_core.scene.scene import Scene
+from mpsfm_core.mapping.refinement import Refiner
+from mpsfm_core.mapping.triangulation import triangulate_image
+from mpsfm_core.scene.scene import Scene, Snapshot
 
 MIN_TURN_DEG = 3.0
 """Hypotheses that differ less are refined to the same pose (ours)."""
@@ -45,6 +47,38 @@ class AbsolutePose:
     def hypothesis(self) -> Hypothesis:
         """The pose alone, to be rated again."""
         return Hypothesis(self.rotation, self.translation, self.source)
+
+
+class PoseSearch:
+    """Finds poses of images beside the registered ones; leaves the scene as it is."""
+
+    def __init__(self, scene: Scene, refiner: Refiner, options: MapperOptions) -> None:
+        self.scene = scene
+        self._refiner = refiner
+        self._options = options
+
+    def poses(self, image: int, found: Correspondences, *, attempt: int) -> list[AbsolutePose]:
+        """A few distinct poses, bundle-adjusted beside their neighbours if that finds more support.
+
+        ``attempt`` counts how often the image was tried: see :func:`find_poses`.
+        """
+        options, seed = self._options.registration, self._options.seed
+        poses = find_poses(self.scene, image, found, options, seed=seed, attempt=attempt)
+        snapshot = self.scene.snapshot()
+        return [self._polished(image, pose, found, snapshot) for pose in poses]
+
+    def _polished(
+        self, image: int, pose: AbsolutePose, found: Correspondences, snapshot: Snapshot
+    ) -> AbsolutePose:
+        scene, options = self.scene, self._options
+        scene.register(image, pose.rotation, pose.translation)
+        triangulate_image(scene, image, options.triangulation)
+        self._refiner.adjust([image], local=True, max_iterations=options.registration.polishing)
+        rotation, translation = scene.rotations[image].copy(), scene.translations[image].copy()
+        scene.restore(snapshot)
+        adjusted = Hypothesis(rotation, translation, pose.source)
+        polished = rate_pose(scene, found, adjusted, options.registration)
+        return max(pose, polished, key=lambda candidate: candidate.support)
 
 
 def find_poses(

@@ -9,7 +9,9 @@ import pytest
 
 from mpsfm_core.data import Bool, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
-from mpsfm_core.mapping.mapper import reconstruct
+from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.initialization import rank_initial_pairs
+from mpsfm_core.mapping.mapper import Mapper, reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.scene.reconstruction import MappingResult
 from mpsfm_core.testing.problems import mapping_problem
@@ -75,3 +77,24 @@ def test_images_that_do_not_fit_are_not_started_with() -> None:
     matches = np.stack([pair.matches[:, 0], shuffled], axis=1)
     wrong = replace(problem, pairs=(replace(pair, matches=matches, calibrated=False),))
     assert not reconstruct(wrong).reconstructions
+
+
+def test_the_best_supported_of_the_largest_pairs_comes_first() -> None:
+    problem = mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
+    rng = np.random.default_rng(0)
+    pairs = list(problem.pairs)
+    largest = max(range(3), key=lambda k: len(pairs[k]))
+    for k, pair in enumerate(pairs):
+        matches, count = pair.matches.copy(), len(pairs[largest]) * 2 // 3
+        if k == largest:
+            wrong = rng.permutation(len(matches))[: int(0.6 * len(matches))]
+            matches[wrong, 1] = rng.permutation(matches[wrong, 1])
+            count = len(matches)
+        pairs[k] = replace(pair, matches=matches[:count], scores=pair.scores[:count])
+    doubtful = pairs[largest]
+    mapper = Mapper(replace(problem, pairs=tuple(pairs)), MapperOptions(), Silent())
+    mapper._begin()
+    assert rank_initial_pairs(mapper.scene)[0] is doubtful
+    assert mapper.starts.ranked(mapper.search, mapper.left)[-1] is doubtful
+    left = np.isin(np.arange(3), [doubtful.image_a, doubtful.image_b])
+    assert mapper.starts.ranked(mapper.search, left) == [doubtful]
