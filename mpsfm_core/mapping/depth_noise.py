@@ -20,6 +20,8 @@ CELLS = 4
 """Residuals are compared in a grid of this many cells per side (ours)."""
 MIN_RESIDUALS = 50
 """Fewer say too little: the declaration stands (ours)."""
+MIN_INDEPENDENT = 0.05
+"""Share of the variance of depth that is independent, at least (ours)."""
 MULTIPLIER_RANGE = (0.1, 10.0)
 """Bounds of the multiplier (ours): a declaration is not off by more without being broken."""
 
@@ -37,6 +39,15 @@ class DepthNoise(NamedTuple):
     def std_factor(self) -> float:
         """Factor of the declared std that makes observations count as if independent."""
         return self.multiplier * float(np.sqrt(self.design_effect))
+
+    @property
+    def loss_factor(self) -> float:
+        """Factor of a loss scale for residuals in terms of that std: the scale then counts in stds
+        of what is independent in an error, as an outlier stands out from its neighbours."""
+        if self == DepthNoise():
+            return 1.0  # not measured
+        independent = max(1.0 - self.correlation, MIN_INDEPENDENT)
+        return float(np.sqrt(independent / self.design_effect))
 
     def independent_pixels(self, pixels: int) -> float:
         """How many independent measurements a map of so many pixels is worth."""

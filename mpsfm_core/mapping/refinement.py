@@ -178,7 +178,7 @@ class Refiner:
         regularized = self.options.depth_regularization and bool(np.isfinite(log_depth).any())
         free_scale = not regularized and moving.any() and np.count_nonzero(~moving) == 1
         options = self.options.bundle
-        depth_scale *= options.depth_scale / np.sqrt(self.noise.design_effect)
+        depth_scale *= options.depth_scale * self.noise.loss_factor
         weight = scene.graph.keypoint_weight[observations]
         _, first, camera_rows = np.unique(
             scene.camera_of[images], return_index=True, return_inverse=True
