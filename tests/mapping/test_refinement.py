@@ -1,11 +1,14 @@
-"""How the scales of priors hold together."""
+"""What bundle adjustment works beside, and how the scales of priors hold together."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from mpsfm_core.data import Float64, PinholeCamera
+from mpsfm_core.mapping.depth_noise import DepthNoise
 from mpsfm_core.mapping.events import Silent
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
@@ -56,3 +59,27 @@ def test_a_certain_metric_prior_keeps_its_scale_beside_the_others(
     apart = scene.maps[2].scale / others
     slack = mapper.options.refinement.max_scale_deviations * declared_std
     assert apart == pytest.approx(np.exp(slack) if scale_holds else 1.2, rel=0.006)
+
+
+@pytest.mark.parametrize(("bundle_depth", "bends"), [("prior", False), ("refined", True)])
+def test_refined_depth_bends_poses_only_if_it_is_asked_for(bundle_depth: str, bends: bool) -> None:
+    mapper = mapped(0.01)
+    scene, refiner = mapper.scene, mapper.refiner
+    refined = scene.maps[1].refined
+    assert refined is not None
+    refiner.options = refiner.options.model_copy(update={"bundle_depth": bundle_depth})
+    before = scene.snapshot()
+    refiner.adjust([0, 1, 2])
+    straight = scene.translations.copy()
+    scene.restore(before)
+    tilt = np.linspace(-0.2, 0.2, refined.log_depth.shape[1])
+    scene.maps[1].set_refined(replace(refined, log_depth=refined.log_depth + tilt))
+    refiner.adjust([0, 1, 2])
+    assert np.array_equal(scene.translations, straight) != bends
+
+
+def test_the_depth_loss_counts_in_what_is_independent_of_errors() -> None:
+    assert DepthNoise().loss_factor == 1.0
+    assert DepthNoise(1.0, 0.0, 1.0).loss_factor == 1.0
+    assert DepthNoise(1.0, 0.75, 16.0).loss_factor == pytest.approx(0.5 / 4)
+    assert DepthNoise(2.0, 1.0, 4.0).loss_factor > 0
