@@ -1,9 +1,14 @@
-"""Where benchmarks find scenes and leave results."""
+"""Where benchmarks find scenes and leave results, and how they tell what is done."""
 
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from mpsfm_core.evaluation.records import Record
+from mpsfm_core.yaml_text import write_yaml
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -15,3 +20,25 @@ def shared_folder() -> Path:
     if not (folder / "data").is_dir():
         raise SystemExit(f"no scenes in {folder}: set MPSFM_SHARED")
     return folder
+
+
+def frame_names(scene: Path) -> list[str]:
+    """Images of a scene folder without their ending, in order."""
+    return sorted(path.stem for path in (scene / "images").iterdir())
+
+
+def with_sets(scene: Path, folder: Path, sets: Mapping[str, Sequence[Sequence[str]]]) -> Path:
+    """The scene once more in ``folder``, with sets of images of its own in each bucket."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for item in scene.iterdir():
+        if item.name != "testsets.yaml" and not (folder / item.name).exists():
+            (folder / item.name).symlink_to(item.resolve())
+    buckets = {bucket: [{"images": list(images)} for images in of] for bucket, of in sets.items()}
+    (folder / "testsets.yaml").write_text(write_yaml(buckets), encoding="utf-8")
+    return folder
+
+
+def tell(record: Record, known: bool) -> None:
+    """Say on stderr that a run is done, or was before."""
+    what = "known" if known else record.error or f"{record.cpu_seconds:.1f} s"
+    print(f"{record.config} {record.set_name} {record.label}: {what}", file=sys.stderr)

@@ -11,14 +11,12 @@ benchmarks/results/ablation-SCENE.md, a table as the paper's table 5: AUC@1 / 5 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from benchmarks._scenes import RESULTS, shared_folder
+from benchmarks._scenes import RESULTS, shared_folder, tell
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS
-from mpsfm_core.evaluation.records import Record
 from mpsfm_core.evaluation.report import Row, make_rows
 from mpsfm_core.optimize.losses import Loss
 from mpsfm_core.yaml_text import write_yaml
@@ -72,7 +70,7 @@ def main() -> None:
         overrides=("runtime.workers=1",),
         workers=arguments.workers,
     )
-    rows = make_rows(run_benchmark(plan, output, done=_tell))
+    rows = make_rows(run_benchmark(plan, output, done=tell))
     text = _table(arguments.scene, rows, configs)
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"ablation-{arguments.scene}.md").write_text(text, encoding="utf-8")
@@ -112,11 +110,6 @@ def _table(scene: str, rows: Sequence[Row], configs: Mapping[str, str]) -> str:
 def _cell(row: Row) -> str:
     failed = f", {row.failed} failed" if row.failed else ""
     return f"{'/'.join(f'{v:.1f}' for v in row.auc.values())} ({row.registered:.0%}{failed})"
-
-
-def _tell(record: Record, known: bool) -> None:
-    what = "known" if known else record.error or f"{record.cpu_seconds:.1f} s"
-    print(f"{record.config} {record.set_name} {record.label}: {what}", file=sys.stderr)
 
 
 if __name__ == "__main__":

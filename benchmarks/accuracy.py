@@ -16,12 +16,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks._scenes import RESULTS, shared_folder
+from benchmarks._scenes import RESULTS, frame_names, shared_folder, tell, with_sets
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS
 from mpsfm_core.evaluation.records import Record
 from mpsfm_core.evaluation.report import Row, make_rows, markdown, write_report
-from mpsfm_core.yaml_text import write_yaml
 
 PRIORS = ("sensor", "degraded", "config")
 """``config`` is FastDepth."""
@@ -99,7 +98,7 @@ def main() -> int:
             overrides=("runtime.workers=1",),
             workers=arguments.workers,
         )
-        records = run_benchmark(plan, output, done=_tell)
+        records = run_benchmark(plan, output, done=tell)
         write_report(output, records)
         pooled = [_pooled(record) for record in records]
         rows = make_rows(pooled)
@@ -124,15 +123,10 @@ def _pooled(record: Record) -> Record:
 
 def _low_parallax(scene: Path, folder: Path) -> Path:
     """The scene once more, with windows of consecutive frames as its sets."""
-    folder.mkdir(exist_ok=True)
-    for item in scene.iterdir():
-        if item.name != "testsets.yaml" and not (folder / item.name).exists():
-            (folder / item.name).symlink_to(item.resolve())
-    frames = sorted(path.stem for path in (scene / "images").iterdir())
+    frames = frame_names(scene)
     starts = [k * (len(frames) - FRAMES) // (WINDOWS - 1) for k in range(WINDOWS)]
-    sets = [{"images": frames[start : start + FRAMES]} for start in starts]
-    (folder / "testsets.yaml").write_text(write_yaml({"low_parallax": sets}), encoding="utf-8")
-    return folder
+    windows = [frames[start : start + FRAMES] for start in starts]
+    return with_sets(scene, folder, {"low_parallax": windows})
 
 
 def _against_bars(rows: Sequence[Row]) -> list[str]:
@@ -146,10 +140,6 @@ def _against_bars(rows: Sequence[Row]) -> list[str]:
             wanted, have = (" / ".join(f"{v:.1f}" for v in side) for side in (bar, found))
             lines.append(f"| {row.bucket} | {row.method} | {wanted} | {have} | {verdict} |")
     return lines
-
-
-def _tell(record: Record, known: bool) -> None:
-    print(f"{record.set_name} {record.label}{' (known)' if known else ''}", file=sys.stderr)
 
 
 if __name__ == "__main__":

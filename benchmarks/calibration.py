@@ -14,13 +14,12 @@ $MPSFM_SHARED or ../shared.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks._scenes import RESULTS, shared_folder
+from benchmarks._scenes import RESULTS, shared_folder, tell
 from mpsfm_core.calibration.calibrate import Photos, calibrate, compare
 from mpsfm_core.calibration.file import load_calibration
 from mpsfm_core.calibration.model import DepthCalibration
@@ -29,7 +28,6 @@ from mpsfm_core.config import load_config
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS
 from mpsfm_core.evaluation.prior_quality import prior_settings
-from mpsfm_core.evaluation.records import Record
 from mpsfm_core.evaluation.report import Row, make_rows
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
 from mpsfm_core.registry import Registry
@@ -147,7 +145,7 @@ def _poses(
         peers=(),
         workers=arguments.workers,
     )
-    records = run_benchmark(plan, output, Registry.discover(), _tell)
+    records = run_benchmark(plan, output, Registry.discover(), tell)
     rows = {}
     for key, path in configs.items():
         own = [replace(r, bucket="all") for r in records if r.config == Path(path).stem]
@@ -207,10 +205,6 @@ def _table(
 
 def _slug(name: str) -> str:
     return name.lower().replace(" ", "-")
-
-
-def _tell(record: Record, known: bool) -> None:
-    print(f"{record.config} {record.set_name}{' (known)' if known else ''}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,76 @@
+"""Mapping time beside COLMAP's incremental mapper on the same matches, and how both grow.
+
+    python -m benchmarks.mapping_time [--scenes rendered_kitchen ...] [--output DIR]
+
+Evenly spaced frames of a scene, twice as many in each set; matches are XFeat + LighterGlue, priors
+true depth, and none of that is timed. A small set comes first to load what is compiled. COLMAP runs
+without and with structure-less registration, its default since 4. Writes
+benchmarks/results/mapping_time.md. Run it on a quiet machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks._scenes import RESULTS, frame_names, shared_folder, tell, with_sets
+from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
+from mpsfm_core.evaluation.records import Record
+
+SIZES = (7, 14, 28, 54)
+PEERS = ("colmap", "colmap-structureless")
+METHODS = ("ours-sensor", *PEERS)
+
+
+def main() -> None:
+    """Run the scenes and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", nargs="+", default=["rendered_kitchen", "hololens_room"])
+    parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))
+    arguments = parser.parse_args()
+    parts = ["# Mapping time", "Wall time and CPU time in seconds (images registered)."]
+    for name in arguments.scenes:
+        scene, output = shared_folder() / "data" / name, arguments.output / "mapping_time" / name
+        frames = frame_names(scene)
+        sizes = [size for size in SIZES if size <= len(frames)]
+        sets = {f"{n:03d}": [_spaced(frames, n)] for n in sizes}
+        folder = with_sets(scene, output / name, {"000": [frames[:4]], **sets})
+        plan = Plan(
+            (folder,), priors=("sensor",), peers=PEERS, overrides=("runtime.workers=1",), workers=1
+        )
+        records = run_benchmark(plan, output, done=tell)
+        parts.append(f"## {name}\n\n{_table(sizes, records)}")
+    text = "\n\n".join(parts) + "\n"
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "mapping_time.md").write_text(text, encoding="utf-8")
+    print(text)
+
+
+def _spaced(frames: Sequence[str], count: int) -> list[str]:
+    return [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+
+
+def _table(sizes: Sequence[int], records: Sequence[Record]) -> str:
+    """A row for each number of images, and the exponents of growth below."""
+    found = {(record.bucket, record.label): record for record in records}
+    lines = [
+        f"| images | {' | '.join(METHODS)} | ours / colmap | ours / colmap-structureless |",
+        "|---" * (len(METHODS) + 3) + "|",
+    ]
+    seconds = np.zeros((len(sizes), len(METHODS)))
+    for row, size in enumerate(sizes):
+        of_size = [found[f"{size:03d}", method] for method in METHODS]
+        seconds[row] = [record.seconds for record in of_size]
+        cells = [f"{r.seconds:.2f}, {r.cpu_seconds:.2f} ({len(r.estimated)})" for r in of_size]
+        ratios = [f"{seconds[row, 0] / other:.1f}x" for other in seconds[row, 1:]]
+        lines.append(f"| {size} | {' | '.join([*cells, *ratios])} |")
+    slopes = np.polyfit(np.log(sizes), np.log(seconds), 1)[0]
+    lines.append(f"| growth | {' | '.join(f'n^{slope:.2f}' for slope in slopes)} | | |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
