@@ -20,7 +20,7 @@ from benchmarks._scenes import RESULTS, frame_names, shared_folder, tell, with_s
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
 from mpsfm_core.evaluation.records import Record
 
-SIZES = (7, 14, 28, 54)
+SIZES = (7, 14, 28)
 PEERS = ("colmap", "colmap-structureless")
 METHODS = ("ours-sensor", *PEERS)
 
