@@ -44,8 +44,8 @@ class DepthNoise(NamedTuple):
     def loss_factor(self) -> float:
         """Factor of a loss scale for residuals in terms of that std: the scale then counts in stds
         of what is independent in an error, as an outlier stands out from its neighbours."""
-        if self == DepthNoise():
-            return 1.0  # not measured
+        if self.design_effect == 1.0:
+            return 1.0  # independent, or nothing to tell it by
         independent = max(1.0 - self.correlation, MIN_INDEPENDENT)
         return float(np.sqrt(independent / self.design_effect))
 

@@ -355,10 +355,9 @@ class Refiner:
             mine = np.flatnonzero(images == image)
             rows = observations[mine] - scene.graph.offsets[image]
             depth_map = scene.maps[image]
-            depth = depth_map.prior_at_keypoints(rows) * depth_map.scale
-            if refined:
-                depth = depth_map.at_keypoints(rows)
-            usable = scene.maps[image].keypoint_valid[rows] & (depth > 0) & (z[mine] > 0)
+            scaled = depth_map.prior_at_keypoints(rows) * depth_map.scale
+            depth = depth_map.at_keypoints(rows) if refined else scaled
+            usable = depth_map.keypoint_valid[rows] & (depth > 0) & (z[mine] > 0)
             usable[usable] &= self._near(z[mine][usable] / depth[usable])
             log_depth[mine[usable]] = np.log(depth[usable])
             log_std[mine[usable]] = scene.keypoint_log_std[observations[mine[usable]]]

@@ -81,5 +81,6 @@ def test_refined_depth_bends_poses_only_if_it_is_asked_for(bundle_depth: str, be
 def test_the_depth_loss_counts_in_what_is_independent_of_errors() -> None:
     assert DepthNoise().loss_factor == 1.0
     assert DepthNoise(1.0, 0.0, 1.0).loss_factor == 1.0
+    assert DepthNoise(1.3, 1.0, 1.0).loss_factor == 1.0, "cells of one residual tell nothing"
     assert DepthNoise(1.0, 0.75, 16.0).loss_factor == pytest.approx(0.5 / 4)
     assert DepthNoise(2.0, 1.0, 4.0).loss_factor > 0
