@@ -96,9 +96,8 @@ class Mapper:
         fixed = known and self.options.known_poses == "fixed"
         if not fixed:
             self._grow(self.left)
-        if not known:
-            self._outgrow()
-        self._finish()
+        if known or not self._outgrow():
+            self._finish()
         self.left &= ~self.scene.registered
         if self.scene.registered.sum() >= self.options.min_model_size:
             self.models.append(finished(self.scene, keep_units=known))
@@ -110,26 +109,29 @@ class Mapper:
             if self._grown():
                 self._refine_globally()
 
-    def _outgrow(self) -> None:
-        """Take images of earlier groups, if that makes this the largest; those are dissolved then.
+    def _outgrow(self) -> bool:
+        """Take images of earlier groups, if this ends as the largest; those are dissolved then.
 
         A bad start holds few images, and would keep them from a good one that comes after it.
-        Images that came with a pose stay where they are.
+        Images that came with a pose stay where they are. Whether it came so; it is finished then.
         """
         largest = max((len(model.images) for model in self.models), default=0)
         if not largest or self.scene.registered.sum() < CONTENDER_SHARE * largest:
-            return
+            return False
         before = self.scene.snapshot()
         self.attempts.forget()
         self._grow(np.array([image.known_pose is None for image in self.problem.images]))
+        if self.scene.registered.sum() > largest:
+            self._finish()
         if self.scene.registered.sum() <= largest:
             self.scene.restore(before)
-            return
+            return False
         for model in list(self.models):
             images = [image.index for image in model.images]
             if self.scene.registered[images].any():
                 self.models.remove(model)
                 self.left[images] = True
+        return True
 
     def _begin(self) -> None:
         self.scene = Scene(self.problem, weigh_by_score=self.options.weigh_by_score)

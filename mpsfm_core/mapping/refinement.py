@@ -15,7 +15,7 @@ import numpy as np
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.mapping.depth_noise import DepthNoise, measure_depth_noise
 from mpsfm_core.mapping.filtering import filter_points
-from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.options import THREADS, MapperOptions
 from mpsfm_core.mapping.triangulation import complete_and_merge, lift_low_parallax
 from mpsfm_core.mapping.view_selection import local_bundle
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
@@ -56,7 +56,7 @@ class Refiner:
 
     @property
     def _alternates(self) -> bool:
-        """Whether maps are refined before each bundle adjustment, and not after the last."""
+        """Whether maps are also refined before each bundle adjustment, for it to agree with."""
         return self.options.bundle_depth == "refined"
 
     @property
@@ -141,7 +141,7 @@ class Refiner:
         if not self.options.integrate:
             return
         covariances = self._covariances(images)
-        with ThreadPoolExecutor(max_workers=2) as pool:
+        with ThreadPoolExecutor(THREADS) as pool:
             list(pool.map(lambda image: self._integrate(image, *covariances), images))
 
     def adjust(
@@ -229,8 +229,7 @@ class Refiner:
             changed += complete_and_merge(self.scene, self.triangulation, images=bundle)
             if changed < options.local_max_change * max(self._num_observations(), 1):
                 break
-        if not self._alternates:
-            self.integrate([image])
+        self.integrate([image])
 
     def refine_globally(self, *, final: bool = False) -> None:
         """Refine everything until little changes; ``final`` sharpens the depth loss."""
@@ -251,8 +250,7 @@ class Refiner:
             changed += complete_and_merge(self.scene, self.triangulation)
             if changed < options.global_max_change * max(self._num_observations(), 1):
                 break
-        if not self._alternates:
-            self.integrate(images)
+        self.integrate(images)
 
     def forget(self, image: int) -> None:
         """Drop what is remembered of an image that left the scene."""

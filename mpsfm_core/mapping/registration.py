@@ -16,7 +16,7 @@ import numpy as np
 from mpsfm_core.data import Bool, Float64
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.correspondences import Correspondences
-from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
+from mpsfm_core.mapping.options import THREADS, MapperOptions, RegistrationOptions
 from mpsfm_core.mapping.pose_hypotheses import Estimate, Hypotheses, Hypothesis
 from mpsfm_core.mapping.refinement import Refiner
 from mpsfm_core.mapping.triangulation import triangulate_image
@@ -24,8 +24,6 @@ from mpsfm_core.scene.scene import Scene, Snapshot
 
 MIN_TURN_DEG = 3.0
 """Hypotheses that differ less are refined to the same pose (ours)."""
-THREADS = 2
-"""That make hypotheses (ours); which ones they make does not depend on it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -114,20 +114,30 @@ def test_an_undone_jump_takes_its_focal_lengths_with_it(mapper: Mapper) -> None:
 
 
 class Limited(Mapper):
-    """A mapper that registers so many images beside the first pair in its next groups."""
+    """Registers ``limit`` images beside the first pair; more than four end as ``kept``."""
 
     limit = 0
+    kept = 9
 
     def _register_next(self, available: Bool) -> bool:
         self.limit -= 1
         return self.limit >= 0 and super()._register_next(available)
 
+    def _check_all(self) -> None:
+        images = self.scene.registered_images()
+        if len(images) > 4:
+            self._drop(images[self.kept :].tolist(), "contradicted at the end")
 
-@pytest.mark.parametrize(("second_limit", "sizes"), [(9, [6]), (2, [4, 2])])
-def test_the_larger_of_two_groups_gets_the_images(second_limit: int, sizes: list[int]) -> None:
+
+@pytest.mark.parametrize(
+    ("second_limit", "kept", "sizes"), [(9, 9, [6]), (9, 5, [5]), (9, 4, [4, 2]), (2, 9, [4, 2])]
+)
+def test_the_group_that_ends_larger_gets_the_images(
+    second_limit: int, kept: int, sizes: list[int]
+) -> None:
     problem = mapping_problem(room_scene(), CAMERA, arc_poses(6, 14.0))
     mapper = Limited(problem, MapperOptions(), Silent())
-    mapper.limit = 2
+    mapper.limit, mapper.kept = 2, kept
     mapper.reconstruct_next()
     assert [len(model.images) for model in mapper.models] == [4]
     mapper.limit = second_limit
