@@ -74,9 +74,11 @@ def run(
 def _print_outcome(result: ReconstructionResult, output: Path) -> None:
     images, best = result.summary["images"], result.summary["reconstructions"][0]
     typer.echo(
-        f"{best['images']} of {images['total']} images, {best['points']} points, mean "
+        f"{len(images['registered'])} of {images['total']} images, {best['points']} points, mean "
         f"reprojection error {best['mean_reprojection_error_px'] or 0:.2f} px"
     )
+    for name, reason in images["unconfirmed"].items():
+        typer.echo(f"  not confirmed: {name}: {reason}")
     for name, reason in images["unregistered"].items():
         typer.echo(f"  not registered: {name}: {reason}")
     seconds = sum(stage["seconds"] for stage in result.summary["stages"].values())

@@ -43,11 +43,14 @@ def finished(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
     count = len(tracks.xyz)
     lengths = np.bincount(points, minlength=count)
     mean_errors = np.bincount(points, errors, minlength=count) / np.maximum(lengths, 1)
-    images = tuple(_registered(scene, int(i), factor, in_metres) for i in scene.registered_images())
+    images = tuple(
+        registered_image(scene, int(i), factor, in_metres) for i in scene.registered_images()
+    )
     return Reconstruction(images, tracks.xyz * factor, mean_errors, metric)
 
 
-def _registered(scene: Scene, index: int, factor: float, in_metres: bool) -> RegisteredImage:
+def registered_image(scene: Scene, index: int, factor: float, in_metres: bool) -> RegisteredImage:
+    """An image as the scene has it, in units that are ``factor`` times smaller than the scene's."""
     image, depth_map = scene.problem.images[index], scene.maps[index]
     depth = depth_map.depth * np.float32(factor)
     variance = (depth_map.log_std * depth) ** 2

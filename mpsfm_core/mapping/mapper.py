@@ -12,6 +12,7 @@ import numpy as np
 from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.attempts import Attempts
+from mpsfm_core.mapping.completion import with_unconfirmed
 from mpsfm_core.mapping.correspondences import Correspondences, correspondences
 from mpsfm_core.mapping.depth_consistency import check_image, conflicting_images
 from mpsfm_core.mapping.events import MappingEvents, Silent
@@ -46,10 +47,11 @@ def reconstruct(
     mapper = Mapper(problem, options or MapperOptions(), events or Silent())
     components = mapper.components()
     components.sort(key=lambda component: -len(component.images))
-    if components:
-        for component in components:
-            for image in component.images:
-                mapper.image_reasons.pop(image.name, None)
+    for component in components:
+        for image in component.images:
+            mapper.image_reasons.pop(image.name, None)
+    if components and mapper.options.place_unconfirmed:
+        components[0] = with_unconfirmed(components[0], problem, mapper.options)
     return MappingResult(
         tuple(components),
         MappingReport(

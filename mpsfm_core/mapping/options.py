@@ -196,6 +196,9 @@ class MappingOptions(Options):
     reprojection errors (ours)."""
     max_components: int = Field(10, ge=1)
     """Largest number of disconnected components."""
+    place_unconfirmed: bool = False
+    """At the end also place the images that are not in the largest component, in that, where their
+    matches fit best. The summary lists them; they see no points and change nothing else."""
     initialization: InitializationOptions = InitializationOptions()
     registration: RegistrationOptions = RegistrationOptions()
     triangulation: TriangulationOptions = TriangulationOptions()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -36,9 +37,11 @@ def fuse_depth_maps(
 ) -> tuple[Float64, UInt8]:
     """World points (n, 3) and their RGB colours (n, 3), from all maps.
 
-    Uncertain pixels are left out, and those that other images see through (free-space violation).
+    Uncertain pixels are left out, those that other images see through (free-space violation), and
+    images that nothing confirms.
     Above ``options.dense_max_points`` a random share of each map's pixels is taken.
     """
+    reconstruction = replace(reconstruction, images=reconstruction.confirmed_images)
     images = reconstruction.images
     limit = max(options.dense_max_relative_std, _WORSE * _median_relative_std(images))
     usable = [_certain(image, limit) for image in images]

@@ -23,18 +23,20 @@ def describe_images(
     component = {
         image.name: number
         for number, reconstruction in enumerate(mapping.reconstructions)
-        for image in reconstruction.images
+        for image in reconstruction.confirmed_images
     }
-    unregistered = {}
+    placed = {image.name for model in mapping.reconstructions[:1] for image in model.images}
+    reasons = {}
     for name in images.names:
         if name not in component:
-            unregistered[name] = mapping.report.image_reasons.get(name, "no reason recorded")
+            reasons[name] = mapping.report.image_reasons.get(name, "no reason recorded")
         elif component[name] > 0:
-            unregistered[name] = f"not connected to the others; in components/{component[name]}"
+            reasons[name] = f"not connected to the others; in components/{component[name]}"
     return {
         "total": len(images),
-        "registered": [name for name in images.names if component.get(name) == 0],
-        "unregistered": unregistered,
+        "registered": [name for name in images.names if name not in reasons],
+        "unconfirmed": {name: reason for name, reason in reasons.items() if name in placed},
+        "unregistered": {name: reason for name, reason in reasons.items() if name not in placed},
         "details": {
             image.name: {
                 "focal_length_from": image.focal_source,

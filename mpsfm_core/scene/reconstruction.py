@@ -17,6 +17,7 @@ class RegisteredImage:
     ``cam_from_world``. ``point_ids``: (n,) int64, for each keypoint of the problem's image its
     row in :attr:`Reconstruction.points` or -1. ``depth``: refined depth in world units with its
     variance, on the grid of the prior. ``scale``: world units per unit of the prior.
+    ``confirmed``: False if it lies where its matches fit best, though nothing confirms that.
     """
 
     index: int
@@ -27,6 +28,7 @@ class RegisteredImage:
     point_ids: Int64
     depth: DepthPrior
     scale: float
+    confirmed: bool = True
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,11 @@ class Reconstruction:
     points: Float64
     errors_px: Float64
     metric: MetricScale | None = None
+
+    @property
+    def confirmed_images(self) -> tuple[RegisteredImage, ...]:
+        """The images whose pose is more than a guess."""
+        return tuple(image for image in self.images if image.confirmed)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from mpsfm_core.optimize.depth_integration import RefinedDepth
 from mpsfm_core.scene.depth_map import DepthMap
 from mpsfm_core.scene.graph import CorrespondenceGraph
 from mpsfm_core.scene.kernels import max_triangulation_angles
+from mpsfm_core.scene.reconstruction import Reconstruction
 from mpsfm_core.scene.tracks import Tracks
 
 
@@ -151,6 +152,18 @@ class Scene:
             self.tracks.xyz, self.tracks.point_of[observations], centers
         )
         return angles
+
+    def resume(self, reconstruction: Reconstruction) -> None:
+        """Start from a finished reconstruction: its poses, focal lengths, scales and points."""
+        self.tracks.xyz = reconstruction.points.copy()
+        for image in reconstruction.images:
+            self.register(image.index, image.rotation, image.translation)
+            self.maps[image.index].set_scale(image.scale)
+            self.tracks.point_of[self.graph.keypoints_of(image.index)] = image.point_ids
+            focal = image.camera.fx, image.camera.fy
+            for other in np.flatnonzero(self.camera_of == self.camera_of[image.index]):
+                if tuple(self.intrinsics[other, :2]) != focal:
+                    self.set_focal(int(other), *focal)
 
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to undo everything that happens from now on."""

@@ -76,6 +76,16 @@ def test_a_wall_in_free_space_is_left_out(solved) -> None:
     assert ((z > 0.99) & (z < 1.01)).sum() < 0.1 * 400
 
 
+def test_images_that_nothing_confirms_are_left_out(solved) -> None:
+    first, second, third = solved.best.images
+    guessed = replace(third, confirmed=False, translation=third.translation + 5.0)
+    doubtful = replace(solved.best, images=(first, second, guessed))
+    without = replace(solved.best, images=(first, second))
+    points, _ = fuse_depth_maps(doubtful, solved.views.__getitem__, ResultOptions())
+    expected, _ = fuse_depth_maps(without, solved.views.__getitem__, ResultOptions())
+    np.testing.assert_array_equal(points, expected)
+
+
 @pytest.mark.parametrize("limit", [1, 500])
 def test_the_size_limit_holds_and_the_choice_is_repeatable(solved, limit: int) -> None:
     options = ResultOptions(dense_max_points=limit)

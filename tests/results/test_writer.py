@@ -24,7 +24,7 @@ from mpsfm_core.results.summary import (
     describe_reconstructions,
 )
 from mpsfm_core.results.writer import Component, write_failure, write_results
-from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction
+from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
 
 PINHOLE = pycolmap.Camera(
     model="PINHOLE", width=160, height=120, params=[140, 141, 80.5, 59], camera_id=1
@@ -182,6 +182,42 @@ def test_further_components_are_models_of_their_own(solved, tmp_path: Path) -> N
     assert {image.name for image in other.images.values()} == {"images/1.png", "images/2.png"}
 
 
+def test_images_that_nothing_confirms_are_in_the_model_without_points(
+    solved, tmp_path: Path
+) -> None:
+    images = photos_of(solved, tmp_path / "photos", PINHOLE)
+    problem, reconstruction = seen_through(solved, images)
+    *others, last = reconstruction.images
+    guessed = replace(last, confirmed=False, point_ids=np.full_like(last.point_ids, -1))
+    complete = replace(reconstruction, images=(*others, guessed))
+    component = Component.of(complete, Photos(images, problem))
+    options = ResultOptions(nerfstudio=True)
+    write_results(tmp_path / "out", [component], Photos(images, problem), options, dict)
+    model = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse"))
+    points = {image.name: image.num_points3D for image in model.images.values()}
+    assert points == {"images/0.png": 40, "images/1.png": 40, "images/2.png": 0}
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert len(frames) == 3
+
+
+def test_the_summary_tells_which_images_nothing_confirms(solved, tmp_path: Path) -> None:
+    images = photos_of(solved, tmp_path, PINHOLE)
+    _, reconstruction = seen_through(solved, images)
+    first, second, third = reconstruction.images
+    guessed = [replace(image, confirmed=False) for image in (second, third)]
+    best = replace(reconstruction, images=(first, *guessed))
+    other = replace(reconstruction, images=(third,))
+    report = MappingReport({"images/1.png": "its depth contradicts", "images/3.png": "no match"})
+    extraction = {"images": {name: {} for name in images.names}}
+    described = describe_images(images, extraction, MappingResult((best, other), report))
+    assert described["registered"] == ["images/0.png"]
+    assert described["unconfirmed"] == {
+        "images/1.png": "its depth contradicts",
+        "images/2.png": "not connected to the others; in components/1",
+    }
+    assert described["unregistered"] == {"images/3.png": "no match"}
+
+
 def test_a_failed_run_leaves_its_summary_and_the_earlier_model(solved, tmp_path: Path) -> None:
     output = write(solved, tmp_path, PINHOLE, ResultOptions())
     before = (output / "sparse" / "points3D.bin").read_bytes()
@@ -206,6 +242,7 @@ def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path)
     assert described["total"] == 4
     assert described["registered"] == ["images/0.png", "images/1.png", "images/2.png"]
     assert described["unregistered"] == {"images/3.png": "too few matches"}
+    assert described["unconfirmed"] == {}
     details = described["details"]["images/0.png"]
     assert details == {"focal_length_from": "intrinsics", "keypoints": 46}
     (pair,) = describe_pairs(extraction, mapping)["all"]

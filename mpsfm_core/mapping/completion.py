@@ -1,0 +1,98 @@
+"""Images that no group holds, placed where their matches fit best; nothing confirms that."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.mapping.correspondences import correspondences
+from mpsfm_core.mapping.finishing import registered_image
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.refinement import Refiner
+from mpsfm_core.mapping.registration import AbsolutePose, PoseSearch
+from mpsfm_core.mapping.triangulation import triangulate_image
+from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
+from mpsfm_core.scene.reconstruction import Reconstruction
+from mpsfm_core.scene.scene import Scene
+
+
+def with_unconfirmed(
+    reconstruction: Reconstruction, problem: MappingProblem, options: MapperOptions
+) -> Reconstruction:
+    """The reconstruction with all further images that have matches to it, however doubtful.
+
+    Again and again the image comes next whose pose is supported best, beside those placed before
+    as well. They see no points, and change neither the points nor the other poses.
+    """
+    completion = _Completion(reconstruction, problem, options)
+    placed = completion.place_all()
+    if not placed:
+        return reconstruction
+    in_metres = reconstruction.metric is not None and reconstruction.metric.trusted
+    further = [
+        replace(registered_image(completion.scene, image, 1.0, in_metres), confirmed=False)
+        for image in placed
+    ]
+    images = sorted([*reconstruction.images, *further], key=lambda image: image.index)
+    return replace(reconstruction, images=tuple(images))
+
+
+class _Completion:
+    """A scene like the finished one, to which images are added."""
+
+    def __init__(
+        self, reconstruction: Reconstruction, problem: MappingProblem, options: MapperOptions
+    ) -> None:
+        self.scene = Scene(problem, weigh_by_score=options.weigh_by_score)
+        self._options = options.registration
+        self._scores = pair_score_matrix(self.scene, options.registration.next_view)
+        self._triangulation = options.triangulation
+        self._refiner = Refiner(self.scene, options, self._scores)
+        self._search = PoseSearch(self.scene, self._refiner, options)
+        self._found: dict[int, tuple[list[int], AbsolutePose | None]] = {}
+        self._scale = float(np.median([image.scale for image in reconstruction.images]))
+        self.scene.resume(reconstruction)
+
+    def place_all(self) -> list[int]:
+        """Place one image after the other; those placed."""
+        placed: list[int] = []
+        while best := self._best():
+            self._place(*best)
+            placed.append(best[0])
+        return placed
+
+    def _place(self, image: int, pose: AbsolutePose) -> None:
+        """Register an image and scale its prior to the points that it may see."""
+        scene, depth_map = self.scene, self.scene.maps[image]
+        before = scene.snapshot()
+        scene.register(image, pose.rotation, pose.translation)
+        triangulate_image(scene, image, self._triangulation)
+        self._refiner.estimate_scale(image, self._found[image][0])
+        scale = depth_map.scale if depth_map.active else self._scale
+        scene.restore(before)
+        scene.register(image, pose.rotation, pose.translation)
+        depth_map.set_scale(scale)
+
+    def _best(self) -> tuple[int, AbsolutePose] | None:
+        """The image whose pose is supported best."""
+        candidates = ~self.scene.registered
+        best: tuple[int, AbsolutePose] | None = None
+        for image, reference in rank_next_images(
+            self.scene, self._scores, candidates, self._options
+        ):
+            pose = self._pose(image, reference)
+            if pose and (best is None or pose.support > best[1].support):
+                best = image, pose
+        return best
+
+    def _pose(self, image: int, reference: int) -> AbsolutePose | None:
+        """The best pose beside some images; found once as long as these are the same."""
+        scene, options = self.scene, self._options
+        references = local_bundle(scene, reference, options.num_neighbors, self._scores)
+        if image not in self._found or self._found[image][0] != references:
+            found = correspondences(scene, image, references, options)
+            poses = self._search.poses(image, found, attempt=0) if len(found.keypoints) else []
+            self._found[image] = references, max(poses, key=lambda p: p.support, default=None)
+        return self._found[image][1]
