@@ -24,6 +24,8 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
+Pose = tuple[Float64, Float64]
+"""Rotation (3, 3) and translation (3,) float64: ``y = R x + t``; of an image ``cam_from_world``."""
 
 UNIT_NORMAL_TOLERANCE = 1e-3
 """Allowed deviation of a normal's length from 1 (float16 storage keeps about 5e-4)."""
@@ -332,8 +334,7 @@ class MappingImage:
     theirs behind the sparse ones. ``depth`` has a variance; ``depth`` and ``normals`` share one
     grid. ``keypoint_std_px``: localisation noise. ``focal_known``: False when the focal length is
     a guess that bundle adjustment may refine; images of equal camera then share it.
-    ``known_pose``: rotation (3, 3) and translation (3,) float64, ``cam_from_world``, when the
-    user brought one.
+    ``known_pose``: ``cam_from_world``, when the user brought one.
     """
 
     name: str
@@ -343,7 +344,7 @@ class MappingImage:
     normals: NormalPrior
     keypoint_std_px: float = 1.0
     focal_known: bool = True
-    known_pose: tuple[Float64, Float64] | None = None
+    known_pose: Pose | None = None
 
     def __post_init__(self) -> None:
         _array(self, "keypoints", np.float64, (None, 2))

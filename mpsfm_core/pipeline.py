@@ -12,13 +12,12 @@ import pycolmap
 from threadpoolctl import threadpool_limits
 
 from mpsfm_core.config import Config, load_config
-from mpsfm_core.data import MappingProblem
+from mpsfm_core.data import MappingProblem, Pose
 from mpsfm_core.errors import InputError, ReconstructionError
-from mpsfm_core.evaluation.models import match_names, read_poses
-from mpsfm_core.evaluation.pose_auc import Pose
 from mpsfm_core.extraction.focal import estimate_focals
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import ImageSet, load_images
+from mpsfm_core.inputs.models import match_names, read_poses
 from mpsfm_core.mapping import mapper
 from mpsfm_core.options import dotted
 from mpsfm_core.registry import Registry, core_version
@@ -65,11 +64,11 @@ def reconstruct(
         images: folder of photos, subfolders included.
         output: folder to write (see :mod:`mpsfm_core.results.writer`), nothing is written if None.
         config: name of a shipped configuration, a YAML file, or a loaded one.
-        intrinsics: ``intrinsics.yaml`` or a COLMAP model; else EXIF, else what the depth provider
-            sees, else a default focal length.
+        intrinsics: ``intrinsics.yaml``, a COLMAP model or ``transforms.json``; else the cameras
+            of ``poses``, else EXIF, else what the depth provider sees, else a default focal length.
         image_list: text file with one image name a line.
-        poses: COLMAP model with known poses of some or all images; ``mapping.known_poses`` says
-            whether they are a start or stay.
+        poses: COLMAP model or ``transforms.json`` with known poses of some or all images;
+            ``mapping.known_poses`` says whether they are a start or stay.
         overrides: settings such as ``"runtime.workers=2"``; not with a loaded configuration.
         registry: the providers to choose from, by default those of all installed plugins.
 
@@ -108,7 +107,7 @@ class _Run:
         if self._output is not None:
             check_writable(self._output)
         with stage("inputs"):
-            images = load_images(folder, intrinsics, image_list, config.inputs)
+            images = load_images(folder, intrinsics, image_list, config.inputs, model=poses)
             known = {} if poses is None else _known_poses(poses, images)
         with stage("extraction"):
             images = estimate_focals(images, config, self._registry, self._stages)

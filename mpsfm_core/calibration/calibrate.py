@@ -25,10 +25,10 @@ from mpsfm_core.calibration.samples import DepthTruth
 from mpsfm_core.calibration.study import Data, Study, StudyOptions, study
 from mpsfm_core.config import Config
 from mpsfm_core.errors import InputError
-from mpsfm_core.evaluation.models import model_folder, read_model
 from mpsfm_core.extraction.backends import ActiveProvider, thread_count
 from mpsfm_core.extraction.workbench import Workbench
 from mpsfm_core.inputs.images import load_images
+from mpsfm_core.inputs.models import read_model
 from mpsfm_core.options import Backend
 from mpsfm_core.pipeline import reconstruct
 from mpsfm_core.registry import Registry, core_version
@@ -150,7 +150,7 @@ class _Run:
 
     def with_model(self, folder: Path) -> Calibrated:
         """Compare with the points of a COLMAP model."""
-        truth = model_truth(read_model(model_folder(folder)), self._bench.images)
+        truth = model_truth(read_model(folder), self._bench.images)
         if not truth:
             raise InputError(f"{folder}: the model has no points in any of the images")
         return self._finish(

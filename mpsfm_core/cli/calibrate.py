@@ -70,7 +70,7 @@ def calibrate(
     from mpsfm_core.cli.progress import showing_progress
     from mpsfm_core.config import load_config
     from mpsfm_core.errors import InputError
-    from mpsfm_core.evaluation.models import model_folder
+    from mpsfm_core.inputs.models import model_folder
     from mpsfm_core.registry import Registry
 
     calibrated_kind, alignments = _checked(kind, alignment or [])

@@ -9,8 +9,8 @@ import typer
 
 
 def evaluate(
-    model: Annotated[Path, typer.Argument(help="COLMAP model, or an output folder of ours.")],
-    truth: Annotated[Path, typer.Argument(metavar="GT", help="COLMAP model with true poses.")],
+    model: Annotated[Path, typer.Argument(help="COLMAP model, transforms.json or our output.")],
+    truth: Annotated[Path, typer.Argument(metavar="GT", help="The same with true poses.")],
     images: Annotated[
         str | None,
         typer.Option(metavar="A,B,C", help="Only these images; extensions may be left out."),

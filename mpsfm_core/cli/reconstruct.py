@@ -19,7 +19,10 @@ def reconstruct(
     config: ConfigName = "default",
     intrinsics: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="intrinsics.yaml or a COLMAP model; else EXIF."),
+        typer.Option(
+            metavar="FILE",
+            help="intrinsics.yaml, a COLMAP model or transforms.json; else --poses, else EXIF.",
+        ),
     ] = None,
     image_list: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Use these images only, one name a line.")
@@ -28,7 +31,8 @@ def reconstruct(
         Path | None,
         typer.Option(
             metavar="MODEL",
-            help="COLMAP model with known poses; --set mapping.known_poses=fixed keeps them.",
+            help="COLMAP model or transforms.json with known poses and cameras; "
+            "--set mapping.known_poses=fixed keeps the poses.",
         ),
     ] = None,
     overrides: Overrides = None,

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpsfm_core.data import Float64
-from mpsfm_core.evaluation.pose_auc import Pose
+from mpsfm_core.data import Float64, Pose
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
 
 

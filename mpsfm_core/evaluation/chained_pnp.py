@@ -13,8 +13,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-from mpsfm_core.data import Int64, MappingProblem, VerifiedPair
-from mpsfm_core.evaluation.pose_auc import Pose
+from mpsfm_core.data import Int64, MappingProblem, Pose, VerifiedPair
 from mpsfm_core.geometry import compose, invert
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.pose_hypotheses import estimate_absolute_pose

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 import pycolmap
 from threadpoolctl import threadpool_limits
 
-from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.data import MappingProblem, PinholeCamera, Pose
 from mpsfm_core.evaluation.chained_pnp import chained_poses
 from mpsfm_core.evaluation.peers import PEERS, run_peer
-from mpsfm_core.evaluation.pose_auc import Pose
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.problems import mapping_problem

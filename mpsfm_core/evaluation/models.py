@@ -1,79 +1,22 @@
-"""Reads COLMAP models and compares two of them by image name."""
+"""Compares the poses of two models by image name."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pycolmap
 
+from mpsfm_core.data import Pose
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.alignment import TrajectoryErrors, trajectory_errors
 from mpsfm_core.evaluation.pose_auc import (
     CONVENTIONS,
-    Pose,
     PoseConvention,
     pose_auc,
     pose_errors_deg,
 )
-
-
-def read_poses(folder: Path) -> dict[str, Pose]:
-    """``cam_from_world`` of the registered images of a COLMAP model, by image name.
-
-    Raises what :func:`model_folder` and :func:`read_model` raise.
-    """
-    return reconstruction_poses(read_model(model_folder(folder)))
-
-
-def model_folder(folder: Path) -> Path:
-    """Where a COLMAP model (binary or text) lies: here, in ``sparse`` or in ``sparse/0``.
-
-    Raises :class:`~mpsfm_core.errors.InputError` when there is none.
-    """
-    for candidate in (folder, folder / "sparse", folder / "sparse" / "0"):
-        if any((candidate / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):
-            return candidate
-    raise InputError(f"{folder}: no COLMAP model here (images.bin or images.txt)")
-
-
-def read_model(folder: Path) -> pycolmap.Reconstruction:
-    """A COLMAP model; raises :class:`~mpsfm_core.errors.InputError` when it cannot be read."""
-    try:
-        return pycolmap.Reconstruction(str(folder))
-    except (RuntimeError, ValueError, IndexError) as error:
-        raise InputError(f"{folder}: not a readable COLMAP model: {error}") from error
-
-
-def reconstruction_poses(model: pycolmap.Reconstruction) -> dict[str, Pose]:
-    """``cam_from_world`` of the registered images, by name, in the order of their names."""
-    poses = {}
-    for image in sorted(model.images.values(), key=lambda image: str(image.name)):
-        if image.has_pose:
-            matrix = np.asarray(image.cam_from_world().matrix(), dtype=np.float64)
-            poses[str(image.name)] = (matrix[:, :3], matrix[:, 3])
-    return poses
-
-
-def match_names(wanted: Iterable[str], available: Iterable[str]) -> dict[str, str]:
-    """Wanted name -> the one available name that equals it, with or without the extension.
-
-    Lists of images in the wild hold stems. Names that nothing or more than one thing answers to
-    are left out, and an available name that is itself wanted answers to no other.
-    """
-    asked, names = list(wanted), set(available)
-    by_stem: dict[str, list[str]] = {}
-    for name in names - set(asked):
-        by_stem.setdefault(_stem(name), []).append(name)
-    matched = {}
-    for name in asked:
-        loose = by_stem.get(name) or by_stem.get(_stem(name), [])
-        candidates = [name] if name in names else loose
-        if len(candidates) == 1:
-            matched[name] = candidates[0]
-    return matched
+from mpsfm_core.inputs.models import match_names
 
 
 def evaluate(
@@ -134,7 +77,3 @@ def _describe(errors: TrajectoryErrors | None) -> dict[str, float] | None:
         "rotation_max_deg": float(errors.rotations_deg.max()),
         "scale": errors.truth_from_estimate.scale,
     }
-
-
-def _stem(name: str) -> str:
-    return str(PurePosixPath(name).with_suffix(""))

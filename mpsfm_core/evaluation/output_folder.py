@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from mpsfm_core.data import Pose
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy, read_ply
 from mpsfm_core.evaluation.depth_accuracy import depth_accuracy, mean_accuracy
-from mpsfm_core.evaluation.pose_auc import Pose
 from mpsfm_core.evaluation.prior_quality import read_depth
 
 

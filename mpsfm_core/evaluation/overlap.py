@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera, UInt8
-from mpsfm_core.evaluation.pose_auc import Pose
+from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera, Pose, UInt8
 from mpsfm_core.geometry import (
     inside,
     pixel_centers,

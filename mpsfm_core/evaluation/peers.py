@@ -15,9 +15,8 @@ from types import MappingProxyType
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Float64, MappingProblem, VerifiedPair
-from mpsfm_core.evaluation.models import reconstruction_poses
-from mpsfm_core.evaluation.pose_auc import Pose
+from mpsfm_core.data import Float64, MappingProblem, Pose, VerifiedPair
+from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.results.colmap_model import pinhole
 
 Models = Mapping[int, pycolmap.Reconstruction]

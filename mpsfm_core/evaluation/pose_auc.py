@@ -13,11 +13,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from mpsfm_core.data import Float64
+from mpsfm_core.data import Float64, Pose
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
-
-Pose = tuple[Float64, Float64]
-"""``cam_from_world``: rotation (3, 3) and translation (3,), float64."""
 
 THRESHOLDS_DEG = (1, 5, 20)
 """The thresholds of the paper's tables."""

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.data import Float64
+from mpsfm_core.data import Float64, Pose
 from mpsfm_core.errors import InputError
-from mpsfm_core.evaluation.pose_auc import Pose, PoseConvention, pose_errors_deg
+from mpsfm_core.evaluation.pose_auc import PoseConvention, pose_errors_deg
 
 RUNS = "runs"
 """Folder of the records below a benchmark's output folder."""

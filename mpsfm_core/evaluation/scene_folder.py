@@ -22,10 +22,10 @@ from typing import Any
 
 import yaml
 
+from mpsfm_core.data import Pose
 from mpsfm_core.errors import InputError
-from mpsfm_core.evaluation.models import match_names, read_poses
-from mpsfm_core.evaluation.pose_auc import Pose
 from mpsfm_core.inputs.images import find_images
+from mpsfm_core.inputs.models import match_names, read_poses
 from mpsfm_core.yaml_text import write_yaml
 
 TESTSETS = "testsets.yaml"

@@ -18,9 +18,9 @@ import pycolmap
 from mpsfm_core.data import Bool, Float64, PinholeCamera, UInt8, View
 from mpsfm_core.errors import InputError, did_you_mean
 from mpsfm_core.inputs.header import Header, read_header
-from mpsfm_core.inputs.intrinsics import read_intrinsics
+from mpsfm_core.inputs.intrinsics import Intrinsics, read_intrinsics
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.inputs.pixels import EXTENSIONS, decode_rgb, read_bytes, read_mask
+from mpsfm_core.inputs.pixels import EXTENSIONS, decode_rgb, read_bytes, read_mask, upright_size
 from mpsfm_core.inputs.recent import Recent
 from mpsfm_core.inputs.undistortion import (
     Warp,
@@ -198,16 +198,20 @@ def load_images(
     intrinsics: Path | None = None,
     image_list: Path | None = None,
     options: InputOptions | None = None,
+    *,
+    model: Path | None = None,
 ) -> ImageSet:
     """Find the images of a folder (and its subfolders) and their cameras; decodes no pixels yet.
 
     Args:
         folder: images, in any of the formats of :data:`mpsfm_core.inputs.pixels.EXTENSIONS`.
-        intrinsics: ``intrinsics.yaml`` or a COLMAP model (folder or ``cameras.txt``), for the
-            images upright (after EXIF rotation). Without it focal lengths come from EXIF, else
-            from ``options.default_focal_ratio`` with a warning.
+        intrinsics: ``intrinsics.yaml``, a COLMAP model (folder or ``cameras.txt``) or
+            ``transforms.json``, for the images upright (after EXIF rotation). Without it focal
+            lengths come from EXIF, else from ``options.default_focal_ratio`` with a warning.
         image_list: text file with one name a line (``#`` starts a comment); its order is kept.
         options: see :class:`InputOptions`.
+        model: COLMAP model or ``transforms.json`` of some of the images. Without ``intrinsics``
+            they have its cameras, and the others too if it has just one of their size.
 
     Raises:
         InputError: no or only one image, unreadable files, names of the list that do not exist
@@ -223,21 +227,28 @@ def load_images(
         found = f"only one image, {names[0]!r}" if names else "no images"
         source = image_list or folder
         raise InputError(f"{source} has {found}: a reconstruction needs two or more")
-    known = read_intrinsics(intrinsics) if intrinsics is not None else None
+    known = _read_cameras(intrinsics, names)
+    partial = _read_cameras(model, names) if known is None else None
     with ThreadPoolExecutor(_READERS) as pool:
         files = list(pool.map(lambda name: _probe(folder / name), names))
     _raise_unreadable(files)
-    guesses = _CameraGuesses(options)
+    guesses = _CameraGuesses(options, partial.max_id if partial else 0)
     images = []
     for name, file in zip(names, files, strict=True):
         focal: FocalSource = "intrinsics"
         if known is not None:
             camera = known.camera(name, file.size)
+        elif (usual := partial and partial.usual_camera(name, file.size)) is not None:
+            camera = usual
         else:
             camera, focal = guesses.camera(file)
         images.append(_source_image(name, folder / name, file, camera, focal, options))
     _warn_of_default(images, options)
     return ImageSet(images, options)
+
+
+def _read_cameras(path: Path | None, names: Sequence[str]) -> Intrinsics | None:
+    return None if path is None else read_intrinsics(path).for_images(names)
 
 
 @dataclass(frozen=True)
@@ -251,10 +262,11 @@ class _File:
 
 
 class _CameraGuesses:
-    """Cameras from EXIF, else the default; equal ones share an id."""
+    """Cameras from EXIF, else the default; equal ones share an id above ``max_id``."""
 
-    def __init__(self, options: InputOptions) -> None:
+    def __init__(self, options: InputOptions, max_id: int) -> None:
         self._options = options
+        self._max_id = max_id
         self._ids: dict[tuple[tuple[int, int], float], int] = {}
 
     def camera(self, file: _File) -> tuple[pycolmap.Camera, FocalSource]:
@@ -263,7 +275,7 @@ class _CameraGuesses:
         focal = file.header.focal_px(*file.size)
         if focal is None:
             source, focal = "default", self._options.default_focal_ratio * max(file.size)
-        number = self._ids.setdefault((file.size, focal), len(self._ids) + 1)
+        number = self._ids.setdefault((file.size, focal), self._max_id + len(self._ids) + 1)
         return _simple_camera(file.size, focal, number), source
 
 
@@ -343,12 +355,7 @@ def _probe(path: Path) -> _File:
     try:
         data = read_bytes(path)
         header = read_header(data)
-        size = header.size
-        if size is None or min(size) == 0:
-            pixels = decode_rgb(data, header, path)
-            size = pixels.shape[1], pixels.shape[0]
-        elif header.orientation >= 5:
-            size = size[1], size[0]
+        size = upright_size(data, header, path)
     except InputError as error:
         return _File((0, 0), Header(None, 1, {}), "", str(error))
     return _File(size, header, hashlib.sha256(data).hexdigest())

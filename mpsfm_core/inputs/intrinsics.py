@@ -1,4 +1,4 @@
-"""Cameras from a file: ``intrinsics.yaml`` or a COLMAP model.
+"""Cameras from a file: ``intrinsics.yaml``, a COLMAP model or ``transforms.json``.
 
 ``intrinsics.yaml`` numbers its cameras::
 
@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import pycolmap
 import yaml
 
 from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.inputs.models import match_names, read_model
 
 _DEFAULT_MODELS = {3: "SIMPLE_PINHOLE", 4: "PINHOLE"}
 _KEYS = ("model", "params", "width", "height", "images")
@@ -53,13 +54,48 @@ class Intrinsics:
     source: Path
     entries: tuple[CameraEntry, ...]
 
+    def for_images(self, names: Iterable[str]) -> Intrinsics:
+        """With the given names where the file calls the images otherwise: see
+        :func:`~mpsfm_core.inputs.models.match_names`."""
+        listed = {image for entry in self.entries for image in entry.images or ()}
+        called: dict[str, set[str]] = {}
+        for name, found in match_names(names, listed).items():
+            called.setdefault(found, set()).add(name)
+        entries = (
+            entry
+            if entry.images is None
+            else replace(
+                entry, images=entry.images.union(*(called.get(i, ()) for i in entry.images))
+            )
+            for entry in self.entries
+        )
+        return Intrinsics(self.source, tuple(entries))
+
+    @property
+    def max_id(self) -> int:
+        """The largest number of a camera."""
+        return max((entry.camera_id for entry in self.entries), default=0)
+
+    def usual_camera(self, name: str, size: tuple[int, int]) -> pycolmap.Camera | None:
+        """The camera of an image if the file names it, else the only one of its size, if any.
+
+        Raises what :meth:`camera` raises.
+        """
+        if any(name in (entry.images or ()) for entry in self.entries):
+            return self.camera(name, size)
+        same = [entry for entry in self.entries if entry.size == size]
+        return self._checked(same[0], name, size) if len(same) == 1 else None
+
     def camera(self, name: str, size: tuple[int, int]) -> pycolmap.Camera:
         """The camera of an image of (width, height) pixels.
 
         Raises :class:`InputError` when the file has none for it, or when it is for images of
         another size.
         """
-        entry = self._entry(name)
+        return self._checked(self._entry(name), name, size)
+
+    def _checked(self, entry: CameraEntry, name: str, size: tuple[int, int]) -> pycolmap.Camera:
+        """The camera for an image that it fits."""
         width, height = entry.size or size
         camera = pycolmap.Camera(
             model=entry.model,
@@ -91,7 +127,7 @@ class Intrinsics:
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
-    """Read ``intrinsics.yaml``, a COLMAP model folder, or its ``cameras.txt``.
+    """Read ``intrinsics.yaml``, a COLMAP model, its ``cameras.txt``, or ``transforms.json``.
 
     Raises :class:`InputError` that names the file, the camera and what is wrong.
     """
@@ -99,6 +135,8 @@ def read_intrinsics(path: Path) -> Intrinsics:
         if path.is_dir():
             text = path / "cameras.txt"
             entries = _from_text(text) if text.is_file() else _from_model(path)
+        elif path.suffix == ".json":
+            entries = _from_model(path)
         elif path.suffix == ".txt":
             entries = _from_text(path)
         else:
@@ -173,10 +211,7 @@ def _lines(path: Path) -> list[str]:
 
 
 def _from_model(path: Path) -> tuple[CameraEntry, ...]:
-    try:
-        model = pycolmap.Reconstruction(path)
-    except (ValueError, RuntimeError) as error:
-        raise InputError(f"{path} is no COLMAP model: {error}") from error
+    model = read_model(path)
     names: dict[int, list[str]] = {}
     for image in model.images.values():
         names.setdefault(image.camera_id, []).append(image.name)

@@ -27,6 +27,18 @@ def read_bytes(path: Path) -> bytes:
         raise InputError(f"image {path} cannot be read: {error.strerror or error}") from error
 
 
+def upright_size(data: bytes, header: Header, path: Path) -> tuple[int, int]:
+    """(width, height) with the EXIF orientation applied; decodes only where the header lacks it.
+
+    Raises :class:`InputError` when the file is no image or damaged.
+    """
+    size = header.size
+    if size is None or min(size) == 0:
+        pixels = decode_rgb(data, header, path)
+        return pixels.shape[1], pixels.shape[0]
+    return (size[1], size[0]) if header.orientation >= 5 else size
+
+
 def decode_rgb(data: bytes, header: Header, path: Path) -> UInt8:
     """(H, W, 3) uint8 RGB with the EXIF orientation applied.
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Bool, Float64, PinholeCamera
+from mpsfm_core.data import Bool, Float64, PinholeCamera, Pose
 from mpsfm_core.geometry import compose, invert
 from mpsfm_core.mapping.correspondences import Correspondences
 from mpsfm_core.mapping.options import RegistrationOptions
@@ -28,9 +28,6 @@ MIN_CORRESPONDENCES = 4
 PNP_ERROR_FACTORS = (1.0, 4.0)
 """PnP is tried with the allowed error and with this multiple of it, for lifts that miss widely over
 a wide baseline (ours)."""
-
-Pose = tuple[Float64, Float64]
-"""Rotation (3, 3) and translation (3,)."""
 
 
 class Hypothesis(NamedTuple):
@@ -214,9 +211,7 @@ class Hypotheses:
         return (pose[0], pose[1]) if pose else None
 
 
-def _baseline(
-    scene: Scene, found: Correspondences, reference: int, relative: tuple[Float64, Float64]
-) -> float | None:
+def _baseline(scene: Scene, found: Correspondences, reference: int, relative: Pose) -> float | None:
     """Factor of a relative translation that brings triangulated points to the known depth."""
     mine = found.references == reference
     rotation, translation = relative

@@ -26,11 +26,11 @@ from typing import Any
 import pycolmap
 
 from mpsfm_core.data import UInt8
+from mpsfm_core.inputs.nerfstudio import can_hold, write_transforms
 from mpsfm_core.results.colmap_model import build_model, pinhole, point_colors, write_model
 from mpsfm_core.results.dense_cloud import fuse_depth_maps
 from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.folder import replacing
-from mpsfm_core.results.nerfstudio import can_hold, write_transforms
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos
 from mpsfm_core.results.ply import write_ply

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from pathlib import Path
 
@@ -120,6 +121,55 @@ def test_other_focal_lengths_where_they_were_the_default(folder: Path, intrinsic
     assert found.view(0).camera.fx == found[0].pinhole.fx == 35.0
     known = load_images(folder, intrinsics)
     assert known.with_focals({1: 70.0})[0] is known[0]
+
+
+def partial_model(path: Path, **focals: float) -> Path:
+    """A ``transforms.json`` of photos of 80 x 60 pixels."""
+    frames = [
+        {
+            "file_path": f"images/{stem}.jpg",
+            "transform_matrix": np.eye(4).tolist(),
+            **{"w": 80, "h": 60, "fl_x": focal},
+        }
+        for stem, focal in focals.items()
+    ]
+    path.write_text(json.dumps({"frames": frames}))
+    return path
+
+
+def test_a_model_gives_its_images_their_cameras(folder: Path, tmp_path: Path) -> None:
+    model = partial_model(tmp_path / "transforms.json", img2=70.0)
+    found = load_images(folder, model=model)
+    assert [image.camera.focal_length_x for image in found] == [70.0] * 3
+    assert {image.camera.camera_id for image in found} == {1}
+    assert all(image.focal_known for image in found)
+
+
+def test_which_camera_of_a_model_others_have_is_not_guessed(folder: Path, tmp_path: Path) -> None:
+    model = partial_model(tmp_path / "transforms.json", img2=70.0, img10=75.0)
+    found = {image.name: image for image in load_images(folder, model=model)}
+    side = found.pop("side/a.png")
+    assert {name: image.camera.focal_length_x for name, image in found.items()} == {
+        "img2.jpg": 70.0,
+        "img10.png": 75.0,
+    }
+    assert side.focal_source == "default"
+    assert side.camera.camera_id not in {image.camera.camera_id for image in found.values()}
+
+
+def test_given_intrinsics_go_before_those_of_a_model(
+    folder: Path, intrinsics: Path, tmp_path: Path
+) -> None:
+    model = partial_model(tmp_path / "transforms.json", img2=90.0)
+    found = load_images(folder, intrinsics, model=model)
+    assert {image.camera.focal_length_x for image in found} == {70.0}
+
+
+def test_a_model_of_photos_of_another_size_is_refused(folder: Path, tmp_path: Path) -> None:
+    model = partial_model(tmp_path / "transforms.json", img2=70.0)
+    model.write_text(model.read_text().replace('"w": 80', '"w": 160'))
+    with pytest.raises(InputError, match=r"img2\.jpg.*are for 160x60 pixels"):
+        load_images(folder, model=model)
 
 
 def test_rotated_photo_is_upright(tmp_path: Path, write_image, photo) -> None:

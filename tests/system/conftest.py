@@ -60,15 +60,12 @@ class PhotoScene:
         return self.folder / "gt"
 
     @property
+    def without_intrinsics(self) -> list[str]:
+        return ["reconstruct", str(self.images), "--config", str(self.config)]
+
+    @property
     def arguments(self) -> list[str]:
-        return [
-            "reconstruct",
-            str(self.images),
-            "--intrinsics",
-            str(self.intrinsics),
-            "--config",
-            str(self.config),
-        ]
+        return [*self.without_intrinsics, "--intrinsics", str(self.intrinsics)]
 
 
 @pytest.fixture(scope="session")

@@ -13,6 +13,7 @@ import pytest
 import mpsfm_core
 from mpsfm_core.errors import ReconstructionError
 from mpsfm_core.evaluation import evaluate, read_poses, reconstruction_poses
+from mpsfm_core.inputs.nerfstudio import write_transforms
 from mpsfm_core.scene.reconstruction import MappingReport, MappingResult
 
 
@@ -129,16 +130,40 @@ def test_the_seed_of_the_run_is_that_of_the_mapper(
     assert seeds == [11]
 
 
-def test_known_poses_stay_and_give_consistent_depth(photo_scene, mpsfm, tmp_path: Path) -> None:
+@pytest.mark.parametrize("file", [".", "transforms.json"], ids=["COLMAP", "nerfstudio"])
+def test_known_cameras_stay_and_give_consistent_depth(
+    photo_scene, mpsfm, tmp_path: Path, file: str
+) -> None:
     output = tmp_path / "out"
-    given = (*photo_scene.arguments, "--output", output, "--poses", photo_scene.truth)
-    ended = mpsfm(*given, "--set", "mapping.known_poses=fixed")
+    model = pycolmap.Reconstruction(str(photo_scene.truth))
+    names = {image.name: f"images/{image.name}" for image in model.images.values()}
+    model.write_text(str(tmp_path))
+    write_transforms(tmp_path / "transforms.json", model, names)
+    poses = ("--poses", tmp_path / file, "--set", "mapping.known_poses=fixed")
+    ended = mpsfm(*photo_scene.without_intrinsics, "--output", output, *poses)
     assert ended.code == 0, ended.err
+    (camera,) = pycolmap.Reconstruction(str(output / "sparse")).cameras.values()
+    assert camera.params.tolist() == [280, 280, 160, 120]
     truth, written = read_poses(photo_scene.truth), read_poses(output)
     assert written.keys() == truth.keys()
     for name, (rotation, translation) in truth.items():
         np.testing.assert_allclose(written[name][0], rotation, atol=1e-9)
         np.testing.assert_allclose(written[name][1], translation, atol=1e-9)
+
+
+def test_a_partial_model_is_continued_with_its_camera(photo_scene, mpsfm, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(str(photo_scene.truth))
+    for number in (4, 5):
+        model.deregister_frame(number)
+    model.write_text(str(tmp_path))
+    output = tmp_path / "out"
+    ended = mpsfm(*photo_scene.without_intrinsics, "--output", output, "--poses", tmp_path)
+    assert ended.code == 0, ended.err
+    report = evaluate(read_poses(output), read_poses(photo_scene.truth))
+    assert (report["registered"], len(read_poses(tmp_path))) == (5, 3)
+    assert report["auc"]["1"] > 80
+    (camera,) = pycolmap.Reconstruction(str(output / "sparse")).cameras.values()
+    assert camera.params.tolist() == [280, 280, 160, 120]
 
 
 def test_poses_of_other_images_are_wrong_input(photo_scene, mpsfm, tmp_path: Path) -> None:

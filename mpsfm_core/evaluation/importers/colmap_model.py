@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Float64, Int64
-from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.importers.frames import Frame, Observations, photo_size
+from mpsfm_core.inputs.models import read_model
 
 
 def model_frames(folder: Path, photo_of: Callable[[str], Path]) -> list[Frame]:
@@ -19,10 +19,7 @@ def model_frames(folder: Path, photo_of: Callable[[str], Path]) -> list[Frame]:
     ``photo_of``: where the photo of an image of the model is; images without one are left out.
     Photos of another size than the model's cameras have get cameras of their size.
     """
-    try:
-        model = pycolmap.Reconstruction(str(folder))
-    except (RuntimeError, ValueError, IndexError) as error:
-        raise InputError(f"{folder}: not a readable COLMAP model: {error}") from error
+    model = read_model(folder)
     frames = []
     for image in sorted(model.images.values(), key=lambda image: str(image.name)):
         photo = photo_of(str(image.name))

@@ -1,0 +1,201 @@
+"""``transforms.json``, the camera file of nerfstudio and of tools that share its format.
+
+It holds a camera and ``world_from_cam`` with OpenGL's axes (x right, y up, z backward) for each
+frame. Here it is read as a COLMAP model without points, and written from one; the world is the
+file's in both.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import posixpath
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import Float64
+from mpsfm_core.errors import InputError
+from mpsfm_core.inputs.header import read_header
+from mpsfm_core.inputs.pixels import EXTENSIONS, read_bytes, upright_size
+
+_COEFFICIENTS: Mapping[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+"""COLMAP models the format can hold, and its names for the parameters behind the intrinsics."""
+_CAMERA_KEYS = (
+    *("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x"),
+    *("k1", "k2", "k3", "k4", "p1", "p2"),
+)
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Between the axes of OpenGL's cameras and ours."""
+_ROTATION_TOLERANCE = 1e-3
+"""Of an entry of R^T R: files are written with few digits."""
+
+
+def can_hold(camera: pycolmap.Camera) -> bool:
+    """Whether the format has this camera model; others have to be undistorted first."""
+    return camera.model_name in _COEFFICIENTS
+
+
+def write_transforms(path: Path, model: pycolmap.Reconstruction, files: Mapping[str, str]) -> None:
+    """Write poses and cameras of a model.
+
+    ``files``: image name -> path of its picture, relative to the folder of ``path``.
+    """
+    frames = []
+    for image in sorted(model.images.values(), key=lambda image: str(image.name)):
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        frames.append(
+            {
+                "file_path": files[image.name],
+                "transform_matrix": (pose @ _FLIP).tolist(),
+                **_intrinsics(model.cameras[image.camera_id]),
+            }
+        )
+    path.write_text(json.dumps({"frames": frames}, indent=2), encoding="utf-8")
+
+
+def _intrinsics(camera: pycolmap.Camera) -> dict[str, Any]:
+    names = _COEFFICIENTS[camera.model_name]
+    matrix = camera.calibration_matrix()
+    fisheye = camera.model_name == "OPENCV_FISHEYE"
+    return {
+        "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": matrix[0, 0],
+        "fl_y": matrix[1, 1],
+        "cx": matrix[0, 2],
+        "cy": matrix[1, 2],
+        **dict(zip(names, camera.params[len(camera.params) - len(names) :].tolist(), strict=True)),
+    }
+
+
+def read_transforms(path: Path) -> pycolmap.Reconstruction:
+    """Cameras and poses of all frames; images are called as their ``file_path``.
+
+    Intrinsics stand in the frames or beside them. Where no size is given, that of the picture is
+    taken. Raises :class:`InputError` that names the frame and what is wrong.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from error
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{path}: no 'frames' in it, is it a transforms.json?")
+    shared = {key: value for key, value in data.items() if key != "frames"}
+    model = pycolmap.Reconstruction()
+    cameras: dict[str, int] = {}
+    names: set[str] = set()
+    for number, frame in enumerate(frames, start=1):
+        where = f"{path}, frame {number}"
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise InputError(f"{where}: has no 'file_path'")
+        name = posixpath.normpath(frame["file_path"].replace("\\", "/"))
+        where += f" ({name})"
+        if name in names:
+            raise InputError(f"{where}: the same picture has a frame before")
+        names.add(name)
+        camera = _camera(where, {**shared, **frame}, path.parent / name)
+        key = f"{camera.model_name} {camera.width} {camera.height} {camera.params.tolist()}"
+        if key not in cameras:
+            camera.camera_id = cameras[key] = len(cameras) + 1
+            model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=name, camera_id=cameras[key], image_id=number)
+        pose = np.linalg.inv(_world_from_camera(where, frame.get("transform_matrix")))
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    return model
+
+
+def _world_from_camera(where: str, value: object) -> Float64:
+    """(4, 4), of a camera with our axes."""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        raise InputError(f"{where}: 'transform_matrix' must be 4 rows of 4 numbers")
+    pose = np.eye(4)
+    pose[:3] = matrix[:3]
+    rotation = pose[:3, :3]
+    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise InputError(f"{where}: the left 3x3 block of 'transform_matrix' is no rotation")
+    left, _, right = np.linalg.svd(rotation)
+    pose[:3, :3] = left @ right
+    return pose @ _FLIP
+
+
+def _camera(where: str, values: Mapping[str, Any], picture: Path) -> pycolmap.Camera:
+    numbers = _numbers(where, values)
+    if "w" not in numbers or "h" not in numbers:
+        numbers.update(_picture_size(where, picture))
+    width, height = int(numbers["w"]), int(numbers["h"])
+    focal = numbers.get("fl_x")
+    if focal is None and 0 < numbers.get("camera_angle_x", 0) < math.pi:
+        focal = 0.5 * width / math.tan(0.5 * numbers["camera_angle_x"])
+    if focal is None or min(focal, width, height) <= 0:
+        raise InputError(f"{where}: no focal length ('fl_x', in pixels, or 'camera_angle_x')")
+    center = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
+    params = [focal, numbers.get("fl_y", focal), *center]
+    k1, k2, k3, k4, p1, p2 = (numbers.get(k, 0.0) for k in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = values.get("camera_model", "OPENCV")
+    if model == "OPENCV_FISHEYE" or values.get("is_fisheye"):
+        model, params = "OPENCV_FISHEYE", [*params, k1, k2, k3, k4]
+    elif model not in _COEFFICIENTS or k4:
+        what = f"camera model {model}" if model not in _COEFFICIENTS else "a fourth coefficient k4"
+        raise InputError(f"{where}: {what} is not supported; undistort the photos first")
+    elif k3:
+        model, params = "FULL_OPENCV", [*params, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
+    elif k1 or k2 or p1 or p2:
+        model, params = "OPENCV", [*params, k1, k2, p1, p2]
+    else:
+        model = "PINHOLE"
+    return pycolmap.Camera(model=model, width=width, height=height, params=params)
+
+
+def _numbers(where: str, values: Mapping[str, Any]) -> dict[str, float]:
+    """The values that describe a camera."""
+    names = [
+        "w",
+        "h",
+        "fl_x",
+        "fl_y",
+        "cx",
+        "cy",
+        "k1",
+        "k2",
+        "k3",
+        "k4",
+        "p1",
+        "p2",
+        "camera_angle_x",
+    ]
+    numbers = {name: values[name] for name in names if values.get(name) is not None}
+    for name, value in numbers.items():
+        if not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise InputError(f"{where}: {name!r} must be a number, it is {value!r}")
+    return numbers
+
+
+def _picture_size(where: str, picture: Path) -> dict[str, float]:
+    """Width and height of the picture; its extension may be missing."""
+    named = (picture.with_name(picture.name + ending) for ending in sorted(EXTENSIONS))
+    candidates = [picture, *named]
+    found = next((path for path in candidates if path.is_file()), None)
+    if found is None:
+        raise InputError(f"{where}: neither 'w' and 'h' nor the picture is there")
+    data = read_bytes(found)
+    width, height = upright_size(data, read_header(data), found)
+    return {"w": width, "h": height}
