@@ -33,19 +33,26 @@ WINDOWS, FRAMES = 6, 5
 
 @dataclass(frozen=True)
 class Comparison:
-    """One table: a scene, its buckets (None: all) and priors, and the features and matcher."""
+    """One table: a scene, its buckets (None: all) and priors, and the configuration.
+
+    ``configuration``: its name, and what it says beside the prior.
+    """
 
     scene: str
     buckets: tuple[str, ...] | None = None
     priors: tuple[str, ...] = PRIORS
-    matching: str = ""
+    configuration: tuple[str, str] = ("xfeat", "")
     low_parallax: bool = False
 
 
-ALIKED = """\
+ALIKED = (
+    "aliked",
+    """\
 features: {use: aliked, options: {max_keypoints: 1500}}
 matcher: {use: lightglue-aliked}
-"""
+""",
+)
+UNCONFIRMED = "unconfirmed", "mapping: {place_unconfirmed: true}\n"
 COMPARISONS: Mapping[str, Comparison] = {
     "rendered_kitchen": Comparison(
         "rendered_kitchen", priors=(*PRIORS, *(f"degraded-{seed}" for seed in range(1, SEEDS)))
@@ -54,6 +61,9 @@ COMPARISONS: Mapping[str, Comparison] = {
     "hololens_room-low_parallax": Comparison("hololens_room", low_parallax=True),
     "hololens_room-aliked": Comparison(
         "hololens_room", ("minimal", "leq5", "leq10"), ("sensor", "config"), ALIKED
+    ),
+    "hololens_room-unconfirmed": Comparison(
+        "hololens_room", ("minimal", "leq5", "leq10", "all"), ("sensor", "config"), UNCONFIRMED
     ),
 }
 """Name of the table -> what is in it."""
@@ -86,9 +96,10 @@ def main() -> int:
     for name in arguments.tables:
         comparison, output = COMPARISONS[name], arguments.output / name
         output.mkdir(parents=True, exist_ok=True)
-        config = output / ("aliked.yaml" if comparison.matching else "xfeat.yaml")
+        label, settings = comparison.configuration
+        config = output / f"{label}.yaml"
         text = CONFIG.format(model=shared / "models" / "fastdepth_224.onnx")
-        config.write_text(text + comparison.matching)
+        config.write_text(text + settings)
         scene = shared / "data" / comparison.scene
         plan = Plan(
             (_low_parallax(scene, output / name) if comparison.low_parallax else scene,),
