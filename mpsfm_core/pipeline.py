@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -29,6 +30,9 @@ from mpsfm_core.scene.reconstruction import MappingResult
 from mpsfm_core.stages import Stages
 
 PathLike = str | Path
+
+_log = logging.getLogger(__name__)
+_MENTIONED = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +203,12 @@ def _known_poses(model: Path, images: ImageSet) -> dict[str, Pose]:
     matched = match_names(images.names, poses)
     if not matched:
         raise InputError(f"{model}: has a pose of none of the images, names differ")
+    if len(matched) < 2:
+        raise InputError(f"{model}: has a pose of {next(iter(matched))} only, two are needed")
+    others = sorted(poses.keys() - set(matched.values()))
+    if others:
+        text = "%s: %d of its %d images are not among the photos: %s"
+        _log.warning(text, model, len(others), len(poses), ", ".join(others[:_MENTIONED]))
     return {name: poses[found] for name, found in matched.items()}
 
 

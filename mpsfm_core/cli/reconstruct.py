@@ -81,9 +81,20 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
         f"{len(images['registered'])} of {images['total']} images, {best['points']} points, mean "
         f"reprojection error {best['mean_reprojection_error_px'] or 0:.2f} px"
     )
+    typer.echo(f"  {_unit(best['metric_scale'])}")
     for name, reason in images["unconfirmed"].items():
         typer.echo(f"  not confirmed: {name}: {reason}")
     for name, reason in images["unregistered"].items():
         typer.echo(f"  not registered: {name}: {reason}")
     seconds = sum(stage["seconds"] for stage in result.summary["stages"].values())
     typer.echo(f"written to {output} in {seconds:.0f} s")
+
+
+def _unit(metric: dict[str, Any] | None) -> str:
+    """What one unit of the reconstruction is; ``metric``: the summary's ``metric_scale``."""
+    if metric is None:
+        return "unit unknown: no depth is metric"
+    by = f"by {metric['num_images']} depth maps, spread {metric['spread']:.0%}"
+    if metric["trusted"]:
+        return f"in metres, {by}"
+    return f"not in metres: one unit is about {metric['metres_per_unit']:.3g} m {by}"

@@ -51,8 +51,8 @@ class SourceImage:
     ``name``: path below the images folder, forward slashes. ``camera``: the original camera, for
     the upright image; ``camera_id`` is the number in the intrinsics file, or counts distinct
     cameras. ``pinhole``: the camera of the undistorted (maybe reduced) view. ``focal_known``:
-    False when the focal length is a guess, a provider's or the default. ``digest``: SHA-256 of the
-    file.
+    False when the focal length is a guess: EXIF's, a provider's or the default. ``digest``: SHA-256
+    of the file.
     """
 
     name: str
@@ -73,7 +73,7 @@ class SourceImage:
     @property
     def focal_known(self) -> bool:
         """Whether the focal length need not be refined."""
-        return self.focal_source in ("intrinsics", "exif")
+        return self.focal_source == "intrinsics"
 
     @property
     def original_size(self) -> tuple[int, int]:

@@ -20,7 +20,8 @@ def metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | None:
     ``keep_units``: the world is the user's; the scale is told, but not trusted to be applied.
     """
     images = [int(i) for i in scene.registered_images()]
-    log_scales = [np.log(scene.maps[i].scale) for i in images if scene.maps[i].prior.metric]
+    maps = [scene.maps[i] for i in images if scene.maps[i].active and scene.maps[i].prior.metric]
+    log_scales = [np.log(depth_map.scale) for depth_map in maps]
     if not log_scales:
         return None
     center = float(np.median(log_scales))

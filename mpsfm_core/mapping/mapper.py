@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -28,8 +29,14 @@ from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, r
 from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
 from mpsfm_core.scene.scene import Scene, Snapshot
 
+_log = logging.getLogger(__name__)
+
 JUMP_DEG = 3.0
 """A camera that turns more in a global refinement may have found a wrong minimum (ours)."""
+_WITHOUT = {
+    True: "the scale of their depth is unknown",
+    False: "starting without these poses, in another world",
+}
 CONTENDER_SHARE = 0.25
 """Of the number of images of the largest group, with which another contends for them (ours)."""
 
@@ -60,6 +67,20 @@ def reconstruct(
     )
 
 
+def _first_reasons(problem: MappingProblem) -> dict[str, str]:
+    """Why each image is not registered, before any was tried."""
+    matched = {index for pair in problem.pairs for index in (pair.image_a, pair.image_b)}
+    reasons = {}
+    for index, image in enumerate(problem.images):
+        reason = "nothing that it matches could be registered"
+        if not image.depth.valid.any():
+            reason = "its depth is valid nowhere"
+        elif index not in matched:
+            reason = "no verified match with another image"
+        reasons[image.name] = reason
+    return reasons
+
+
 class Mapper:
     """State of one run; :meth:`components` is the loop.
 
@@ -72,13 +93,12 @@ class Mapper:
         self.problem = problem
         self.options = options
         self.events = events
-        self.image_reasons = {
-            image.name: "no verified match with a registered image" for image in problem.images
-        }
+        self.image_reasons = _first_reasons(problem)
         self.pair_reasons: dict[str, str] = {}
         self.starts = Starts(options)
         self.models: list[Reconstruction] = []
         self.left: Bool = np.ones(len(problem.images), dtype=np.bool_)
+        self._known_poses_failed = False
         self.seconds: dict[str, float] = defaultdict(float)
         self.counts: dict[str, int] = defaultdict(int)
 
@@ -86,7 +106,9 @@ class Mapper:
         """Reconstruct one group of images after the other."""
         for _ in range(self.options.max_components):
             if not self.reconstruct_next():
-                break
+                return self.models
+        for image in np.flatnonzero(self.left):
+            self._reject(int(image), f"not tried: there are {self.options.max_components} groups")
         return self.models
 
     def reconstruct_next(self) -> bool:
@@ -101,9 +123,20 @@ class Mapper:
         if known or not self._outgrow():
             self._finish()
         self.left &= ~self.scene.registered
-        if self.scene.registered.sum() >= self.options.min_model_size:
-            self.models.append(finished(self.scene, keep_units=known))
+        self._keep(keep_units=known)
+        if fixed:
+            for image in np.flatnonzero(self.left):
+                self._reject(int(image), "has no known pose, and known poses are fixed")
         return not fixed
+
+    def _keep(self, *, keep_units: bool) -> None:
+        """Keep the group if it is large enough."""
+        images, least = self.scene.registered_images(), self.options.min_model_size
+        if len(images) >= least:
+            self.models.append(finished(self.scene, keep_units=keep_units))
+            return
+        for image in map(int, images):
+            self._reject(image, f"only {len(images)} images are connected, {least} are wanted")
 
     def _grow(self, available: Bool) -> None:
         """Register images until none of the available ones can be."""
@@ -145,21 +178,28 @@ class Mapper:
         self._last_size = (0, 0)
 
     def _start_from_known_poses(self) -> bool:
-        """Register all images that came with a pose; False when there are fewer than two."""
+        """Register all images that came with a pose; False when fewer than two hold together."""
         known = {
             index: image.known_pose
             for index, image in enumerate(self.problem.images)
             if image.known_pose is not None and self.left[index]
         }
-        if len(known) < 2:
+        if len(known) < 2 or self._known_poses_failed:
             return False
         scene, options = self.scene, self.options
         for image, pose in known.items():
             scene.register(image, *pose)
-        self.refiner.fixed[list(known)] = options.known_poses == "fixed"
+        fixed = options.known_poses == "fixed"
+        self.refiner.fixed[list(known)] = fixed
         complete_and_merge(scene, options.triangulation, create=True)
         self.refiner.scale_together(list(known))
+        if not len(scene.tracks):
+            _log.warning("images with known poses share no points: %s", _WITHOUT[fixed])
         self._refine_globally()
+        self._known_poses_failed = scene.registered.sum() < 2
+        if self._known_poses_failed:
+            self._begin()
+            return False
         for image in map(int, scene.registered_images()):
             self._accept(image)
         return True

@@ -135,7 +135,9 @@ class RefinementOptions(Options):
     global_growth: float = Field(0.3, gt=0)
     """Refine globally when images or points grew by this share (reference; COLMAP: 0.1)."""
     refine_focal: bool = True
-    """Refine focal lengths that are guesses, in global refinement."""
+    """Refine focal lengths that are guesses, in global refinement. Ours: EXIF is a guess. On
+    rendered_kitchen (all images, degraded depth) a focal length 3 % too long takes AUC@1/5/20 from
+    56/90/98 to 13/63/89, and refined it gives 58/91/98."""
     focal_min_images: int = Field(3, ge=2)
     """Registered images below which a guessed focal length stays (ours)."""
     focal_min_angle_deg: float = Field(2.0, ge=0)

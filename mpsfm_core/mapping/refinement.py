@@ -101,11 +101,12 @@ class Refiner:
     def rescale(self, images: list[int]) -> None:
         """Estimate all scales anew from points that rays determine.
 
-        Their mean stays, which holds the scale of the world, unless fixed poses hold it. Those of
-        metric priors stay near their median: a group of images that few matches hold to the rest
-        agrees with its own points at any scale.
+        Fixed poses hold the scale of the world; else those of metric priors stay near their median,
+        as a group of images that few matches hold to the rest agrees with its own points at any
+        scale, and their mean stays.
         """
         scene, tracks = self.scene, self.scene.tracks
+        images = [image for image in images if scene.maps[image].active]
         stable = scene.track_angles_deg() >= self.options.anchor_min_angle_deg
         log_scales = np.array([np.log(scene.maps[image].scale) for image in images])
         updated = log_scales.copy()
@@ -119,11 +120,11 @@ class Refiner:
             good[good] &= self._near(z[good] / (depth_map.scale * prior[good]))
             if good.sum() >= MIN_SCALE_POINTS:
                 updated[position] = np.median(np.log(z[good] / prior[good]))
-        if not self.fixed.any():
+        if len(images) and not self.fixed.any():
+            center = np.median(updated)
+            limits = [self._scale_slack(image) for image in images]
+            updated = center + np.clip(updated - center, np.negative(limits), limits)
             updated += log_scales.mean() - updated.mean()
-        center = np.median(updated)
-        limits = [self._scale_slack(image) for image in images]
-        updated = center + np.clip(updated - center, np.negative(limits), limits)
         for image, log_scale in zip(images, updated, strict=True):
             scene.maps[image].set_scale(float(np.exp(log_scale)))
 
@@ -137,9 +138,13 @@ class Refiner:
         return self.options.max_scale_deviations * std
 
     def integrate(self, images: list[int]) -> None:
-        """Refine the depth maps of some images against the current points."""
+        """Refine the depth maps of some images against the current points.
+
+        Those whose scale is unknown stay as they are.
+        """
         if not self.options.integrate:
             return
+        images = [image for image in images if self.scene.maps[image].active]
         covariances = self._covariances(images)
         with ThreadPoolExecutor(THREADS) as pool:
             list(pool.map(lambda image: self._integrate(image, *covariances), images))
@@ -209,11 +214,11 @@ class Refiner:
                 }
             ),
         )
+        if focal and not self._take_focal(images, result.intrinsics[camera_rows]):
+            return
         scene.rotations[images] = result.rotations
         scene.translations[images] = result.translations
         tracks.xyz[points] = result.points
-        if focal:
-            self._take_focal(images, result.intrinsics[camera_rows])
 
     def refine_locally(self, image: int) -> None:
         """Refine an image and its neighbours until little changes."""
@@ -289,16 +294,18 @@ class Refiner:
         wide = len(angles) > 0 and float(np.median(angles)) >= options.focal_min_angle_deg
         return wide and bool(self._guessed(images).any())
 
-    def _take_focal(self, images: Int64, intrinsics: Float64) -> None:
-        """Use refined focal lengths, also for images not yet registered, unless they ran away."""
+    def _take_focal(self, images: Int64, intrinsics: Float64) -> bool:
+        """Use refined focal lengths, also for images not yet registered; no if one ran away."""
         scene, limit = self.scene, self.options.focal_max_change
-        for row in np.flatnonzero(self._guessed(images)):
-            fx, fy = map(float, intrinsics[row, :2])
-            guess = scene.problem.images[images[row]].camera.fx
-            if not 1 / limit < fx / guess < limit:
-                continue
+        rows = np.flatnonzero(self._guessed(images))
+        guesses = np.array([scene.problem.images[image].camera.fx for image in images[rows]])
+        ratios = intrinsics[rows, 0] / guesses
+        if not ((1 / limit < ratios) & (ratios < limit)).all():
+            return False
+        for row in rows:
             for image in np.flatnonzero(scene.camera_of == scene.camera_of[images[row]]):
-                scene.set_focal(int(image), fx, fy)
+                scene.set_focal(int(image), *map(float, intrinsics[row, :2]))
+        return True
 
     def _measure_noise(self) -> None:
         """Measure how good the priors are; integrators that assumed much else are made anew."""

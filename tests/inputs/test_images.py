@@ -99,7 +99,7 @@ def test_focal_length_from_exif(tmp_path: Path, write_image) -> None:
     for name in ("a.jpg", "b.jpg"):
         write_image(name, tags={0xA405: 36})
     found = load_images(tmp_path / "images")
-    assert found[0].focal_source == "exif" and found[0].focal_known
+    assert found[0].focal_source == "exif" and not found[0].focal_known
     assert found[0].camera.focal_length == pytest.approx(36 / 43.2666 * 100, rel=1e-5)
     assert found[0].camera.camera_id == found[1].camera.camera_id == 1
 

@@ -155,50 +155,25 @@ def test_unmatched_images_are_reported() -> None:
     assert list(result.report.image_reasons) == ["view_2.png"]
 
 
+def test_reasons_say_what_kept_an_image_out() -> None:
+    poses = arc_poses(6, 14.0)
+    links = [(0, 1), (1, 2), (0, 2), (3, 4)]
+    problem = mapping_problem(room_scene(), CAMERA, poses, links=links)
+    last = problem.images[5]
+    nowhere = replace(last.depth, valid=np.zeros_like(last.depth.valid))
+    problem = replace(problem, images=(*problem.images[:5], replace(last, depth=nowhere)))
+    reasons = reconstruct(problem, MapperOptions(min_model_size=3)).report.image_reasons
+    assert reasons["view_3.png"] == "only 2 images are connected, 3 are wanted"
+    assert reasons["view_5.png"] == "its depth is valid nowhere"
+    reasons = reconstruct(problem, MapperOptions(max_components=1)).report.image_reasons
+    assert reasons["view_3.png"] == "not tried: there are 1 groups"
+
+
 def test_no_pairs_give_no_reconstruction() -> None:
     problem = mapping_problem(room_scene(), CAMERA, arc_poses(2, 14.0), links=[])
     result = reconstruct(problem)
     assert result.reconstructions == ()
     assert len(result.report.image_reasons) == 2
-
-
-def with_poses(problem: MappingProblem, poses: dict[int, Float64]) -> MappingProblem:
-    """The problem whose images bring some poses along."""
-    images = tuple(
-        replace(image, known_pose=(poses[i][:, :3].copy(), poses[i][:, 3].copy()))
-        if i in poses
-        else image
-        for i, image in enumerate(problem.images)
-    )
-    return MappingProblem(images, problem.pairs)
-
-
-def test_fixed_poses_stay_and_give_the_world_its_unit() -> None:
-    poses = arc_poses(4, 14.0)
-    problem = mapping_problem(room_scene(), CAMERA, poses, noise=Noise(scale=0.1))
-    doubled = {i: np.column_stack([p[:, :3], 2 * p[:, 3]]) for i, p in enumerate(poses)}
-    fixed = MapperOptions(known_poses="fixed")
-    reconstruction = reconstruct(with_poses(problem, doubled), fixed).reconstructions[0]
-    assert len(reconstruction.images) == 4
-    for image in reconstruction.images:
-        assert np.array_equal(image.rotation, doubled[image.index][:, :3])
-        assert np.array_equal(image.translation, doubled[image.index][:, 3])
-        rows, columns = image.depth.shape
-        truth = room_scene().render(CAMERA.resized(columns, rows), poses[image.index]).depth
-        ratio = np.median(image.depth.depth[image.depth.valid] / truth[image.depth.valid])
-        assert ratio == pytest.approx(2.0, rel=0.01)
-
-
-def test_a_partial_model_is_continued() -> None:
-    poses = arc_poses(5, 14.0)
-    problem = with_poses(
-        mapping_problem(room_scene(), CAMERA, poses), {i: poses[i] for i in (0, 1, 2)}
-    )
-    reconstruction = reconstruct(problem).reconstructions[0]
-    assert len(reconstruction.images) == 5
-    assert relative_errors_deg(reconstruction, poses).max() < 0.05
-    first = reconstruction.images[0]
-    assert np.allclose(first.translation, poses[0][:, 3], atol=0.02)
 
 
 def test_a_guessed_focal_length_is_refined_and_shared() -> None:

@@ -23,6 +23,7 @@ def output(photo_scene, mpsfm, tmp_path_factory: pytest.TempPathFactory) -> Path
     ended = mpsfm(*photo_scene.arguments, "--output", folder)
     assert ended.code == 0, ended.err
     assert "5 of 5 images" in ended.out
+    assert "in metres, by 5 depth maps, spread " in ended.out
     return folder
 
 
@@ -174,6 +175,32 @@ def test_poses_of_other_images_are_wrong_input(photo_scene, mpsfm, tmp_path: Pat
     ended = mpsfm(*photo_scene.arguments, "--output", tmp_path / "out", "--poses", tmp_path)
     assert ended.code == 2
     assert "none of the images" in ended.err
+
+
+def test_one_known_pose_is_wrong_input(photo_scene, mpsfm, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(str(photo_scene.truth))
+    for number in (2, 3, 4, 5):
+        model.deregister_frame(number)
+    model.write_text(str(tmp_path))
+    ended = mpsfm(*photo_scene.arguments, "--output", tmp_path / "out", "--poses", tmp_path)
+    assert ended.code == 2
+    assert "has a pose of 0.png only, two are needed" in ended.err
+
+
+def test_poses_without_a_photo_are_told(
+    photo_scene, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    listed = tmp_path / "list.txt"
+    listed.write_text("0.png\n1.png\n2.png\n")
+    result = mpsfm_core.reconstruct(
+        photo_scene.images,
+        config=photo_scene.config,
+        image_list=listed,
+        poses=photo_scene.truth,
+        overrides=["mapping.known_poses=fixed"],
+    )
+    assert result.model.num_images() == 3
+    assert "2 of its 5 images are not among the photos: 3.png, 4.png" in caplog.text
 
 
 @pytest.fixture(scope="module")
