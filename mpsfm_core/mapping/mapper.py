@@ -276,7 +276,25 @@ class Mapper:
             if self._displace():
                 continue
             if not ranked or not self.ladder.relax():
-                return False
+                return self._reconsider(available)
+
+    def _reconsider(self, available: Bool) -> bool:
+        """Register a contradicted image, if refining everything around it settles that.
+
+        Where a loop closes, drift contradicts a right pose. False when none can be.
+        """
+        scores = np.where(self.attempts.refuted, self.scores, 0)
+        options = self.options.registration
+        for image, reference in rank_next_images(self.scene, scores, available, options):
+            self.attempts.refuted[image] = False
+            reason = self._try_image(image, self._references(image, reference), everything=True)
+            if reason is None:
+                self.ladder.reset()
+                self._accept(image)
+                self.attempts.forget()
+                return True
+            self._reject(image, reason)
+        return False
 
     def _displace(self) -> bool:
         """Take out the image that most newcomers contradicted, if several did; each image once."""
@@ -317,8 +335,13 @@ class Mapper:
         attempts.remember(image, references, poses[0] if poses else None, searched=search)
         return poses
 
-    def _try_image(self, image: int, references: list[int]) -> str | None:
-        """Register an image with the first of its possible poses that holds; None, or why not."""
+    def _try_image(
+        self, image: int, references: list[int], *, everything: bool = False
+    ) -> str | None:
+        """Register an image with the first of its possible poses that holds; None, or why not.
+
+        ``everything``: refine all before the depth check, not just the image.
+        """
         scene = self.scene
         with self._timed("registration"):
             found = correspondences(scene, image, references, self.options.registration)
@@ -326,20 +349,25 @@ class Mapper:
             if most < self.ladder.min_inliers:
                 return f"{most} matches have a 3D point, {self.ladder.min_inliers} are needed"
             poses = self._find_poses(image, references, found)
-        snapshot = scene.snapshot()
+        snapshot, noise = scene.snapshot(), self.refiner.noise
         reason: str | None = "neither PnP nor an essential matrix gives a pose"
         for pose in poses:
-            reason = self.ladder.objection(pose) or self.attempts.refusal(image, pose)
+            reason = self.ladder.objection(pose)
+            if not everything:
+                reason = reason or self.attempts.refusal(image, pose)
             if reason is None:
-                reason = self._try_pose(image, pose, found)
+                reason = self._try_pose(image, pose, found, everything=everything)
                 if reason is None:
                     return None
                 self.attempts.refuse(image, pose, reason)
                 scene.restore(snapshot)
+                self.refiner.noise = noise
                 self.refiner.forget(image)
         return reason
 
-    def _try_pose(self, image: int, pose: AbsolutePose, found: Correspondences) -> str | None:
+    def _try_pose(
+        self, image: int, pose: AbsolutePose, found: Correspondences, *, everything: bool
+    ) -> str | None:
         """Grow and refine the scene around a new pose; None, or why it is rejected."""
         scene, options = self.scene, self.options
         with self._timed("local refinement"):
@@ -354,6 +382,10 @@ class Mapper:
                 return "too few points are left after refinement"
             self.refiner.estimate_scale(image, bundle[1:])
             self.refiner.integrate([image])
+        if everything:
+            with self._timed("global refinement"):
+                self.refiner.refine_locally(image)
+                self.refiner.refine_globally()
         reason = self._contradiction(image, self.options.consistency.max_violations)
         if reason:
             self._refute(image, pose, found)

@@ -113,6 +113,39 @@ def test_an_undone_jump_takes_its_focal_lengths_with_it(mapper: Mapper) -> None:
     np.testing.assert_allclose(mapper.scene.maps[2].depth, refined, rtol=1e-4)
 
 
+@pytest.mark.parametrize("drift", [(0.3, 0.0, 0.0), (0.0, 0.0, 0.3)])
+@pytest.mark.parametrize("settles", [True, False])
+def test_an_image_that_only_drift_contradicts_is_registered(
+    drift: tuple[float, float, float], settles: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The image in the middle of a chain sees both halves, and these have drifted apart."""
+    links = [(0, 1), (1, 2), (2, 3), (3, 4)]
+    problem = mapping_problem(
+        room_scene(), CAMERA, arc_poses(5, 14.0), links=links, declared_depth_std=0.02
+    )
+    mapper = Mapper(problem, MapperOptions(), Silent())
+    mapper.reconstruct_next()
+    scene = mapper.scene
+    true_centers = scene.centers()
+    take_out(mapper, 2)
+    mapper.attempts.forget()
+    observed = np.flatnonzero(scene.tracks.point_of >= 0)
+    far = scene.mask([3, 4])[scene.graph.image_of[observed]]
+    scene.tracks.xyz[np.unique(scene.tracks.point_of[observed[far]])] += drift
+    for image in (3, 4):
+        scene.translations[image] -= scene.rotations[image] @ drift
+    if not settles:
+        monkeypatch.setattr(mapper, "_reconsider", lambda available: False)
+    registered = mapper._register_next(np.ones(5, dtype=np.bool_))
+    assert registered == scene.registered[2] == settles
+    if settles:
+        steps = np.linalg.norm(np.diff(scene.centers(), axis=0), axis=1)
+        true_steps = np.linalg.norm(np.diff(true_centers, axis=0), axis=1)
+        assert steps == pytest.approx(true_steps, rel=0.02)
+    else:
+        assert "contradict the depth" in mapper.image_reasons["view_2.png"]
+
+
 class Limited(Mapper):
     """Registers ``limit`` images beside the first pair; more than four end as ``kept``."""
 
