@@ -34,7 +34,11 @@ from mpsfm_core.yaml_text import line_of, parse_yaml, write_yaml
 
 
 class RuntimeOptions(Options):
-    """Where and how a run computes; nothing here changes what it computes but the seed."""
+    """Where and how a run computes; nothing here changes what it computes but the seed.
+
+    That is up to rounding: networks may add in another order on other devices and thread counts.
+    What is cached stands, whatever made it.
+    """
 
     workers: int | None = Field(None, ge=1)
     """Images or pairs that the extraction works on at once, null for one a core."""

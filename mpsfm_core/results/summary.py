@@ -67,8 +67,7 @@ def describe_reconstructions(
     """Sizes and errors of each reconstruction, in the order of ``components/``, first ``sparse``.
 
     ``models``: the COLMAP model of each. ``mean_reprojection_error_px`` is over its points, in
-    pixels of the original photos; ``lifted_points`` are those that no model has, as only one
-    image sees them.
+    pixels of the original photos.
     """
     return [
         _describe(reconstruction, model)
@@ -88,7 +87,6 @@ def _describe(reconstruction: Reconstruction, model: pycolmap.Reconstruction) ->
         "observations": model.compute_num_observations(),
         "mean_track_length": model.compute_mean_track_length() if model.num_points3D() else 0.0,
         "mean_reprojection_error_px": _mean_error(model),
-        "lifted_points": len(reconstruction.points) - model.num_points3D(),
         "median_relative_depth_std": _median(relative_std),
         "metric_scale": _metric(reconstruction.metric),
     }

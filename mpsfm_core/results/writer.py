@@ -7,7 +7,7 @@
            components/N/    models of further, disconnected groups of images, largest first
            undistorted/     images/ and sparse/ for tools that want pinhole cameras; only written
                             when a photo is distorted
-           points.ply       all points of the first model, those that one image sees as well
+           points.ply       the points of the first model
            dense.ply        the refined depth maps, fused
            depth/NAME.npz   refined depth, variance and camera of each registered image
            transforms.json  for nerfstudio, if asked for

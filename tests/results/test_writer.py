@@ -249,7 +249,6 @@ def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path)
     assert pair == {**extraction["pairs"][0], "cannot_start": "no parallax"}
     (numbers,) = describe_reconstructions(mapping, [model])
     assert (numbers["images"], numbers["points"], numbers["observations"]) == (3, 40, 120)
-    assert numbers["lifted_points"] == 5
     assert numbers["mean_track_length"] == 3
     assert numbers["mean_reprojection_error_px"] == pytest.approx(0, abs=1e-6)
     assert 0.001 < numbers["median_relative_depth_std"] < 0.1
