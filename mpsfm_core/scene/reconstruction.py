@@ -16,7 +16,8 @@ class RegisteredImage:
     intrinsics, refined if that was asked for. ``rotation`` (3, 3), ``translation`` (3,) float64:
     ``cam_from_world``. ``point_ids``: (n,) int64, for each keypoint of the problem's image its
     row in :attr:`Reconstruction.points` or -1. ``depth``: refined depth in world units, on the
-    grid of the prior, with the relative variance that the prior declares. ``scale``: world units per unit of the prior.
+    grid of the prior, with the relative variance that the prior declares. ``scale``: world units
+    per unit of the prior.
     ``confirmed``: False if it lies where its matches fit best, though nothing confirms that.
     """
 
