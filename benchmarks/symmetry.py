@@ -23,6 +23,7 @@ from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_de
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.mapping.depth_consistency import check_image
 from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.group import Group
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.degraded_depth import DepthErrors
@@ -44,7 +45,8 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
     options = MapperOptions(known_poses="fixed")
     mapper = Mapper(MappingProblem(images, pairs), options, Silent())
     mapper.reconstruct_next()
-    scene, room, noise = mapper.scene, np.array(case.room), mapper.refiner.noise.multiplier
+    scene, noise = mapper.group.scene, mapper.group.refiner.noise.multiplier
+    room = np.array(case.room)
     everything = scene.registered.copy()
     for image in np.flatnonzero(room >= 0):
         for wrong in (False, True):
@@ -60,8 +62,8 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
             scene.translations[image], scene.registered = truth, everything
 
 
-class Observed(Mapper):
-    """The mapper, with a list of every check: whether the pose was wrong, and the verdict."""
+class Observed(Group):
+    """A group with a list of every check: whether the pose was wrong, and the verdict."""
 
     case: SymmetricProblem
     verdicts: list[tuple[bool, bool]]
@@ -88,15 +90,16 @@ class Observed(Mapper):
 def mapped(case: SymmetricProblem, enabled: bool) -> tuple[np.ndarray, int, list, float]:  # type: ignore[type-arg]
     """Pose errors of the largest component, its size, verdicts, and seconds."""
     options = MapperOptions.model_validate({"consistency": {"enabled": enabled}})
-    mapper = Observed(case.problem, options, Silent())
-    mapper.case, mapper.verdicts = case, []
+    verdicts: list[tuple[bool, bool]] = []
+    mapper = Mapper(case.problem, options, Silent())
+    mapper.group_type = type("Observed", (Observed,), {"case": case, "verdicts": verdicts})
     start = time.perf_counter()
     best = max(mapper.components(), key=lambda c: len(c.images), default=None)
     seconds = time.perf_counter() - start
     found = {i.name: (i.rotation, i.translation) for i in best.images} if best else {}
     views = zip(case.problem.images, case.poses, strict=True)
     truth = {image.name: (pose[:, :3], pose[:, 3]) for image, pose in views}
-    return pose_errors_deg(found, truth, CONVENTIONS["paper"]), len(found), mapper.verdicts, seconds
+    return pose_errors_deg(found, truth, CONVENTIONS["paper"]), len(found), verdicts, seconds
 
 
 def shares(verdicts: list[tuple[bool, bool]]) -> str:

@@ -1,42 +1,19 @@
-"""The incremental loop: first pair, next images, refinement, checks (paper, system overview)."""
+"""A reconstruction of all images: group after group, each from its own start."""
 
 from __future__ import annotations
 
-import logging
-import time
-from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 
-from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
-from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.mapping.attempts import Attempts
+from mpsfm_core.data import Bool, MappingProblem
 from mpsfm_core.mapping.completion import with_unconfirmed
-from mpsfm_core.mapping.correspondences import Correspondences, correspondences
-from mpsfm_core.mapping.depth_consistency import check_image, conflicting_images
 from mpsfm_core.mapping.events import MappingEvents, Silent
-from mpsfm_core.mapping.failure_ladder import FailureLadder
-from mpsfm_core.mapping.filtering import disconnected_images, filter_points, lost_images
 from mpsfm_core.mapping.finishing import finished
-from mpsfm_core.mapping.initialization import Start, Starts, place_first
+from mpsfm_core.mapping.group import Group
+from mpsfm_core.mapping.initialization import Starts
+from mpsfm_core.mapping.journal import Journal
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement import Refiner
-from mpsfm_core.mapping.registration import AbsolutePose, PoseSearch, rate_pose
-from mpsfm_core.mapping.triangulation import complete_and_merge, triangulate_image
-from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
-from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
-from mpsfm_core.scene.scene import Scene, Snapshot
+from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction
 
-_log = logging.getLogger(__name__)
-
-JUMP_DEG = 3.0
-"""A camera that turns more in a global refinement may have found a wrong minimum (ours)."""
-_WITHOUT = {
-    True: "the scale of their depth is unknown",
-    False: "starting without these poses, in another world",
-}
 CONTENDER_SHARE = 0.25
 """Of the number of images of the largest group, with which another contends for them (ours)."""
 
@@ -52,97 +29,63 @@ def reconstruct(
     result is the same bit for bit for the same problem, options and machine.
     """
     mapper = Mapper(problem, options or MapperOptions(), events or Silent())
-    components = mapper.components()
-    components.sort(key=lambda component: -len(component.images))
-    for component in components:
-        for image in component.images:
-            mapper.image_reasons.pop(image.name, None)
-    if components and mapper.options.place_unconfirmed:
-        components[0] = with_unconfirmed(components[0], problem, mapper.options)
-    return MappingResult(
-        tuple(components),
-        MappingReport(
-            mapper.image_reasons, mapper.pair_reasons, dict(mapper.seconds), dict(mapper.counts)
-        ),
-    )
-
-
-def _first_reasons(problem: MappingProblem) -> dict[str, str]:
-    """Why each image is not registered, before any was tried."""
-    matched = {index for pair in problem.pairs for index in (pair.image_a, pair.image_b)}
-    reasons = {}
-    for index, image in enumerate(problem.images):
-        reason = "nothing that it matches could be registered"
-        if not image.depth.valid.any():
-            reason = "its depth is valid nowhere"
-        elif index not in matched:
-            reason = "no verified match with another image"
-        reasons[image.name] = reason
-    return reasons
+    models = sorted(mapper.components(), key=lambda model: -len(model.images))
+    report = mapper.journal.report(models)
+    if models and mapper.options.place_unconfirmed:
+        models[0] = with_unconfirmed(models[0], problem, mapper.options)
+    return MappingResult(tuple(models), report)
 
 
 class Mapper:
-    """State of one run; :meth:`components` is the loop.
+    """One run. ``models`` are the groups, ``left`` the images in none, ``group`` the last one."""
 
-    ``scene`` is that of the last group; ``models`` are the groups, ``left`` the images in none.
-    """
+    group: Group
+    group_type: type[Group] = Group
 
     def __init__(
         self, problem: MappingProblem, options: MapperOptions, events: MappingEvents
     ) -> None:
         self.problem = problem
         self.options = options
-        self.events = events
-        self.image_reasons = _first_reasons(problem)
-        self.pair_reasons: dict[str, str] = {}
-        self.starts = Starts(options)
+        self.journal = Journal(problem, events)
         self.models: list[Reconstruction] = []
         self.left: Bool = np.ones(len(problem.images), dtype=np.bool_)
-        self._known_poses_failed = False
-        self.seconds: dict[str, float] = defaultdict(float)
-        self.counts: dict[str, int] = defaultdict(int)
+        self._starts = Starts(options)
+        self._poses_hold = sum(image.known_pose is not None for image in problem.images) >= 2
 
     def components(self) -> list[Reconstruction]:
         """Reconstruct one group of images after the other."""
-        for _ in range(self.options.max_components):
+        most = self.options.max_components
+        for _ in range(most):
             if not self.reconstruct_next():
                 return self.models
-        for image in np.flatnonzero(self.left):
-            self._reject(int(image), f"not tried: there are {self.options.max_components} groups")
+        self._reject(self.left, f"not tried: there are {most} groups")
         return self.models
 
     def reconstruct_next(self) -> bool:
         """Reconstruct a group among the images that are left; False when there is none."""
-        self._begin()
+        self.group = self._new_group()
         known = self._start_from_known_poses()
-        if not known and not self._initialize():
+        if not known and not self.group.start_from_pair(self.left):
             return False
         fixed = known and self.options.known_poses == "fixed"
         if not fixed:
-            self._grow(self.left)
+            self.group.grow(self.left)
         if known or not self._outgrow():
-            self._finish()
-        self.left &= ~self.scene.registered
-        self._keep(keep_units=known)
+            self.group.finish()
+        self._keep(in_users_world=known)
         if fixed:
-            for image in np.flatnonzero(self.left):
-                self._reject(int(image), "has no known pose, and known poses are fixed")
+            self._reject(self.left, "has no known pose, and known poses are fixed")
         return not fixed
 
-    def _keep(self, *, keep_units: bool) -> None:
-        """Keep the group if it is large enough."""
-        images, least = self.scene.registered_images(), self.options.min_model_size
-        if len(images) >= least:
-            self.models.append(finished(self.scene, keep_units=keep_units))
-            return
-        for image in map(int, images):
-            self._reject(image, f"only {len(images)} images are connected, {least} are wanted")
+    def _new_group(self) -> Group:
+        return self.group_type(self.problem, self.options, self._starts, self.journal)
 
-    def _grow(self, available: Bool) -> None:
-        """Register images until none of the available ones can be."""
-        while self._register_next(available):
-            if self._grown():
-                self._refine_globally()
+    def _start_from_known_poses(self) -> bool:
+        if self._poses_hold and not self.group.start_from_known_poses(self.left):
+            self._poses_hold = False
+            self.group = self._new_group()
+        return self._poses_hold
 
     def _outgrow(self) -> bool:
         """Take images of earlier groups, if this ends as the largest; those are dissolved then.
@@ -150,357 +93,35 @@ class Mapper:
         A bad start holds few images, and would keep them from a good one that comes after it.
         Images that came with a pose stay where they are. Whether it came so; it is finished then.
         """
+        group = self.group
         largest = max((len(model.images) for model in self.models), default=0)
-        if not largest or self.scene.registered.sum() < CONTENDER_SHARE * largest:
+        if not largest or group.size < CONTENDER_SHARE * largest:
             return False
-        before = self.scene.snapshot()
-        self.attempts.forget()
-        self._grow(np.array([image.known_pose is None for image in self.problem.images]))
-        if self.scene.registered.sum() > largest:
-            self._finish()
-        if self.scene.registered.sum() <= largest:
-            self.scene.restore(before)
+        before = group.scene.snapshot()
+        group.attempts.forget()
+        group.grow(np.array([image.known_pose is None for image in self.problem.images]))
+        if group.size > largest:
+            group.finish()
+        if group.size <= largest:
+            group.scene.restore(before)
             return False
         for model in list(self.models):
             images = [image.index for image in model.images]
-            if self.scene.registered[images].any():
+            if group.scene.registered[images].any():
                 self.models.remove(model)
                 self.left[images] = True
         return True
 
-    def _begin(self) -> None:
-        self.scene = Scene(self.problem, weigh_by_score=self.options.weigh_by_score)
-        self.scores = pair_score_matrix(self.scene, self.options.registration.next_view)
-        self.refiner = Refiner(self.scene, self.options, self.scores)
-        self.search = PoseSearch(self.scene, self.refiner, self.options)
-        self.ladder = FailureLadder(self.options.registration)
-        self.attempts = Attempts(self.scene.num_images, self.options.registration)
-        self._last_size = (0, 0)
+    def _keep(self, *, in_users_world: bool) -> None:
+        """Keep the group if it is large enough; its images are no longer left."""
+        scene, size, least = self.group.scene, self.group.size, self.options.min_model_size
+        self.left &= ~scene.registered
+        if size >= least:
+            self.models.append(finished(scene, keep_units=in_users_world))
+        else:
+            reason = f"only {size} images are connected, {least} are wanted"
+            self._reject(scene.registered, reason)
 
-    def _start_from_known_poses(self) -> bool:
-        """Register all images that came with a pose; False when fewer than two hold together."""
-        known = {
-            index: image.known_pose
-            for index, image in enumerate(self.problem.images)
-            if image.known_pose is not None and self.left[index]
-        }
-        if len(known) < 2 or self._known_poses_failed:
-            return False
-        scene, options = self.scene, self.options
-        for image, pose in known.items():
-            scene.register(image, *pose)
-        fixed = options.known_poses == "fixed"
-        self.refiner.fixed[list(known)] = fixed
-        complete_and_merge(scene, options.triangulation, create=True)
-        self.refiner.scale_together(list(known))
-        if not len(scene.tracks):
-            _log.warning("images with known poses share no points: %s", _WITHOUT[fixed])
-        self._refine_globally()
-        self._known_poses_failed = scene.registered.sum() < 2
-        if self._known_poses_failed:
-            self._begin()
-            return False
-        for image in map(int, scene.registered_images()):
-            self._accept(image)
-        return True
-
-    def _initialize(self) -> bool:
-        """Find the first pair among the images that are left and refine it."""
-        with self._timed("initialization"):
-            pairs = self.starts.ranked(self.search, self.left)
-        snapshot = self.scene.snapshot()
-        while True:
-            for pair in pairs:
-                with self._timed("initialization"):
-                    reason = self._try_pair(pair)
-                if reason is None:
-                    self.ladder.reset()
-                    self._accept(pair.image_a)
-                    self._accept(pair.image_b)
-                    self._refine_globally()
-                    return True
-                names = [self.problem.images[i].name for i in (pair.image_a, pair.image_b)]
-                self.pair_reasons[" ".join(names)] = reason
-                self.scene.restore(snapshot)
-            if not pairs or not self.ladder.relax():
-                return False
-
-    def _try_pair(self, pair: VerifiedPair) -> str | None:
-        """Start with a pair; None, or why it cannot be the first (remembered if that is final)."""
-        start = self.starts.find(self.search, pair)
-        if isinstance(start, str):
-            return start
-        reason = self.ladder.objection(start.pose)
-        if reason is None:
-            reason = self._grow_start(start)
-            if reason:
-                self.starts.refuse(pair, reason)
-        return reason
-
-    def _grow_start(self, start: Start) -> str | None:
-        """Refine the first two images and their points; None, or why they are rejected."""
-        a, b = start.reference, start.image
-        place_first(self.scene, a)
-        self.scene.register(b, start.pose.rotation, start.pose.translation)
-        triangulate_image(self.scene, b, self.options.triangulation)
-        self.refiner.estimate_scale(b, [])
-        self.refiner.adjust([a, b])
-        filter_points(self.scene, self.options.triangulation)
-        if lost_images(self.scene):
-            return "too few points are left after refinement"
-        self.refiner.estimate_scale(a, [])
-        self.refiner.estimate_scale(b, [])
-        self.refiner.integrate([a, b])
-        self.refiner.adjust([a, b])
-        filter_points(self.scene, self.options.triangulation)
-        if lost_images(self.scene):
-            return "too few points are left after refinement"
-        return self._contradiction(b, self.options.consistency.max_violations_initial)
-
-    def _register_next(self, available: Bool) -> bool:
-        """Register one more image, relaxing step by step; False when none can be."""
-        options = self.options.registration
-        while True:
-            trusted = np.where(self.attempts.refuted, 0, self.scores)
-            ranked = rank_next_images(self.scene, trusted, available, options)
-            for image, reference in ranked:
-                references = self._references(image, reference)
-                if self._known_to_fail(image, references):
-                    continue
-                reason = self._try_image(image, references)
-                if reason is None:
-                    self.ladder.reset()
-                    self._accept(image)
-                    return True
-                self._reject(image, reason)
-            if self._displace():
-                continue
-            if not ranked or not self.ladder.relax():
-                return self._reconsider(available)
-
-    def _reconsider(self, available: Bool) -> bool:
-        """Register a contradicted image, if refining everything around it settles that.
-
-        Where a loop closes, drift contradicts a right pose. False when none can be.
-        """
-        scores = np.where(self.attempts.refuted, self.scores, 0)
-        options = self.options.registration
-        for image, reference in rank_next_images(self.scene, scores, available, options):
-            self.attempts.refuted[image] = False
-            reason = self._try_image(image, self._references(image, reference), everything=True)
-            if reason is None:
-                self.ladder.reset()
-                self._accept(image)
-                self.attempts.forget()
-                return True
-            self._reject(image, reason)
-        return False
-
-    def _displace(self) -> bool:
-        """Take out the image that most newcomers contradicted, if several did; each image once."""
-        culprit = self.attempts.take_culprit(self.scene.registered)
-        if culprit is None or self.scene.registered.sum() <= 2:
-            return False
-        image, count = culprit
-        self._drop([image], f"{count} other images contradict its depth")
-        self.attempts.forget()
-        return True
-
-    def _references(self, image: int, reference: int) -> list[int]:
-        """The registered images by whose points an image is posed."""
-        options = self.options.registration
-        nearby = local_bundle(self.scene, reference, options.num_neighbors, self.scores)
-        return [other for other in nearby if not self.attempts.refuted[image, other]]
-
-    def _known_to_fail(self, image: int, references: list[int]) -> bool:
-        """Whether even the best pose of the same attempt before lacks support still."""
-        if not self.attempts.exhausted(image, references):
-            return False
-        best = self.attempts.best_pose(image)
-        return best is None or self.ladder.objection(best) is not None
-
-    def _find_poses(
-        self, image: int, references: list[int], found: Correspondences
-    ) -> list[AbsolutePose]:
-        """Possible poses of an image, best first, that of earlier attempts among them."""
-        options, attempts = self.options.registration, self.attempts
-        poses = []
-        known = attempts.best_pose(image)
-        if known:
-            poses.append(rate_pose(self.scene, found, known.hypothesis, options))
-        search = not attempts.exhausted(image, references)
-        if search:
-            poses += self.search.poses(image, found, attempt=attempts.searches(image))
-        poses.sort(key=lambda pose: -pose.support)
-        attempts.remember(image, references, poses[0] if poses else None, searched=search)
-        return poses
-
-    def _try_image(
-        self, image: int, references: list[int], *, everything: bool = False
-    ) -> str | None:
-        """Register an image with the first of its possible poses that holds; None, or why not.
-
-        ``everything``: refine all before the depth check, not just the image.
-        """
-        scene = self.scene
-        with self._timed("registration"):
-            found = correspondences(scene, image, references, self.options.registration)
-            most = int(np.bincount(found.references, minlength=1).max())
-            if most < self.ladder.min_inliers:
-                return f"{most} matches have a 3D point, {self.ladder.min_inliers} are needed"
-            poses = self._find_poses(image, references, found)
-        snapshot, noise = scene.snapshot(), self.refiner.noise
-        reason: str | None = "neither PnP nor an essential matrix gives a pose"
-        for pose in poses:
-            reason = self.ladder.objection(pose)
-            if not everything:
-                reason = reason or self.attempts.refusal(image, pose)
-            if reason is None:
-                reason = self._try_pose(image, pose, found, everything=everything)
-                if reason is None:
-                    return None
-                self.attempts.refuse(image, pose, reason)
-                scene.restore(snapshot)
-                self.refiner.noise = noise
-                self.refiner.forget(image)
-        return reason
-
-    def _try_pose(
-        self, image: int, pose: AbsolutePose, found: Correspondences, *, everything: bool
-    ) -> str | None:
-        """Grow and refine the scene around a new pose; None, or why it is rejected."""
-        scene, options = self.scene, self.options
-        with self._timed("local refinement"):
-            scene.register(image, pose.rotation, pose.translation)
-            triangulate_image(scene, image, options.triangulation)
-            bundle = local_bundle(scene, image, options.refinement.local_images - 1, self.scores)
-            self.refiner.estimate_scale(image, bundle[1:])
-            wide = options.refinement.first_reprojection_scale
-            self.refiner.adjust([image], local=True, reprojection_scale=wide)
-            filter_points(scene, options.triangulation)
-            if image in lost_images(scene):
-                return "too few points are left after refinement"
-            self.refiner.estimate_scale(image, bundle[1:])
-            self.refiner.integrate([image])
-        if everything:
-            with self._timed("global refinement"):
-                self.refiner.refine_locally(image)
-                self.refiner.refine_globally()
-        reason = self._contradiction(image, self.options.consistency.max_violations)
-        if reason:
-            self._refute(image, pose, found)
-            return reason
-        with self._timed("local refinement"):
-            self.refiner.refine_locally(image)
-        lost = lost_images(scene)
-        if image in lost:
-            return "too few points are left after refinement"
-        self._drop(lost, "lost its points when another image was refined")
-        return None
-
-    def _refute(self, image: int, pose: AbsolutePose, found: Correspondences) -> None:
-        """Try an image no more beside those whose matches led to a contradicted pose."""
-        for other in map(int, np.unique(found.references)):
-            alone = found.select(found.references == other)
-            options = self.options.registration
-            led = rate_pose(self.scene, alone, pose.hypothesis, options)
-            self.attempts.refuted[image, other] |= led.inlier_share >= options.min_inlier_share
-
-    def _contradiction(self, image: int, limit: float) -> str | None:
-        """Why the depth of an image contradicts that of another view, if it does."""
-        options = self.options.consistency
-        if not options.enabled:
-            return None
-        with self._timed("depth check"):
-            check = check_image(self.scene, image, options, self.refiner.std_factor)
-        if check.share <= limit:
-            return None
-        self.attempts.blame(check.other, image)
-        other = self.problem.images[check.other].name
-        return f"{check.share:.0%} of the pixels contradict the depth of {other}"
-
-    def _grown(self) -> bool:
-        """Whether images or points grew so much that everything should be refined."""
-        images, points = int(self.scene.registered.sum()), len(self.scene.tracks)
-        growth = 1 + self.options.refinement.global_growth
-        return images > growth * self._last_size[0] or points > growth * self._last_size[1]
-
-    def _refine_globally(self, *, final: bool = False) -> None:
-        before = self.scene.snapshot()
-        with self._timed("global refinement"):
-            self.refiner.refine_globally(final=final)
-            self.scene.tracks.compact()
-        self._undo_jump(before)
-        self.attempts.forget()
-        self._last_size = int(self.scene.registered.sum()), len(self.scene.tracks)
-        self._drop(lost_images(self.scene), "lost its points in global refinement")
-
-    def _undo_jump(self, before: Snapshot) -> None:
-        """Return to an earlier state if cameras jumped and their depth contradicts since then.
-
-        A robust loss has many minima; where few matches hold images, the next one may be wrong.
-        """
-        images = self.scene.registered_images()
-        turns = self.scene.rotations[images] @ before.rotations[images].transpose(0, 2, 1)
-        if not len(images) or rotation_angle_deg(turns).max() < JUMP_DEG:
-            return
-        limit = self.options.consistency.max_violations
-        after, worse = self.scene.snapshot(), len(self._conflicts(limit))
-        self.scene.restore(before)
-        if not worse > len(self._conflicts(limit)):
-            self.scene.restore(after)
-
-    def _conflicts(self, limit: float) -> list[tuple[int, float]]:
-        """Images to leave out so that no two views contradict each other, and how much each did."""
-        options = self.options.consistency
-        if not options.enabled:
-            return []
-        with self._timed("depth check"):
-            return conflicting_images(self.scene, limit, options, self.refiner.std_factor)
-
-    def _finish(self) -> None:
-        """Last refinements, and the depth check once more for every image."""
-        self._refine_globally()
-        consistency = self.options.consistency
-        if consistency.enabled and consistency.check_at_end:
-            self._check_all()
-        if self.options.refinement.final_robust:
-            self._refine_globally(final=True)
-
-    def _check_all(self) -> None:
-        """Deregister images until no two views contradict each other."""
-        conflicting = self._conflicts(self.options.consistency.max_violations_final)
-        for image, share in conflicting:
-            self._drop([image], f"at the end {share:.0%} of the pixels contradict another view's")
-        if conflicting:
-            apart = disconnected_images(self.scene)
-            self._drop(apart, "held to the rest only by an image that was dropped at the end")
-
-    def _accept(self, image: int) -> None:
-        self.attempts.scene_changed()
-        registered, total = int(self.scene.registered.sum()), len(self.problem.images)
-        self.events.image_registered(self.problem.images[image].name, registered, total)
-
-    def _reject(self, image: int, reason: str) -> None:
-        name = self.problem.images[image].name
-        self.image_reasons[name] = reason
-        self.events.image_rejected(name, reason)
-
-    def _drop(self, images: list[int], reason: str) -> None:
-        """Take images out that were registered before; the run goes on."""
-        for image in images:
-            if self.refiner.fixed[image]:
-                continue
-            self.scene.deregister(image)
-            self.refiner.forget(image)
-            self.attempts.scene_changed()
-            self._reject(image, reason)
-
-    @contextmanager
-    def _timed(self, step: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[step] += time.perf_counter() - start
-            self.counts[step] += 1
+    def _reject(self, images: Bool, reason: str) -> None:
+        for image in np.flatnonzero(images):
+            self.journal.rejected(int(image), reason)

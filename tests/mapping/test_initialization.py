@@ -9,11 +9,14 @@ import pytest
 
 from mpsfm_core.data import Bool, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
-from mpsfm_core.mapping.events import Silent
-from mpsfm_core.mapping.initialization import rank_initial_pairs
-from mpsfm_core.mapping.mapper import Mapper, reconstruct
+from mpsfm_core.mapping.initialization import Starts, rank_initial_pairs
+from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.refinement import Refiner
+from mpsfm_core.mapping.registration import PoseSearch
+from mpsfm_core.mapping.view_selection import pair_score_matrix
 from mpsfm_core.scene.reconstruction import MappingResult
+from mpsfm_core.scene.scene import Scene
 from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 
@@ -92,9 +95,11 @@ def test_the_best_supported_of_the_largest_pairs_comes_first() -> None:
             count = len(matches)
         pairs[k] = replace(pair, matches=matches[:count], scores=pair.scores[:count])
     doubtful = pairs[largest]
-    mapper = Mapper(replace(problem, pairs=tuple(pairs)), MapperOptions(), Silent())
-    mapper._begin()
-    assert rank_initial_pairs(mapper.scene)[0] is doubtful
-    assert mapper.starts.ranked(mapper.search, mapper.left)[-1] is doubtful
+    options, starts = MapperOptions(), Starts(MapperOptions())
+    scene = Scene(replace(problem, pairs=tuple(pairs)))
+    refiner = Refiner(scene, options, pair_score_matrix(scene, "match-scores"))
+    search = PoseSearch(scene, refiner, options)
+    assert rank_initial_pairs(scene)[0] is doubtful
+    assert starts.ranked(search, np.ones(3, dtype=np.bool_))[-1] is doubtful
     left = np.isin(np.arange(3), [doubtful.image_a, doubtful.image_b])
-    assert mapper.starts.ranked(mapper.search, left) == [doubtful]
+    assert starts.ranked(search, left) == [doubtful]

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from mpsfm_core.data import Bool, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.group import Group
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.registration import AbsolutePose
@@ -21,96 +22,96 @@ CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
 @pytest.fixture
-def mapper() -> Mapper:
+def group() -> Group:
     """All of an exact scene is registered."""
     mapper = Mapper(
         mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0)), MapperOptions(), Silent()
     )
     mapper.reconstruct_next()
-    assert mapper.scene.registered.all()
-    return mapper
+    assert mapper.group.scene.registered.all()
+    return mapper.group
 
 
-def turned(mapper: Mapper, image: int, degrees: float) -> None:
+def turned(group: Group, image: int, degrees: float) -> None:
     """Turn a camera about its own centre."""
     turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
-    mapper.scene.rotations[image] = turn @ mapper.scene.rotations[image]
-    mapper.scene.translations[image] = turn @ mapper.scene.translations[image]
+    group.scene.rotations[image] = turn @ group.scene.rotations[image]
+    group.scene.translations[image] = turn @ group.scene.translations[image]
 
 
-def take_out(mapper: Mapper, *images: int) -> None:
+def take_out(group: Group, *images: int) -> None:
     for image in images:
-        mapper.scene.deregister(image)
+        group.scene.deregister(image)
 
 
-def test_the_view_that_several_newcomers_contradict_goes_once(mapper: Mapper) -> None:
-    take_out(mapper, 0, 4)
-    mapper.attempts.blame(3, 0)
-    mapper.attempts.blame(3, 4)
-    mapper.attempts.blame(1, 4)
-    assert mapper._displace()
-    assert np.flatnonzero(~mapper.scene.registered).tolist() == [0, 3, 4]
-    assert "2 other images contradict" in mapper.image_reasons["view_3.png"]
-    while mapper._register_next(np.ones(5, dtype=np.bool_)):
+def test_the_view_that_several_newcomers_contradict_goes_once(group: Group) -> None:
+    take_out(group, 0, 4)
+    group.attempts.blame(3, 0)
+    group.attempts.blame(3, 4)
+    group.attempts.blame(1, 4)
+    assert group._displace()
+    assert np.flatnonzero(~group.scene.registered).tolist() == [0, 3, 4]
+    assert "2 other images contradict" in group.journal.image_reasons["view_3.png"]
+    while group._register_next(np.ones(5, dtype=np.bool_)):
         pass
-    assert mapper.scene.registered[3], "it may come back"
-    take_out(mapper, 0, 4)
-    mapper.attempts.blame(3, 0)
-    mapper.attempts.blame(3, 4)
-    assert not mapper._displace(), "but goes only once"
+    assert group.scene.registered[3], "it may come back"
+    take_out(group, 0, 4)
+    group.attempts.blame(3, 0)
+    group.attempts.blame(3, 4)
+    assert not group._displace(), "but goes only once"
 
 
-def test_one_newcomer_is_not_believed(mapper: Mapper) -> None:
-    take_out(mapper, 4)
-    mapper.attempts.blame(3, 4)
-    assert not mapper._displace()
-    assert mapper.scene.registered[3]
+def test_one_newcomer_is_not_believed(group: Group) -> None:
+    take_out(group, 4)
+    group.attempts.blame(3, 4)
+    assert not group._displace()
+    assert group.scene.registered[3]
 
 
-def test_newcomers_that_were_registered_since_blame_no_more(mapper: Mapper) -> None:
-    mapper.attempts.blame(3, 0)
-    mapper.attempts.blame(3, 4)
-    assert not mapper._displace()
+def test_newcomers_that_were_registered_since_blame_no_more(group: Group) -> None:
+    group.attempts.blame(3, 0)
+    group.attempts.blame(3, 4)
+    assert not group._displace()
 
 
-def test_a_refused_pose_is_tried_again_only_in_another_scene(mapper: Mapper) -> None:
+def test_a_refused_pose_is_tried_again_only_in_another_scene(group: Group) -> None:
     pose = AbsolutePose(np.eye(3), np.zeros(3), "PnP", 1.0, 30, 1.0)
-    mapper.attempts.refuse(2, pose, "it floats")
-    assert mapper.attempts.refusal(2, replace(pose, support=2.0)) == "it floats"
-    assert mapper.attempts.refusal(2, replace(pose, translation=np.ones(3))) is None
-    assert mapper.attempts.refusal(1, pose) is None
-    mapper._drop([4], "to change the scene")
-    assert mapper.attempts.refusal(2, pose) is None
+    group.attempts.refuse(2, pose, "it floats")
+    assert group.attempts.refusal(2, replace(pose, support=2.0)) == "it floats"
+    assert group.attempts.refusal(2, replace(pose, translation=np.ones(3))) is None
+    assert group.attempts.refusal(1, pose) is None
+    group._drop([4], "to change the scene")
+    assert group.attempts.refusal(2, pose) is None
 
 
-def test_a_jump_that_contradicts_is_undone(mapper: Mapper) -> None:
-    before = mapper.scene.snapshot()
-    turned(mapper, 2, 25.0)
-    mapper._undo_jump(before)
-    assert np.array_equal(mapper.scene.rotations, before.rotations)
+def test_a_jump_that_contradicts_is_undone(group: Group) -> None:
+    before = group.scene.snapshot()
+    turned(group, 2, 25.0)
+    group._undo_jump(before)
+    assert np.array_equal(group.scene.rotations, before.rotations)
 
 
-def test_a_jump_to_a_better_state_stays(mapper: Mapper) -> None:
-    right = mapper.scene.rotations.copy()
-    turned(mapper, 2, 25.0)
-    before = mapper.scene.snapshot()
-    turned(mapper, 2, -25.0)
-    mapper._undo_jump(before)
-    assert rotation_angle_deg(mapper.scene.rotations @ right.transpose(0, 2, 1)).max() < 1e-6
+def test_a_jump_to_a_better_state_stays(group: Group) -> None:
+    right = group.scene.rotations.copy()
+    turned(group, 2, 25.0)
+    before = group.scene.snapshot()
+    turned(group, 2, -25.0)
+    group._undo_jump(before)
+    assert rotation_angle_deg(group.scene.rotations @ right.transpose(0, 2, 1)).max() < 1e-6
 
 
-def test_an_undone_jump_takes_its_focal_lengths_with_it(mapper: Mapper) -> None:
-    before = mapper.scene.snapshot()
-    mapper.refiner.integrate([2])
-    refined = mapper.scene.maps[2].depth.copy()
-    turned(mapper, 2, 25.0)
-    mapper.scene.set_focal(2, 300.0, 300.0)
-    mapper.refiner.integrate([2])
-    mapper._undo_jump(before)
-    assert mapper.scene.intrinsics[2].tolist() == [260.0, 260.0, 160.0, 120.0]
-    assert mapper.scene.maps[2].camera == CAMERA.resized(*mapper.scene.maps[2].camera.size)
-    mapper.refiner.integrate([2])
-    np.testing.assert_allclose(mapper.scene.maps[2].depth, refined, rtol=1e-4)
+def test_an_undone_jump_takes_its_focal_lengths_with_it(group: Group) -> None:
+    before = group.scene.snapshot()
+    group.refiner.integrate([2])
+    refined = group.scene.maps[2].depth.copy()
+    turned(group, 2, 25.0)
+    group.scene.set_focal(2, 300.0, 300.0)
+    group.refiner.integrate([2])
+    group._undo_jump(before)
+    assert group.scene.intrinsics[2].tolist() == [260.0, 260.0, 160.0, 120.0]
+    assert group.scene.maps[2].camera == CAMERA.resized(*group.scene.maps[2].camera.size)
+    group.refiner.integrate([2])
+    np.testing.assert_allclose(group.scene.maps[2].depth, refined, rtol=1e-4)
 
 
 @pytest.mark.parametrize("drift", [(0.3, 0.0, 0.0), (0.0, 0.0, 0.3)])
@@ -125,28 +126,29 @@ def test_an_image_that_only_drift_contradicts_is_registered(
     )
     mapper = Mapper(problem, MapperOptions(), Silent())
     mapper.reconstruct_next()
-    scene = mapper.scene
+    group = mapper.group
+    scene = group.scene
     true_centers = scene.centers()
-    take_out(mapper, 2)
-    mapper.attempts.forget()
+    take_out(group, 2)
+    group.attempts.forget()
     observed = np.flatnonzero(scene.tracks.point_of >= 0)
     far = scene.mask([3, 4])[scene.graph.image_of[observed]]
     scene.tracks.xyz[np.unique(scene.tracks.point_of[observed[far]])] += drift
     for image in (3, 4):
         scene.translations[image] -= scene.rotations[image] @ drift
     if not settles:
-        monkeypatch.setattr(mapper, "_reconsider", lambda available: False)
-    registered = mapper._register_next(np.ones(5, dtype=np.bool_))
+        monkeypatch.setattr(group, "_reconsider", lambda available: False)
+    registered = group._register_next(np.ones(5, dtype=np.bool_))
     assert registered == scene.registered[2] == settles
     if settles:
         steps = np.linalg.norm(np.diff(scene.centers(), axis=0), axis=1)
         true_steps = np.linalg.norm(np.diff(true_centers, axis=0), axis=1)
         assert steps == pytest.approx(true_steps, rel=0.02)
     else:
-        assert "contradict the depth" in mapper.image_reasons["view_2.png"]
+        assert "contradict the depth" in group.journal.image_reasons["view_2.png"]
 
 
-class Limited(Mapper):
+class Limited(Group):
     """Registers ``limit`` images beside the first pair; more than four end as ``kept``."""
 
     limit = 0
@@ -166,14 +168,16 @@ class Limited(Mapper):
     ("second_limit", "kept", "sizes"), [(9, 9, [6]), (9, 5, [5]), (9, 4, [4, 2]), (2, 9, [4, 2])]
 )
 def test_the_group_that_ends_larger_gets_the_images(
-    second_limit: int, kept: int, sizes: list[int]
+    second_limit: int, kept: int, sizes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem = mapping_problem(room_scene(), CAMERA, arc_poses(6, 14.0))
-    mapper = Limited(problem, MapperOptions(), Silent())
-    mapper.limit, mapper.kept = 2, kept
+    mapper = Mapper(problem, MapperOptions(), Silent())
+    mapper.group_type = Limited
+    monkeypatch.setattr(Limited, "kept", kept)
+    monkeypatch.setattr(Limited, "limit", 2)
     mapper.reconstruct_next()
     assert [len(model.images) for model in mapper.models] == [4]
-    mapper.limit = second_limit
+    monkeypatch.setattr(Limited, "limit", second_limit)
     mapper.reconstruct_next()
     assert [len(model.images) for model in mapper.models] == sizes
     images = [image.index for model in mapper.models for image in model.images]

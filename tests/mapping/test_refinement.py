@@ -10,6 +10,7 @@ import pytest
 from mpsfm_core.data import Float64, PinholeCamera
 from mpsfm_core.mapping.depth_noise import DepthNoise
 from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.group import Group
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.problems import mapping_problem
@@ -18,21 +19,22 @@ from mpsfm_core.testing.scenes import arc_poses, room_scene
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
-def mapped(declared_depth_std: float) -> Mapper:
-    """A mapper that has registered three images, in metres."""
+def mapped(declared_depth_std: float) -> Group:
+    """Three registered images, in metres."""
     problem = mapping_problem(
         room_scene(), CAMERA, arc_poses(3, 14.0), declared_depth_std=declared_depth_std
     )
     mapper = Mapper(problem, MapperOptions(), Silent())
     mapper.reconstruct_next()
-    assert mapper.scene.registered.all()
-    mapper.refiner.noise = mapper.refiner.noise._replace(multiplier=1.0)
-    return mapper
+    group = mapper.group
+    assert group.scene.registered.all()
+    group.refiner.noise = group.refiner.noise._replace(multiplier=1.0)
+    return group
 
 
-def push(mapper: Mapper, image: int, factor: float) -> None:
+def push(group: Group, image: int, factor: float) -> None:
     """Move the points an image sees along its rays."""
-    scene = mapper.scene
+    scene = group.scene
     seen = np.unique(scene.tracks.point_of[scene.graph.keypoints_of(image)])
     seen = seen[seen >= 0]
     center: Float64 = scene.centers()[image]
@@ -44,31 +46,31 @@ def test_a_certain_metric_prior_keeps_its_scale_beside_the_others(
     declared_std: float, scale_holds: bool
 ) -> None:
     """A view and its points, 20 % larger together, look as right as before to that view alone."""
-    mapper = mapped(declared_std)
-    scene = mapper.scene
+    group = mapped(declared_std)
+    scene = group.scene
     seen = scene.tracks.point_of[scene.graph.keypoints_of(2)]
     for image in (0, 1):  # leave the view alone with its points
         shared = np.arange(*scene.graph.offsets[image : image + 2])
         shared = shared[np.isin(scene.tracks.point_of[shared], seen[seen >= 0])]
         scene.tracks.remove_observations(shared, min_length=1)
-    push(mapper, 2, 1.2)
+    push(group, 2, 1.2)
     scene.maps[2].set_scale(1.2 * scene.maps[2].scale)
-    mapper.refiner.options = mapper.refiner.options.model_copy(update={"anchor_min_angle_deg": 0.0})
-    mapper.refiner.rescale([0, 1, 2])
+    group.refiner.options = group.refiner.options.model_copy(update={"anchor_min_angle_deg": 0.0})
+    group.refiner.rescale([0, 1, 2])
     others = np.sqrt(scene.maps[0].scale * scene.maps[1].scale)
     apart = scene.maps[2].scale / others
-    slack = mapper.options.refinement.max_scale_deviations * declared_std
+    slack = MapperOptions().refinement.max_scale_deviations * declared_std
     assert apart == pytest.approx(np.exp(slack) if scale_holds else 1.2, rel=0.006)
 
 
 def test_scales_do_not_drift() -> None:
-    mapper = mapped(0.01)
-    maps = mapper.scene.maps
-    push(mapper, 2, 1.3)
-    mapper.refiner.rescale([0, 1, 2])
+    group = mapped(0.01)
+    maps = group.scene.maps
+    push(group, 2, 1.3)
+    group.refiner.rescale([0, 1, 2])
     before = [depth_map.scale for depth_map in maps]
     for _ in range(5):
-        mapper.refiner.rescale([0, 1, 2])
+        group.refiner.rescale([0, 1, 2])
     assert [depth_map.scale for depth_map in maps] == pytest.approx(before, rel=1e-9)
 
 
@@ -79,7 +81,8 @@ def test_a_focal_length_that_runs_away_changes_nothing() -> None:
     keep = MapperOptions.model_validate({"refinement": {"refine_focal": False}})
     mapper = Mapper(replace(problem, images=images), keep, Silent())
     mapper.reconstruct_next()
-    scene, refiner = mapper.scene, mapper.refiner
+    group = mapper.group
+    scene, refiner = group.scene, group.refiner
     before = scene.snapshot()
     refiner.options = refiner.options.model_copy(update={"focal_max_change": 1.01})
     refiner.adjust([0, 1, 2], focal=True)
@@ -92,8 +95,8 @@ def test_a_focal_length_that_runs_away_changes_nothing() -> None:
 
 @pytest.mark.parametrize(("bundle_depth", "bends"), [("prior", False), ("refined", True)])
 def test_refined_depth_bends_poses_only_if_it_is_asked_for(bundle_depth: str, bends: bool) -> None:
-    mapper = mapped(0.01)
-    scene, refiner = mapper.scene, mapper.refiner
+    group = mapped(0.01)
+    scene, refiner = group.scene, group.refiner
     refined = scene.maps[1].refined
     assert refined is not None
     refiner.options = refiner.options.model_copy(update={"bundle_depth": bundle_depth})

@@ -1,0 +1,371 @@
+"""One connected group of images: its start, its growth, its end (paper, system overview)."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
+from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.mapping.attempts import Attempts
+from mpsfm_core.mapping.correspondences import Correspondences, correspondences
+from mpsfm_core.mapping.depth_consistency import check_image, conflicting_images
+from mpsfm_core.mapping.failure_ladder import FailureLadder
+from mpsfm_core.mapping.filtering import disconnected_images, filter_points, lost_images
+from mpsfm_core.mapping.initialization import Start, Starts, place_first
+from mpsfm_core.mapping.journal import Journal
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.refinement import Refiner
+from mpsfm_core.mapping.registration import AbsolutePose, PoseSearch, rate_pose
+from mpsfm_core.mapping.triangulation import complete_and_merge, triangulate_image
+from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
+from mpsfm_core.scene.scene import Scene, Snapshot
+
+_log = logging.getLogger(__name__)
+
+JUMP_DEG = 3.0
+"""A camera that turns more in a global refinement may have found a wrong minimum (ours)."""
+_WITHOUT = {
+    True: "the scale of their depth is unknown",
+    False: "starting without these poses, in another world",
+}
+
+
+class Group:
+    """Images that hold together: started, grown image by image, and finished.
+
+    ``starts``: first pairs, which all groups of a run share.
+    """
+
+    def __init__(
+        self, problem: MappingProblem, options: MapperOptions, starts: Starts, journal: Journal
+    ) -> None:
+        self.scene = Scene(problem, weigh_by_score=options.weigh_by_score)
+        self._scores = pair_score_matrix(self.scene, options.registration.next_view)
+        self.refiner = Refiner(self.scene, options, self._scores)
+        self.attempts = Attempts(self.scene.num_images, options.registration)
+        self._problem, self._options = problem, options
+        self._starts, self.journal = starts, journal
+        self._search = PoseSearch(self.scene, self.refiner, options)
+        self._ladder = FailureLadder(options.registration)
+        self._last_size = (0, 0)
+
+    @property
+    def size(self) -> int:
+        """Number of registered images."""
+        return int(self.scene.registered.sum())
+
+    def start_from_known_poses(self, left: Bool) -> bool:
+        """Register all images that came with a pose; False when fewer than two hold together."""
+        images = self._problem.images
+        poses = {int(i): images[i].known_pose for i in np.flatnonzero(left)}
+        known = {image: pose for image, pose in poses.items() if pose is not None}
+        if len(known) < 2:
+            return False
+        scene, options = self.scene, self._options
+        for image, pose in known.items():
+            scene.register(image, *pose)
+        fixed = options.known_poses == "fixed"
+        self.refiner.fixed[list(known)] = fixed
+        complete_and_merge(scene, options.triangulation, create=True)
+        self.refiner.scale_together(list(known))
+        if not len(scene.tracks):
+            _log.warning("images with known poses share no points: %s", _WITHOUT[fixed])
+        self._refine_globally()
+        if self.size < 2:
+            return False
+        for image in map(int, scene.registered_images()):
+            self._accept(image)
+        return True
+
+    def start_from_pair(self, left: Bool) -> bool:
+        """Find the first pair among the images that are left and refine it."""
+        with self.journal.timed("initialization"):
+            pairs = self._starts.ranked(self._search, left)
+        snapshot = self.scene.snapshot()
+        while True:
+            for pair in pairs:
+                with self.journal.timed("initialization"):
+                    reason = self._try_pair(pair)
+                if reason is None:
+                    self._ladder.reset()
+                    self._accept(pair.image_a)
+                    self._accept(pair.image_b)
+                    self._refine_globally()
+                    return True
+                self.journal.pair_rejected(pair, reason)
+                self.scene.restore(snapshot)
+            if not pairs or not self._ladder.relax():
+                return False
+
+    def grow(self, available: Bool) -> None:
+        """Register images until none of the available ones can be."""
+        while self._register_next(available):
+            if self._grown():
+                self._refine_globally()
+
+    def finish(self) -> None:
+        """Last refinements, and the depth check once more for every image."""
+        self._refine_globally()
+        consistency = self._options.consistency
+        if consistency.enabled and consistency.check_at_end:
+            self._check_all()
+        if self._options.refinement.final_robust:
+            self._refine_globally(final=True)
+
+    def _try_pair(self, pair: VerifiedPair) -> str | None:
+        """Start with a pair; None, or why it cannot be the first (remembered if that is final)."""
+        start = self._starts.find(self._search, pair)
+        if isinstance(start, str):
+            return start
+        reason = self._ladder.objection(start.pose)
+        if reason is None:
+            reason = self._grow_start(start)
+            if reason:
+                self._starts.refuse(pair, reason)
+        return reason
+
+    def _grow_start(self, start: Start) -> str | None:
+        """Refine the first two images and their points; None, or why they are rejected."""
+        a, b = start.reference, start.image
+        place_first(self.scene, a)
+        self.scene.register(b, start.pose.rotation, start.pose.translation)
+        triangulate_image(self.scene, b, self._options.triangulation)
+        self.refiner.estimate_scale(b, [])
+        self.refiner.adjust([a, b])
+        filter_points(self.scene, self._options.triangulation)
+        if lost_images(self.scene):
+            return "too few points are left after refinement"
+        self.refiner.estimate_scale(a, [])
+        self.refiner.estimate_scale(b, [])
+        self.refiner.integrate([a, b])
+        self.refiner.adjust([a, b])
+        filter_points(self.scene, self._options.triangulation)
+        if lost_images(self.scene):
+            return "too few points are left after refinement"
+        return self._contradiction(b, self._options.consistency.max_violations_initial)
+
+    def _register_next(self, available: Bool) -> bool:
+        """Register one more image, relaxing step by step; False when none can be."""
+        options = self._options.registration
+        while True:
+            trusted = np.where(self.attempts.refuted, 0, self._scores)
+            ranked = rank_next_images(self.scene, trusted, available, options)
+            for image, reference in ranked:
+                references = self._references(image, reference)
+                if self._known_to_fail(image, references):
+                    continue
+                reason = self._try_image(image, references)
+                if reason is None:
+                    self._ladder.reset()
+                    self._accept(image)
+                    return True
+                self.journal.rejected(image, reason)
+            if self._displace():
+                continue
+            if not ranked or not self._ladder.relax():
+                return self._reconsider(available)
+
+    def _reconsider(self, available: Bool) -> bool:
+        """Register a contradicted image, if refining everything around it settles that.
+
+        Where a loop closes, drift contradicts a right pose. False when none can be.
+        """
+        scores = np.where(self.attempts.refuted, self._scores, 0)
+        options = self._options.registration
+        for image, reference in rank_next_images(self.scene, scores, available, options):
+            self.attempts.refuted[image] = False
+            reason = self._try_image(image, self._references(image, reference), everything=True)
+            if reason is None:
+                self._ladder.reset()
+                self._accept(image)
+                self.attempts.forget()
+                return True
+            self.journal.rejected(image, reason)
+        return False
+
+    def _displace(self) -> bool:
+        """Take out the image that most newcomers contradicted, if several did; each image once."""
+        culprit = self.attempts.take_culprit(self.scene.registered)
+        if culprit is None or self.size <= 2:
+            return False
+        image, count = culprit
+        self._drop([image], f"{count} other images contradict its depth")
+        self.attempts.forget()
+        return True
+
+    def _references(self, image: int, reference: int) -> list[int]:
+        """The registered images by whose points an image is posed."""
+        options = self._options.registration
+        nearby = local_bundle(self.scene, reference, options.num_neighbors, self._scores)
+        return [other for other in nearby if not self.attempts.refuted[image, other]]
+
+    def _known_to_fail(self, image: int, references: list[int]) -> bool:
+        """Whether even the best pose of the same attempt before lacks support still."""
+        if not self.attempts.exhausted(image, references):
+            return False
+        best = self.attempts.best_pose(image)
+        return best is None or self._ladder.objection(best) is not None
+
+    def _find_poses(
+        self, image: int, references: list[int], found: Correspondences
+    ) -> list[AbsolutePose]:
+        """Possible poses of an image, best first, that of earlier attempts among them."""
+        options, attempts = self._options.registration, self.attempts
+        poses = []
+        known = attempts.best_pose(image)
+        if known:
+            poses.append(rate_pose(self.scene, found, known.hypothesis, options))
+        search = not attempts.exhausted(image, references)
+        if search:
+            poses += self._search.poses(image, found, attempt=attempts.searches(image))
+        poses.sort(key=lambda pose: -pose.support)
+        attempts.remember(image, references, poses[0] if poses else None, searched=search)
+        return poses
+
+    def _try_image(
+        self, image: int, references: list[int], *, everything: bool = False
+    ) -> str | None:
+        """Register an image with the first of its possible poses that holds; None, or why not.
+
+        ``everything``: refine all before the depth check, not just the image.
+        """
+        scene = self.scene
+        with self.journal.timed("registration"):
+            found = correspondences(scene, image, references, self._options.registration)
+            most = int(np.bincount(found.references, minlength=1).max())
+            if most < self._ladder.min_inliers:
+                return f"{most} matches have a 3D point, {self._ladder.min_inliers} are needed"
+            poses = self._find_poses(image, references, found)
+        snapshot, noise = scene.snapshot(), self.refiner.noise
+        reason: str | None = "neither PnP nor an essential matrix gives a pose"
+        for pose in poses:
+            reason = self._ladder.objection(pose)
+            if not everything:
+                reason = reason or self.attempts.refusal(image, pose)
+            if reason is None:
+                reason = self._try_pose(image, pose, found, everything=everything)
+                if reason is None:
+                    return None
+                self.attempts.refuse(image, pose, reason)
+                scene.restore(snapshot)
+                self.refiner.noise = noise
+                self.refiner.forget(image)
+        return reason
+
+    def _try_pose(
+        self, image: int, pose: AbsolutePose, found: Correspondences, *, everything: bool
+    ) -> str | None:
+        """Grow and refine the scene around a new pose; None, or why it is rejected."""
+        scene, options = self.scene, self._options
+        with self.journal.timed("local refinement"):
+            scene.register(image, pose.rotation, pose.translation)
+            triangulate_image(scene, image, options.triangulation)
+            bundle = local_bundle(scene, image, options.refinement.local_images - 1, self._scores)
+            self.refiner.estimate_scale(image, bundle[1:])
+            wide = options.refinement.first_reprojection_scale
+            self.refiner.adjust([image], local=True, reprojection_scale=wide)
+            filter_points(scene, options.triangulation)
+            if image in lost_images(scene):
+                return "too few points are left after refinement"
+            self.refiner.estimate_scale(image, bundle[1:])
+            self.refiner.integrate([image])
+        if everything:
+            with self.journal.timed("global refinement"):
+                self.refiner.refine_locally(image)
+                self.refiner.refine_globally()
+        reason = self._contradiction(image, self._options.consistency.max_violations)
+        if reason:
+            self._refute(image, pose, found)
+            return reason
+        with self.journal.timed("local refinement"):
+            self.refiner.refine_locally(image)
+        lost = lost_images(scene)
+        if image in lost:
+            return "too few points are left after refinement"
+        self._drop(lost, "lost its points when another image was refined")
+        return None
+
+    def _refute(self, image: int, pose: AbsolutePose, found: Correspondences) -> None:
+        """Try an image no more beside those whose matches led to a contradicted pose."""
+        for other in map(int, np.unique(found.references)):
+            alone = found.select(found.references == other)
+            options = self._options.registration
+            led = rate_pose(self.scene, alone, pose.hypothesis, options)
+            self.attempts.refuted[image, other] |= led.inlier_share >= options.min_inlier_share
+
+    def _contradiction(self, image: int, limit: float) -> str | None:
+        """Why the depth of an image contradicts that of another view, if it does."""
+        options = self._options.consistency
+        if not options.enabled:
+            return None
+        with self.journal.timed("depth check"):
+            check = check_image(self.scene, image, options, self.refiner.std_factor)
+        if check.share <= limit:
+            return None
+        self.attempts.blame(check.other, image)
+        other = self._problem.images[check.other].name
+        return f"{check.share:.0%} of the pixels contradict the depth of {other}"
+
+    def _grown(self) -> bool:
+        """Whether images or points grew so much that everything should be refined."""
+        images, points = self.size, len(self.scene.tracks)
+        growth = 1 + self._options.refinement.global_growth
+        return images > growth * self._last_size[0] or points > growth * self._last_size[1]
+
+    def _refine_globally(self, *, final: bool = False) -> None:
+        before = self.scene.snapshot()
+        with self.journal.timed("global refinement"):
+            self.refiner.refine_globally(final=final)
+            self.scene.tracks.compact()
+        self._undo_jump(before)
+        self.attempts.forget()
+        self._last_size = self.size, len(self.scene.tracks)
+        self._drop(lost_images(self.scene), "lost its points in global refinement")
+
+    def _undo_jump(self, before: Snapshot) -> None:
+        """Return to an earlier state if cameras jumped and their depth contradicts since then.
+
+        A robust loss has many minima; where few matches hold images, the next one may be wrong.
+        """
+        images = self.scene.registered_images()
+        turns = self.scene.rotations[images] @ before.rotations[images].transpose(0, 2, 1)
+        if not len(images) or rotation_angle_deg(turns).max() < JUMP_DEG:
+            return
+        limit = self._options.consistency.max_violations
+        after, worse = self.scene.snapshot(), len(self._conflicts(limit))
+        self.scene.restore(before)
+        if not worse > len(self._conflicts(limit)):
+            self.scene.restore(after)
+
+    def _conflicts(self, limit: float) -> list[tuple[int, float]]:
+        """Images to leave out so that no two views contradict each other, and how much each did."""
+        options = self._options.consistency
+        if not options.enabled:
+            return []
+        with self.journal.timed("depth check"):
+            return conflicting_images(self.scene, limit, options, self.refiner.std_factor)
+
+    def _check_all(self) -> None:
+        """Deregister images until no two views contradict each other."""
+        conflicting = self._conflicts(self._options.consistency.max_violations_final)
+        for image, share in conflicting:
+            self._drop([image], f"at the end {share:.0%} of the pixels contradict another view's")
+        if conflicting:
+            apart = disconnected_images(self.scene)
+            self._drop(apart, "held to the rest only by an image that was dropped at the end")
+
+    def _accept(self, image: int) -> None:
+        self.attempts.scene_changed()
+        self.journal.registered(image, self.size)
+
+    def _drop(self, images: list[int], reason: str) -> None:
+        """Take images out that were registered before; the run goes on."""
+        for image in images:
+            if self.refiner.fixed[image]:
+                continue
+            self.scene.deregister(image)
+            self.refiner.forget(image)
+            self.attempts.scene_changed()
+            self.journal.rejected(image, reason)
