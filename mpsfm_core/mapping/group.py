@@ -170,15 +170,16 @@ class Group:
     def _reconsider(self, available: Bool) -> bool:
         """Register a contradicted image, if refining everything around it settles that.
 
-        Where a loop closes, drift contradicts a right pose. False when none can be.
+        Where a loop closes, drift contradicts a right pose. Its support is as good as any: nothing
+        is relaxed. False when none can be.
         """
+        self._ladder.reset()
         scores = np.where(self.attempts.refuted, self._scores, 0)
         options = self._options.registration
         for image, reference in rank_next_images(self.scene, scores, available, options):
             self.attempts.refuted[image] = False
             reason = self._try_image(image, self._references(image, reference), everything=True)
             if reason is None:
-                self._ladder.reset()
                 self._accept(image)
                 self.attempts.forget()
                 return True
