@@ -46,17 +46,13 @@ class Attempts:
         """The best pose that the last attempt at an image knew."""
         return self._last[image].pose if image in self._last else None
 
-    def tried(self, image: int, references: list[int]) -> bool:
-        """Whether the last attempt at an image was beside the same images."""
-        return image in self._last and self._last[image].references == references
-
     def exhausted(self, image: int, references: list[int]) -> bool:
         """Whether another search for the pose of an image would only repeat the last one.
 
         A few are different in any case: they take other halves of the matches.
         """
         several = self._searches[image] >= self._options.resampled_attempts
-        return several and self.tried(image, references)
+        return several and image in self._last and self._last[image].references == references
 
     def remember(
         self, image: int, references: list[int], best: AbsolutePose | None, *, searched: bool

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,13 +32,6 @@ _WITHOUT = {
 }
 
 
-class _Search(NamedTuple):
-    """What was found of an image's pose in the present scene."""
-
-    found: Correspondences
-    poses: list[AbsolutePose]
-
-
 class Group:
     """Images that hold together: started, grown image by image, and finished.
 
@@ -57,7 +49,6 @@ class Group:
         self._starts, self.journal = starts, journal
         self._search = PoseSearch(self.scene, self.refiner, options)
         self._ladder = FailureLadder(options.registration)
-        self._searched: dict[int, _Search] = {}
         self._last_size = (0, 0)
 
     @property
@@ -161,7 +152,7 @@ class Group:
         while True:
             trusted = np.where(self.attempts.refuted, 0, self._scores)
             ranked = rank_next_images(self.scene, trusted, available, options)
-            for image, reference in self._compared(ranked):
+            for image, reference in ranked:
                 references = self._references(image, reference)
                 if self._known_to_fail(image, references):
                     continue
@@ -183,7 +174,6 @@ class Group:
         is relaxed. False when none can be.
         """
         self._ladder.reset()
-        self._searched.clear()
         scores = np.where(self.attempts.refuted, self._scores, 0)
         options = self._options.registration
         for image, reference in rank_next_images(self.scene, scores, available, options):
@@ -206,27 +196,6 @@ class Group:
         self.attempts.forget()
         return True
 
-    def _compared(self, ranked: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """The first few of them in the order of the support of their best pose, then the others."""
-        self._searched.clear()
-        count = self._options.registration.num_compared
-        first, others = ranked[:count], ranked[count:]
-        if len(first) < 2:
-            return ranked
-        support = {image: self._support(image, reference) for image, reference in first}
-        return sorted(first, key=lambda candidate: -support[candidate[0]]) + others
-
-    def _support(self, image: int, reference: int) -> float:
-        """Support of the best pose of an image; 0 if none can be taken."""
-        references = self._references(image, reference)
-        if self._known_to_fail(image, references):
-            return 0.0
-        search = self._search_image(image, references, again=False)
-        if isinstance(search, str):
-            return 0.0
-        able = (pose.support for pose in search.poses if not self._objection(image, pose))
-        return max(able, default=0.0)
-
     def _references(self, image: int, reference: int) -> list[int]:
         """The registered images by whose points an image is posed."""
         options = self._options.registration
@@ -235,39 +204,26 @@ class Group:
 
     def _known_to_fail(self, image: int, references: list[int]) -> bool:
         """Whether even the best pose of the same attempt before lacks support still."""
-        if image in self._searched or not self.attempts.exhausted(image, references):
+        if not self.attempts.exhausted(image, references):
             return False
         best = self.attempts.best_pose(image)
         return best is None or self._ladder.objection(best) is not None
 
-    def _search_image(self, image: int, references: list[int], *, again: bool) -> _Search | str:
-        """Possible poses of an image, that of earlier attempts among them; or why there are none.
-
-        ``again``: search once more where the same was searched before; it takes other samples.
-        """
-        if image in self._searched:
-            return self._searched[image]
+    def _find_poses(
+        self, image: int, references: list[int], found: Correspondences
+    ) -> list[AbsolutePose]:
+        """Possible poses of an image, best first, that of earlier attempts among them."""
         options, attempts = self._options.registration, self.attempts
-        with self.journal.timed("registration"):
-            found = correspondences(self.scene, image, references, options)
-            most = int(np.bincount(found.references, minlength=1).max())
-            if most < self._ladder.min_inliers:
-                return f"{most} matches have a 3D point, {self._ladder.min_inliers} are needed"
-            poses = []
-            known = attempts.best_pose(image)
-            if known:
-                poses.append(rate_pose(self.scene, found, known.hypothesis, options))
-            exhausted = attempts.exhausted(image, references)
-            search = not exhausted and (again or not attempts.tried(image, references))
-            if search:
-                poses += self._search.poses(image, found, attempt=attempts.searches(image))
-            poses.sort(key=lambda pose: -pose.support)
-            result = _Search(found, poses)
-            if search:
-                self._searched[image] = result
-            if search or again:
-                attempts.remember(image, references, poses[0] if poses else None, searched=search)
-        return result
+        poses = []
+        known = attempts.best_pose(image)
+        if known:
+            poses.append(rate_pose(self.scene, found, known.hypothesis, options))
+        search = not attempts.exhausted(image, references)
+        if search:
+            poses += self._search.poses(image, found, attempt=attempts.searches(image))
+        poses.sort(key=lambda pose: -pose.support)
+        attempts.remember(image, references, poses[0] if poses else None, searched=search)
+        return poses
 
     def _try_image(
         self, image: int, references: list[int], *, everything: bool = False
@@ -276,16 +232,21 @@ class Group:
 
         ``everything``: refine all before the depth check, not just the image.
         """
-        search = self._search_image(image, references, again=True)
-        if isinstance(search, str):
-            return search
         scene = self.scene
+        with self.journal.timed("registration"):
+            found = correspondences(scene, image, references, self._options.registration)
+            most = int(np.bincount(found.references, minlength=1).max())
+            if most < self._ladder.min_inliers:
+                return f"{most} matches have a 3D point, {self._ladder.min_inliers} are needed"
+            poses = self._find_poses(image, references, found)
         snapshot, noise = scene.snapshot(), self.refiner.noise
         reason: str | None = "neither PnP nor an essential matrix gives a pose"
-        for pose in search.poses:
-            reason = self._objection(image, pose, refused=not everything)
+        for pose in poses:
+            reason = self._ladder.objection(pose)
+            if not everything:
+                reason = reason or self.attempts.refusal(image, pose)
             if reason is None:
-                reason = self._try_pose(image, pose, search.found, everything=everything)
+                reason = self._try_pose(image, pose, found, everything=everything)
                 if reason is None:
                     return None
                 self.attempts.refuse(image, pose, reason)
@@ -293,11 +254,6 @@ class Group:
                 self.refiner.noise = noise
                 self.refiner.forget(image)
         return reason
-
-    def _objection(self, image: int, pose: AbsolutePose, *, refused: bool = True) -> str | None:
-        """Why a pose is not worth a try; ``refused``: it was tried in this very scene before."""
-        reason = self._ladder.objection(pose)
-        return reason or (self.attempts.refusal(image, pose) if refused else None)
 
     def _try_pose(
         self, image: int, pose: AbsolutePose, found: Correspondences, *, everything: bool

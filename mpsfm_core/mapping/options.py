@@ -38,10 +38,6 @@ class RegistrationOptions(Options):
     next_view: Literal["match-scores", "inlier-matches", "visible-points"] = "match-scores"
     """Rank by summed match scores, number of verified matches (both with the best registered
     image), or number of 3D points seen (paper, next view selection; default: the paper's)."""
-    num_compared: int = Field(4, ge=1)
-    """Next images whose poses are compared; the best supported is tried first (ours: AUC@20 of
-    rendered_kitchen leq30 with degraded depth 89.8 -> 90.6, mean of six seeds, the worst 82 -> 87;
-    hololens_room 40.1 -> 42.2)."""
     min_inliers: int = Field(30, ge=3)
     """Reference and COLMAP: abs_pose_min_num_inliers."""
     min_inlier_share: float = Field(0.7, ge=0, le=1)

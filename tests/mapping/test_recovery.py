@@ -182,26 +182,3 @@ def test_the_group_that_ends_larger_gets_the_images(
     assert [len(model.images) for model in mapper.models] == sizes
     images = [image.index for model in mapper.models for image in model.images]
     assert len(images) == len(set(images)) == 6 - mapper.left.sum()
-
-
-@pytest.mark.parametrize(("num_compared", "first"), [(1, 2), (4, 3)])
-def test_the_best_supported_of_the_next_images_comes_first(num_compared: int, first: int) -> None:
-    problem = mapping_problem(room_scene(), CAMERA, arc_poses(4, 10.0))
-    rng = np.random.default_rng(0)
-    pairs = []
-    for pair in problem.pairs:
-        matches, scores = pair.matches.copy(), pair.scores
-        if pair.image_b == 2:  # many matches, and most of them wrong
-            wrong = rng.permutation(len(matches))[: int(0.6 * len(matches))]
-            matches[wrong, 1] = rng.permutation(matches[wrong, 1])
-        elif pair.image_b == 3:
-            matches, scores = matches[:60], scores[:60]
-        pairs.append(replace(pair, matches=matches, scores=scores))
-    options = MapperOptions.model_validate({"registration": {"num_compared": num_compared}})
-    mapper = Mapper(replace(problem, pairs=tuple(pairs)), options, Silent())
-    mapper.left[2:] = False
-    mapper.reconstruct_next()
-    group = mapper.group
-    assert np.flatnonzero(group.scene.registered).tolist() == [0, 1]
-    ranked = [(2, 1), (3, 1)]
-    assert group._compared(ranked)[0][0] == first
