@@ -170,8 +170,8 @@ class Group:
     def _reconsider(self, available: Bool) -> bool:
         """Register a contradicted image, if refining everything around it settles that.
 
-        Where a loop closes, drift contradicts a right pose. Its support is as good as any: nothing
-        is relaxed. False when none can be.
+        Where a loop closes, drift contradicts a right pose. Nearly all matches support it, and no
+        other pose is worth the time. False when none can be.
         """
         self._ladder.reset()
         scores = np.where(self.attempts.refuted, self._scores, 0)
@@ -245,6 +245,8 @@ class Group:
             reason = self._ladder.objection(pose)
             if not everything:
                 reason = reason or self.attempts.refusal(image, pose)
+            elif pose.inlier_share < self._options.registration.confident_share:
+                reason = reason or self.journal.image_reasons[self._problem.images[image].name]
             if reason is None:
                 reason = self._try_pose(image, pose, found, everything=everything)
                 if reason is None:
