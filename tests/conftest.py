@@ -8,6 +8,7 @@ import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import pycolmap
 import pytest
 
 _DEFAULT = Path(__file__).resolve().parents[2] / "shared"
@@ -20,6 +21,17 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no shared scenes and models here (set MPSFM_SHARED)")
     return folder
+
+
+@pytest.fixture
+def model() -> pycolmap.Reconstruction:
+    """A COLMAP model of five views and twenty points."""
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig = 1, 1
+    options.num_frames_per_rig = 5
+    options.num_points3D = 20
+    return pycolmap.synthesize_dataset(options)
 
 
 InstallPlugin = Callable[..., str]

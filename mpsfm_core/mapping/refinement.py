@@ -303,8 +303,7 @@ class Refiner:
         if not ((1 / limit < ratios) & (ratios < limit)).all():
             return False
         for row in rows:
-            for image in np.flatnonzero(scene.camera_of == scene.camera_of[images[row]]):
-                scene.set_focal(int(image), *map(float, intrinsics[row, :2]))
+            scene.set_shared_focal(int(images[row]), *map(float, intrinsics[row, :2]))
         return True
 
     def _measure_noise(self) -> None:

@@ -101,6 +101,12 @@ class Scene:
         self.intrinsics[image, :2] = fx, fy
         self.maps[image].set_camera(self.camera(image))
 
+    def set_shared_focal(self, image: int, fx: float, fy: float) -> None:
+        """Change the focal length of an image and of all that have its camera."""
+        same = self.camera_of == self.camera_of[image]
+        for other in np.flatnonzero(same & (self.intrinsics[:, :2] != (fx, fy)).any(axis=1)):
+            self.set_focal(int(other), fx, fy)
+
     def centers(self) -> Float64:
         """(n, 3) camera centres in the world."""
         return camera_center(self.rotations, self.translations)
@@ -160,10 +166,7 @@ class Scene:
             self.register(image.index, image.rotation, image.translation)
             self.maps[image.index].set_scale(image.scale)
             self.tracks.point_of[self.graph.keypoints_of(image.index)] = image.point_ids
-            focal = image.camera.fx, image.camera.fy
-            for other in np.flatnonzero(self.camera_of == self.camera_of[image.index]):
-                if tuple(self.intrinsics[other, :2]) != focal:
-                    self.set_focal(int(other), *focal)
+            self.set_shared_focal(image.index, image.camera.fx, image.camera.fy)
 
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to undo everything that happens from now on."""

@@ -13,16 +13,6 @@ from mpsfm_core.evaluation.models import evaluate
 from mpsfm_core.inputs.models import read_poses
 
 
-@pytest.fixture
-def model() -> pycolmap.Reconstruction:
-    pycolmap.set_random_seed(0)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig = 1, 1
-    options.num_frames_per_rig = 5
-    options.num_points3D = 20
-    return pycolmap.synthesize_dataset(options)
-
-
 def test_the_report_is_plain_data(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
     model.write_text(str(tmp_path))
     truth = read_poses(tmp_path)

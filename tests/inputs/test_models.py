@@ -12,16 +12,6 @@ from mpsfm_core.errors import InputError
 from mpsfm_core.inputs.models import match_names, read_poses
 
 
-@pytest.fixture
-def model() -> pycolmap.Reconstruction:
-    pycolmap.set_random_seed(0)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig = 1, 1
-    options.num_frames_per_rig = 5
-    options.num_points3D = 20
-    return pycolmap.synthesize_dataset(options)
-
-
 @pytest.mark.parametrize("layout", [".", "sparse", "sparse/0"])
 @pytest.mark.parametrize("form", ["text", "binary"])
 def test_models_are_found_and_read(
