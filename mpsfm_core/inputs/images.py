@@ -24,6 +24,7 @@ from mpsfm_core.inputs.pixels import EXTENSIONS, decode_rgb, read_bytes, read_ma
 from mpsfm_core.inputs.recent import Recent
 from mpsfm_core.inputs.undistortion import (
     Warp,
+    camera_key,
     is_pinhole,
     pinhole_camera,
     resized_camera,
@@ -146,7 +147,7 @@ class ImageSet:
         image = self.images[index]
         parts = [image.digest, str(image.pinhole.size)]
         if not is_pinhole(image.camera):
-            parts += [_camera_key(image.camera), str(image.pinhole.params.tolist())]
+            parts += [camera_key(image.camera), str(image.pinhole.params.tolist())]
         mask = self._mask_path(image)
         if mask is not None:
             parts.append(hashlib.sha256(read_bytes(mask)).hexdigest())
@@ -164,7 +165,7 @@ class ImageSet:
             return View(image.name, pixels, image.pinhole, mask)
         size = _reduced_size(image.original_size, self._options.max_image_size)
         camera = resized_camera(image.camera, size)
-        warp = self._warps.get(_camera_key(camera), lambda: Warp(camera, image.pinhole))
+        warp = self._warps.get(camera_key(camera), lambda: Warp(camera, image.pinhole))
         pixels = warp.image(_resize(pixels, size))
         if mask is not None:
             mask = warp.mask(_resize_mask(mask, size))
@@ -403,10 +404,6 @@ def _resize_mask(mask: Bool, size: tuple[int, int]) -> Bool:
     resized = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)
     allowed: Bool = resized > 0
     return allowed
-
-
-def _camera_key(camera: pycolmap.Camera) -> str:
-    return f"{camera.model_name} {camera.width} {camera.height} {camera.params.tolist()}"
 
 
 def _bytes(view: View) -> int:

@@ -21,6 +21,7 @@ from mpsfm_core.data import Float64
 from mpsfm_core.errors import InputError
 from mpsfm_core.inputs.header import read_header
 from mpsfm_core.inputs.pixels import EXTENSIONS, read_bytes, upright_size
+from mpsfm_core.inputs.undistortion import camera_key
 
 _COEFFICIENTS: Mapping[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": (),
@@ -108,7 +109,7 @@ def read_transforms(path: Path) -> pycolmap.Reconstruction:
             raise InputError(f"{where}: the same picture has a frame before")
         names.add(name)
         camera = _camera(where, {**shared, **frame}, path.parent / name)
-        key = f"{camera.model_name} {camera.width} {camera.height} {camera.params.tolist()}"
+        key = camera_key(camera)
         if key not in cameras:
             camera.camera_id = cameras[key] = len(cameras) + 1
             model.add_camera_with_trivial_rig(camera)

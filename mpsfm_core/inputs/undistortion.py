@@ -13,6 +13,11 @@ _ROWS = 256
 """Rows of a warp that are computed at once: bounds the memory for large images."""
 
 
+def camera_key(camera: pycolmap.Camera) -> str:
+    """The same text for cameras that are the same but for their number."""
+    return f"{camera.model_name} {camera.width} {camera.height} {camera.params.tolist()}"
+
+
 def is_pinhole(camera: pycolmap.Camera) -> bool:
     """Whether pixels of the camera are those of a pinhole camera already."""
     return bool(camera.is_perspective_pinhole() and camera.is_undistorted())

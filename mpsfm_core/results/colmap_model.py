@@ -10,6 +10,7 @@ import pycolmap
 
 from mpsfm_core.data import Float64, PinholeCamera, UInt8, View
 from mpsfm_core.geometry import sample_nearest
+from mpsfm_core.inputs.undistortion import camera_key
 from mpsfm_core.scene.reconstruction import Reconstruction
 
 MIN_TRACK_LENGTH = 2
@@ -36,7 +37,7 @@ def build_model(
     model = pycolmap.Reconstruction()
     ids: dict[str, int] = {}
     for image, camera, xy in zip(reconstruction.images, cameras, keypoints, strict=True):
-        key = f"{camera.model_name} {camera.width} {camera.height} {camera.params.tolist()}"
+        key = camera_key(camera)
         if key not in ids:
             ids[key] = len(ids) + 1
             model.add_camera_with_trivial_rig(_with_id(camera, ids[key]))
