@@ -9,7 +9,7 @@ import numpy as np
 
 from mpsfm_core.data import Bool
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.registration import AbsolutePose
+from mpsfm_core.mapping.pose_support import AbsolutePose
 
 MIN_CONTRADICTED = 2
 """Newcomers that contradict a view before it is the one to go (ours)."""

@@ -10,8 +10,9 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.mapping.correspondences import correspondences
 from mpsfm_core.mapping.finishing import registered_image
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.pose_support import AbsolutePose
 from mpsfm_core.mapping.refinement import Refiner
-from mpsfm_core.mapping.registration import AbsolutePose, PoseSearch
+from mpsfm_core.mapping.registration import PoseSearch
 from mpsfm_core.mapping.triangulation import triangulate_image
 from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
 from mpsfm_core.scene.reconstruction import Reconstruction

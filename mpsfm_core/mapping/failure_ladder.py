@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.registration import AbsolutePose
+from mpsfm_core.mapping.pose_support import AbsolutePose
 
 
 class FailureLadder:
@@ -31,9 +31,10 @@ class FailureLadder:
         """Share of the correspondences that must be inliers."""
         return self._options.min_inlier_share / 1.2**self._relaxations
 
-    def objection(self, pose: AbsolutePose) -> str | None:
-        """Why too few matches agree with a pose, if so."""
-        needed, share = self.min_inliers, self.min_inlier_share
+    def objection(self, pose: AbsolutePose, *, certain: bool = False) -> str | None:
+        """Why too few matches agree with a pose, if so; ``certain``: nearly all have to."""
+        needed = self.min_inliers
+        share = self._options.confident_share if certain else self.min_inlier_share
         if pose.num_inliers < needed:
             return f"{pose.num_inliers} matches support its pose, {needed} are needed"
         if pose.inlier_share < share:

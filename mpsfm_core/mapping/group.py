@@ -16,8 +16,9 @@ from mpsfm_core.mapping.filtering import disconnected_images, filter_points, los
 from mpsfm_core.mapping.initialization import Start, Starts, place_first
 from mpsfm_core.mapping.journal import Journal
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.pose_support import AbsolutePose, rate_pose
 from mpsfm_core.mapping.refinement import Refiner
-from mpsfm_core.mapping.registration import AbsolutePose, PoseSearch, rate_pose
+from mpsfm_core.mapping.registration import PoseSearch
 from mpsfm_core.mapping.triangulation import complete_and_merge, triangulate_image
 from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
 from mpsfm_core.scene.scene import Scene, Snapshot
@@ -170,20 +171,18 @@ class Group:
     def _reconsider(self, available: Bool) -> bool:
         """Register a contradicted image, if refining everything around it settles that.
 
-        Where a loop closes, drift contradicts a right pose. Nearly all matches support it, and no
-        other pose is worth the time. False when none can be.
+        Where a loop closes, drift contradicts a right pose. False when none can be.
         """
         self._ladder.reset()
         scores = np.where(self.attempts.refuted, self._scores, 0)
         options = self._options.registration
         for image, reference in rank_next_images(self.scene, scores, available, options):
             self.attempts.refuted[image] = False
-            reason = self._try_image(image, self._references(image, reference), everything=True)
-            if reason is None:
+            references = self._references(image, reference)
+            if self._try_image(image, references, everything=True) is None:
                 self._accept(image)
                 self.attempts.forget()
                 return True
-            self.journal.rejected(image, reason)
         return False
 
     def _displace(self) -> bool:
@@ -230,7 +229,8 @@ class Group:
     ) -> str | None:
         """Register an image with the first of its possible poses that holds; None, or why not.
 
-        ``everything``: refine all before the depth check, not just the image.
+        ``everything``: refine all before the depth check, not just the image. Only a pose that
+        nearly all matches support is worth that time.
         """
         scene = self.scene
         with self.journal.timed("registration"):
@@ -242,11 +242,9 @@ class Group:
         snapshot, noise = scene.snapshot(), self.refiner.noise
         reason: str | None = "neither PnP nor an essential matrix gives a pose"
         for pose in poses:
-            reason = self._ladder.objection(pose)
+            reason = self._ladder.objection(pose, certain=everything)
             if not everything:
                 reason = reason or self.attempts.refusal(image, pose)
-            elif pose.inlier_share < self._options.registration.confident_share:
-                reason = reason or self.journal.image_reasons[self._problem.images[image].name]
             if reason is None:
                 reason = self._try_pose(image, pose, found, everything=everything)
                 if reason is None:

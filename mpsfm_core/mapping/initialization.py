@@ -14,7 +14,8 @@ from mpsfm_core.data import Bool, VerifiedPair
 from mpsfm_core.geometry import triangulation_angle_deg
 from mpsfm_core.mapping.correspondences import correspondences
 from mpsfm_core.mapping.options import InitializationOptions, MapperOptions, RegistrationOptions
-from mpsfm_core.mapping.registration import AbsolutePose, PoseSearch
+from mpsfm_core.mapping.pose_support import AbsolutePose
+from mpsfm_core.mapping.registration import PoseSearch
 from mpsfm_core.mapping.triangulation import midpoints
 from mpsfm_core.scene.scene import Scene
 

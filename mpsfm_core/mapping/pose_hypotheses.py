@@ -25,9 +25,6 @@ from mpsfm_core.scene.scene import Scene
 
 MIN_CORRESPONDENCES = 4
 """PnP needs three; the fourth chooses among the solutions."""
-PNP_ERROR_FACTORS = (1.0, 4.0)
-"""PnP is tried with the allowed error and with this multiple of it, for lifts that miss widely over
-a wide baseline (ours)."""
 
 
 class Hypothesis(NamedTuple):
@@ -55,7 +52,6 @@ def estimate_absolute_pose(
     points: Float64,
     options: RegistrationOptions,
     seed: int,
-    error_factor: float = 1.0,
     *,
     refine: bool = True,
 ) -> tuple[Float64, Float64, Bool] | None:
@@ -67,7 +63,7 @@ def estimate_absolute_pose(
     if len(xy) < MIN_CORRESPONDENCES:
         return None
     ransac = pycolmap.RANSACOptions(
-        max_error=options.max_error_px * error_factor,
+        max_error=options.max_error_px,
         min_inlier_ratio=options.min_inlier_ratio,
         confidence=0.99999,  # COLMAP, reference
         min_num_trials=100,
@@ -95,22 +91,17 @@ def estimate_absolute_pose(
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """The estimators of an image's pose on some correspondences.
-
-    ``refine``: PnP minimises the reprojection error of its inliers at last.
-    """
+    """The estimators of an image's pose on some correspondences."""
 
     scene: Scene
     image: int
     found: Correspondences
     options: RegistrationOptions
     seed: int
-    refine: bool = True
 
     def of_all(self) -> Iterator[Estimate]:
         """From all correspondences, and from each reference image alone."""
-        for factor in PNP_ERROR_FACTORS:
-            yield partial(self._forward, factor)
+        yield self._forward
         if not self.options.lifting:
             return
         references = set(self.found.references.tolist())
@@ -120,8 +111,7 @@ class Hypotheses:
             reference = pair.image_a if self.image == pair.image_b else pair.image_b
             if reference not in references:
                 continue
-            for factor in PNP_ERROR_FACTORS:
-                yield partial(self._reverse, reference, factor)
+            yield partial(self._reverse, reference)
             if pair.calibrated:
                 relative = pair.rotation, pair.translation
                 if self.image == pair.image_a:
@@ -141,21 +131,20 @@ class Hypotheses:
         mine = np.flatnonzero(found.references == reference)
         half_size = min(max(len(mine) // 2, MIN_CORRESPONDENCES), len(mine))
         odds = found.scores[mine] / found.scores[mine].sum()
-        for trial in range(self.options.num_resamples):
+        for _ in range(self.options.num_resamples):
             chosen = np.sort(rng.choice(mine, half_size, replace=False, p=odds))
-            half = replace(self, found=found.select(chosen), refine=False)
-            factor = PNP_ERROR_FACTORS[trial % len(PNP_ERROR_FACTORS)]
-            yield partial(half._forward, factor)
-            yield partial(half._reverse, reference, factor)
+            half = replace(self, found=found.select(chosen))
+            yield half._forward
+            yield partial(half._reverse, reference)
             yield partial(half._essential, found, reference)
 
-    def _forward(self, error_factor: float) -> Hypothesis | None:
+    def _forward(self) -> Hypothesis | None:
         """PnP on the points of the scene."""
         xy = self.scene.keypoints[self.found.keypoints]
-        pose = self._pnp(self.image, xy, self.found.points, error_factor)
+        pose = self._pnp(self.image, xy, self.found.points)
         return Hypothesis(*pose, "PnP") if pose else None
 
-    def _reverse(self, reference: int, error_factor: float) -> Hypothesis | None:
+    def _reverse(self, reference: int) -> Hypothesis | None:
         """PnP of the reference on the image's own lifts, at the reference's scale."""
         scene, found = self.scene, self.found
         depth_map = scene.maps[self.image]
@@ -166,7 +155,7 @@ class Hypotheses:
         depth = depth_map.prior_at_keypoints(rows[use]) * scene.maps[reference].scale
         points = scene.rays(found.keypoints[use]) * depth[:, None]
         xy = scene.keypoints[found.matched[use]]
-        pose = self._pnp(reference, xy, points, error_factor)
+        pose = self._pnp(reference, xy, points)
         return self._placed(reference, invert(*pose), "reverse PnP") if pose else None
 
     def _essential(self, judges: Correspondences, reference: int) -> Hypothesis | None:
@@ -203,11 +192,9 @@ class Hypotheses:
         world = self.scene.rotations[reference], self.scene.translations[reference]
         return Hypothesis(*compose(relative, world), source)
 
-    def _pnp(self, image: int, xy: Float64, points: Float64, error_factor: float) -> Pose | None:
+    def _pnp(self, image: int, xy: Float64, points: Float64) -> Pose | None:
         camera, options = self.scene.camera(image), self.options
-        pose = estimate_absolute_pose(
-            camera, xy, points, options, self.seed, error_factor, refine=self.refine
-        )
+        pose = estimate_absolute_pose(camera, xy, points, options, self.seed, refine=False)
         return (pose[0], pose[1]) if pose else None
 
 

@@ -1,50 +1,29 @@
 """Pose of the next image from triangulated and depth-lifted points (paper section 3.2).
 
-Of many hypotheses the one that most matches support wins. A match supports a pose if its keypoint
-lies near the segment onto which the other keypoint's ray projects between the depths that the prior
-allows, and if the depth that follows fits the new image's own prior.
+Of many hypotheses the one that most matches support wins, after the best have been moved to where
+matches support them most.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Float64
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.correspondences import Correspondences
 from mpsfm_core.mapping.options import THREADS, MapperOptions, RegistrationOptions
 from mpsfm_core.mapping.pose_hypotheses import Estimate, Hypotheses, Hypothesis
+from mpsfm_core.mapping.pose_support import AbsolutePose, improve_pose, rate_pose
 from mpsfm_core.mapping.refinement import Refiner
 from mpsfm_core.mapping.triangulation import triangulate_image
 from mpsfm_core.scene.scene import Scene, Snapshot
 
 MIN_TURN_DEG = 3.0
 """Hypotheses that differ less are refined to the same pose (ours)."""
-
-
-@dataclass(frozen=True, eq=False)
-class AbsolutePose:
-    """``cam_from_world``, its source, and the support of the reference image with most of it.
-
-    ``support`` is the truncated quadratic score (MSAC) by which hypotheses are compared, weighted
-    by the scores of the matches, as is ``inlier_share``.
-    """
-
-    rotation: Float64
-    translation: Float64
-    source: str
-    support: float
-    num_inliers: int
-    inlier_share: float
-
-    @property
-    def hypothesis(self) -> Hypothesis:
-        """The pose alone, to be rated again."""
-        return Hypothesis(self.rotation, self.translation, self.source)
 
 
 class PoseSearch:
@@ -98,97 +77,28 @@ def find_poses(
     hypotheses = Hypotheses(scene, image, found, options, seed)
     with ThreadPoolExecutor(THREADS) as pool:
 
-        def rate(estimates: Iterator[Estimate]) -> None:
+        def add(estimates: Iterator[Estimate]) -> None:
             made = pool.map(lambda estimate: estimate(), estimates)
-            poses.extend(rate_pose(scene, found, pose, options) for pose in made if pose)
-            poses.sort(key=lambda pose: -pose.support)
+            rated = [rate_pose(scene, found, pose, options) for pose in made if pose]
+            chosen = _distinct(rated, options.num_improved)
+            improved = pool.map(partial(improve_pose, scene, found, options=options), chosen)
+            poses.extend([*rated, *improved])
 
-        rate(hypotheses.of_all())
-        confident = bool(poses) and poses[0].inlier_share >= options.confident_share
+        add(hypotheses.of_all())
+        best = max(poses, key=lambda pose: pose.support, default=None)
+        confident = best is not None and best.inlier_share >= options.confident_share
         if options.lifting and not confident and attempt < options.resampled_attempts:
-            rate(replace(hypotheses, seed=seed + attempt).of_halves())
-    return _distinct(poses)[: options.num_polished]
+            add(replace(hypotheses, seed=seed + attempt).of_halves())
+    return _distinct(poses, options.num_polished)
 
 
-def _distinct(poses: list[AbsolutePose]) -> list[AbsolutePose]:
-    """The poses without those that are turned little from a better one."""
-    kept: list[AbsolutePose] = []
-    for pose in poses:
-        turns = [rotation_angle_deg(pose.rotation @ other.rotation.T) for other in kept]
-        if all(turn > MIN_TURN_DEG for turn in turns):
-            kept.append(pose)
-    return kept
-
-
-def rate_pose(
-    scene: Scene,
-    found: Correspondences,
-    hypothesis: Hypothesis,
-    options: RegistrationOptions,
-) -> AbsolutePose:
-    """A pose with the support that the correspondences give it."""
-    misfit = _misfits(scene, found, hypothesis, options)
-    inlier = misfit < 1
-
-    def per_reference(values: Float64) -> Float64:
-        sums = np.bincount(found.references, values, minlength=scene.num_images)
-        return sums.astype(np.float64)
-
-    support = per_reference(found.scores * (1 - misfit**2))
-    best = int(np.argmax(support))
-    total = per_reference(found.scores)[best]
-    return AbsolutePose(
-        *hypothesis,
-        float(support[best]),
-        int(inlier[found.references == best].sum()),
-        float(per_reference(found.scores * inlier)[best] / total) if total else 0.0,
-    )
-
-
-def _misfits(
-    scene: Scene,
-    found: Correspondences,
-    pose: Hypothesis,
-    options: RegistrationOptions,
-) -> Float64:
-    """(m,) how far each match is from supporting a pose, in terms of the limits; at most 1."""
-    image = scene.graph.image_of[found.keypoints]
-    fx, fy, cx, cy = scene.intrinsics[image].T
-    xy = scene.keypoints[found.keypoints]
-    ends, depths = [], []
-    for points in (found.near, found.far):
-        camera = points @ pose.rotation.T + pose.translation
-        z = np.where(camera[:, 2] > 1e-9, camera[:, 2], np.nan)
-        ends.append(np.stack([fx * camera[:, 0] / z + cx, fy * camera[:, 1] / z + cy], axis=1))
-        depths.append(z)
-    along = ends[1] - ends[0]
-    length = np.maximum((along**2).sum(axis=1), 1e-12)
-    share = np.clip(((xy - ends[0]) * along).sum(axis=1) / length, 0, 1)
-    distance = np.linalg.norm(ends[0] + share[:, None] * along - xy, axis=1)
-    misfits = distance / (options.max_support_error_px * scene.keypoint_std_px[image])
-    depth = 1 / ((1 - share) / depths[0] + share / depths[1])
-    misfits = np.fmax(misfits, _depth_misfits(scene, found, depth, misfits < 1, options))
-    return np.where(misfits < 1, misfits, 1.0)
-
-
-def _depth_misfits(
-    scene: Scene,
-    found: Correspondences,
-    depth: Float64,
-    near: Bool,
-    options: RegistrationOptions,
-) -> Float64:
-    """(m,) how far depths in the new image are from its prior, up to one scale; NaN: unknown."""
-    misfits = np.full(len(depth), np.nan)
-    if not len(depth):
-        return misfits
-    image = int(scene.graph.image_of[found.keypoints[0]])
-    rows = found.keypoints - scene.graph.offsets[image]
-    known = scene.maps[image].keypoint_valid[rows] & (depth > 0)
-    if (known & near).any():
-        log_ratio = np.log(depth[known] / scene.maps[image].prior_at_keypoints(rows[known]))
-        own = scene.keypoint_log_std[found.keypoints[known]]
-        other = scene.keypoint_log_std[found.matched[known]]
-        limit = options.depth_deviations * np.hypot(own, other)
-        misfits[known] = np.abs(log_ratio - np.median(log_ratio[near[known]])) / limit
-    return misfits
+def _distinct(poses: list[AbsolutePose], count: int) -> list[AbsolutePose]:
+    """The best supported poses, at most ``count``, none turned little from a better one."""
+    poses = sorted(poses, key=lambda pose: -pose.support)
+    rotations = np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3)
+    turns = rotation_angle_deg(rotations[:, None] @ rotations.transpose(0, 2, 1))
+    kept: list[int] = []
+    for row in range(len(poses)):
+        if len(kept) < count and (turns[row, kept] > MIN_TURN_DEG).all():
+            kept.append(row)
+    return [poses[row] for row in kept]

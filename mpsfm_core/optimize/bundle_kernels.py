@@ -663,7 +663,7 @@ def step_points(
 
 
 @_kernel
-def _rotation(x: float, y: float, z: float) -> Any:
+def rotation_of(x: float, y: float, z: float) -> Any:
     """Rodrigues' formula, row by row; the series near 0 keeps full precision."""
     squared = x * x + y * y + z * z
     angle = np.sqrt(squared)
@@ -688,7 +688,7 @@ def move_cameras(delta: Float64, layout: Layout, state: State, trial: State) -> 
         if slot < 0:
             continue
         n = POSE * slot
-        turn = _rotation(delta[n], delta[n + 1], delta[n + 2])
+        turn = rotation_of(delta[n], delta[n + 1], delta[n + 2])
         for a in range(3):
             trial.translations[image, a] += delta[n + 3 + a]
             for b in range(3):

@@ -13,7 +13,7 @@ from mpsfm_core.mapping.correspondences import Correspondences
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
 from mpsfm_core.mapping.pose_hypotheses import Hypothesis
-from mpsfm_core.mapping.registration import rate_pose
+from mpsfm_core.mapping.pose_support import rate_pose
 from mpsfm_core.scene.graph import MIN_SCORE, CorrespondenceGraph
 from mpsfm_core.scene.scene import Scene
 from mpsfm_core.testing.problems import Noise, mapping_problem

@@ -14,7 +14,7 @@ from mpsfm_core.mapping.events import Silent
 from mpsfm_core.mapping.group import Group
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.registration import AbsolutePose
+from mpsfm_core.mapping.pose_support import AbsolutePose
 from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 

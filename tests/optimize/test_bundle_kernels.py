@@ -195,7 +195,7 @@ def test_step_solves_the_damped_normal_equations(sparse: bool, monkeypatch) -> N
 
 def test_rotation_near_zero_and_beyond_half_a_turn() -> None:
     for vector in ([0, 0, 0], [1e-9, -1e-7, 1e-8], [9e-5, 0, 0], [1e-3, 2e-3, 0], [3, -2, 1]):
-        turn = np.array(kernels._rotation(*map(float, vector)))
+        turn = np.array(kernels.rotation_of(*map(float, vector)))
         np.testing.assert_allclose(turn, rotation(np.array(vector)), atol=1e-15)
 
 

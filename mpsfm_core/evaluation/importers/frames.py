@@ -16,6 +16,7 @@ from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.prior_quality import write_depth
 from mpsfm_core.geometry import inside, pixel_centers, sample_nearest
 from mpsfm_core.inputs.header import read_header
+from mpsfm_core.inputs.undistortion import camera_key
 
 PHOTOS = (".jpg", ".jpeg", ".png")
 _DEPTH_COLUMNS = 1024
@@ -59,7 +60,7 @@ def write_frames(target: Path, frames: Sequence[Frame]) -> None:
         _link(frame.photo, photo)
         if frame.depth is not None:
             write_depth((target / "gt_depth" / frame.name).with_suffix(".png"), frame.depth())
-        key = f"{frame.camera.model_name} {frame.camera.width} {frame.camera.params.tolist()}"
+        key = camera_key(frame.camera)
         if key not in cameras:
             cameras[key] = len(cameras) + 1
             own = pycolmap.Camera({**frame.camera.todict(), "camera_id": cameras[key]})
