@@ -35,6 +35,7 @@ VARIANTS: Mapping[str, Mapping[str, object]] = {
     "final robust pass": {"refinement": {"final_robust": True}},
     "next view by inlier matches": {"registration": {"next_view": "inlier-matches"}},
     "next view by visible points": {"registration": {"next_view": "visible-points"}},
+    "poses of RANSAC as they are": {"registration": {"num_improved": 0}},
     "declared depth noise": {"refinement": {"measure_depth_noise": False}},
     "no rescaling of priors": {"refinement": {"rescale": False}},
     "metric scales free of each other": {"refinement": {"max_scale_deviations": 1000.0}},
