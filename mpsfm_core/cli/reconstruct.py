@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -82,6 +83,8 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
         f"reprojection error {best['mean_reprojection_error_px'] or 0:.2f} px"
     )
     typer.echo(f"  {_unit(best['metric_scale'])}")
+    if refined := _refined_focal_lengths(images["details"].values()):
+        typer.echo(f"  {refined}")
     for name, reason in images["unconfirmed"].items():
         typer.echo(f"  not confirmed: {name}: {reason}")
     for name, reason in images["unregistered"].items():
@@ -98,3 +101,19 @@ def _unit(metric: dict[str, Any] | None) -> str:
     if metric["trusted"]:
         return f"in metres, {by}"
     return f"not in metres: one unit is about {metric['metres_per_unit']:.3g} m {by}"
+
+
+def _refined_focal_lengths(details: Collection[Mapping[str, Any]]) -> str:
+    """What became of guessed focal lengths; empty if nothing. ``details``: of the summary."""
+    changes = {
+        (image["focal_length_px"], image["refined_focal_length_px"], image["focal_length_from"])
+        for image in details
+        if "refined_focal_length_px" in image
+    }
+    if len(changes) == 1:
+        guess, refined, source = changes.pop()
+        return f"focal length refined from {guess:.0f} ({source}) to {refined:.0f} px"
+    factors = [refined / guess - 1 for guess, refined, _ in changes]
+    if not factors:
+        return ""
+    return f"{len(factors)} focal lengths refined, by {min(factors):+.0%} to {max(factors):+.0%}"

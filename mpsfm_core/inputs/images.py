@@ -71,6 +71,18 @@ class SourceImage:
         """Pixels (n, 2) of the upright original image as pixels of the undistorted view."""
         return to_view(self.pinhole, self.camera, xy)
 
+    def refined_camera(self, pinhole: PinholeCamera) -> pycolmap.Camera:
+        """The original camera, with the focal length that a refined camera of the view has.
+
+        Focal lengths are refined when they were a guess, and guessed cameras have no distortion,
+        so that scaling the focal length is exact.
+        """
+        camera = pycolmap.Camera(self.camera.todict())
+        params = np.array(camera.params)
+        params[list(camera.focal_length_idxs())] *= pinhole.fx / self.pinhole.fx
+        camera.params = params
+        return camera
+
     @property
     def focal_known(self) -> bool:
         """Whether the focal length need not be refined."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Float64, MappingProblem, View
@@ -42,17 +41,8 @@ class Photos:
         ]
 
     def original_camera(self, image: RegisteredImage) -> pycolmap.Camera:
-        """The camera of the upright photo, with the focal length that the mapper refined.
-
-        Focal lengths are refined when they were a guess, and guessed cameras have no distortion,
-        so that scaling the focal length is exact.
-        """
-        source = self.source(image)
-        camera = pycolmap.Camera(source.camera.todict())
-        params = np.array(camera.params)
-        params[list(camera.focal_length_idxs())] *= image.camera.fx / source.pinhole.fx
-        camera.params = params
-        return camera
+        """The camera of the upright photo, with the focal length that the mapper refined."""
+        return self.source(image).refined_camera(image.camera)
 
     def any_distorted(self, reconstruction: Reconstruction) -> bool:
         """Whether a photo of the reconstruction is not a pinhole image."""

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from mpsfm_core.inputs.images import ImageSet
+from mpsfm_core.data import PinholeCamera
+from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.scene.reconstruction import MappingResult, MetricScale, Reconstruction
 
 
@@ -26,6 +27,9 @@ def describe_images(
         for image in reconstruction.confirmed_images
     }
     placed = {image.name for model in mapping.reconstructions[:1] for image in model.images}
+    cameras = {
+        image.name: image.camera for model in mapping.reconstructions for image in model.images
+    }
     reasons = {}
     for name in images.names:
         if name not in component:
@@ -39,12 +43,24 @@ def describe_images(
         "unregistered": {name: reason for name, reason in reasons.items() if name not in placed},
         "details": {
             image.name: {
-                "focal_length_from": image.focal_source,
+                **_focal_length(image, cameras.get(image.name)),
                 **extraction["images"][image.name],
             }
             for image in images
         },
     }
+
+
+def _focal_length(image: SourceImage, refined: PinholeCamera | None) -> dict[str, Any]:
+    """Of the upright photo: as it was given or guessed, and as it came out if it was refined."""
+    described = {
+        "focal_length_from": image.focal_source,
+        "focal_length_px": image.camera.mean_focal_length(),
+    }
+    if refined is not None and refined != image.pinhole:
+        camera = image.refined_camera(refined)
+        described["refined_focal_length_px"] = camera.mean_focal_length()
+    return described
 
 
 def describe_pairs(extraction: Mapping[str, Any], mapping: MappingResult) -> dict[str, Any]:

@@ -158,6 +158,15 @@ def test_a_refined_focal_length_reaches_the_photos_camera(solved, tmp_path: Path
     model = Component.of(reconstruction, Photos(images, problem)).model
     (camera,) = model.cameras.values()
     np.testing.assert_allclose(camera.params, [154, 155.1, 80.5, 59])
+    mapping = MappingResult((reconstruction,), solved.result.report)
+    nothing: dict[str, dict[str, object]] = {name: {} for name in images.names}
+    details = describe_images(images, {"images": nothing}, mapping)["details"]
+    assert details["images/0.png"] == {
+        "focal_length_from": "default",
+        "focal_length_px": pytest.approx(140.5),
+        "refined_focal_length_px": pytest.approx(154.55),
+    }
+    assert "refined_focal_length_px" not in details["images/3.png"], "it is not registered"
 
 
 def test_everything_that_can_be_left_out_is(solved, tmp_path: Path) -> None:
@@ -244,7 +253,11 @@ def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path)
     assert described["unregistered"] == {"images/3.png": "too few matches"}
     assert described["unconfirmed"] == {}
     details = described["details"]["images/0.png"]
-    assert details == {"focal_length_from": "intrinsics", "keypoints": 46}
+    assert details == {
+        "focal_length_from": "intrinsics",
+        "focal_length_px": pytest.approx(140.5),
+        "keypoints": 46,
+    }
     (pair,) = describe_pairs(extraction, mapping)["all"]
     assert pair == {**extraction["pairs"][0], "cannot_start": "no parallax"}
     (numbers,) = describe_reconstructions(mapping, [model])

@@ -11,6 +11,7 @@ import pycolmap
 import pytest
 
 import mpsfm_core
+from mpsfm_core.cli.reconstruct import _refined_focal_lengths
 from mpsfm_core.errors import ReconstructionError
 from mpsfm_core.evaluation import evaluate, read_poses, reconstruction_poses
 from mpsfm_core.inputs.nerfstudio import write_transforms
@@ -74,6 +75,37 @@ def test_the_summary_says_what_was_used_and_what_came_out(output: Path) -> None:
         assert stage["peak_memory_mb"] > 10
     (best,) = summary["reconstructions"]
     assert best["images"] == 5
+
+
+def test_a_guessed_focal_length_is_refined_and_told(photo_scene, mpsfm, tmp_path: Path) -> None:
+    (camera,) = pycolmap.Reconstruction(str(photo_scene.truth)).cameras.values()
+    guess = 1.06 * camera.focal_length_x
+    ended = mpsfm(
+        *photo_scene.without_intrinsics,
+        "--output",
+        tmp_path / "out",
+        "--set",
+        f"inputs.default_focal_ratio={guess / camera.width}",
+    )
+    assert ended.code == 0, ended.err
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    (told,) = {
+        (image["focal_length_px"], image["refined_focal_length_px"], image["focal_length_from"])
+        for image in summary["images"]["details"].values()
+    }
+    assert told == (pytest.approx(guess), pytest.approx(camera.focal_length_x, rel=0.02), "default")
+    assert f"focal length refined from {guess:.0f} (default) to {told[1]:.0f} px" in ended.out
+
+
+def test_refined_focal_lengths_of_several_cameras_are_told_as_a_range() -> None:
+    known = {"focal_length_from": "intrinsics", "focal_length_px": 500.0}
+    guessed = {"focal_length_from": "exif", "focal_length_px": 1000.0}
+    longer = {**guessed, "refined_focal_length_px": 1030.0}
+    shorter = {**guessed, "refined_focal_length_px": 980.0}
+    assert _refined_focal_lengths([known, longer, longer, shorter]) == (
+        "2 focal lengths refined, by -2% to +3%"
+    )
+    assert _refined_focal_lengths([known, guessed]) == ""
 
 
 def test_python_gives_the_same_poses_without_writing(
