@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from mpsfm_core.data import MappingProblem
+from mpsfm_core.geometry import compose, invert
 from mpsfm_core.mapping.correspondences import correspondences
 from mpsfm_core.mapping.finishing import registered_image
 from mpsfm_core.mapping.options import MapperOptions
@@ -20,14 +22,18 @@ from mpsfm_core.scene.scene import Scene
 
 
 def with_unconfirmed(
-    reconstruction: Reconstruction, problem: MappingProblem, options: MapperOptions
+    reconstruction: Reconstruction,
+    others: Sequence[Reconstruction],
+    problem: MappingProblem,
+    options: MapperOptions,
 ) -> Reconstruction:
     """The reconstruction with all further images that have matches to it, however doubtful.
 
     Again and again the image comes next whose pose is supported best, beside those placed before
-    as well. They see no points, and change neither the points nor the other poses.
+    as well; an image of one of the ``others`` takes that whole group along. They see no points,
+    and change neither the points nor the other poses.
     """
-    completion = _Completion(reconstruction, problem, options)
+    completion = _Completion(reconstruction, others, problem, options)
     placed = completion.place_all()
     if not placed:
         return reconstruction
@@ -44,7 +50,11 @@ class _Completion:
     """A scene like the finished one, to which images are added."""
 
     def __init__(
-        self, reconstruction: Reconstruction, problem: MappingProblem, options: MapperOptions
+        self,
+        reconstruction: Reconstruction,
+        others: Sequence[Reconstruction],
+        problem: MappingProblem,
+        options: MapperOptions,
     ) -> None:
         self.scene = Scene(problem, weigh_by_score=options.weigh_by_score)
         self._options = options.registration
@@ -53,16 +63,19 @@ class _Completion:
         self._refiner = Refiner(self.scene, options, self._scores)
         self._search = PoseSearch(self.scene, self._refiner, options)
         self._found: dict[int, tuple[list[int], AbsolutePose | None]] = {}
+        self._groups = {image.index: group for group in others for image in group.images}
         self._scale = float(np.median([image.scale for image in reconstruction.images]))
         self.scene.resume(reconstruction)
 
     def place_all(self) -> list[int]:
-        """Place one image after the other; those placed."""
-        placed: list[int] = []
+        """Place one image or group after the other; the images placed."""
+        before = self.scene.registered.copy()
         while best := self._best():
-            self._place(*best)
-            placed.append(best[0])
-        return placed
+            image, pose = best
+            self._place(image, pose)
+            if image in self._groups:
+                self._place_beside(image, self._groups[image])
+        return [int(image) for image in np.flatnonzero(self.scene.registered & ~before)]
 
     def _place(self, image: int, pose: AbsolutePose) -> None:
         """Register an image and scale its prior to the points that it may see."""
@@ -75,6 +88,19 @@ class _Completion:
         scene.restore(before)
         scene.register(image, pose.rotation, pose.translation)
         depth_map.set_scale(scale)
+
+    def _place_beside(self, image: int, group: Reconstruction) -> None:
+        """Register the other images of a placed image's group as they lie to it."""
+        scene = self.scene
+        (own,) = (member for member in group.images if member.index == image)
+        growth = scene.maps[image].scale / own.scale
+        placed = scene.rotations[image].copy(), scene.translations[image].copy()
+        inverse = invert(own.rotation, own.translation)
+        for member in group.images:
+            if member.index != image:
+                turn, step = compose((member.rotation, member.translation), inverse)
+                scene.register(member.index, *compose((turn, growth * step), placed))
+                scene.maps[member.index].set_scale(growth * member.scale)
 
     def _best(self) -> tuple[int, AbsolutePose] | None:
         """The image whose pose is supported best."""

@@ -32,7 +32,7 @@ def reconstruct(
     models = sorted(mapper.components(), key=lambda model: -len(model.images))
     report = mapper.journal.report(models)
     if models and mapper.options.place_unconfirmed:
-        models[0] = with_unconfirmed(models[0], problem, mapper.options)
+        models[0] = with_unconfirmed(models[0], models[1:], problem, mapper.options)
     return MappingResult(tuple(models), report)
 
 

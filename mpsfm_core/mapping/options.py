@@ -204,7 +204,8 @@ class MappingOptions(Options):
     """Largest number of disconnected components."""
     place_unconfirmed: bool = False
     """At the end also place the images that are not in the largest component, in that, where their
-    matches fit best. The summary lists them; they see no points and change nothing else."""
+    matches fit best; those of another component as a whole. The summary lists them; they see no
+    points and change nothing else."""
     initialization: InitializationOptions = InitializationOptions()
     registration: RegistrationOptions = RegistrationOptions()
     triangulation: TriangulationOptions = TriangulationOptions()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import Float64, MappingProblem, PinholeCamera
-from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.geometry import compose, invert, rotation_angle_deg
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.scene.reconstruction import RegisteredImage
@@ -61,6 +61,19 @@ def test_few_matches_place_an_image_and_those_beyond_it(problem: MappingProblem)
     }
     assert turns_deg(list(best.images)).max() < 1.0
     assert list(complete.report.image_reasons) == ["view_5.png"], "no match places it"
+
+
+def test_a_group_is_placed_as_a_whole(problem: MappingProblem) -> None:
+    best, group = reconstruct(problem, COMPLETE).reconstructions
+    placed = [image for image in best.images if not image.confirmed]
+    (turn, step), (own_turn, own_step) = (
+        compose((b.rotation, b.translation), invert(a.rotation, a.translation))
+        for a, b in (placed, group.images)
+    )
+    growth = placed[0].scale / group.images[0].scale
+    np.testing.assert_allclose(turn, own_turn, atol=1e-12)
+    np.testing.assert_allclose(step, growth * own_step, atol=1e-12)
+    assert placed[1].scale == pytest.approx(growth * group.images[1].scale)
 
 
 def test_what_is_confirmed_does_not_change(problem: MappingProblem) -> None:
