@@ -1,6 +1,6 @@
 """The depth check on two rooms that look alike: what it rejects, and what that is worth.
 
-    python -m benchmarks.symmetry [--seeds 3] [--placed-only] [--output FILE]
+    python -m benchmarks.symmetry [--seeds 9] [--placed-only] [--output FILE]
 
 *Placed*: all views stand at their true poses with refined depth; each view of a room is then judged
 where it belongs, beside all others, and a room too far, beside the views of the other room and the
@@ -113,7 +113,7 @@ def shares(verdicts: list[tuple[bool, bool]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=9)
     parser.add_argument("--placed-only", action="store_true")
     parser.add_argument("--output", type=Path)
     arguments = parser.parse_args()
