@@ -106,6 +106,31 @@ class PairsOfSets:
         return [(a, b) for a, b in pairs if (min(a, b), max(a, b)) in self._allowed]
 
 
+def problem_of_sets(
+    scene: SceneFolder,
+    sets: Sequence[EvaluationSet],
+    prior: str,
+    config: str,
+    overrides: Sequence[str],
+    work: Path,
+    registry: Registry,
+) -> tuple[MappingProblem, MapperOptions]:
+    """Verified matches and priors of all images of the sets, and the configuration's mapper.
+
+    ``prior``: a quality of :mod:`~mpsfm_core.evaluation.prior_quality`. ``work``: a folder for the
+    depth of that quality.
+    """
+    names = sorted({name for item in sets for name in item.images})
+    settings = prior_settings(prior, scene, names, work / f"{prior}-depth")
+    loaded = load_config(config, (*settings, *overrides), registry=registry)
+    work.mkdir(parents=True, exist_ok=True)
+    listed = work / "images.txt"
+    listed.write_text("\n".join(names) + "\n", encoding="utf-8")
+    images = load_images(scene.images, scene.intrinsics, listed, loaded.inputs)
+    extraction = extract(images, loaded, registry, Stages(registry))
+    return extraction.problem, loaded.mapper_options()
+
+
 class _SceneRuns:
     """All runs of one scene with one configuration."""
 
@@ -129,7 +154,15 @@ class _SceneRuns:
     def __call__(self) -> Iterator[tuple[Record, bool]]:
         """Records and whether they were there already."""
         for number, prior in enumerate(self._plan.priors):
-            problem, options = self._problem(prior)
+            problem, options = problem_of_sets(
+                self._scene,
+                self._sets,
+                prior,
+                self._config,
+                self._plan.overrides,
+                self._output / "work" / self._scene.name,
+                self._registry,
+            )
             methods = {
                 _label(method, prior): method
                 for method in (OURS, *self._plan.peers)
@@ -150,21 +183,6 @@ class _SceneRuns:
                 record = self._record(*places[task], task, outcome)
                 write_record(self._output, record)
                 yield record, False
-
-    def _problem(self, prior: str) -> tuple[MappingProblem, MapperOptions]:
-        """Verified matches and priors of all images of the sets."""
-        scene, work = self._scene, self._output / "work" / self._scene.name
-        names = sorted({name for item in self._sets for name in item.images})
-        settings = prior_settings(prior, scene, names, work / f"{prior}-depth")
-        config = load_config(
-            self._config, (*settings, *self._plan.overrides), registry=self._registry
-        )
-        work.mkdir(parents=True, exist_ok=True)
-        listed = work / "images.txt"
-        listed.write_text("\n".join(names) + "\n", encoding="utf-8")
-        images = load_images(scene.images, scene.intrinsics, listed, config.inputs)
-        extraction = extract(images, config, self._registry, Stages(self._registry))
-        return extraction.problem, config.mapper_options()
 
     def _known(self, item: EvaluationSet, label: str, key: str) -> Record | None:
         path = self._output / record_file(self._scene.name, self._config_name, item.name, label)

@@ -42,6 +42,9 @@ _FILLED_LOG_VARIANCE = 1.0
 # times re-weighted. Ours: at 768 x 512 an energy lower than without, at three quarters of the time.
 _COARSE_COLUMNS = 300
 _FINE_ITERATIONS = 3
+# Depth that is continued along normals stays within this factor of what is known (ours): a normal
+# that grazes the line of sight says that the next pixel is at any distance.
+_MAX_CONTINUATION = 100.0
 # Weight that holds known depth fixed, against couplings below 1e12.
 _FIXED = 1e15
 
@@ -351,7 +354,10 @@ class DepthIntegrator:
         )
         solver = _KernelSolver(terms)
         step = solver.step(solver.majorise(self._log_depth), iterations=50, tolerance=1e-3)
-        return self._log_depth + step.x
+        low, high = self._log_depth[known].min(), self._log_depth[known].max()
+        margin = np.log(_MAX_CONTINUATION)
+        filled: Float64 = np.nan_to_num(self._log_depth + step.x, nan=0.5 * (low + high))
+        return np.clip(filled, low - margin, high + margin)
 
 
 def _reachable(depth_valid: Bool, normals_valid: Bool) -> Bool:

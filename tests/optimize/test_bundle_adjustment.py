@@ -433,7 +433,7 @@ def degenerate_problems(draw: st.DrawFn) -> BundleProblem:
     )
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=300)
 @given(
     problem=degenerate_problems(),
     reprojection_loss=st.sampled_from(Loss),

@@ -9,7 +9,7 @@ from mpsfm_core.optimize.depth_variance import inverse_diagonal
 from tests.optimize.integration_reference import grid_operator
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(height=st.integers(1, 22), width=st.integers(1, 22), seed=st.integers(0, 10**6))
 def test_equals_the_dense_inverse(height, width, seed):
     rng = np.random.default_rng(seed)

@@ -62,7 +62,7 @@ def energy_error(planes: Planes, x: np.ndarray, solution: np.ndarray) -> float:
     return float(np.sqrt(error @ (matrix @ error) / (full @ (matrix @ full))))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     height=st.integers(1, 14),
     width=st.integers(1, 14),
