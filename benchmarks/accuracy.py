@@ -27,6 +27,8 @@ PRIORS = ("sensor", "degraded", "config")
 SEEDS = 12
 """Of degraded depth on rendered_kitchen: its sets have few images, and their AUC depends on the
 errors that these happen to have by several points."""
+DEGRADED = ("degraded", *(f"degraded-{seed}" for seed in range(1, SEEDS)))
+"""The priors of these seeds."""
 WINDOWS, FRAMES = 6, 5
 """Low parallax: so many windows, evenly spaced, of so many consecutive frames."""
 
@@ -57,7 +59,7 @@ UNCONFIRMED = "unconfirmed", "mapping: {place_unconfirmed: true}\n"
 COMPARISONS: Mapping[str, Comparison] = {
     "rendered_kitchen": Comparison(
         "rendered_kitchen",
-        priors=(*PRIORS, *(f"degraded-{seed}" for seed in range(1, SEEDS))),
+        priors=(*PRIORS, *DEGRADED[1:]),
         note=f"Degraded depth: errors of {SEEDS} seeds, each counted as a set.",
     ),
     "hololens_room": Comparison("hololens_room"),

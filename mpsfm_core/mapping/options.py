@@ -58,8 +58,9 @@ class RegistrationOptions(Options):
     """Attempts at an image after which no more halves are tried (ours)."""
     num_improved: int = Field(8, ge=0)
     """Best supported distinct poses that are moved to where matches support them most. Ours, beside
-    PnP refined by reprojection errors: AUC@1 of rendered_kitchen leq30 with sensor depth 61 -> 63,
-    AUC@20 of hololens_room 41 -> 45, FastDepth on leq10 of the former 42 -> 51, in less time."""
+    PnP refined by reprojection errors, means of seeds: AUC@1 of rendered_kitchen leq30 with sensor
+    depth 61 -> 63 (minimal 61 -> 57), AUC@20 of hololens_room 41 -> 45, FastDepth on leq10 of the
+    former 42 -> 51, in less time."""
     num_polished: int = Field(3, ge=1)
     """Best supported distinct poses that are bundle-adjusted before one is chosen (ours)."""
     polishing: int = Field(10, ge=1)

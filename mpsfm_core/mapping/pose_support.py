@@ -93,11 +93,11 @@ def _intrinsics(scene: Scene, found: Correspondences) -> Float64:
 def _segments(scene: Scene, found: Correspondences, options: RegistrationOptions) -> Segments:
     std = scene.keypoint_std_px[scene.graph.image_of[found.keypoints]]
     return Segments(
-        near=np.ascontiguousarray(found.near, dtype=np.float64),
-        far=np.ascontiguousarray(found.far, dtype=np.float64),
-        xy=np.ascontiguousarray(scene.keypoints[found.keypoints], dtype=np.float64),
-        limit=options.max_support_error_px * np.asarray(std, dtype=np.float64),
-        weight=np.asarray(found.scores, dtype=np.float64),
+        near=found.near,
+        far=found.far,
+        xy=scene.keypoints[found.keypoints],
+        limit=options.max_support_error_px * std,
+        weight=found.scores,
     )
 
 

@@ -15,9 +15,8 @@ import numpy as np
 from numba import njit
 
 from mpsfm_core.data import Float64, Pose
-from mpsfm_core.optimize.bundle_kernels import MIN_DEPTH, rotation_of
+from mpsfm_core.optimize.bundle_kernels import MIN_DEPTH, POSE, rotation_of
 
-POSE = 6
 DAMPING = 1e-6
 """Relative, of the normal equations: keeps few matches from being singular (ours)."""
 MAX_TURN = 1.0

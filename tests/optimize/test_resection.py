@@ -19,6 +19,7 @@ from mpsfm_core.optimize.resection import (
 )
 
 INTRINSICS = np.array([500.0, 480.0, 320.0, 240.0])
+NARROWING = np.array([5.0, 3.0, 2.0, *np.ones(9)])
 TRUTH = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix(), np.array([0.3, -0.1, 0.2])
 
 
@@ -131,7 +132,7 @@ def test_pose_is_found_from_far_off_among_wrong_matches() -> None:
     start = moved(TRUTH, np.array([0.02, -0.02, 0.02, 0.1, 0.1, -0.1]))
     off = distances_and_depths(start, INTRINSICS, seen)[0][~wrong]
     assert np.median(off) > 4.0
-    found = refine_pose(start, INTRINSICS, seen, scales=np.array([5.0, 3.0, 2.0, *np.ones(9)]))
+    found = refine_pose(start, INTRINSICS, seen, scales=NARROWING)
     turn, shift = errors(found)
     assert turn < 0.05
     assert shift < 0.01
@@ -157,7 +158,7 @@ def test_points_are_as_good_as_colmap_makes_of_them() -> None:
     """COLMAP minimises another robust loss of the same errors."""
     seen = segments(200, slack=0.0, noise_px=0.5, seed=3)
     start = moved(TRUTH, np.array([0.01, -0.01, 0.01, 0.05, 0.05, -0.05]))
-    found = refine_pose(start, INTRINSICS, seen, scales=np.array([5.0, 3.0, 2.0, *np.ones(9)]))
+    found = refine_pose(start, INTRINSICS, seen, scales=NARROWING)
     camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=INTRINSICS)
     colmap = pycolmap.refine_absolute_pose(
         pycolmap.Rigid3d(pycolmap.Rotation3d(start[0]), start[1]),
