@@ -235,7 +235,7 @@ class Group:
         scene = self.scene
         with self.journal.timed("registration"):
             found = correspondences(scene, image, references, self._options.registration)
-            most = int(np.bincount(found.references, minlength=1).max())
+            most = int(np.bincount(found.references, found.worth, minlength=1).max())
             if most < self._ladder.min_inliers:
                 return f"{most} matches have a 3D point, {self._ladder.min_inliers} are needed"
             poses = self._find_poses(image, references, found)

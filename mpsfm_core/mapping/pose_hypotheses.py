@@ -121,7 +121,7 @@ class Hypotheses:
     def of_halves(self) -> Iterator[Estimate]:
         """From random halves of the matches to the image that has most of them.
 
-        A match is drawn in proportion to its score.
+        A match is drawn in proportion to its weight.
         """
         found = self.found
         if len(found.keypoints) < MIN_CORRESPONDENCES:
@@ -130,7 +130,7 @@ class Hypotheses:
         reference = int(np.bincount(found.references).argmax())
         mine = np.flatnonzero(found.references == reference)
         half_size = min(max(len(mine) // 2, MIN_CORRESPONDENCES), len(mine))
-        odds = found.scores[mine] / found.scores[mine].sum()
+        odds = found.weights[mine] / found.weights[mine].sum()
         for _ in range(self.options.num_resamples):
             chosen = np.sort(rng.choice(mine, half_size, replace=False, p=odds))
             half = replace(self, found=found.select(chosen))
@@ -140,8 +140,8 @@ class Hypotheses:
 
     def _forward(self) -> Hypothesis | None:
         """PnP on the points of the scene."""
-        xy = self.scene.keypoints[self.found.keypoints]
-        pose = self._pnp(self.image, xy, self.found.points)
+        found = self.found.select(self.found.known)
+        pose = self._pnp(self.image, self.scene.keypoints[found.keypoints], found.points)
         return Hypothesis(*pose, "PnP") if pose else None
 
     def _reverse(self, reference: int) -> Hypothesis | None:
@@ -200,7 +200,7 @@ class Hypotheses:
 
 def _baseline(scene: Scene, found: Correspondences, reference: int, relative: Pose) -> float | None:
     """Factor of a relative translation that brings triangulated points to the known depth."""
-    mine = found.references == reference
+    mine = (found.references == reference) & found.known
     rotation, translation = relative
     known = found.points[mine] @ scene.rotations[reference].T + scene.translations[reference]
     rays_a = known / known[:, 2:]

@@ -2,7 +2,7 @@
 
 A match supports a pose if its keypoint lies near the segment onto which the other keypoint's ray
 projects between the depths that the prior allows, and if the depth that follows fits the new
-image's own prior.
+image's own prior. Where the other depth is unknown, the segment is all of the ray that may be seen.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ points may be off by pixels first (ours)."""
 class AbsolutePose:
     """``cam_from_world``, its source, and the support of the reference image with most of it.
 
-    ``support`` is the truncated quadratic score (MSAC) by which hypotheses are compared, weighted
-    by the scores of the matches, as is ``inlier_share``.
+    ``support`` is the truncated quadratic score (MSAC) by which hypotheses are compared, in terms
+    of the matches' weights, as is ``inlier_share``; ``num_inliers`` counts what they are worth.
     """
 
     rotation: Float64
@@ -58,14 +58,14 @@ def rate_pose(
         sums = np.bincount(found.references, values, minlength=scene.num_images)
         return sums.astype(np.float64)
 
-    support = per_reference(found.scores * (1 - misfit**2))
+    support = per_reference(found.weights * (1 - misfit**2))
     best = int(np.argmax(support))
-    total = per_reference(found.scores)[best]
+    total = per_reference(found.weights)[best]
     return AbsolutePose(
         *hypothesis,
         float(support[best]),
-        int(inlier[found.references == best].sum()),
-        float(per_reference(found.scores * inlier)[best] / total) if total else 0.0,
+        int(per_reference(found.worth * inlier)[best]),
+        float(per_reference(found.weights * inlier)[best] / total) if total else 0.0,
     )
 
 
@@ -97,7 +97,7 @@ def _segments(scene: Scene, found: Correspondences, options: RegistrationOptions
         far=found.far,
         xy=scene.keypoints[found.keypoints],
         limit=options.max_support_error_px * std,
-        weight=found.scores,
+        weight=found.weights,
     )
 
 
@@ -130,7 +130,7 @@ def _depth_misfits(
     misfits = np.full(len(depth), np.nan)
     image = int(scene.graph.image_of[found.keypoints[0]])
     rows = found.keypoints - scene.graph.offsets[image]
-    known = scene.maps[image].keypoint_valid[rows] & (depth > 0)
+    known = found.known & scene.maps[image].keypoint_valid[rows] & (depth > 0)
     if (known & near).any():
         log_ratio = np.log(depth[known] / scene.maps[image].prior_at_keypoints(rows[known]))
         own = scene.keypoint_log_std[found.keypoints[known]]

@@ -117,22 +117,32 @@ class Scene:
         xy = self.keypoints[keypoints]
         return np.stack([(xy[:, 0] - cx) / fx, (xy[:, 1] - cy) / fy, np.ones(len(xy))], axis=1)
 
-    def lift(self, keypoints: Int64) -> tuple[Float64, Bool]:
-        """World points (m, 3) of keypoints at the best depth of their image, and where valid."""
+    def depth_at(self, keypoints: Int64) -> tuple[Float64, Bool]:
+        """Best depth (m,) of keypoints in their images, world units, 0 where not valid; and where
+        it is."""
         images = self.graph.image_of[keypoints]
         depth = np.zeros(len(keypoints))
-        valid = np.zeros(len(keypoints), dtype=np.bool_)
         for image in map(int, np.unique(images)):
             if not self.maps[image].active:
                 continue
             of_image = images == image
             rows = keypoints[of_image] - self.graph.offsets[image]
-            depth[of_image] = self.maps[image].at_keypoints(rows)
-            valid[of_image] = self.maps[image].keypoint_valid[rows]
+            valid = self.maps[image].keypoint_valid[rows]
+            depth[of_image] = np.where(valid, self.maps[image].at_keypoints(rows), 0.0)
+        return np.maximum(depth, 0.0), depth > 0
+
+    def at_depth(self, keypoints: Int64, depth: Float64) -> Float64:
+        """World points (m, 3) on the rays of keypoints at a depth (m,) in their images."""
+        images = self.graph.image_of[keypoints]
         camera_points = self.rays(keypoints) * depth[:, None]
         rotations, translations = self.rotations[images], self.translations[images]
-        world = np.einsum("nji,nj->ni", rotations, camera_points - translations)
-        return world, valid & (depth > 0)
+        world: Float64 = np.einsum("nji,nj->ni", rotations, camera_points - translations)
+        return world
+
+    def lift(self, keypoints: Int64) -> tuple[Float64, Bool]:
+        """World points (m, 3) of keypoints at the best depth of their image, and where valid."""
+        depth, valid = self.depth_at(keypoints)
+        return self.at_depth(keypoints, depth), valid
 
     def project(self, keypoints: Int64, points: Float64) -> tuple[Float64, Float64]:
         """Reproject world points (m, 3) into the images of keypoints (m,).
