@@ -64,7 +64,7 @@ def pose_errors_deg(problem: MappingProblem, *, weigh_by_score: bool) -> list[fl
 def test_matches_that_the_matcher_doubts_hardly_bend_the_poses() -> None:
     weighed: list[float] = []
     alike: list[float] = []
-    for seed in range(6):
+    for seed in range(12):
         problem = problem_with_doubtful_matches(seed)
         weighed += pose_errors_deg(problem, weigh_by_score=True)
         alike += pose_errors_deg(problem, weigh_by_score=False)
@@ -107,9 +107,8 @@ def test_support_and_inlier_share_count_scores_and_inliers_count_matches() -> No
     points = scene.rays(keypoints) * 2.0  # view 1 is at the origin and sees them where they are
     points[6:, 0] += 1.0  # but for the last four
     scores = np.where(np.arange(count) < 6, 0.9, 0.1)
-    found = Correspondences(
-        keypoints, keypoints, points, points, points, np.zeros(count, dtype=np.int64), scores
-    )
+    references, worth = np.zeros(count, dtype=np.int64), np.ones(count)
+    found = Correspondences(keypoints, keypoints, points, points, points, references, worth, scores)
     options = RegistrationOptions(depth_deviations=1e6)
     pose = rate_pose(scene, found, Hypothesis(np.eye(3), np.zeros(3), "PnP"), options)
     assert pose.num_inliers == 6
