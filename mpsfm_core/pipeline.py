@@ -166,6 +166,7 @@ class _Run:
             "pairs": describe_pairs(extraction.report, mapping),
             "reconstructions": describe_reconstructions(mapping, models),
             "stages": {name: asdict(record) for name, record in self._stages.report().items()},
+            "mapping_runs": mapping.report.runs,
             "mapping_steps": {
                 name: {"seconds": seconds, "calls": mapping.report.counts.get(name)}
                 for name, seconds in mapping.report.seconds.items()

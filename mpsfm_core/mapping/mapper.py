@@ -1,21 +1,49 @@
-"""A reconstruction of all images: group after group, each from its own start."""
+"""A reconstruction of all images: group after group, each from its own start; in several runs where
+random choices decide."""
 
 from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from mpsfm_core.data import Bool, MappingProblem
 from mpsfm_core.mapping.completion import with_unconfirmed
 from mpsfm_core.mapping.events import MappingEvents, Silent
+from mpsfm_core.mapping.explained import explained_score, total_score
 from mpsfm_core.mapping.finishing import finished
 from mpsfm_core.mapping.group import Group
 from mpsfm_core.mapping.initialization import Starts
 from mpsfm_core.mapping.journal import Journal
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction
+from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
 
 CONTENDER_SHARE = 0.25
 """Of the number of images of the largest group, with which another contends for them (ours)."""
+AGREEMENT = 0.01
+"""Of all matches; two runs that differ by less in what they explain came to the same (ours)."""
+
+
+class Run(NamedTuple):
+    """``models``: the groups of one run, the largest first. ``explained``: by each, of the summed
+    scores of all matches."""
+
+    models: Sequence[Reconstruction]
+    explained: Sequence[float]
+    report: MappingReport
+
+    @property
+    def of_largest(self) -> float:
+        """Share of the matches that the largest group explains."""
+        return self.explained[0] if self.explained else 0.0
+
+    @property
+    def size(self) -> int:
+        """Number of images of the largest group."""
+        return len(self.models[0].images) if self.models else 0
 
 
 def reconstruct(
@@ -25,15 +53,43 @@ def reconstruct(
 ) -> MappingResult:
     """Pose as many images as can be posed confidently, with points and refined depth.
 
-    Disconnected groups of images become reconstructions of their own, the largest first. The
-    result is the same bit for bit for the same problem, options and machine.
+    Disconnected groups of images become reconstructions of their own, the largest first. Where
+    much of the matches stays unexplained, other random choices may come to more: then there are
+    several runs, and that counts which explains most. The result is the same bit for bit for the
+    same problem, options and machine.
     """
-    mapper = Mapper(problem, options or MapperOptions(), events or Silent())
-    models = sorted(mapper.components(), key=lambda model: -len(model.images))
-    report = mapper.journal.report(models)
-    if models and mapper.options.place_unconfirmed:
-        models[0] = with_unconfirmed(models[0], models[1:], problem, mapper.options)
-    return MappingResult(tuple(models), report)
+    options = options or MapperOptions()
+    runs: list[Run] = []
+    for number in range(options.max_runs):
+        own = options.model_copy(update={"seed": options.seed + number})
+        mapper = Mapper(problem, own, events or Silent())
+        runs.append(mapper.run())
+        if mapper.keeps_poses or _settled(runs, options.enough_explained):
+            break
+    best = max(runs, key=lambda run: run.of_largest)
+    models = list(best.models)
+    if models and options.place_unconfirmed:
+        models[0] = with_unconfirmed(models[0], models[1:], problem, options)
+    return MappingResult(tuple(models), _with_all_times(best.report, runs))
+
+
+def _settled(runs: Sequence[Run], enough: float) -> bool:
+    """Whether the last run explains enough, or came to the same as one before it."""
+    *before, last = runs
+    return sum(last.explained) >= enough or any(
+        run.size == last.size and abs(run.of_largest - last.of_largest) < AGREEMENT
+        for run in before
+    )
+
+
+def _with_all_times(report: MappingReport, runs: Sequence[Run]) -> MappingReport:
+    """The report with the time that all runs took."""
+    seconds: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
+    for run in runs:
+        seconds.update(run.report.seconds)
+        counts.update(run.report.counts)
+    return replace(report, seconds=dict(seconds), counts=dict(counts), runs=len(runs))
 
 
 class Mapper:
@@ -52,6 +108,18 @@ class Mapper:
         self.left: Bool = np.ones(len(problem.images), dtype=np.bool_)
         self._starts = Starts(options)
         self._poses_hold = sum(image.known_pose is not None for image in problem.images) >= 2
+
+    @property
+    def keeps_poses(self) -> bool:
+        """Whether known poses stay as they are, so that nothing is left to chance."""
+        return self._poses_hold and self.options.known_poses == "fixed"
+
+    def run(self) -> Run:
+        """Reconstruct all groups."""
+        models = sorted(self.components(), key=lambda model: -len(model.images))
+        total = total_score(self.problem) or 1.0
+        explained = [explained_score(model, self.problem) / total for model in models]
+        return Run(models, explained, self.journal.report(models))
 
     def components(self) -> list[Reconstruction]:
         """Reconstruct one group of images after the other."""

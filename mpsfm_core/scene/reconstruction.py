@@ -70,13 +70,15 @@ class MappingReport:
     """What happened, for people and for summary.json.
 
     ``image_reasons``: image name -> why it is not registered. ``pair_reasons``: "a b" -> why the
-    pair could not start a reconstruction. ``seconds``: step -> time. ``counts``: step -> calls.
+    pair could not start a reconstruction. ``seconds``: step -> time. ``counts``: step -> calls,
+    both of all ``runs``.
     """
 
     image_reasons: Mapping[str, str] = field(default_factory=dict)
     pair_reasons: Mapping[str, str] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
+    runs: int = 1
 
 
 @dataclass(frozen=True, eq=False)
