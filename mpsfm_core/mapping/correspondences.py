@@ -23,11 +23,11 @@ class Correspondences(NamedTuple):
     """Keypoints of an image and what they see.
 
     ``keypoints`` (m,): of the image. ``matched`` (m,): their matches in registered images.
-    ``near``, ``far``: (m, 3) world points that bound where the
-    point may lie along the ray of the matched keypoint (the same point twice when triangulated);
-    ``points`` (m, 3): the best guess. ``references`` (m,): the image the match comes from.
-    ``worth`` (m,): 1, or :data:`WORTH_OF_RAY` where depth is unknown. ``weights`` (m,): the scores
-    of the matches, in (0, 1], times their worth.
+    ``near``, ``far``: (m, 3) world points that bound where the point may lie along the ray of the
+    matched keypoint (the same point twice when triangulated); ``points`` (m, 3): the best guess.
+    ``references`` (m,): the image the match comes from. ``worth`` (m,): 1, or
+    :data:`WORTH_OF_RAY` where depth is unknown. ``weights`` (m,): the scores of the matches, in
+    (0, 1], times their worth.
     """
 
     keypoints: Int64
