@@ -210,7 +210,7 @@ class MappingOptions(Options):
     47, elsewhere the same."""
     enough_explained: float = Field(0.75, ge=0, le=1)
     """Share of all matches, by score, of which both keypoints see the same point, with which one
-    run is enough (ours; rendered_kitchen 0.80 to 0.98, hololens_room mostly below 0.75)."""
+    run is enough (ours; rendered_kitchen 0.80 to 0.98, hololens_room 0.5 to 0.9)."""
     place_unconfirmed: bool = False
     """At the end also place the images that are not in the largest component, in that, where their
     matches fit best; those of another component as a whole. The summary lists them; they see no
