@@ -38,6 +38,11 @@ def with_sets(scene: Path, folder: Path, sets: Mapping[str, Sequence[Sequence[st
     return folder
 
 
+def percent(area: Mapping[float, float]) -> str:
+    """Pose AUC by threshold, in percent, for a cell of a table."""
+    return " / ".join(f"{100 * value:.1f}" for value in area.values())
+
+
 def tell(record: Record, known: bool) -> None:
     """Say on stderr that a run is done, or was before."""
     what = "known" if known else record.error or f"{record.cpu_seconds:.1f} s"

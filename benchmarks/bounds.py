@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks._scenes import RESULTS, shared_folder
+from benchmarks._scenes import RESULTS, percent, shared_folder
 from benchmarks.accuracy import DEGRADED
 from mpsfm_core.data import Float64, MappingProblem, Pose
 from mpsfm_core.evaluation.benchmark import PairsOfSets, problem_of_sets
@@ -59,16 +59,15 @@ def main() -> None:
             plain = problem.subset(list(item.images))
             for start, run in (("by itself", plain), ("at the truth", _posed(plain, truth))):
                 models = reconstruct(run, options).reconstructions
-                found = {i.name: (i.rotation, i.translation) for m in models[:1] for i in m.images}
+                found = models[0].poses if models else {}
                 key = item.bucket, start
                 errors.setdefault(key, []).append(pose_errors_deg(found, truth, CONVENTION))
                 sizes.setdefault(key, []).append(len(found) / len(truth))
     lines = [HEADER]
     for (bucket, start), each in errors.items():
         area = pose_auc(np.concatenate(each), CONVENTION)
-        auc = " / ".join(f"{100 * value:.1f}" for value in area.values())
         share = np.mean(sizes[bucket, start])
-        lines.append(f"| {bucket} | {len(each)} | {start} | {auc} | {share:.0%} |")
+        lines.append(f"| {bucket} | {len(each)} | {start} | {percent(area)} | {share:.0%} |")
     parts = [
         f"# What matches and depth hold on {SCENE}",
         f"Degraded depth, errors of {len(DEGRADED)} seeds; our mapper, and the same started at the "

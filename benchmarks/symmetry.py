@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks._scenes import percent
 from mpsfm_core.data import MappingProblem, VerifiedPair
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.geometry import camera_center
@@ -96,7 +97,7 @@ def mapped(case: SymmetricProblem, enabled: bool) -> tuple[np.ndarray, int, list
     start = time.perf_counter()
     best = max(mapper.components(), key=lambda c: len(c.images), default=None)
     seconds = time.perf_counter() - start
-    found = {i.name: (i.rotation, i.translation) for i in best.images} if best else {}
+    found = best.poses if best else {}
     views = zip(case.problem.images, case.poses, strict=True)
     truth = {image.name: (pose[:, :3], pose[:, 3]) for image, pose in views}
     return pose_errors_deg(found, truth, CONVENTIONS["paper"]), len(found), verdicts, seconds
@@ -132,7 +133,7 @@ def main() -> None:
             for enabled in (False, True):
                 runs = [mapped(case, enabled) for case in cases]
                 area = pose_auc(np.concatenate([run[0] for run in runs]), convention)
-                auc = " / ".join(f"{100 * value:.1f}" for value in area.values())
+                auc = percent(area)
                 size = sum(run[1] for run in runs) / sum(len(case.poses) for case in cases)
                 verdicts = [v for run in runs for v in run[2]] if enabled else []
                 seconds = np.mean([run[3] for run in runs])

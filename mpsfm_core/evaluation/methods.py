@@ -90,10 +90,7 @@ def _models(method: str, problem: MappingProblem, options: MapperOptions) -> lis
         return chained_poses(problem, options.seed)
     if method != OURS:
         return run_peer(method, problem)
-    return [
-        {image.name: (image.rotation, image.translation) for image in model.images}
-        for model in mapper.reconstruct(problem, options).reconstructions
-    ]
+    return [model.poses for model in mapper.reconstruct(problem, options).reconstructions]
 
 
 class _Lanes:

@@ -25,9 +25,8 @@ class Correspondences(NamedTuple):
     ``keypoints`` (m,): of the image. ``matched`` (m,): their matches in registered images.
     ``near``, ``far``: (m, 3) world points that bound where the point may lie along the ray of the
     matched keypoint (the same point twice when triangulated); ``points`` (m, 3): the best guess.
-    ``references`` (m,): the image the match comes from. ``worth`` (m,): 1, or
-    :data:`WORTH_OF_RAY` where depth is unknown. ``weights`` (m,): the scores of the matches, in
-    (0, 1], times their worth.
+    ``references`` (m,): the image the match comes from. ``known`` (m,) bool: whether the depth of
+    the point is. ``weights`` (m,): the scores of the matches, in (0, 1], times their worth.
     """
 
     keypoints: Int64
@@ -36,14 +35,13 @@ class Correspondences(NamedTuple):
     near: Float64
     far: Float64
     references: Int64
-    worth: Float64
+    known: Bool
     weights: Float64
 
     @property
-    def known(self) -> Bool:
-        """(m,) bool, whether the depth of the point is known."""
-        known: Bool = self.worth == 1.0
-        return known
+    def worth(self) -> Float64:
+        """(m,) 1, or :data:`WORTH_OF_RAY` where depth is unknown."""
+        return worth_of(self.known)
 
     def select(self, chosen: Int64 | Bool) -> Correspondences:
         """Some of them, by row or mask."""
@@ -79,9 +77,13 @@ def correspondences(
     along = points - centers
     near = centers + along * np.maximum(np.exp(-slack), MIN_DEPTH_SHARE)[:, None]
     far = centers + along * np.exp(slack)[:, None]
-    worth = np.where(known, 1.0, WORTH_OF_RAY)
-    of = graph.image_of[target]
-    return Correspondences(source, target, points, near, far, of, worth, scores * worth)
+    of, weights = graph.image_of[target], scores * worth_of(known)
+    return Correspondences(source, target, points, near, far, of, known, weights)
+
+
+def worth_of(known: Bool) -> Float64:
+    """(m,) what matches count for whose depth is known or not."""
+    return np.where(known, 1.0, WORTH_OF_RAY)
 
 
 def _depths(

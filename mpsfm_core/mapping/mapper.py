@@ -3,47 +3,21 @@ random choices decide."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
-
 import numpy as np
 
 from mpsfm_core.data import Bool, MappingProblem
 from mpsfm_core.mapping.completion import with_unconfirmed
 from mpsfm_core.mapping.events import MappingEvents, Silent
-from mpsfm_core.mapping.explained import explained_score, total_score
 from mpsfm_core.mapping.finishing import finished
 from mpsfm_core.mapping.group import Group
 from mpsfm_core.mapping.initialization import Starts
 from mpsfm_core.mapping.journal import Journal
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
+from mpsfm_core.mapping.runs import Run, explained_shares, settled, with_all_times
+from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction
 
 CONTENDER_SHARE = 0.25
 """Of the number of images of the largest group, with which another contends for them (ours)."""
-AGREEMENT = 0.01
-"""Of all matches; two runs that differ by less in what they explain came to the same (ours)."""
-
-
-class Run(NamedTuple):
-    """``models``: the groups of one run, the largest first. ``explained``: by each, of the summed
-    scores of all matches."""
-
-    models: Sequence[Reconstruction]
-    explained: Sequence[float]
-    report: MappingReport
-
-    @property
-    def of_largest(self) -> float:
-        """Share of the matches that the largest group explains."""
-        return self.explained[0] if self.explained else 0.0
-
-    @property
-    def size(self) -> int:
-        """Number of images of the largest group."""
-        return len(self.models[0].images) if self.models else 0
 
 
 def reconstruct(
@@ -64,32 +38,13 @@ def reconstruct(
         own = options.model_copy(update={"seed": options.seed + number})
         mapper = Mapper(problem, own, events or Silent())
         runs.append(mapper.run())
-        if mapper.keeps_poses or _settled(runs, options.enough_explained):
+        if mapper.keeps_poses or settled(runs, options.enough_explained):
             break
     best = max(runs, key=lambda run: run.of_largest)
     models = list(best.models)
     if models and options.place_unconfirmed:
         models[0] = with_unconfirmed(models[0], models[1:], problem, options)
-    return MappingResult(tuple(models), _with_all_times(best.report, runs))
-
-
-def _settled(runs: Sequence[Run], enough: float) -> bool:
-    """Whether the last run explains enough, or came to the same as one before it."""
-    *before, last = runs
-    return sum(last.explained) >= enough or any(
-        run.size == last.size and abs(run.of_largest - last.of_largest) < AGREEMENT
-        for run in before
-    )
-
-
-def _with_all_times(report: MappingReport, runs: Sequence[Run]) -> MappingReport:
-    """The report with the time that all runs took."""
-    seconds: Counter[str] = Counter()
-    counts: Counter[str] = Counter()
-    for run in runs:
-        seconds.update(run.report.seconds)
-        counts.update(run.report.counts)
-    return replace(report, seconds=dict(seconds), counts=dict(counts), runs=len(runs))
+    return MappingResult(tuple(models), with_all_times(best.report, runs))
 
 
 class Mapper:
@@ -117,9 +72,7 @@ class Mapper:
     def run(self) -> Run:
         """Reconstruct all groups."""
         models = sorted(self.components(), key=lambda model: -len(model.images))
-        total = total_score(self.problem) or 1.0
-        explained = [explained_score(model, self.problem) / total for model in models]
-        return Run(models, explained, self.journal.report(models))
+        return Run(models, explained_shares(models, self.problem), self.journal.report(models))
 
     def components(self) -> list[Reconstruction]:
         """Reconstruct one group of images after the other."""

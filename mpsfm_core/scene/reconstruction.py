@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from mpsfm_core.data import DepthPrior, Float64, Int64, PinholeCamera
+from mpsfm_core.data import DepthPrior, Float64, Int64, PinholeCamera, Pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +58,11 @@ class Reconstruction:
     points: Float64
     errors_px: Float64
     metric: MetricScale | None = None
+
+    @property
+    def poses(self) -> dict[str, Pose]:
+        """Pose of each image by its name."""
+        return {image.name: (image.rotation, image.translation) for image in self.images}
 
     @property
     def confirmed_images(self) -> tuple[RegisteredImage, ...]:

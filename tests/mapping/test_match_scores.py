@@ -107,8 +107,8 @@ def test_support_and_inlier_share_count_scores_and_inliers_count_matches() -> No
     points = scene.rays(keypoints) * 2.0  # view 1 is at the origin and sees them where they are
     points[6:, 0] += 1.0  # but for the last four
     scores = np.where(np.arange(count) < 6, 0.9, 0.1)
-    references, worth = np.zeros(count, dtype=np.int64), np.ones(count)
-    found = Correspondences(keypoints, keypoints, points, points, points, references, worth, scores)
+    references, known = np.zeros(count, dtype=np.int64), np.ones(count, dtype=np.bool_)
+    found = Correspondences(keypoints, keypoints, points, points, points, references, known, scores)
     options = RegistrationOptions(depth_deviations=1e6)
     pose = rate_pose(scene, found, Hypothesis(np.eye(3), np.zeros(3), "PnP"), options)
     assert pose.num_inliers == 6

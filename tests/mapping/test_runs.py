@@ -10,9 +10,9 @@ import pytest
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.mapping import mapper
-from mpsfm_core.mapping.explained import explained_score, total_score
-from mpsfm_core.mapping.mapper import Run, reconstruct
+from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.runs import Run, explained_score, total_score
 from mpsfm_core.scene.reconstruction import MappingReport, Reconstruction
 from mpsfm_core.testing.problems import Noise, mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
@@ -33,7 +33,8 @@ def with_false_matches(problem: MappingProblem, share: float) -> MappingProblem:
     pairs = []
     for pair in problem.pairs:
         matches = pair.matches.copy()
-        matches[: int(share * len(matches)), 1] = matches[: int(share * len(matches)), 1][::-1]
+        wrong = slice(int(share * len(matches)))
+        matches[wrong, 1] = matches[wrong, 1][::-1]
         pairs.append(replace(pair, matches=matches))
     return MappingProblem(problem.images, tuple(pairs))
 

@@ -1,0 +1,78 @@
+"""Runs of the mapper with different random choices: which counts, and when no more are needed.
+
+They are compared by how many of the matches they explain.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.scene.reconstruction import MappingReport, Reconstruction
+
+AGREEMENT = 0.01
+"""Of all matches; two runs that differ by less in what they explain came to the same (ours)."""
+
+
+class Run(NamedTuple):
+    """``models``: the groups of one run, the largest first. ``explained``: by each, of the summed
+    scores of all matches."""
+
+    models: Sequence[Reconstruction]
+    explained: Sequence[float]
+    report: MappingReport
+
+    @property
+    def of_largest(self) -> float:
+        """Share of the matches that the largest group explains."""
+        return self.explained[0] if self.explained else 0.0
+
+    @property
+    def size(self) -> int:
+        """Number of images of the largest group."""
+        return len(self.models[0].images) if self.models else 0
+
+
+def settled(runs: Sequence[Run], enough: float) -> bool:
+    """Whether the last run explains enough, or came to the same as one before it."""
+    *before, last = runs
+    return sum(last.explained) >= enough or any(
+        run.size == last.size and abs(run.of_largest - last.of_largest) < AGREEMENT
+        for run in before
+    )
+
+
+def with_all_times(report: MappingReport, runs: Sequence[Run]) -> MappingReport:
+    """The report with the time that all runs took."""
+    seconds: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
+    for run in runs:
+        seconds.update(run.report.seconds)
+        counts.update(run.report.counts)
+    return replace(report, seconds=dict(seconds), counts=dict(counts), runs=len(runs))
+
+
+def explained_shares(models: Sequence[Reconstruction], problem: MappingProblem) -> list[float]:
+    """What each model explains of the summed scores of all matches."""
+    total = total_score(problem) or 1.0
+    return [explained_score(model, problem) / total for model in models]
+
+
+def explained_score(model: Reconstruction, problem: MappingProblem) -> float:
+    """Summed scores of the matches of which both keypoints see the same point of a model."""
+    points = {image.index: image.point_ids for image in model.images}
+    total = 0.0
+    for pair in problem.pairs:
+        if pair.image_a in points and pair.image_b in points:
+            seen_a = points[pair.image_a][pair.matches[:, 0]]
+            seen_b = points[pair.image_b][pair.matches[:, 1]]
+            total += float(pair.scores[(seen_a >= 0) & (seen_a == seen_b)].sum(dtype=float))
+    return total
+
+
+def total_score(problem: MappingProblem) -> float:
+    """Summed scores of all matches."""
+    return sum(float(pair.scores.sum(dtype=float)) for pair in problem.pairs)
