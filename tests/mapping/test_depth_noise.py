@@ -1,0 +1,81 @@
+"""What the views of a scene say of its depth priors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera
+from mpsfm_core.mapping.depth_noise import DepthNoise, measure_depth_noise
+from mpsfm_core.mapping.options import TriangulationOptions
+from mpsfm_core.mapping.triangulation import complete_and_merge
+from mpsfm_core.scene.scene import Scene
+from mpsfm_core.testing.problems import mapping_problem
+from mpsfm_core.testing.scenes import arc_poses, room_scene
+
+CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
+POSES = arc_poses(3, 14.0)
+DECLARED = 0.01
+Errors = Callable[[np.random.Generator, tuple[int, int]], Float64]
+
+
+def measured(errors: Errors, scales: tuple[float, ...] = (1.0, 1.0, 1.0)) -> DepthNoise:
+    """Of true poses, beside priors with relative errors and images with scales that are off."""
+    problem = mapping_problem(
+        room_scene(), CAMERA, POSES, points_per_view=400, declared_depth_std=DECLARED
+    )
+    images = []
+    for number, image in enumerate(problem.images):
+        prior = image.depth
+        error = errors(np.random.default_rng(number), prior.depth.shape)
+        depth = prior.depth * np.exp(error).astype(np.float32)
+        images.append(
+            replace(image, depth=DepthPrior.from_arrays(depth, prior.variance, prior.valid))
+        )
+    scene = Scene(MappingProblem(tuple(images), problem.pairs))
+    for image, (pose, scale) in enumerate(zip(POSES, scales, strict=True)):
+        scene.register(image, pose[:, :3], pose[:, 3])
+        scene.maps[image].set_scale(scale)
+    complete_and_merge(scene, TriangulationOptions(), create=True)
+    return measure_depth_noise(scene)
+
+
+def independent(rng: np.random.Generator, shape: tuple[int, int]) -> Float64:
+    """Twice what is declared, in each pixel anew."""
+    return 2 * DECLARED * rng.normal(size=shape)
+
+
+def smooth(rng: np.random.Generator, shape: tuple[int, int]) -> Float64:
+    """As large, the same over an eighth of the map's width."""
+    noise = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), shape[1] / 8)
+    return np.asarray(2 * DECLARED * noise / noise.std())
+
+
+def test_errors_of_pixels_are_measured_as_large_as_they_are_and_independent() -> None:
+    noise = measured(independent)
+    # depth is interpolated between pixels, which averages their errors
+    assert 1.2 < noise.multiplier < 2.2
+    assert noise.correlation < 0.1
+    assert noise.design_effect < 2
+
+
+def test_smooth_errors_are_measured_as_large_as_they_are_and_correlated() -> None:
+    noise = measured(smooth)
+    assert noise.multiplier == pytest.approx(2.0, rel=0.35)
+    assert noise.correlation > 0.5
+    assert noise.design_effect > 5
+
+
+def test_scales_that_are_off_are_no_noise_while_there_are_few_views() -> None:
+    right, wrong = measured(independent), measured(independent, (1.0, 1.05, 0.96))
+    assert wrong.multiplier == pytest.approx(right.multiplier, rel=0.15)
+    assert wrong.correlation < 0.15
+
+
+def test_too_few_common_points_leave_the_declaration() -> None:
+    problem = mapping_problem(room_scene(), CAMERA, POSES)
+    assert measure_depth_noise(Scene(problem)) == DepthNoise()
