@@ -62,7 +62,11 @@ COMPARISONS: Mapping[str, Comparison] = {
         priors=(*PRIORS, *DEGRADED[1:]),
         note=f"Degraded depth: errors of {SEEDS} seeds, each counted as a set.",
     ),
-    "hololens_room": Comparison("hololens_room"),
+    "hololens_room": Comparison(
+        "hololens_room",
+        note="`minimal` hangs on one pair, for which the device's pose is 2 degrees off: beside "
+        "better ones ours is as good as COLMAP's (device_poses.md).",
+    ),
     "hololens_room-low_parallax": Comparison("hololens_room", low_parallax=True),
     "hololens_room-aliked": Comparison(
         "hololens_room", ("minimal", "leq5", "leq10"), ("sensor", "config"), ALIKED
