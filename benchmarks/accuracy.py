@@ -64,8 +64,7 @@ COMPARISONS: Mapping[str, Comparison] = {
     ),
     "hololens_room": Comparison(
         "hololens_room",
-        note="`minimal` hangs on one pair, for which the device's pose is 2 degrees off: beside "
-        "better ones ours is as good as COLMAP's (device_poses.md).",
+        note="`minimal` hangs on one pair: device_poses.md says what its truth is worth.",
     ),
     "hololens_room-low_parallax": Comparison("hololens_room", low_parallax=True),
     "hololens_room-aliked": Comparison(

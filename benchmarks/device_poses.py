@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from benchmarks._scenes import RESULTS, frame_names, shared_folder, tell, with_sets
+from benchmarks._scenes import RESULTS, frame_names, percent, shared_folder, tell, with_sets
 from benchmarks.accuracy import ALIKED
 from mpsfm_core.data import Pose
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
@@ -109,20 +109,25 @@ def _area(record: Record, truths: Sequence[Poses]) -> str:
     """AUC@20, each pair held against the first of some truths that has it, at last the device."""
     errors = []
     for pair in combinations(record.truth, 2):
-        truth = next(t for t in (*truths, record.truth) if t.keys() >= set(pair))
-        errors.append(pose_errors_deg(record.estimated, {n: truth[n] for n in pair}, CONVENTION))
-    return f"{100 * pose_auc(np.concatenate(errors), CONVENTION)[20]:.1f}"
+        truth = _of_pair(truths, pair) or {name: record.truth[name] for name in pair}
+        errors.append(pose_errors_deg(record.estimated, truth, CONVENTION))
+    return percent(pose_auc(np.concatenate(errors), CONVENTION, (20,)))
 
 
 def _apart(some: Sequence[Poses], others: Sequence[Poses], images: Poses) -> float:
     """Largest difference of the pairs of these images that are in one model of both, in degrees."""
     errors = [0.0]
     for pair in combinations(images, 2):
-        both = [next((m for m in side if m.keys() >= set(pair)), None) for side in (some, others)]
-        if both[0] is not None and both[1] is not None:
-            truth = {name: both[1][name] for name in pair}
-            errors.append(float(pose_errors_deg(both[0], truth, CONVENTION).mean()))
+        ours, theirs = _of_pair(some, pair), _of_pair(others, pair)
+        if ours and theirs:
+            errors.append(float(pose_errors_deg(ours, theirs, CONVENTION).mean()))
     return max(errors)
+
+
+def _of_pair(models: Sequence[Poses], pair: tuple[str, str]) -> Poses:
+    """The poses of two images in the first model that has both; empty if none has."""
+    model = next((model for model in models if model.keys() >= set(pair)), None)
+    return {name: model[name] for name in pair} if model else {}
 
 
 if __name__ == "__main__":
