@@ -21,8 +21,6 @@ from typing import Any
 
 from benchmarks._scenes import RESULTS, shared_folder, tell
 from mpsfm_core.calibration.calibrate import Photos, calibrate, compare
-from mpsfm_core.calibration.file import load_calibration
-from mpsfm_core.calibration.model import DepthCalibration
 from mpsfm_core.calibration.study import judge
 from mpsfm_core.config import load_config
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
@@ -31,6 +29,8 @@ from mpsfm_core.evaluation.prior_quality import prior_settings
 from mpsfm_core.evaluation.report import Row, make_rows
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
 from mpsfm_core.registry import Registry
+from mpsfm_core.uncertainty.file import load_calibration
+from mpsfm_core.uncertainty.model import DepthCalibration
 from mpsfm_core.yaml_text import write_yaml
 
 FACTOR = 5.0

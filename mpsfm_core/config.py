@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from mpsfm_core.calibration.file import CALIBRATIONS, read_values
 from mpsfm_core.errors import ConfigError, ProviderError, did_you_mean
 from mpsfm_core.extraction.options import ExtractionOptions, PairOptions, VerificationOptions
 from mpsfm_core.inputs.options import InputOptions
@@ -30,6 +29,7 @@ from mpsfm_core.options import (
 from mpsfm_core.providers import Kind
 from mpsfm_core.registry import Registry
 from mpsfm_core.results.options import ResultOptions
+from mpsfm_core.uncertainty.file import CALIBRATIONS, read_values
 from mpsfm_core.yaml_text import line_of, parse_yaml, write_yaml
 
 

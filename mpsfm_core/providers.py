@@ -25,7 +25,6 @@ from typing import Literal, Protocol, get_args, runtime_checkable
 import pluggy
 from pydantic import BaseModel
 
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.data import (
     Bool,
     DepthPrior,
@@ -37,6 +36,7 @@ from mpsfm_core.data import (
 )
 from mpsfm_core.errors import ProviderError
 from mpsfm_core.options import Options
+from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 
 API_VERSION = 1
 """Version of this contract. A plugin that names a newer one is listed as unavailable."""

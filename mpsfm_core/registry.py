@@ -18,7 +18,6 @@ from typing import Any, Literal
 import pluggy
 
 from mpsfm_core.builtin import plugin as builtin
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.discovery import (
     Plugin,
     inspect_plugin,
@@ -37,6 +36,7 @@ from mpsfm_core.providers import (
     ProviderContext,
     ProviderSpec,
 )
+from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 
 _log = logging.getLogger(__name__)
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.config import Config, describe_shipped, load_config, shipped_configs
 from mpsfm_core.errors import ConfigError
 from mpsfm_core.first_party import FIRST_PARTY, requirement_for
 from mpsfm_core.options import SettingsError, dotted
 from mpsfm_core.registry import CORE, Registry
+from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 
 NAMES = sorted(shipped_configs())
 ROOT = Path(__file__).parents[1]

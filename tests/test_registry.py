@@ -22,10 +22,10 @@ from mpsfm_core import (
     View,
     hookimpl,
 )
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.errors import InputError, ProviderError, WeightsError
 from mpsfm_core.options import Backend, SettingsError
 from mpsfm_core.registry import CORE, ProviderStatus, Registry
+from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 
 InstallPlugin = Callable[..., str]
 

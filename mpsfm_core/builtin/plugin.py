@@ -10,8 +10,8 @@ from mpsfm_core.builtin.options import (
     NormalFileOptions,
     SiftOptions,
 )
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.providers import ProviderSpec, hookimpl
+from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 
 _LICENSE = "Apache-2.0"
 

@@ -1,1 +1,1 @@
-"""The uncertainty model of priors, fitting it, and its report."""
+"""Fitting the uncertainty of a prior, and the report on it."""

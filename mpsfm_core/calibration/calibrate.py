@@ -1,7 +1,7 @@
 """Calibrate a provider on a folder of photos: with true maps, with a model, or with nothing.
 
-This stands beside the pipeline, which it uses; the model of calibrations itself
-(:mod:`mpsfm_core.calibration.model`) is below all providers.
+This stands above the pipeline, which it uses; the model of calibrations itself
+(:mod:`mpsfm_core.uncertainty.model`) is below all providers.
 """
 
 from __future__ import annotations
@@ -17,9 +17,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mpsfm_core.calibration.comparison import Comparison
-from mpsfm_core.calibration.file import CalibratedKind, CalibrationFile, Provenance
 from mpsfm_core.calibration.fitting import Alignment, rounded, std_of
-from mpsfm_core.calibration.model import Calibration
 from mpsfm_core.calibration.model_truth import model_truth
 from mpsfm_core.calibration.samples import DepthTruth
 from mpsfm_core.calibration.study import Data, Study, StudyOptions, study
@@ -33,6 +31,8 @@ from mpsfm_core.options import Backend
 from mpsfm_core.pipeline import reconstruct
 from mpsfm_core.registry import Registry, core_version
 from mpsfm_core.stages import Stages
+from mpsfm_core.uncertainty.file import CalibratedKind, CalibrationFile, Provenance
+from mpsfm_core.uncertainty.model import Calibration
 
 _log = logging.getLogger(__name__)
 

@@ -7,9 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mpsfm_core.calibration.file import CalibratedKind
 from mpsfm_core.calibration.fitting import Alignment, DepthData, NormalData
-from mpsfm_core.calibration.model import DepthCalibration
 from mpsfm_core.calibration.model_truth import drawn_evenly
 from mpsfm_core.calibration.samples import (
     MIN_SAMPLES,
@@ -26,6 +24,8 @@ from mpsfm_core.errors import InputError
 from mpsfm_core.extraction.backends import ActiveProvider
 from mpsfm_core.extraction.raw_priors import RawPriors
 from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.uncertainty.file import CalibratedKind
+from mpsfm_core.uncertainty.model import DepthCalibration
 
 Samples = TypeVar("Samples", DepthSamples, NormalSamples)
 

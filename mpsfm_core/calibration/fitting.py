@@ -14,7 +14,6 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from mpsfm_core.calibration.fit import DOMINANT_SHARE, Fit, fit_std
-from mpsfm_core.calibration.model import Calibration, DepthCalibration, NormalCalibration
 from mpsfm_core.calibration.samples import (
     GROSS_DEPTH,
     DepthSamples,
@@ -24,6 +23,7 @@ from mpsfm_core.calibration.samples import (
     normal_residuals,
 )
 from mpsfm_core.data import Float64, Int64
+from mpsfm_core.uncertainty.model import Calibration, DepthCalibration, NormalCalibration
 
 Alignment = Literal["scale", "scale-shift", "disparity"]
 """What an image's depth is unknown up to: a factor; and a shift of depth, or of inverse depth."""

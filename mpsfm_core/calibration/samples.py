@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.calibration.model import DepthCalibration, medians
 from mpsfm_core.data import DepthPrior, Float64, Int64, NormalPrior
 from mpsfm_core.geometry import (
     angle_between_deg,
@@ -17,6 +16,7 @@ from mpsfm_core.geometry import (
     sample_nearest,
     scale_pixels,
 )
+from mpsfm_core.uncertainty.model import DepthCalibration, medians
 
 MIN_SAMPLES = 20
 """An image with fewer says nothing about its scale and is left out (ours)."""

@@ -14,10 +14,10 @@ from pydantic import Field
 from mpsfm_core.calibration.fit import DOMINANT_SHARE, Fit, bootstrap
 from mpsfm_core.calibration.fitting import Candidate, DepthData, NormalData, std_of, winner
 from mpsfm_core.calibration.metrics import MAD_TO_STD, coverage, measure
-from mpsfm_core.calibration.model import Calibration
 from mpsfm_core.calibration.samples import Residuals, join
 from mpsfm_core.data import Float64, Int64
 from mpsfm_core.options import Options
+from mpsfm_core.uncertainty.model import Calibration
 
 FEW_IMAGES = 10
 """Fewer images than these do not show how images differ (ours)."""

@@ -11,8 +11,8 @@ from mpsfm_core.cli.arguments import Quiet
 
 if TYPE_CHECKING:
     from mpsfm_core.calibration.calibrate import Calibrated
-    from mpsfm_core.calibration.file import CalibratedKind
     from mpsfm_core.calibration.fitting import Alignment
+    from mpsfm_core.uncertainty.file import CalibratedKind
 
 _OWN = ("options.", "wrap.", "calibration")
 _TRUTH = "ground_truth."
@@ -110,9 +110,9 @@ def _checked(
     kind: str, alignments: list[str]
 ) -> tuple[CalibratedKind, tuple[Alignment, ...] | None]:
     """The kind and the alignments if there are such."""
-    from mpsfm_core.calibration.file import CalibratedKind
     from mpsfm_core.calibration.fitting import Alignment
     from mpsfm_core.errors import InputError, did_you_mean
+    from mpsfm_core.uncertainty.file import CalibratedKind
 
     kinds: dict[str, CalibratedKind] = {name: name for name in get_args(CalibratedKind)}
     known: dict[str, Alignment] = {name: name for name in get_args(Alignment)}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.config import Config
 from mpsfm_core.data import DepthPrior, NormalPrior
 from mpsfm_core.errors import ConfigError
@@ -13,6 +12,7 @@ from mpsfm_core.extraction.matching import Candidates, PairMatcher
 from mpsfm_core.extraction.raw_priors import RawPriors
 from mpsfm_core.extraction.workbench import Workbench
 from mpsfm_core.registry import Registry
+from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 
 FROM_MATCHER = "matcher"
 """The depth provider's name that means: take the depth that the matcher predicts."""

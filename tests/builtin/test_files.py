@@ -16,11 +16,11 @@ from mpsfm_core.builtin.options import (
     MaskFileOptions,
     NormalFileOptions,
 )
-from mpsfm_core.calibration.model import DepthCalibration
 from mpsfm_core.data import DepthPrior, PinholeCamera, View
 from mpsfm_core.errors import InputError
 from mpsfm_core.providers import ProviderContext
 from mpsfm_core.registry import Registry
+from mpsfm_core.uncertainty.model import DepthCalibration
 
 CAMERA = PinholeCamera(40, 30, 40.0, 40.0, 20.0, 15.0)
 VIEW = View("side/a.jpg", np.zeros((30, 40, 3), np.uint8), CAMERA)

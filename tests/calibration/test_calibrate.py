@@ -17,11 +17,11 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from mpsfm_core.calibration.file import load_calibration
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.calibration.report import write_report
 from mpsfm_core.cli import build_app
 from mpsfm_core.config import load_config
+from mpsfm_core.uncertainty.file import load_calibration
+from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 from mpsfm_core.yaml_text import parse_yaml
 from tests.calibration.scene_model import write_model
 

@@ -9,7 +9,6 @@ import pytest
 
 from mpsfm_core.calibration.fit import bootstrap, fit_std
 from mpsfm_core.calibration.fitting import DepthData, NormalData, std_of, winner
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.calibration.samples import (
     DepthSamples,
     NormalSamples,
@@ -18,6 +17,7 @@ from mpsfm_core.calibration.samples import (
     tangent_errors,
 )
 from mpsfm_core.data import Float64
+from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 from tests.calibration.simulation import Simulated, simulate
 
 PLAIN = Simulated()

@@ -11,13 +11,13 @@ import pytest
 
 from mpsfm_core.calibration.calibrate import Calibrated, Photos, calibrate, compare
 from mpsfm_core.calibration.fitting import std_of
-from mpsfm_core.calibration.model import DepthCalibration
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.evaluation.peers import PEERS, write_database
 from mpsfm_core.extraction.runner import extract
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.registry import Registry
 from mpsfm_core.stages import Stages
+from mpsfm_core.uncertainty.model import DepthCalibration
 
 pytest.importorskip("mpsfm_onnx")
 pytest.importorskip("mpsfm_kornia")

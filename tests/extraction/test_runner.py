@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from mpsfm_core.calibration.model import DepthCalibration
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.errors import ConfigError, ProviderOutputError, ProviderRunError
@@ -17,6 +16,7 @@ from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_ang
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.options import Backend
 from mpsfm_core.providers import ProviderSpec, hookimpl
+from mpsfm_core.uncertainty.model import DepthCalibration
 
 ALL_PAIRS = {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, hookimpl
-from mpsfm_core.calibration.model import NormalCalibration
+from mpsfm_core.uncertainty.model import NormalCalibration
 from mpsfm_dsine.options import DsineOptions
 
 

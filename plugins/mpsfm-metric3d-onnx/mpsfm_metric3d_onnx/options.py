@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mpsfm_core import Options, WeightsFile
-from mpsfm_core.calibration.model import DepthCalibration
+from mpsfm_core.uncertainty.model import DepthCalibration
 
 WEIGHTS_LICENSE = "CC0-1.0 (export; the authors name none for their weights)"
 

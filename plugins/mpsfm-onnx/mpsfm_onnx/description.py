@@ -12,9 +12,9 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from mpsfm_core import Options
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.errors import ConfigError, did_you_mean
 from mpsfm_core.options import parse_settings
+from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 from mpsfm_core.yaml_text import parse_yaml
 
 _FOLDER = Path(__file__).parent / "descriptions"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pydantic import BaseModel
 
 from mpsfm_core import ProviderSpec, hookimpl
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.providers import Capability, Kind
+from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 from mpsfm_onnx.description import load_description
 from mpsfm_onnx.options import OnnxOptions
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from mpsfm_core.calibration.file import CalibrationFile, Provenance, load_calibration
-from mpsfm_core.calibration.model import Calibration, DepthCalibration, NormalCalibration
 from mpsfm_core.config import load_config
 from mpsfm_core.errors import ConfigError
+from mpsfm_core.uncertainty.file import CalibrationFile, Provenance, load_calibration
+from mpsfm_core.uncertainty.model import Calibration, DepthCalibration, NormalCalibration
 
 DEPTH = DepthCalibration(relative_std=0.07, shift=0.2, edge_ratio=1.1, edge_std_scale=2)
 NORMALS = NormalCalibration(std_scale=1.5, std_floor_deg=3.0)

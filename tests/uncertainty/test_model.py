@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpsfm_core.calibration.model import DepthCalibration, NormalCalibration
 from mpsfm_core.data import DepthPrior, NormalPrior
+from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 
 DEPTH = np.array([[1.0, 2.0], [4.0, 8.0]])
 

@@ -13,9 +13,9 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from mpsfm_core.calibration.model import Calibration, DepthCalibration, NormalCalibration
 from mpsfm_core.errors import ConfigError
 from mpsfm_core.options import Options, SettingsError, parse_settings
+from mpsfm_core.uncertainty.model import Calibration, DepthCalibration, NormalCalibration
 from mpsfm_core.yaml_text import parse_yaml, write_yaml
 
 CalibratedKind = Literal["depth", "normals"]
