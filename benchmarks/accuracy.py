@@ -37,13 +37,15 @@ WINDOWS, FRAMES = 6, 5
 class Comparison:
     """One table: a scene, its buckets (None: all) and priors, and the configuration.
 
-    ``configuration``: its name, and what it says beside the prior. ``note``: said above the table.
+    ``configuration``: its name, and what it says beside the prior. ``depth``: what it says of the
+    prior ``config``, None for FastDepth. ``note``: said above the table.
     """
 
     scene: str
     buckets: tuple[str, ...] | None = None
     priors: tuple[str, ...] = PRIORS
     configuration: tuple[str, str] = ("xfeat", "")
+    depth: str | None = None
     low_parallax: bool = False
     note: str = ""
 
@@ -55,6 +57,8 @@ features: {use: aliked, options: {max_keypoints: 1500}}
 matcher: {use: lightglue-aliked}
 """,
 )
+FASTDEPTH = "depth: {{use: onnx, options: {{model: {model}}}}}\n"
+COMPACT = "depth: {use: compact}\nnormals: {use: compact}\n"
 UNCONFIRMED = "unconfirmed", "mapping: {place_unconfirmed: true}\n"
 COMPARISONS: Mapping[str, Comparison] = {
     "rendered_kitchen": Comparison(
@@ -78,6 +82,12 @@ COMPARISONS: Mapping[str, Comparison] = {
         note="With `mapping.place_unconfirmed`: images that nothing confirms are placed where "
         "their matches fit best, and count.",
     ),
+    **{
+        f"{scene}-compact": Comparison(
+            scene, priors=("config",), depth=COMPACT, note="Depth and normals of `compact`."
+        )
+        for scene in ("rendered_kitchen", "hololens_room")
+    },
 }
 """Name of the table -> what is in it."""
 BARS: Mapping[tuple[str, str], tuple[float, float, float]] = {
@@ -90,12 +100,6 @@ BARS: Mapping[tuple[str, str], tuple[float, float, float]] = {
     ("all", "ours-degraded"): (45, 80, 92),
 }
 """Bucket and method on rendered_kitchen -> AUC@1, 5, 20 that are wanted."""
-CONFIG = """\
-extends: benchmark
-depth:
-  use: onnx
-  options: {{model: {model}}}
-"""
 
 
 def main() -> int:
@@ -111,8 +115,8 @@ def main() -> int:
         output.mkdir(parents=True, exist_ok=True)
         label, settings = comparison.configuration
         config = output / f"{label}.yaml"
-        text = CONFIG.format(model=shared / "models" / "fastdepth_224.onnx")
-        config.write_text(text + settings)
+        fastdepth = FASTDEPTH.format(model=shared / "models" / "fastdepth_224.onnx")
+        config.write_text(f"extends: benchmark\n{comparison.depth or fastdepth}{settings}")
         scene = shared / "data" / comparison.scene
         plan = Plan(
             (_low_parallax(scene, output / name) if comparison.low_parallax else scene,),

@@ -102,20 +102,27 @@ def calibrate(
 def compare(
     photos: Photos,
     config: Config,
-    ground_truth: Mapping[str, Any],
+    ground_truth: Mapping[str, Any] | None = None,
     kind: CalibratedKind = "depth",
     *,
+    model: Path | None = None,
     options: StudyOptions | None = None,
     registry: Registry | None = None,
 ) -> Data:
-    """A prior beside true maps, for :func:`mpsfm_core.calibration.study.judge`.
+    """A prior beside true maps or a model's points, for :func:`mpsfm_core.calibration.study.judge`.
 
-    Arguments and errors as of :func:`calibrate`.
+    Arguments and errors as of :func:`calibrate`; one of ``ground_truth`` and ``model``.
     """
+    if (ground_truth is None) == (model is None):
+        raise InputError("give true maps or a model")
     registry = registry or Registry.discover()
     run = _Run(photos, config, kind, registry, None, options or StudyOptions())
     with threadpool_limits(thread_count(config.runtime), user_api="blas"):
-        return run.prepare().with_files(ground_truth)
+        run.prepare()
+        if model is not None:
+            return run.data_of_model(model)
+        assert ground_truth is not None
+        return run.data_of_files(ground_truth)
 
 
 class _Run:
@@ -138,24 +145,29 @@ class _Run:
         self._bench = Workbench(images, config, registry, Stages(registry))
         self._comparison = Comparison(self._bench, kind, alignments, options)
 
-    def prepare(self) -> Comparison:
+    def prepare(self) -> None:
         """Run the mask providers: what they mask is not compared."""
         self._bench.run_masks()
-        return self._comparison
 
     def with_files(self, options: Mapping[str, Any]) -> Calibrated:
-        """Compare with true maps."""
-        data = self._comparison.with_files(options)
+        """Calibrate with true maps."""
+        data = self.data_of_files(options)
         return self._finish(data, f"{self._kind} maps in {PurePath(options['directory']).name}")
 
     def with_model(self, folder: Path) -> Calibrated:
-        """Compare with the points of a COLMAP model."""
+        """Calibrate with the points of a COLMAP model."""
+        return self._finish(self.data_of_model(folder), f"points of a model: {folder.name}")
+
+    def data_of_files(self, options: Mapping[str, Any]) -> Data:
+        """The prior beside true maps."""
+        return self._comparison.with_files(options)
+
+    def data_of_model(self, folder: Path) -> Data:
+        """The prior beside the points of a COLMAP model."""
         truth = model_truth(read_model(folder), self._bench.images)
         if not truth:
             raise InputError(f"{folder}: the model has no points in any of the images")
-        return self._finish(
-            self._comparison.with_points(truth), f"points of a model: {folder.name}"
-        )
+        return self._comparison.with_points(truth)
 
     def alone(self) -> Calibrated:
         """Reconstruct, compare with what the rays of its points say, and again."""

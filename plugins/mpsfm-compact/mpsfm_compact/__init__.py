@@ -1,0 +1,1 @@
+"""A small network of our own: metric depth, normals, their uncertainty and validity."""

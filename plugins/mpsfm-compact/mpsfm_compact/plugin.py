@@ -1,0 +1,44 @@
+"""Announces the providers. Imports neither onnxruntime nor OpenCV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mpsfm_compact.options import WEIGHTS, CompactOptions
+from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
+from mpsfm_core.providers import Capability, Kind
+from mpsfm_core.uncertainty.file import CalibratedKind, load_calibration
+
+_LICENSE = "Apache-2.0"
+
+
+@hookimpl
+def mpsfm_providers() -> list[ProviderSpec]:
+    """Depth, which gives normals in the same pass, normals alone, and a mask."""
+    return [
+        _spec("depth", "Depth", "metric depth and normals", "metric", "variance", "joint-normals"),
+        _spec("normals", "Normals", "normals", "variance"),
+        _spec("mask", "Mask", "leaves out sky, mirrors and glass"),
+    ]
+
+
+def _spec(kind: Kind, factory: str, summary: str, *capabilities: Capability) -> ProviderSpec:
+    return ProviderSpec(
+        kind=kind,
+        name="compact",
+        factory=f"mpsfm_compact.provider:Compact{factory}",
+        options=CompactOptions,
+        capabilities=frozenset({"intrinsics-aware", *capabilities}),
+        summary=f"small network of our own, its weights in the package: {summary}",
+        requires=("onnxruntime",),
+        install_hint="pip install mpsfm-compact",
+        code_license=_LICENSE,
+        weights_license=_LICENSE,
+        weights=(WeightsFile(WEIGHTS, license=_LICENSE),),
+        calibration=None if kind == "mask" else _calibration(kind),
+        contract="mpsfm_compact.contract:setup",
+    )
+
+
+def _calibration(kind: CalibratedKind):
+    return load_calibration(Path(__file__).with_name(f"calibration-{kind}.yaml"), kind)

@@ -1,0 +1,86 @@
+"""``python -m training``: make data, train, export, evaluate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, add_completion=False)
+Data = Annotated[Path, typer.Option(help="folder of shards")]
+
+
+@app.command("draw")
+def draw(
+    data: Data,
+    shards: int = 50,
+    seed: int = 1,
+    workers: int = 2,
+    photos: Annotated[Path | None, typer.Option(help="pictures for textures")] = None,
+) -> None:
+    """Draw samples of random rooms, streets and table tops."""
+    from training.make_data import make_drawn
+
+    make_drawn(data, shards, seed, workers, photos)
+
+
+@app.command("convert")
+def convert(data: Data, source: Path) -> None:
+    """Convert folders of RGB-D frames."""
+    from training.make_data import make_real
+
+    make_real(data, source)
+
+
+@app.command("label")
+def label(data: Data, photos: Path, teacher: Path, names: list[str]) -> None:
+    """Label photos of rooms by another network."""
+    from training.make_data import make_labelled
+
+    make_labelled(data, photos, teacher, names)
+
+
+@app.command("train")
+def train(
+    data: Data,
+    run: Annotated[Path, typer.Option(help="folder of checkpoints, to go on from")],
+    steps: int = 20_000,
+    cooldown: int = 1000,
+    held_out: Annotated[list[str] | None, typer.Option(help="parts of names of shards")] = None,
+    start: Annotated[Path | None, typer.Option(help="weights to begin with")] = None,
+    minutes: Annotated[float | None, typer.Option(help="stop then, to go on later")] = None,
+    seed: int = 0,
+    real_share: float = 0.5,
+) -> None:
+    """Train, or go on with a run."""
+    from training.train import Schedule
+    from training.train import train as run_training
+
+    schedule = Schedule(steps, cooldown, real_share=real_share)
+    run_training(data, run, schedule, held_out or ["drawn-1-0000"], seed, start, minutes)
+
+
+@app.command("export")
+def export(checkpoint: Path, output: Path) -> None:
+    """Write the network of a checkpoint as ONNX, and say how far it is from torch's."""
+    from training.export import export as run_export
+
+    for name, gap in run_export(checkpoint, output).items():
+        typer.echo(f"{name}: {gap:.1e}")
+
+
+@app.command("unpack")
+def unpack(
+    data: Data, output: Path, shards: list[str], most: Annotated[int, typer.Option()] = 40
+) -> None:
+    """Write samples of shards, named in part, as a scene folder for ``mpsfm calibrate``."""
+    from training.samples import find_shards
+    from training.unpack import unpack as run_unpack
+
+    chosen = [path for path in find_shards(data) if any(name in path.name for name in shards)]
+    typer.echo(f"{run_unpack(chosen, output, most)} samples")
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,221 @@
+"""Batches of augmented samples.
+
+What a camera does to a picture is done to its labels and its intrinsics too: crops move the
+principal point, zooms lengthen the focal length, a roll turns the normals, a mirror flips them.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from training.network import CANONICAL_FOCAL
+from training.samples import HEIGHT, SURFACE, WIDTH, Shard
+
+_SIZES = ((256, 192), (256, 192), (256, 192), (192, 256), (224, 224))
+"""Width and height of the network's input, drawn for each batch; about 49 000 pixels."""
+_ZOOM = 1.6
+"""Largest enlargement; most samples are seen nearly whole, as photos are later."""
+_ROLL_DEG = 6.0
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Input and labels; label maps are of half the size of the input.
+
+    ``image`` (n, 3, h, w) of 0 to 255; ``rays`` (n, 2, h / 32, w / 32); ``log_depth`` (n, 1, ...),
+    canonical; ``known`` bool; ``normals`` (n, 3, ...), 0 where unknown; ``kind``; ``log_focal``
+    (n, 1) over the diagonal; ``metric`` (n,) bool.
+    """
+
+    image: Tensor
+    rays: Tensor
+    log_depth: Tensor
+    known: Tensor
+    normals: Tensor
+    kind: Tensor
+    log_focal: Tensor
+    metric: Tensor
+
+
+class Sampler:
+    """Draws samples: every source with its share, within it scenes by the root of their size."""
+
+    def __init__(self, sources: Sequence[tuple[Sequence[Path], float]]) -> None:
+        self._shards: list[Shard] = []
+        weights: list[float] = []
+        for folders, share in sources:
+            shards = [Shard(folder) for folder in folders]
+            sizes = np.sqrt([len(s) for s in shards])
+            weights += list(share * sizes / sizes.sum())
+            self._shards += shards
+        self._weights = np.array(weights) / np.sum(weights)
+
+    def draw(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """One stored sample."""
+        shard = self._shards[rng.choice(len(self._shards), p=self._weights)]
+        return shard[int(rng.integers(len(shard)))]
+
+
+def batches(sampler: Sampler, size: int, seed: int, first: int) -> Iterator[Batch]:
+    """Endless batches from number ``first`` on, made ahead in a thread."""
+
+    def make(number: int) -> Batch:
+        rng = np.random.default_rng((seed, number))
+        drawn = [sampler.draw(rng) for _ in range(size)]
+        return augmented(drawn, _SIZES[rng.integers(len(_SIZES))], rng)
+
+    with ThreadPoolExecutor(1) as pool:
+        ahead = deque(pool.submit(make, first + k) for k in range(3))
+        for number in count(first + 3):
+            yield ahead.popleft().result()
+            ahead.append(pool.submit(make, number))
+
+
+def augmented(
+    drawn: Sequence[dict[str, np.ndarray]],
+    size: tuple[int, int],
+    rng: np.random.Generator | None = None,
+) -> Batch:
+    """A batch of stored samples at ``size`` (width, height); as they are without ``rng``."""
+    width, height = size
+    n = len(drawn)
+    image = torch.from_numpy(np.stack([_developed(d["image"], rng) for d in drawn]))
+    image = image.permute(0, 3, 1, 2).float()
+    labels = np.concatenate(
+        [
+            np.stack([d["depth"].astype(np.float32)[None] for d in drawn]),
+            np.stack([d["kind"].astype(np.float32)[None] for d in drawn]),
+            np.stack([d["normals"].astype(np.float32).transpose(2, 0, 1) / 127 for d in drawn]),
+        ],
+        1,
+    )
+    camera = np.stack([d["camera"] for d in drawn]).astype(np.float64)
+    smallest = max(width / WIDTH, height / HEIGHT)
+    zoom = smallest * np.ones(n)
+    roll, mirror, slack = np.zeros(n), np.ones(n), np.full((n, 2), 0.5)
+    if rng is not None:
+        zoom = smallest * _ZOOM ** rng.random(n) ** 2
+        roll = np.radians(_ROLL_DEG) * rng.normal(0, 0.5, n)
+        mirror = rng.choice([-1.0, 1.0], n)
+        slack = rng.random((n, 2))
+    corner = slack * (np.array([WIDTH, HEIGHT]) - np.array(size) / zoom[:, None])
+    # out = c_out + mirror * R(-roll) * zoom * (stored - c): a turn about the principal point
+    center_out = (camera[:, 2:] - corner) * zoom[:, None]
+    center_out[:, 0] = np.where(mirror < 0, width - center_out[:, 0], center_out[:, 0])
+    cos, sin = np.cos(roll), np.sin(roll)
+    back = np.stack([np.stack([cos * mirror, -sin], -1), np.stack([sin * mirror, cos], -1)], -2)
+    back = back / zoom[:, None, None]
+
+    matrix, center, center_out = (
+        torch.from_numpy(x).float() for x in (back, camera[:, 2:], center_out)
+    )
+
+    def grid(step: int) -> Tensor:
+        x, y = torch.arange(width // step) + 0.5, torch.arange(height // step) + 0.5
+        out = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(1, -1, 2) * step
+        stored = (out - center_out[:, None]) @ matrix.mT + center[:, None]
+        shape = (n, height // step, width // step, 2)
+        return (stored * torch.tensor([2 / WIDTH, 2 / HEIGHT]) - 1).reshape(shape)
+
+    small = functional.grid_sample(
+        image, grid(1), mode="bilinear", padding_mode="reflection", align_corners=False
+    )
+    maps = functional.grid_sample(
+        torch.from_numpy(labels), grid(2), mode="nearest", align_corners=False
+    )
+    forth = torch.from_numpy(np.linalg.inv(back) / zoom[:, None, None]).float()
+    normals = maps[:, 2:5].clone()
+    normals[:, :2] = torch.einsum("nij,njhw->nihw", forth, maps[:, 2:4])
+    focal = np.sqrt(camera[:, 0] * camera[:, 1]) * zoom
+    known = (maps[:, 1:2] == SURFACE) & (maps[:, 0:1] > 0)
+    shift = torch.from_numpy(np.log(focal)).float()[:, None, None, None]
+    log_depth = (
+        torch.where(known, maps[:, 0:1], torch.ones(())).log() - shift + np.log(CANONICAL_FOCAL)
+    )
+    return Batch(
+        small if rng is None else _spoiled(small, rng),
+        rays(width, height, camera[:, :2] * zoom[:, None], center_out.numpy()),
+        log_depth,
+        known,
+        normals,
+        maps[:, 1:2].long(),
+        torch.from_numpy(np.log(focal / np.hypot(width, height))).float()[:, None],
+        torch.from_numpy(np.array([bool(d["metric"]) for d in drawn])),
+    )
+
+
+def rays(width: int, height: int, focal: np.ndarray, center: np.ndarray) -> Tensor:
+    """Slopes (n, 2, h / 32, w / 32) of the rays through the centres of blocks of 32 pixels.
+
+    ``focal`` (n, 2), ``center`` (n, 2) in pixels.
+    """
+    x, y = np.meshgrid(np.arange(width // 32) * 32 + 16.0, np.arange(height // 32) * 32 + 16.0)
+    slopes = (np.stack([x, y]) - center[:, :, None, None]) / focal[:, :, None, None]
+    return torch.from_numpy(slopes).float()
+
+
+def _developed(image: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
+    """Tone, colour and JPEG of another camera, on uint8 tables."""
+    if rng is None:
+        return image
+    if rng.random() < 0.8:
+        levels = np.arange(256) / 255
+        tables = []
+        gamma, gain, offset = (
+            np.exp(rng.normal(0, 0.2)),
+            np.exp(rng.normal(0, 0.15)),
+            rng.normal(0, 0.04),
+        )
+        for _ in range(3):
+            channel = (
+                levels ** (gamma * np.exp(rng.normal(0, 0.05))) * gain * np.exp(rng.normal(0, 0.05))
+            )
+            tables.append((255 * np.clip(channel + offset, 0, 1)).astype(np.uint8))
+        image = cv2.LUT(image, np.stack(tables, -1)[None].reshape(1, 256, 3))
+    if rng.random() < 0.3:
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None]
+        share = rng.uniform(-0.4, 1.0)
+        image = np.clip(image * (1 - share) + grey * share, 0, 255).astype(np.uint8)
+    if rng.random() < 0.3:
+        _, code = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 90))])
+        image = cv2.imdecode(code, cv2.IMREAD_COLOR)
+    return image
+
+
+def _spoiled(image: Tensor, rng: np.random.Generator) -> Tensor:
+    """Blur by focus or motion, low resolution, noise."""
+    out = []
+    for picture in image:
+        kind = rng.random()
+        array = picture.permute(1, 2, 0).numpy()
+        if kind < 0.2:
+            array = cv2.GaussianBlur(array, (0, 0), rng.uniform(0.4, 1.6))
+        elif kind < 0.35:
+            length = int(rng.integers(3, 12))
+            kernel = np.zeros((length, length), np.float32)
+            kernel[length // 2] = 1 / length
+            turn = cv2.getRotationMatrix2D(
+                (length / 2 - 0.5, length / 2 - 0.5), rng.uniform(0, 180), 1
+            )
+            kernel = cv2.warpAffine(kernel, turn, (length, length))
+            array = cv2.filter2D(array, -1, kernel / max(kernel.sum(), 1e-6))
+        elif kind < 0.45:
+            share = rng.uniform(0.35, 0.8)
+            little = cv2.resize(array, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+            array = cv2.resize(little, array.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+        if rng.random() < 0.5:
+            noise = rng.standard_normal(array.shape, dtype=np.float32)
+            array = array + np.float32(rng.uniform(1, 12)) * noise
+        out.append(torch.from_numpy(np.ascontiguousarray(array)).permute(2, 0, 1))
+    return torch.stack(out).clamp(0, 255)

@@ -1,0 +1,134 @@
+"""The trained network as an ONNX file of the plugin."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torch import Tensor, nn
+
+from training.network import CompactNetwork
+
+_OPSET = 18
+_SMALL = 1024
+"""Arrays of fewer values stay float32."""
+
+
+class Exported(nn.Module):
+    """The network with the plugin's inputs and outputs.
+
+    Input: ``image`` (1, 3, h, w) RGB of 0 to 255, ``intrinsics`` (1, 3, 3) in its pixels.
+    Output, (1, c, h / 2, w / 2): ``depth`` and ``std`` in metres for a camera of the
+    canonical focal length, ``normals``, ``angle`` (std about
+    each axis in rad), ``validity`` in 0..1; ``focal`` (1, 1), in pixels of the input.
+    """
+
+    def __init__(self, network: CompactNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor, intrinsics: Tensor) -> tuple[Tensor, ...]:
+        height, width = image.shape[2:]
+        focal, center = intrinsics[:, [0, 1], [0, 1]], intrinsics[:, :2, 2]
+        x = torch.arange(width // 32, device=image.device) * 32.0 + 16.0
+        y = torch.arange(height // 32, device=image.device) * 32.0 + 16.0
+        x = (x - center[:, :1]) / focal[:, :1]
+        y = (y - center[:, 1:]) / focal[:, 1:]
+        shape = (-1, height // 32, width // 32)
+        rays = torch.stack([x[:, None].expand(shape), y[:, :, None].expand(shape)], 1)
+        out = self.network(image, rays)
+        depth = out["log_depth"].exp()
+        diagonal = torch.sqrt(torch.as_tensor(height * height + width * width, dtype=torch.float32))
+        return (
+            depth,
+            depth * out["log_std"].exp(),
+            out["normals"],
+            out["log_angle"].exp(),
+            out["validity"].sigmoid(),
+            out["log_focal"].exp() * diagonal,
+        )
+
+
+_OUTPUTS = ("depth", "std", "normals", "angle", "validity", "focal")
+
+
+def export(checkpoint: Path, output: Path) -> dict[str, float]:
+    """Write the averaged weights of a checkpoint as ONNX, weights as float16; compare with torch.
+
+    Returns the largest relative difference of each output on a random image.
+    """
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    network = CompactNetwork()
+    network.load_state_dict(averaged(state))
+    module = Exported(network).eval()
+    image, intrinsics = torch.rand(1, 3, 192, 256) * 255, torch.eye(3)[None] * 220
+    intrinsics[0, :2, 2] = torch.tensor([128.0, 96.0])
+    with warnings.catch_warnings():
+        # The exporter that needs no further package, and what it says of shapes that are dynamic.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            module,
+            (image, intrinsics),
+            str(output),
+            input_names=["image", "intrinsics"],
+            output_names=list(_OUTPUTS),
+            dynamic_axes={"image": {2: "h", 3: "w"}}
+            | {name: {2: "h2", 3: "w2"} for name in _OUTPUTS[:-1]},
+            opset_version=_OPSET,
+            dynamo=False,
+        )
+    model = onnx.load(output)
+    _halve(model)
+    model.producer_name = "mpsfm-compact"
+    steps = {"samples": int(state["step"]) * int(state.get("batch", 16))}
+    model.metadata_props.add(key="training", value=json.dumps(steps))
+    onnx.checker.check_model(model, full_check=True)
+    onnx.save(model, output)
+    return _difference(module, output)
+
+
+def averaged(state: dict) -> dict[str, Tensor]:
+    """The running mean of the weights of a checkpoint of training, or the weights as they are."""
+    mean = state.get("mean")
+    if mean is None:
+        return state
+    return {k.removeprefix("module."): v for k, v in mean.items() if k.startswith("module.")}
+
+
+def _halve(model: onnx.ModelProto) -> None:
+    """Store large arrays as float16; a Cast after each makes them float32 when it is loaded."""
+    graph = model.graph
+    casts = []
+    for array in list(graph.initializer):
+        values = numpy_helper.to_array(array)
+        if array.data_type != TensorProto.FLOAT or values.size < _SMALL:
+            continue
+        stored = numpy_helper.from_array(values.astype(np.float16), array.name + "_half")
+        graph.initializer.remove(array)
+        graph.initializer.append(stored)
+        casts.append(helper.make_node("Cast", [stored.name], [array.name], to=TensorProto.FLOAT))
+    nodes = [*casts, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
+def _difference(module: nn.Module, path: Path) -> dict[str, float]:
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    worst = dict.fromkeys(_OUTPUTS, 0.0)
+    for height, width in ((192, 256), (256, 160)):
+        image = torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(0)) * 255
+        intrinsics = torch.tensor([[[210.0, 0, width / 2], [0, 205.0, height / 2], [0, 0, 1]]])
+        with torch.inference_mode():
+            wanted = module(image, intrinsics)
+        feed = {"image": image.numpy(), "intrinsics": intrinsics.numpy()}
+        for name, a, b in zip(_OUTPUTS, wanted, session.run(list(_OUTPUTS), feed), strict=True):
+            gap = np.abs(a.numpy() - b).max() / np.abs(a.numpy()).max()
+            worst[name] = max(worst[name], float(gap))
+    return worst

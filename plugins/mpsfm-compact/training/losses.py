@@ -1,0 +1,78 @@
+"""What the network is trained to minimise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from training.batches import Batch
+from training.samples import EMPTY, UNKNOWN
+
+_WEIGHTS = {
+    "shape": 1.0,
+    "scale": 0.5,
+    "edges": 0.6,
+    "std": 0.3,
+    "normals": 0.7,
+    "angle": 0.2,
+    "validity": 0.1,
+    "focal": 0.1,
+}
+"""Chosen so that each part moves the shared layers about as much at the start."""
+_EMPTY_WEIGHT = 3.0
+"""Pixels without a surface are rare."""
+
+
+def losses(out: Mapping[str, Tensor], batch: Batch) -> dict[str, Tensor]:
+    """The parts of the loss, weighted.
+
+    Depth is judged by the absolute difference of logs: its shape after each image is given its
+    own scale, and for metric samples the scale and the steps between pixels at four distances. A
+    std is that of a Laplace distribution of what remains, and moves nothing but itself.
+    """
+    known = batch.known
+    residual = torch.where(known, out["log_depth"] - batch.log_depth, 0.0)
+    count = known.sum((1, 2, 3)).clamp(min=1)
+    offset = residual.sum((1, 2, 3)) / count
+    shape = torch.where(known, residual - offset[:, None, None, None], 0.0)
+    error = shape.abs()
+    log_std = out["log_std"]
+    metric = batch.metric.float()
+    parts = {
+        "shape": _mean(error, known),
+        "scale": (offset.abs() * metric).sum() / metric.sum().clamp(min=1),
+        "edges": _edges(residual, known & batch.metric[:, None, None, None]),
+        "std": _mean(error.detach() * torch.exp(-log_std) + log_std, known),
+    }
+    seen = batch.normals.square().sum(1, keepdim=True) > 0.5
+    truth = functional.normalize(batch.normals, dim=1)
+    cosine = (out["normals"] * truth).sum(1, keepdim=True)
+    angle = torch.acos(cosine.clamp(-0.9999, 0.9999))
+    log_angle = out["log_angle"]
+    parts["normals"] = _mean(angle, seen)
+    parts["angle"] = _mean(angle.detach() * torch.exp(-log_angle) + 2 * log_angle, seen)
+    empty = (batch.kind == EMPTY).float()
+    cross = functional.binary_cross_entropy_with_logits(
+        out["validity"], 1 - empty, reduction="none"
+    )
+    parts["validity"] = _mean(cross * (1 + (_EMPTY_WEIGHT - 1) * empty), batch.kind != UNKNOWN)
+    parts["focal"] = (out["log_focal"] - batch.log_focal).abs().mean()
+    return {name: _WEIGHTS[name] * part for name, part in parts.items()}
+
+
+def _edges(residual: Tensor, known: Tensor) -> Tensor:
+    total = residual.new_zeros(())
+    for step in (1, 2, 4, 8):
+        for axis in (2, 3):
+            size = residual.shape[axis] - step
+            a, b = residual.narrow(axis, 0, size), residual.narrow(axis, step, size)
+            both = known.narrow(axis, 0, size) & known.narrow(axis, step, size)
+            total = total + _mean((a - b).abs(), both) / 4
+    return total
+
+
+def _mean(values: Tensor, where: Tensor) -> Tensor:
+    return torch.where(where, values, 0.0).sum() / where.sum().clamp(min=1)

@@ -1,0 +1,126 @@
+"""Fill a folder with shards of drawn and of real samples."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import Progress
+
+from training.normals import normals_of_depth
+from training.samples import HEIGHT, SURFACE, UNKNOWN, WIDTH, Sample, write_shard
+from training.synthetic.make import draw_samples
+
+PER_SHARD = 240
+_FIELD_DEG = 60.0
+"""Horizontal field of view of photos that do not tell theirs."""
+
+
+def make_drawn(output: Path, shards: int, seed: int, workers: int, photos: Path | None) -> None:
+    """Draw what is missing of ``shards`` shards of :data:`PER_SHARD` samples.
+
+    ``photos``: a folder of pictures whose pieces become textures.
+    """
+    pictures = sorted(photos.rglob("*.jpg")) if photos else []
+    wanted = [n for n in range(shards) if not (output / f"drawn-{seed}-{n:04d}").exists()]
+    with Progress() as progress, ProcessPoolExecutor(workers) as pool:
+        task = progress.add_task("drawing", total=shards, completed=shards - len(wanted))
+        jobs = [pool.submit(_draw_shard, output, seed, n, pictures) for n in wanted]
+        for job in as_completed(jobs):
+            job.result()
+            progress.advance(task)
+
+
+def make_real(output: Path, source: Path) -> None:
+    """Convert scenes of RGB-D frames, one shard a scene.
+
+    A scene is a folder with ``scene.json`` (fx, fy, cx, cy in pixels, metric), and pairs of
+    ``NAME.jpg`` and ``NAME.png``, depth along z in millimetres, 16 bit, 0 where unknown.
+    """
+    for description in sorted(source.rglob("scene.json")):
+        name = "real-" + "-".join(description.parent.relative_to(source).parts)
+        if not (output / name).exists():
+            count = write_shard(output / name, _frames(description))
+            print(f"{name}: {count} frames")  # noqa: T201
+
+
+def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str]) -> None:
+    """Label photos of rooms by a depth network, one shard a folder of photos.
+
+    ``photos``: a folder of folders with JPEGs and ``licence.json`` (``hfov_deg`` by file name, or
+    none: then 60). ``teacher``: ONNX file with input (1, 3, 224, 224) RGB in 0..1 and output
+    (1, 1, 224, 224), as FastDepth has. ``names``: photos whose name or folder begins so.
+
+    The teacher's edges and scale are not to be learned: these samples are not ``metric``.
+    """
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(teacher), providers=["CPUExecutionProvider"])
+    for description in sorted(photos.rglob("licence.json")):
+        folder = description.parent
+        chosen = [
+            path
+            for path in sorted(folder.glob("*.jpg"))
+            if any(name.startswith(tuple(names)) for name in (path.name, folder.name))
+        ]
+        name = f"real-labelled-{folder.name}"
+        if chosen and not (output / name).exists():
+            angles = json.loads(description.read_text(encoding="utf-8")).get("hfov_deg", {})
+            labelled = (_labelled(p, angles.get(p.name, _FIELD_DEG), session) for p in chosen)
+            print(f"{name}: {write_shard(output / name, labelled)} photos")  # noqa: T201
+
+
+def _labelled(path: Path, field_deg: float, session: Any) -> Sample:
+    image = cv2.imread(str(path))[..., ::-1]
+    height, width = image.shape[:2]
+    small = cv2.resize(image, (224, 224), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    feed = {session.get_inputs()[0].name: small.transpose(2, 0, 1)[None]}
+    depth = cv2.resize(session.run(None, feed)[0][0, 0], (width, height))
+    focal = width / 2 / np.tan(np.radians(field_deg) / 2)
+    camera = np.array([focal, focal, width / 2, height / 2], np.float32)
+    sample = _fitted(image, np.maximum(depth, 0.1), camera, metric=False)
+    return replace(sample, normals=np.zeros_like(sample.normals))
+
+
+def _draw_shard(output: Path, seed: int, number: int, photos: list[Path]) -> None:
+    samples = draw_samples((seed, number), photos)
+    write_shard(output / f"drawn-{seed}-{number:04d}", islice(samples, PER_SHARD))
+
+
+def _frames(description: Path) -> Iterator[Sample]:
+    scene = json.loads(description.read_text(encoding="utf-8"))
+    for path in sorted(description.parent.glob("*.png")):
+        image, depth = cv2.imread(str(path.with_suffix(".jpg"))), cv2.imread(str(path), -1)
+        if image is None or depth is None or image.shape[:2] != depth.shape:
+            continue
+        metres = depth.astype(np.float32) / 1000
+        camera = np.array([scene[k] for k in ("fx", "fy", "cx", "cy")], np.float32)
+        sample = _fitted(image[..., ::-1], metres, camera, bool(scene["metric"]))
+        if (sample.kind == SURFACE).mean() > 0.2:
+            yield sample
+
+
+def _fitted(
+    image: NDArray[np.uint8], depth: NDArray[np.float32], camera: NDArray[np.float32], metric: bool
+) -> Sample:
+    """A frame of any size, cut to the samples' aspect ratio about its middle and resized."""
+    height, width = depth.shape
+    scale = max(WIDTH / width, HEIGHT / height)
+    w, h = min(width, round(WIDTH / scale)), min(height, round(HEIGHT / scale))
+    x, y = (width - w) // 2, (height - h) // 2
+    image, depth = image[y : y + h, x : x + w], depth[y : y + h, x : x + w]
+    ratio = np.array([WIDTH / w, HEIGHT / h], np.float32)
+    camera = np.concatenate([camera[:2] * ratio, (camera[2:] - [x, y]) * ratio]).astype(np.float32)
+    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    image = cv2.resize(np.ascontiguousarray(image), (WIDTH, HEIGHT), interpolation=method)
+    depth = cv2.resize(depth, (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST_EXACT)
+    kind = np.where(depth > 0, SURFACE, UNKNOWN).astype(np.uint8)
+    return Sample(image, depth, normals_of_depth(depth, camera), kind, camera, metric)

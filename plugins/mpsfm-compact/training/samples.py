@@ -1,0 +1,82 @@
+"""Training samples on disk: shards of arrays that are mapped into memory.
+
+A sample is an image of 320 x 240 or 240 x 320 pixels with what is known of it. Portrait ones are
+stored turned by a quarter, with their flag set, so that a shard is one block.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+WIDTH, HEIGHT = 320, 240
+UNKNOWN, SURFACE, EMPTY = 0, 1, 2
+"""Of a pixel: nothing is known, there is a surface, there is none that one could measure (sky,
+mirrors, glass)."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One training image.
+
+    ``image`` (240, 320, 3) uint8 RGB; ``depth`` (240, 320) float32, metres along z, 0 where
+    unknown; ``normals`` (240, 320, 3) in the camera's frame, 0 where unknown; ``kind`` (240, 320)
+    of UNKNOWN, SURFACE, EMPTY; ``camera``: fx, fy, cx, cy in pixels of the image, centre of the
+    first pixel (0.5, 0.5); ``metric``: whether the scale of depth is true.
+    """
+
+    image: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    kind: NDArray[np.uint8]
+    camera: NDArray[np.float32]
+    metric: bool = True
+
+
+def write_shard(folder: Path, samples: Iterable[Sample]) -> int:
+    """Write one shard as a folder; it is there as a whole or not at all. Returns how many."""
+    kept = list(samples)
+    if not kept:
+        return 0
+    building = folder.with_name(folder.name + ".part")
+    building.mkdir(parents=True, exist_ok=True)
+    np.save(building / "image.npy", np.stack([s.image for s in kept]))
+    np.save(building / "depth.npy", np.stack([s.depth for s in kept]).astype(np.float16))
+    coded = [np.round(127 * s.normals).astype(np.int8) for s in kept]
+    np.save(building / "normals.npy", np.stack(coded))
+    np.save(building / "kind.npy", np.stack([s.kind for s in kept]))
+    np.save(building / "camera.npy", np.stack([s.camera for s in kept]).astype(np.float32))
+    np.save(building / "metric.npy", np.array([s.metric for s in kept]))
+    (building / "shard.json").write_text(json.dumps({"samples": len(kept)}))
+    building.rename(folder)
+    return len(kept)
+
+
+class Shard:
+    """A shard, mapped into memory."""
+
+    def __init__(self, folder: Path) -> None:
+        self.name = folder.name
+        names = ("image", "depth", "normals", "kind", "camera", "metric")
+        self._arrays = {n: np.load(folder / f"{n}.npy", mmap_mode="r") for n in names}
+
+    def __len__(self) -> int:
+        return len(self._arrays["metric"])
+
+    def __getitem__(self, index: int) -> dict[str, NDArray[np.generic]]:
+        """Arrays of a sample as stored: float16 depth, normals times 127 as int8."""
+        return {name: np.asarray(array[index]) for name, array in self._arrays.items()}
+
+
+def find_shards(folder: Path) -> Iterator[Path]:
+    """Finished shards below a folder, in order."""
+    return (
+        path.parent
+        for path in sorted(folder.glob("**/shard.json"))
+        if path.parent.suffix != ".part"
+    )

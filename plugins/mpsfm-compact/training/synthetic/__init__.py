@@ -1,0 +1,1 @@
+"""Rooms, streets and things that are built at random and drawn by casting rays."""
