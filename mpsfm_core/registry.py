@@ -35,6 +35,7 @@ from mpsfm_core.providers import (
     Kind,
     ProviderContext,
     ProviderSpec,
+    WeightsFile,
 )
 from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 
@@ -194,6 +195,17 @@ class Registry:
         """The provider's options as plain values, None for those that the user has to give."""
         model = self._options_model(kind, name) or _NoOptions
         return dict.fromkeys(model.model_fields) | model.model_construct().model_dump(mode="json")
+
+    def weights(
+        self, kind: Kind, name: str, values: Mapping[str, Any] | None = None
+    ) -> tuple[WeightsFile, ...]:
+        """The weights files that a provider loads with these options.
+
+        Raises :class:`~mpsfm_core.options.SettingsError` when the options are wrong or lack one
+        that the user has to give.
+        """
+        files = self.spec(kind, name).weights
+        return tuple(files(self.validate_options(kind, name, values)) if callable(files) else files)
 
     def calibration(self, kind: Kind, backend: Backend) -> Calibration:
         """The uncertainty model of a depth or normals backend.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
+import socket
 import subprocess
 import sys
 import threading
@@ -227,9 +228,23 @@ def test_server_errors(
     assert len(server.requests) == requests
 
 
-def test_no_server(tmp_path: Path) -> None:
+def test_no_server_is_found_out_with_one_attempt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(weights, "_RETRY_WAIT_S", 3600)
     with pytest.raises(WeightsError, match=r"cannot be downloaded.*local file"):
         WeightStore(tmp_path).resolve("http://127.0.0.1:9/model.onnx")
+
+
+def test_a_server_that_does_not_answer_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(weights, "_OPENING_S", 0.05)
+    monkeypatch.setattr(weights, "_RETRY_WAIT_S", 3600)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        uri = f"http://127.0.0.1:{silent.getsockname()[1]}/model.onnx"
+        with pytest.raises(WeightsError, match=r"no answer from 127\.0\.0\.1"):
+            WeightStore(tmp_path).resolve(uri)
 
 
 def test_offline(tmp_path: Path, server: Server, uri: str, monkeypatch: pytest.MonkeyPatch) -> None:

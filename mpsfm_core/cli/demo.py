@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Overrides, Quiet
+from mpsfm_core.cli.arguments import Offline, Overrides, Quiet
 
 if TYPE_CHECKING:
     from mpsfm_core.evaluation import Pose
@@ -21,6 +21,7 @@ def demo(
         Path | None, typer.Option(metavar="DIR", help="A scene of the same layout.")
     ] = None,
     overrides: Overrides = None,
+    offline: Offline = False,
     quiet: Quiet = False,
 ) -> None:
     """Reconstruct the sample scene and say how far its poses are from the truth."""
