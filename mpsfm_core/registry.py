@@ -204,8 +204,18 @@ class Registry:
         Raises :class:`~mpsfm_core.options.SettingsError` when the options are wrong or lack one
         that the user has to give.
         """
-        files = self.spec(kind, name).weights
-        return tuple(files(self.validate_options(kind, name, values)) if callable(files) else files)
+        entry = self._entry(kind, name)
+        files = entry.spec.weights
+        if not callable(files):
+            return tuple(files)
+        options = self.validate_options(kind, name, values)
+        try:
+            return tuple(files(options))
+        except MpsfmError:
+            raise
+        except Exception as error:
+            what = f"cannot say which weights it loads: {type(error).__name__}: {error}"
+            raise ProviderError(_sentence(entry.label, what, "tell its author")) from error
 
     def calibration(self, kind: Kind, backend: Backend) -> Calibration:
         """The uncertainty model of a depth or normals backend.
