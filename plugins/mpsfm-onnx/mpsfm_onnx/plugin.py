@@ -74,6 +74,7 @@ def _spec(
         code_license="Apache-2.0",
         weights_license="of the chosen model",
         weights=_onnx_files,
+        accuracy="of the chosen network",
     )
 
 
