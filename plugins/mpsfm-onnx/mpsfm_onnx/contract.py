@@ -22,7 +22,6 @@ from mpsfm_onnx.stand_in import save_model
 
 KAPPA = (1 + np.sqrt(1 - NORMALS_STD**2)) / NORMALS_STD
 """Concentration whose expected angle is the std of painted normals (``exp(-kappa pi)`` is 0)."""
-_UNCERTAINTY = {"confidence": 1 - RELATIVE_STD}
 
 _TINY = """
 name: tiny
@@ -90,7 +89,8 @@ def moge_stand_in(path: Path) -> Path:
 
 def stand_in(description: Description, folder: Path) -> Path:
     """A model that gives painted views their depth and normals, through a description with named
-    input, NCHW tensors, ``output: depth`` and a concentration of the normals.
+    input, NCHW tensors, ``output: depth`` and an uncertainty of the normals; where no depth is painted is
+    not valid.
 
     A canonical camera has the focal length of the kit's main example on the network's input.
     """
@@ -103,15 +103,21 @@ def stand_in(description: Description, folder: Path) -> Path:
     if outputs.depth is not None:
         unit = graph.array([_canonical_unit(description)])
         graph.add("Mul", "metres", unit, to=outputs.depth.name)
-    if outputs.confidence is not None:
-        sure = graph.array([_UNCERTAINTY[outputs.confidence.output]])
-        graph.add("Add", "nothing", sure, to=outputs.confidence.name)
+    if outputs.confidence is not None and outputs.confidence.output == "confidence":
+        graph.add("Add", "nothing", graph.array([1 - RELATIVE_STD]), to=outputs.confidence.name)
+    elif outputs.confidence is not None:  # the std; a variance would be its square
+        share = graph.array([RELATIVE_STD * _canonical_unit(description)])
+        graph.add("Mul", "metres", share, to=outputs.confidence.name)
+    if outputs.mask is not None:
+        graph.add("Mul", "metres", graph.array([1e3]), to="steep")
+        graph.add("Min", "steep", graph.array([1.0]), to=outputs.mask.name)
     if outputs.normals is not None and outputs.kappa is not None:
         normals, kappa = outputs.normals.name, outputs.kappa.name
         parts = (normals, kappa) if normals != kappa else ("towards", "concentration")
         axes = np.array(outputs.normals.axes, dtype=np.float64).reshape(1, 3, 1, 1)
         graph.add("Mul", "slopes", graph.array(axes), to=parts[0])
-        graph.add("Add", "nothing", graph.array([KAPPA]), to=parts[1])
+        certainty = KAPPA if outputs.kappa.output == "kappa" else NORMALS_STD
+        graph.add("Add", "nothing", graph.array([certainty]), to=parts[1])
         if normals == kappa:
             graph.add("Concat", *parts, to=normals, axis=1)
     told = rule.intrinsics.name if rule.intrinsics else None

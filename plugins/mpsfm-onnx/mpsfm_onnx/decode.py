@@ -13,6 +13,7 @@ from mpsfm_core.geometry import pixel_centers, rays
 from mpsfm_onnx.description import (
     ConfidenceOutput,
     DepthOutput,
+    KappaOutput,
     Layout,
     NormalsOutput,
 )
@@ -113,17 +114,23 @@ def decode_normals(
     value: Float32,
     rule: NormalsOutput,
     camera: PinholeCamera,
-    kappa: Float32 | None = None,
+    std: Float64 | None = None,
     valid: Bool | None = None,
 ) -> NormalPrior:
-    """Normals and their angular variance from (h, w, 3 or more) and the (h, w) concentration.
+    """Normals from (h, w, 3 or more), and their variance from the (h, w) angular std in rad.
 
     Pixels whose normal does not face the ``camera`` of the view are invalid, as are those that
     the network itself does not call ``valid``.
     """
-    variance = None if kappa is None else expected_angle(kappa.astype(np.float64)) ** 2
+    variance = None if std is None else std**2
     normals = value[..., :3] * np.array(rule.axes, dtype=np.float32)
     return NormalPrior.from_arrays(normals, variance, valid, camera=camera)
+
+
+def angular_std(value: Float32, rule: KappaOutput) -> Float64:
+    """Std of normals about each axis in rad, (h, w), from the tensor of their uncertainty."""
+    tensor = value[..., rule.channel].astype(np.float64)
+    return expected_angle(tensor) if rule.output == "kappa" else np.maximum(tensor, 0)
 
 
 def expected_angle(kappa: Float64) -> Float64:

@@ -133,9 +133,11 @@ class NormalsOutput(Options):
 
 
 class KappaOutput(Options):
-    """The tensor of the normals' concentration, of which the angular variance is computed."""
+    """The tensor that the normals' angular variance comes from."""
 
     name: str
+    output: Literal["kappa", "angle"] = "kappa"
+    """``kappa``: the concentration of DSINE and Metric3D. ``angle``: std about each axis, rad."""
     channel: int = Field(0, ge=0)
     """3 if it is the fourth channel of the normals."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from mpsfm_core import DepthPrior, NormalPrior, PinholeCamera, ProviderContext, View
 from mpsfm_core.data import Bool
 from mpsfm_core.errors import ConfigError
-from mpsfm_onnx.decode import decode_depth, decode_normals
+from mpsfm_onnx.decode import angular_std, decode_depth, decode_normals
 from mpsfm_onnx.description import (
     DepthOutput,
     Description,
@@ -145,9 +145,9 @@ class OnnxJoint(DescribedJoint):
 
 def _normals(view: View, answer: Answer, outputs: Outputs, rule: NormalsOutput) -> NormalPrior:
     known = outputs.kappa
-    kappa = answer.maps[known.name][..., known.channel] if known else None
+    std = angular_std(answer.maps[known.name], known) if known else None
     valid = _mask(outputs, answer)
-    return decode_normals(answer.maps[rule.name], rule, view.camera, kappa, valid)
+    return decode_normals(answer.maps[rule.name], rule, view.camera, std, valid)
 
 
 def _mask(outputs: Outputs, answer: Answer) -> Bool | None:
