@@ -2,7 +2,12 @@
 
 A file may say ``extends:`` with the name of a shipped configuration or a path relative to itself.
 Mappings are merged key by key, everything else is replaced; a block whose ``use:`` changes loses
-the rest that its parent said of it, as another provider has other options.
+the rest that its parent said of it, as another provider has other options, and a block that says
+``use:`` loses its parent's ``otherwise:``.
+
+A block may name providers to take ``otherwise``. Which of them it will be is not the
+configuration's to say: it depends on the machine, and :mod:`mpsfm_core.provision` finds it out
+when a run starts.
 """
 
 from __future__ import annotations
@@ -19,6 +24,7 @@ from mpsfm_core.extraction.options import ExtractionOptions, PairOptions, Verifi
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.options import MapperOptions, MappingOptions
 from mpsfm_core.options import (
+    AS_DEPTH,
     Backend,
     Options,
     SettingPath,
@@ -69,6 +75,7 @@ class Config(Options):
     retrieval: Backend | None = None
     depth: Backend
     normals: Backend
+    """Of the depth network's own pass with ``use: as-depth``, if that gives normals."""
     masks: tuple[Backend, ...] = ()
     """A pixel is used when all masks allow it."""
     verification: VerificationOptions = Field(default_factory=VerificationOptions)
@@ -85,6 +92,14 @@ class Config(Options):
                 yield (name,), kind, backend
         for index, backend in enumerate(self.masks):
             yield ("masks", index), "mask", backend
+
+    def replaced(self, path: SettingPath, backend: Backend) -> Config:
+        """The configuration with another backend at a path of :meth:`backends`."""
+        block, *index = path
+        value: Any = backend
+        if index:
+            value = tuple(backend if i == index[0] else b for i, b in enumerate(self.masks))
+        return self.model_copy(update={str(block): value})
 
     def mapper_options(self) -> MapperOptions:
         """The settings of the mapper, with the seed of the run."""
@@ -103,6 +118,10 @@ _BLOCKS: dict[str, Kind] = {
     "depth": "depth",
     "normals": "normals",
 }
+
+
+BLOCKS = (*_BLOCKS, "masks")
+"""The blocks that name providers, each after those that its choice depends on."""
 
 
 def shipped_configs() -> dict[str, Path]:
@@ -246,6 +265,8 @@ def _merge(base: Any, change: Any) -> Any:
         return _merge_items(base or [], change)
     if not isinstance(base, Mapping) or change.get("use", base.get("use")) != base.get("use"):
         base = {}
+    elif "use" in change:  # who names a provider wants this one
+        base = {key: value for key, value in base.items() if key != "otherwise"}
     return {**base, **{key: _merge(base.get(key), value) for key, value in change.items()}}
 
 
@@ -261,34 +282,70 @@ def _merge_items(base: list[Any], change: Mapping[str, Any]) -> list[Any]:
 
 
 def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complete: bool) -> Config:
-    """The configuration with the options of every backend checked and filled in."""
+    """The configuration with the options of every backend checked and filled in.
+
+    Of a backend that is open one candidate must be possible; its options stay as they are given.
+    """
     problems: list[SettingProblem] = []
-    blocks: dict[str, Any] = {"masks": list(config.masks)}
+    checked = config
     for path, kind, backend in config.backends():
         try:
-            checked = _check_backend(path, kind, backend, registry, layers, complete)
+            known = backend.model_copy(
+                update={"calibration": _calibration(path, kind, backend, layers)}
+            )
+            if known.is_open:
+                _check_open(path, kind, known, registry, complete)
+            else:
+                known = check_backend(path, kind, known, registry, complete)
+            checked = checked.replaced(path, known)
         except SettingsError as error:
             problems += error.problems
-            continue
-        if path[0] == "masks":
-            blocks["masks"][path[1]] = checked
-        else:
-            blocks[str(path[0])] = checked
     if not problems:
-        problems += _combination_problems(config, registry)
+        problems += _missing_blocks(config)
+    if not problems:
+        problems += combination_problems(config, registry)
     if problems:
         raise SettingsError(tuple(problems))
-    return config.model_copy(update={**blocks, "masks": tuple(blocks["masks"])})
+    return checked
 
 
-def _check_backend(
-    path: SettingPath,
-    kind: Kind,
-    backend: Backend,
-    registry: Registry,
-    layers: Sequence[_Layer],
-    complete: bool,
+def _check_open(
+    path: SettingPath, kind: Kind, backend: Backend, registry: Registry, complete: bool
+) -> None:
+    """Raise if none of the candidates could be taken, whatever is on this machine later."""
+    names = (backend.use, *backend.otherwise)
+    here = [name for name in names if name in registry.names(kind)]
+    known = {key for name in here for key in registry.default_options(kind, name)}
+    unknown = [key for key in backend.options if key not in known]
+    if here and unknown and AS_DEPTH not in names:
+        places = [(*path, "options", key) for key in unknown]
+        texts = [f"unknown key{did_you_mean(key, known)}" for key in unknown]
+        raise SettingsError(tuple(map(SettingProblem, places, texts)))
+    errors = []
+    for name in here or names:
+        if name == AS_DEPTH:
+            return
+        candidate = backend.model_copy(update={"use": name, "otherwise": ()})
+        try:
+            check_backend(path, kind, candidate, registry, complete)
+            return
+        except SettingsError as error:
+            errors.append(error)
+    if here:
+        raise errors[0]
+    raise SettingsError(tuple(problem for error in errors for problem in error.problems))
+
+
+def check_backend(
+    path: SettingPath, kind: Kind, backend: Backend, registry: Registry, complete: bool = True
 ) -> Backend:
+    """A backend that names one provider, with its options and its wrappers' filled in.
+
+    ``path``: of the block, for messages. ``complete=False`` lets required options be absent.
+
+    Raises :class:`~mpsfm_core.options.SettingsError` when there is no such provider or wrapper,
+    or an option is wrong.
+    """
     try:
         options = registry.validate_options(kind, backend.use, backend.options, (*path, "options"))
         filled = options.model_dump(mode="json") if options else {}
@@ -299,15 +356,14 @@ def _check_backend(
             raise
         filled = registry.default_options(kind, backend.use) | backend.options
     wrap = tuple(
-        _check_backend((*path, "wrap", index), "wrapper", wrapper, registry, layers, complete)
+        check_backend((*path, "wrap", index), "wrapper", wrapper, registry, complete)
         for index, wrapper in enumerate(backend.wrap)
     )
     for index, wrapper in enumerate(wrap):
         if f"wraps-{kind}" not in registry.spec("wrapper", wrapper.use).capabilities:
             text = f"{wrapper.use!r} does not wrap {kind} providers"
             raise SettingsError((SettingProblem((*path, "wrap", index, "use"), text),))
-    calibration = _calibration(path, kind, backend, layers)
-    return backend.model_copy(update={"options": filled, "wrap": wrap, "calibration": calibration})
+    return backend.model_copy(update={"options": filled, "wrap": wrap})
 
 
 def _calibration(
@@ -329,25 +385,40 @@ def _calibration(
     return parse_settings(CALIBRATIONS[kind], values, path).model_dump(mode="json")
 
 
-def _combination_problems(config: Config, registry: Registry) -> list[SettingProblem]:
-    """What does not fit together although each block is right by itself."""
+def _missing_blocks(config: Config) -> list[SettingProblem]:
+    """Blocks that others need."""
     if config.matcher is None and config.dense_matcher is None:
         return [SettingProblem(("matcher",), "a matcher or a dense_matcher is needed")]
     problems = []
-    for name, capability in (("matcher", "sparse"), ("dense_matcher", "dense")):
-        backend: Backend | None = getattr(config, name)
-        if backend and capability not in registry.spec("matcher", backend.use).capabilities:
-            text = f"{backend.use!r} is not a {capability} matcher"
-            problems.append(SettingProblem((name, "use"), text))
-    if config.matcher is None:
-        return problems
-    if config.features is None:
+    if config.matcher is not None and config.features is None:
         text = f"is needed by the sparse matcher {config.matcher.use!r}"
-        return [*problems, SettingProblem(("features",), text)]
-    accepted = set(registry.spec("matcher", config.matcher.use).tags)
-    if accepted and not accepted & set(registry.spec("features", config.features.use).tags):
-        text = f"{config.matcher.use!r} matches {', '.join(sorted(accepted))} features"
-        text += f", not {config.features.use!r}"
+        problems.append(SettingProblem(("features",), text))
+    if config.pairs.mode == "retrieval" and config.retrieval is None:
+        problems.append(SettingProblem(("retrieval",), "is needed by pairs.mode: retrieval"))
+    return problems
+
+
+def combination_problems(config: Config, registry: Registry) -> list[SettingProblem]:
+    """What does not fit together in a configuration although each block is right by itself.
+
+    Open blocks fit for the present. The path of a problem begins with the block that should change.
+    """
+    problems = []
+    settled = {
+        path[0]: registry.spec(kind, backend.use)
+        for path, kind, backend in config.backends()
+        if not backend.is_open
+    }
+    for name, capability in (("matcher", "sparse"), ("dense_matcher", "dense")):
+        if name in settled and capability not in settled[name].capabilities:
+            text = f"{settled[name].name!r} is not a {capability} matcher"
+            problems.append(SettingProblem((name, "use"), text))
+    if not {"matcher", "features"} <= settled.keys():
+        return problems
+    accepted = set(settled["matcher"].tags)
+    if accepted and not accepted & set(settled["features"].tags):
+        text = f"{settled['matcher'].name!r} matches {', '.join(sorted(accepted))} features"
+        text += f", not {settled['features'].name!r}"
         problems.append(SettingProblem(("matcher", "use"), text))
     return problems
 

@@ -171,6 +171,9 @@ def _malformed(spec: ProviderSpec) -> str:
         values = getattr(spec, name)
         if isinstance(values, str) or not all(isinstance(value, str) for value in values):
             return f"{name} must be a tuple or set of texts"
+    weights: Any = spec.weights
+    if not (callable(weights) or isinstance(weights, (tuple, list))):
+        return "weights is neither a tuple of files nor a function of the options"
     unknown = sorted(set(spec.capabilities) - set(CAPABILITIES))
     if unknown:
         return f"unknown capability {unknown[0]!r}{did_you_mean(unknown[0], CAPABILITIES)}"

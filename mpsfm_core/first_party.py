@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
+_ONNX = ("onnx", "onnx-joint", "moge-2-small")
 _METRIC3D = ("metric3d-v2-small", "metric3d-v2-large", "metric3d-v2-giant2")
 
 FIRST_PARTY: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
-        "mpsfm-onnx": ("depth/onnx", "depth/onnx-joint", "normals/onnx", "normals/onnx-joint"),
+        "mpsfm-compact": ("depth/compact", "normals/compact", "mask/compact"),
+        "mpsfm-onnx": tuple(f"{k}/{n}" for k in ("depth", "normals") for n in _ONNX),
         "mpsfm-metric3d-onnx": tuple(f"{k}/{n}" for k in ("depth", "normals") for n in _METRIC3D),
         "mpsfm-dsine": ("normals/dsine",),
         "mpsfm-flip-consistency": ("wrapper/flip-consistency",),

@@ -24,11 +24,18 @@ class Options(BaseModel):
     )
 
 
+AS_DEPTH = "as-depth"
+"""As the normals provider: the depth network's own normals, of the same pass."""
+
+
 class Backend(Options):
-    """The choice of one provider."""
+    """The choice of one provider, or of several in the order of preference."""
 
     use: str
     """Name of the provider (see ``mpsfm plugins list``)."""
+    otherwise: tuple[str, ...] = ()
+    """Providers to take instead, in this order, where ``use`` cannot be had: its plugin or weights
+    are missing, or it does not know the given options."""
     options: dict[str, Any] = Field(default_factory=dict)
     """The provider's own options."""
     wrap: tuple[Backend, ...] = ()
@@ -36,6 +43,11 @@ class Backend(Options):
     calibration: dict[str, Any] | str | None = None
     """Uncertainty of a depth or normals provider: the values, a YAML or JSON file with them, or
     null for what the plugin declares."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is yet to be found out which provider it is (:mod:`mpsfm_core.provision`)."""
+        return bool(self.otherwise) or self.use == AS_DEPTH
 
 
 SettingPath = tuple[str | int, ...]

@@ -17,10 +17,10 @@ from mpsfm_core.data import MappingProblem, Pose
 from mpsfm_core.errors import InputError, ReconstructionError
 from mpsfm_core.extraction.focal import estimate_focals
 from mpsfm_core.extraction.runner import Extraction, extract
-from mpsfm_core.inputs.images import ImageSet, load_images
+from mpsfm_core.inputs.images import ImageSet, find_images, load_images
 from mpsfm_core.inputs.models import match_names, read_poses
 from mpsfm_core.mapping import mapper
-from mpsfm_core.options import dotted
+from mpsfm_core.provision import Provision, provide
 from mpsfm_core.registry import Registry, core_version
 from mpsfm_core.results.folder import check_writable
 from mpsfm_core.results.photos import Photos
@@ -77,7 +77,8 @@ def reconstruct(
         registry: the providers to choose from, by default those of all installed plugins.
 
     Raises:
-        InputError: images, intrinsics, poses, configuration, weights or output are wrong.
+        InputError: images, intrinsics, poses, configuration, weights or output are wrong. What
+            providers lack is found out before any photo is looked at.
         ReconstructionError: no reconstruction was possible; ``summary.json`` has the reasons.
         MpsfmError: a provider failed or broke its contract, or the disk is full.
     """
@@ -99,6 +100,7 @@ class _Run:
         self._registry = registry
         self._output = output
         self._stages = Stages(registry)
+        self._provision = Provision(config, ())
 
     def __call__(
         self,
@@ -107,9 +109,13 @@ class _Run:
         image_list: Path | None,
         poses: Path | None,
     ) -> ReconstructionResult:
-        config, stage = self._config, self._stages.stage
+        stage = self._stages.stage
         if self._output is not None:
             check_writable(self._output)
+        find_images(folder)  # no folder, no downloads
+        with stage("providers"):
+            self._provision = provide(self._config, self._registry, self._stages)
+        config = self._provision.config
         with stage("inputs"):
             images = load_images(folder, intrinsics, image_list, config.inputs, model=poses)
             known = {} if poses is None else _known_poses(poses, images)
@@ -172,7 +178,7 @@ class _Run:
                 for name, seconds in mapping.report.seconds.items()
             },
             "providers": self._providers(extraction.report["providers"]),
-            "config": self._config.model_dump(mode="json"),
+            "config": self._provision.config.model_dump(mode="json"),
             "versions": {
                 "mpsfm-core": core_version(),
                 "pycolmap": pycolmap.__version__,
@@ -181,18 +187,22 @@ class _Run:
         }
 
     def _providers(self, usage: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """What predicted what, under which licences, how often and how long."""
+        """What predicted what, why it was chosen, under which licences, how often, how long."""
         used = {(line["kind"], line["name"]): line for line in usage}
         described = []
-        for path, kind, backend in self._config.backends():
-            spec = self._registry.spec(kind, backend.use)
+        blocks = zip(self._provision.choices, self._provision.config.backends(), strict=True)
+        for choice, (_, kind, backend) in blocks:
+            spec = choice.provider
             described.append(
                 {
-                    "block": dotted(path),
+                    "block": choice.block,
                     **used.get((kind, spec.name), {"kind": kind, "name": spec.name}),
-                    "from": self._registry.version(kind, backend.use),
+                    "from": choice.origin,
+                    "chosen": choice.reason,
+                    "passed_over": dict(choice.passed_over),
                     "code_license": spec.code_license,
                     "weights_license": spec.weights_license,
+                    "accuracy": spec.accuracy,
                     "wrappers": [wrapper.use for wrapper in backend.wrap],
                 }
             )

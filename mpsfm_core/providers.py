@@ -18,9 +18,9 @@ the method of its kind's protocol below.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, Protocol, get_args, runtime_checkable
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import pluggy
 from pydantic import BaseModel
@@ -175,15 +175,36 @@ CAPABILITY_METHODS: dict[Capability, str] = {
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """A weights file that a provider loads by default, for ``mpsfm models``.
+    """A weights file that a provider loads.
 
     ``uri``: see :mod:`mpsfm_core.weights`. ``sha256``: hex digest, or None where the publisher
-    gives none (it is then recorded at first use). ``license``: SPDX id or a short text.
+    gives none (it is then recorded at first use). ``license``: SPDX id or a short text. ``size``:
+    in bytes, None where it is not known; told before a download.
     """
 
     uri: str
     sha256: str | None = None
     license: str = "unknown"
+    size: int | None = None
+
+
+def file_named_by(
+    option: str, *known: WeightsFile, sha256: str = "sha256"
+) -> Callable[[Any], tuple[WeightsFile, ...]]:
+    """For :attr:`ProviderSpec.weights`: the file that an option of the provider names.
+
+    ``option``: its name, whose value is a path or URI, or None for no file. ``sha256``: the option
+    with the expected hash. ``known``: what is known of files that it may name, as its default.
+    """
+
+    def files(options: Any) -> tuple[WeightsFile, ...]:
+        uri = getattr(options, option)
+        if uri is None:
+            return ()
+        file = next((file for file in known if file.uri == uri), WeightsFile(uri))
+        return (replace(file, sha256=getattr(options, sha256) or file.sha256),)
+
+    return files
 
 
 @dataclass(frozen=True)
@@ -196,10 +217,15 @@ class ProviderSpec:
     :class:`Options` subclass or ``"package.module:Class"``, None when there are none.
     ``capabilities``: from :data:`CAPABILITIES`. ``requires``: import names that must be
     installed, checked without importing; ``install_hint`` says how to get them.
-    ``code_license``, ``weights_license``: SPDX ids or short texts. ``weights``: the default
-    files. ``calibration``: declared uncertainty of a depth or normals provider. ``contract``:
-    how the contract kit tests it without weights, a function (see
-    :class:`mpsfm_core.testing.Setup`) by reference like ``factory``.
+    ``code_license``, ``weights_license``: SPDX ids or short texts. ``weights``: the files that it
+    loads, a function of its options where these can name others; a run finds or fetches them
+    before it looks at the first photo. ``accuracy``: what to expect, with its source, in a line.
+    ``calibration``: declared uncertainty of a depth or normals provider. ``contract``: how the
+    contract kit tests it without weights, a function (see :class:`mpsfm_core.testing.Setup`) by
+    reference like ``factory``.
+
+    An option of type :class:`~pathlib.Path` names a file or folder that the provider reads: a run
+    ends at once where it does not exist.
     """
 
     kind: Kind
@@ -212,7 +238,8 @@ class ProviderSpec:
     install_hint: str = ""
     code_license: str = "unknown"
     weights_license: str = "none"
-    weights: tuple[WeightsFile, ...] = ()
+    weights: tuple[WeightsFile, ...] | Callable[[Any], tuple[WeightsFile, ...]] = ()
+    accuracy: str = ""
     calibration: DepthCalibration | NormalCalibration | None = None
     api_version: int = API_VERSION
     tags: tuple[str, ...] = field(default=())
@@ -244,6 +271,11 @@ class Hooks:
 
         ``kind`` is depth or normals, or ``wrapper`` for a wrapper around such a provider.
         """
+
+    @hookspec
+    def mpsfm_notice(self, text: str) -> None:
+        """Something that the user should know while the run goes on, in one line: which provider
+        is taken and why, what is downloaded."""
 
     @hookspec
     def mpsfm_stage_started(self, stage: str, total: int | None) -> None:

@@ -35,6 +35,7 @@ from mpsfm_core.providers import (
     Kind,
     ProviderContext,
     ProviderSpec,
+    WeightsFile,
 )
 from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 
@@ -194,6 +195,27 @@ class Registry:
         """The provider's options as plain values, None for those that the user has to give."""
         model = self._options_model(kind, name) or _NoOptions
         return dict.fromkeys(model.model_fields) | model.model_construct().model_dump(mode="json")
+
+    def weights(
+        self, kind: Kind, name: str, values: Mapping[str, Any] | None = None
+    ) -> tuple[WeightsFile, ...]:
+        """The weights files that a provider loads with these options.
+
+        Raises :class:`~mpsfm_core.options.SettingsError` when the options are wrong or lack one
+        that the user has to give.
+        """
+        entry = self._entry(kind, name)
+        files = entry.spec.weights
+        if not callable(files):
+            return tuple(files)
+        options = self.validate_options(kind, name, values)
+        try:
+            return tuple(files(options))
+        except MpsfmError:
+            raise
+        except Exception as error:
+            what = f"cannot say which weights it loads: {type(error).__name__}: {error}"
+            raise ProviderError(_sentence(entry.label, what, "tell its author")) from error
 
     def calibration(self, kind: Kind, backend: Backend) -> Calibration:
         """The uncertainty model of a depth or normals backend.

@@ -44,6 +44,16 @@ class Stages:
             self._finished[name] = record
             self.stage_finished(name, record.seconds)
 
+    @contextmanager
+    def step(self, name: str, total: int | None) -> Iterator[None]:
+        """A step within a stage, of ``total`` units if known."""
+        started = time.perf_counter()
+        self.stage_started(name, total)
+        try:
+            yield
+        finally:
+            self.stage_finished(name, time.perf_counter() - started)
+
     def report(self) -> dict[str, StageRecord]:
         """The stages of the pipeline in order; one that still runs with what it took so far.
 
@@ -53,6 +63,10 @@ class Stages:
 
     def _record(self, name: str) -> StageRecord:
         return StageRecord(time.perf_counter() - self._running[name], _peak_memory_mb())
+
+    def notice(self, text: str) -> None:
+        """Something that the user should know now, in one line."""
+        self._registry.call_hook("mpsfm_notice", text=text)
 
     def stage_started(self, stage: str, total: int | None) -> None:
         """A stage begins, with this many steps if known."""

@@ -25,6 +25,7 @@ import importlib.util
 import json
 import os
 import re
+import threading
 import time
 import urllib.error
 import urllib.parse
@@ -46,6 +47,8 @@ OFFLINE_VARIABLES = ("MPSFM_OFFLINE", "HF_HUB_OFFLINE")
 Progress = Callable[[str, int, "int | None"], None]
 """Called with the file's name, the bytes that are here, and the bytes in total if known."""
 
+_OPENING_S = 4.0
+"""A server that has not answered by then is not there: name, connection, encryption and headers."""
 _TIMEOUT_S = 30.0
 _FRUITLESS_ATTEMPTS = 4
 _RETRY_WAIT_S = 0.5
@@ -150,8 +153,8 @@ class WeightStore:
             state = "is damaged in" if path.is_file() else "is not in"
             raise WeightsError(
                 f"{uri} {state} the cache {self.cache_dir} and downloads are switched off "
-                f"(runtime.offline or ${' or $'.join(OFFLINE_VARIABLES)}): run 'mpsfm models "
-                f"fetch' with network, or name a local file instead"
+                f"(--offline, runtime.offline or ${' or $'.join(OFFLINE_VARIABLES)}): run 'mpsfm "
+                f"models fetch {uri}' with network, or name a local file instead"
             )
         part = path.with_name(path.name + ".part")
         _download(uri, part, expected, self._progress)
@@ -325,22 +328,30 @@ def _hub_request(uri: str) -> urllib.request.Request:
 
 
 def _download(uri: str, part: Path, expected: str | None, progress: Progress | None) -> None:
-    """Download into ``part``, going on from what is there, until it is complete."""
-    fruitless = 0
+    """Download into ``part``, going on from what is there, until it is complete.
+
+    A server that cannot be reached at all is not asked again: most likely there is no network.
+    """
+    fruitless, reached = 0, False
     while True:
         before = _size(part)
         try:
-            _receive(_request(uri, expected), part, expected is not None, progress)
+            response = _open(_request(uri, expected), part, expected is not None)
+            reached = True
+            if response is not None:
+                _receive(response, part, progress)
             return
         except urllib.error.HTTPError as error:
+            reached = True
             if error.code not in _WORTH_A_RETRY:
                 answer = f"{error.code} {error.reason}"
                 raise WeightsError(f"{uri}: the server answers {answer}") from error
             failure: Exception = error
         except _CONNECTION_FAILURES as error:
+            reached = reached or not isinstance(error, (urllib.error.URLError, TimeoutError))
             failure = error
         fruitless = 0 if _size(part) > before else fruitless + 1
-        if fruitless >= _FRUITLESS_ATTEMPTS:
+        if fruitless >= _FRUITLESS_ATTEMPTS or not reached:
             raise WeightsError(
                 f"{uri} cannot be downloaded: {failure}. Try again (it goes on after the "
                 f"{_size(part)} bytes that are here), or name a local file"
@@ -348,10 +359,13 @@ def _download(uri: str, part: Path, expected: str | None, progress: Progress | N
         time.sleep(_RETRY_WAIT_S * 2**fruitless)
 
 
-def _receive(
-    request: urllib.request.Request, part: Path, hash_is_known: bool, progress: Progress | None
-) -> None:
-    """One attempt. Goes on from ``part`` if the rest certainly belongs to the same file."""
+def _open(
+    request: urllib.request.Request, part: Path, hash_is_known: bool
+) -> http.client.HTTPResponse | None:
+    """The server's answer; goes on from ``part`` if the rest certainly belongs to the same file.
+
+    None when everything had arrived before.
+    """
     etag_file = _etag_file(part)
     etag = etag_file.read_text(encoding="utf-8") if etag_file.is_file() else ""
     have = _size(part) if etag or hash_is_known else 0
@@ -360,7 +374,7 @@ def _receive(
         if etag:
             request.add_header("If-Range", etag)
     try:
-        response = urllib.request.urlopen(request, timeout=_TIMEOUT_S)
+        return _answer(request)
     except urllib.error.HTTPError as error:
         with error:
             if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
@@ -368,12 +382,36 @@ def _receive(
             if error.headers.get("Content-Range") != f"bytes */{have}":
                 _discard(part)
                 raise ConnectionError("the file on the server has changed") from error
-            return  # everything had arrived before
+            return None
+
+
+def _answer(request: urllib.request.Request) -> http.client.HTTPResponse:
+    """Open the connection, in a thread: no other limit covers the look-up of the server's name."""
+    outcome: list[Any] = []
+
+    def work() -> None:
+        try:
+            outcome.append(urllib.request.urlopen(request, timeout=_TIMEOUT_S))
+        except Exception as error:
+            outcome.append(error)
+
+    thread = threading.Thread(target=work, name="mpsfm download", daemon=True)
+    thread.start()
+    thread.join(_OPENING_S)
+    if not outcome:
+        raise TimeoutError(f"no answer from {request.host} within {_OPENING_S:g} s")
+    if isinstance(outcome[0], Exception):
+        raise outcome[0]
+    response: http.client.HTTPResponse = outcome[0]
+    return response
+
+
+def _receive(response: http.client.HTTPResponse, part: Path, progress: Progress | None) -> None:
+    """Append what a server sends to ``part``, or start it anew if that is what it sends."""
     with response:
-        if response.status != http.HTTPStatus.PARTIAL_CONTENT:
-            have = 0
+        have = _size(part) if response.status == http.HTTPStatus.PARTIAL_CONTENT else 0
         etag = response.headers.get("ETag", "")
-        etag_file.write_text("" if etag.startswith("W/") else etag, encoding="utf-8")
+        _etag_file(part).write_text("" if etag.startswith("W/") else etag, encoding="utf-8")
         length = response.headers.get("Content-Length")
         total = have + int(length) if length else None
         with part.open("r+b" if have else "wb") as file:

@@ -10,7 +10,8 @@ import yaml
 from mpsfm_core.config import Config, describe_shipped, load_config, shipped_configs
 from mpsfm_core.errors import ConfigError
 from mpsfm_core.first_party import FIRST_PARTY, requirement_for
-from mpsfm_core.options import SettingsError, dotted
+from mpsfm_core.options import AS_DEPTH, SettingsError, dotted
+from mpsfm_core.provision import provide
 from mpsfm_core.registry import CORE, Registry
 from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 
@@ -30,10 +31,23 @@ def registry() -> Registry:
     return registry
 
 
+def closed(config: Config, registry: Registry) -> Config:
+    """With the first choice of each block."""
+    joint = "joint-normals" in registry.spec("depth", config.depth.use).capabilities
+    for path, _, backend in list(config.backends()):
+        chosen = {"use": backend.use, "otherwise": ()}
+        if backend.use == AS_DEPTH and joint:
+            chosen |= {"use": config.depth.use, "options": config.depth.options}
+        elif backend.use == AS_DEPTH:
+            chosen["use"] = backend.otherwise[0]
+        config = config.replaced(path, backend.model_copy(update=chosen))
+    return config
+
+
 def required(config: Config, registry: Registry) -> list[str]:
     """Options that only the user can know, as ``--set`` names them."""
     found = []
-    for path, kind, backend in config.backends():
+    for path, kind, backend in closed(config, registry).backends():
         given = {key: value for key, value in backend.options.items() if value is not None}
         try:
             registry.validate_options(kind, backend.use, given)
@@ -47,6 +61,7 @@ def test_loads_and_resolves(name: str, registry: Registry) -> None:
     config = load_config(name, (), registry, complete=False)
     assert describe_shipped()[name]
     complete = load_config(name, [f"{o}=FILE" for o in required(config, registry)], registry)
+    complete = closed(complete, registry)
     for path, kind, backend in complete.backends():
         chosen = [(kind, backend.use), *(("wrapper", w.use) for w in backend.wrap)]
         for each in chosen:
@@ -74,8 +89,13 @@ def test_says_what_it_has_to_be_told(name: str, registry: Registry) -> None:
 def test_tells_what_to_install(name: str, registry: Registry) -> None:
     """Without any plugin the error names the package of the first thing that is missing."""
     config = load_config(name, (), registry, complete=False)
-    homes = {requirement_for(kind, backend.use) for _, kind, backend in config.backends()}
-    hints = [f"pip install '{home}'" for home in homes if home]
+    wanted = [
+        (kind, name)
+        for _, kind, backend in config.backends()
+        for name in (backend.use, *backend.otherwise)
+        if AS_DEPTH not in (backend.use, *backend.otherwise)
+    ]
+    hints = [f"pip install '{home}'" for choice in wanted if (home := requirement_for(*choice))]
     with pytest.raises(ConfigError) as caught:
         load_config(name, (), Registry(), complete=False)
     assert all(hint in str(caught.value) for hint in hints)
@@ -83,7 +103,7 @@ def test_tells_what_to_install(name: str, registry: Registry) -> None:
 
 def test_one_pass_gives_depth_and_normals_where_nothing_wraps_them(registry: Registry) -> None:
     for name in NAMES:
-        config = load_config(name, (), registry, complete=False)
+        config = closed(load_config(name, (), registry, complete=False), registry)
         joint = "joint-normals" in registry.spec("depth", config.depth.use).capabilities
         if joint and config.depth.use == config.normals.use and not config.normals.wrap:
             assert config.depth.options == config.normals.options
@@ -106,3 +126,12 @@ def test_every_first_party_provider_is_announced_and_in_the_guide(registry: Regi
             short = line.name.removeprefix("metric3d-v2")
             assert f"`{line.name}`" in text or f"`{short}`" in text, f"{line.kind} {line.name}"
     assert found == {provider for brought in FIRST_PARTY.values() for provider in brought}
+
+
+@pytest.mark.parametrize("name", ["default", "fast-cpu", "demo"])
+def test_runs_with_nothing_named_and_without_a_network_connection(
+    name: str, registry: Registry, tmp_path: Path
+) -> None:
+    offline = ("runtime.offline=true", f"runtime.cache_dir={tmp_path}")
+    provision = provide(load_config(name, offline, registry), registry)
+    assert provision.config.depth.use == provision.config.normals.use == "compact"

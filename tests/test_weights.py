@@ -5,12 +5,11 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -18,79 +17,18 @@ import pytest
 
 from mpsfm_core import weights
 from mpsfm_core.errors import WeightsError
+from mpsfm_core.testing.file_server import Server, serving
 from mpsfm_core.weights import WeightStore, file_sha256, load_torch_state
 
 CONTENT = np.random.default_rng(5).bytes(300_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 
-@dataclass
-class Server:
-    """What a test wants of the server, and what the server has seen."""
-
-    url: str
-    files: dict[str, bytes] = field(default_factory=dict)
-    etag: str | None = '"v1"'
-    cut_after: int | None = None
-    """Bytes after which a connection is cut, each time."""
-    redirects: dict[str, str] = field(default_factory=dict)
-    status: int | None = None
-    requests: list[tuple[str, dict[str, str]]] = field(default_factory=list)
-
-    def ranges(self) -> list[str | None]:
-        return [headers.get("Range") for _, headers in self.requests]
-
-
-class Handler(BaseHTTPRequestHandler):
-    server_state: Server
-
-    def do_GET(self) -> None:
-        state = self.server_state
-        state.requests.append((self.path, dict(self.headers)))
-        if state.status:
-            return self.send_error(state.status)
-        if self.path in state.redirects:
-            self.send_response(302)
-            self.send_header("Location", state.redirects[self.path])
-            return self.end_headers()
-        if self.path not in state.files:
-            return self.send_error(404)
-        content, start = state.files[self.path], 0
-        same = self.headers.get("If-Range") in (None, state.etag)
-        if same and "Range" in self.headers:
-            start = int(self.headers["Range"].removeprefix("bytes=").removesuffix("-"))
-        if start >= len(content):
-            self.send_response(416)
-            self.send_header("Content-Range", f"bytes */{len(content)}")
-            return self.end_headers()
-        self.send_response(206 if start else 200)
-        if start:
-            self.send_header("Content-Range", f"bytes {start}-{len(content) - 1}/{len(content)}")
-        if state.etag:
-            self.send_header("ETag", state.etag)
-        self.send_header("Content-Length", str(len(content) - start))
-        self.end_headers()
-        stop = len(content) if state.cut_after is None else start + state.cut_after
-        self.wfile.write(content[start:stop])
-
-    def log_message(self, *args: object) -> None:
-        pass
-
-
 @pytest.fixture
 def server() -> Iterator[Server]:
-    class OwnHandler(Handler):
-        pass
-
-    http = ThreadingHTTPServer(("127.0.0.1", 0), OwnHandler)
-    OwnHandler.server_state = Server(f"http://127.0.0.1:{http.server_port}")
-    OwnHandler.server_state.files["/v1/model.onnx"] = CONTENT
-    thread = threading.Thread(target=http.serve_forever, args=(0.01,))
-    thread.start()
-    yield OwnHandler.server_state
-    http.shutdown()
-    thread.join()
-    http.server_close()
+    with serving() as server:
+        server.files["/v1/model.onnx"] = CONTENT
+        yield server
 
 
 @pytest.fixture(autouse=True)
@@ -227,9 +165,23 @@ def test_server_errors(
     assert len(server.requests) == requests
 
 
-def test_no_server(tmp_path: Path) -> None:
+def test_no_server_is_found_out_with_one_attempt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(weights, "_RETRY_WAIT_S", 3600)
     with pytest.raises(WeightsError, match=r"cannot be downloaded.*local file"):
         WeightStore(tmp_path).resolve("http://127.0.0.1:9/model.onnx")
+
+
+def test_a_server_that_does_not_answer_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(weights, "_OPENING_S", 0.05)
+    monkeypatch.setattr(weights, "_RETRY_WAIT_S", 3600)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        uri = f"http://127.0.0.1:{silent.getsockname()[1]}/model.onnx"
+        with pytest.raises(WeightsError, match=r"no answer from 127\.0\.0\.1"):
+            WeightStore(tmp_path).resolve(uri)
 
 
 def test_offline(tmp_path: Path, server: Server, uri: str, monkeypatch: pytest.MonkeyPatch) -> None:

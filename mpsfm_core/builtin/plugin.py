@@ -61,6 +61,16 @@ def _depth() -> list[ProviderSpec]:
         ),
         ProviderSpec(
             kind="depth",
+            name="flat",
+            factory="mpsfm_core.builtin.flat:Flat",
+            summary="a plane parallel to the image: no prior at all, for photos with much overlap",
+            code_license=_LICENSE,
+            accuracy="none: it does not look at the photo (a network: pip install mpsfm-compact)",
+            # Ours: with 0.3 to 0.5 the sample scene's poses are the same, with 1.0 they are worse.
+            calibration=DepthCalibration(relative_std=0.5),
+        ),
+        ProviderSpec(
+            kind="depth",
             name="matcher",
             factory="mpsfm_core.builtin.matcher_depth:MatcherDepth",
             capabilities=frozenset({"uncached"}),

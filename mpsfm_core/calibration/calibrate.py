@@ -29,6 +29,7 @@ from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.models import read_model
 from mpsfm_core.options import Backend
 from mpsfm_core.pipeline import reconstruct
+from mpsfm_core.provision import provide
 from mpsfm_core.registry import Registry, core_version
 from mpsfm_core.stages import Stages
 from mpsfm_core.uncertainty.file import CalibratedKind, CalibrationFile, Provenance
@@ -137,12 +138,15 @@ class _Run:
         alignments: Sequence[Alignment] | None,
         options: StudyOptions,
     ) -> None:
+        stages = Stages(registry)
+        needed = ("depth", "normals", "masks")  # a reconstruction sees to the others itself
+        config = provide(config, registry, stages, needed).config
         self._photos, self._config, self._kind = photos, config, kind
         self._registry, self._options = registry, options
         self._backend: Backend = getattr(config, kind)
         self._declared: Calibration = registry.calibration(kind, self._backend)
         images = load_images(photos.folder, photos.intrinsics, photos.image_list, config.inputs)
-        self._bench = Workbench(images, config, registry, Stages(registry))
+        self._bench = Workbench(images, config, registry, stages)
         self._comparison = Comparison(self._bench, kind, alignments, options)
 
     def prepare(self) -> None:

@@ -16,6 +16,14 @@ Overrides: TypeAlias = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, e.g. runtime.workers=2."),
 ]
+Offline: TypeAlias = Annotated[
+    bool, typer.Option("--offline", help="Download nothing; take what is on this machine.")
+]
 Quiet: TypeAlias = Annotated[
     bool, typer.Option("--quiet", "-q", help="No progress, no summary; errors only.")
 ]
+
+
+def settings(overrides: list[str] | None, offline: bool) -> list[str]:
+    """The settings that the options ``--set`` and ``--offline`` mean."""
+    return [*(overrides or ()), *(["runtime.offline=true"] if offline else [])]

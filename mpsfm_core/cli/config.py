@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Overrides
+from mpsfm_core.cli.arguments import Offline, Overrides, settings
 
 app = typer.Typer(no_args_is_help=True, help="Configurations and their effective settings.")
 
@@ -24,8 +24,23 @@ def list_configs() -> None:
 def show(
     name: Annotated[str, typer.Argument(metavar="[NAME_OR_FILE]")] = "default",
     overrides: Overrides = None,
+    offline: Offline = False,
 ) -> None:
-    """Print the effective configuration as YAML, with all defaults."""
-    from mpsfm_core.config import load_config
+    """Print the effective configuration as YAML, with all defaults.
 
-    typer.echo(load_config(name, overrides or (), complete=False).to_yaml(), nl=False)
+    Comments at its end say which providers a run would take here and now; nothing is downloaded.
+    """
+    from mpsfm_core.config import load_config
+    from mpsfm_core.errors import InputError
+    from mpsfm_core.provision import look_up
+    from mpsfm_core.registry import Registry
+
+    registry = Registry.discover()
+    config = load_config(name, settings(overrides, offline), registry, complete=False)
+    typer.echo(config.to_yaml(), nl=False)
+    typer.echo("\n# here and now:")
+    try:
+        for choice in look_up(config, registry).choices:
+            typer.echo(f"# {choice}")
+    except InputError as error:
+        typer.echo(f"# it does not run: {error}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Overrides, Quiet
+from mpsfm_core.cli.arguments import Offline, Overrides, Quiet, settings
 
 if TYPE_CHECKING:
     from mpsfm_core.evaluation import Pose
@@ -18,28 +18,31 @@ def demo(
         Path("demo-output")
     ),
     scene: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="A scene of the same layout.")
+        Path | None, typer.Option(metavar="DIR", help="Another scene, with images/ and gt/.")
     ] = None,
     overrides: Overrides = None,
+    offline: Offline = False,
     quiet: Quiet = False,
 ) -> None:
-    """Reconstruct the sample scene and say how far its poses are from the truth."""
+    """Reconstruct the sample photos, from pixels alone, and say how far the poses are off.
+
+    gt/ is a COLMAP model of true poses. The cameras are its, and nothing else of it is used before
+    the comparison.
+    """
     from mpsfm_core.cli.reconstruct import run
     from mpsfm_core.evaluation import read_poses, reconstruction_poses
 
     folder = _sample_scene() if scene is None else scene
-    priors = [
-        f"{kind}.options.directory={folder / 'priors' / kind}" for kind in ("depth", "normals")
-    ]
     result = run(
         folder / "images",
         output,
         "demo",
         quiet,
-        intrinsics=folder / "intrinsics.yaml",
-        overrides=[*priors, *(overrides or ())],
+        intrinsics=folder / "gt",
+        overrides=settings(overrides, offline),
     )
-    _compare(reconstruction_poses(result.model), read_poses(folder / "gt"))
+    metric = result.summary["reconstructions"][0]["metric_scale"] is not None
+    _compare(reconstruction_poses(result.model), read_poses(folder / "gt"), metric)
     typer.echo("open next:")
     typer.echo(f"  {output}/dense.ply     in MeshLab, CloudCompare or Blender")
     typer.echo(f"  {output}/sparse        in COLMAP (File > Import model) or pycolmap")
@@ -47,19 +50,15 @@ def demo(
 
 
 def _sample_scene() -> Path:
+    """Installed from a wheel it lies in the package, in a source tree among the examples."""
     import mpsfm_core
-    from mpsfm_core.errors import InputError
 
-    folder = Path(mpsfm_core.__file__).parents[1] / "examples" / "sample_scene"
-    if not folder.is_dir():
-        raise InputError(
-            "the sample scene is part of the repository, not of the installed package: run the "
-            "demo from a clone, or give --scene"
-        )
-    return folder
+    package = Path(mpsfm_core.__file__).parent
+    places = (package / "sample_scene", package.parent / "examples" / "sample_scene")
+    return next(place for place in places if place.is_dir())
 
 
-def _compare(estimated: dict[str, Pose], truth: dict[str, Pose]) -> None:
+def _compare(estimated: dict[str, Pose], truth: dict[str, Pose], metric: bool) -> None:
     from mpsfm_core.evaluation import evaluate
 
     report = evaluate(estimated, truth)
@@ -75,4 +74,5 @@ def _compare(estimated: dict[str, Pose], truth: dict[str, Pose]) -> None:
             f"{100 * trajectory['ate_median']:.1f} cm (largest "
             f"{trajectory['rotation_max_deg']:.2f} deg, {100 * trajectory['ate_max']:.1f} cm)"
         )
+    if trajectory is not None and metric:
         typer.echo(f"  metric scale off by {100 * abs(1 / trajectory['scale'] - 1):.1f} %")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
@@ -111,13 +111,15 @@ def path(targets: Targets, cache: CacheDir = None) -> None:
 
 def _known() -> Iterator[tuple[str, WeightsFile]]:
     """Kind and name of each usable provider with each of its default weights files."""
+    from mpsfm_core.errors import InputError
     from mpsfm_core.registry import Registry
 
     registry = Registry.discover()
     for status in registry.status():
         if status.available and status.kind != "plugin":
-            for file in registry.spec(status.kind, status.name).weights:
-                yield f"{status.kind}/{status.name}", file
+            with suppress(InputError):  # the user has to name the file: there is no default
+                for file in registry.weights(status.kind, status.name):
+                    yield f"{status.kind}/{status.name}", file
 
 
 def _select(targets: list[str]) -> list[WeightsFile]:

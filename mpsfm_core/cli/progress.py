@@ -49,6 +49,11 @@ class Bars:
         self._tasks: dict[str, TaskID] = {}
 
     @hookimpl
+    def mpsfm_notice(self, text: str) -> None:
+        """Print it above the bars."""
+        self._progress.console.print(text, markup=False)
+
+    @hookimpl
     def mpsfm_stage_started(self, stage: str, total: int | None) -> None:
         """Add a bar."""
         self._tasks[stage] = self._progress.add_task(stage, total=total)
@@ -78,6 +83,11 @@ class Lines:
 
     def __init__(self, console: Console) -> None:
         self._console = console
+
+    @hookimpl
+    def mpsfm_notice(self, text: str) -> None:
+        """Print it."""
+        self._console.print(text, markup=False, soft_wrap=True)
 
     @hookimpl
     def mpsfm_stage_finished(self, stage: str, seconds: float) -> None:

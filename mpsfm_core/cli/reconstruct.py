@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mpsfm_core.cli.arguments import ConfigName, Overrides, Quiet
+from mpsfm_core.cli.arguments import ConfigName, Offline, Overrides, Quiet, settings
 
 if TYPE_CHECKING:
     from mpsfm_core.pipeline import ReconstructionResult
@@ -37,9 +37,12 @@ def reconstruct(
         ),
     ] = None,
     overrides: Overrides = None,
+    offline: Offline = False,
     quiet: Quiet = False,
 ) -> None:
     """Reconstruct a folder of photos.
+
+    Without --config it takes the best features, depth and normals that it can get, and says which.
 
     Writes a COLMAP model (DIR/sparse), point clouds (DIR/points.ply, DIR/dense.ply), refined
     depth (DIR/depth) and DIR/summary.json. Exits with 0 on success, 2 on wrong input, 3 when no
@@ -53,7 +56,7 @@ def reconstruct(
         intrinsics=intrinsics,
         image_list=image_list,
         poses=poses,
-        overrides=overrides or (),
+        overrides=settings(overrides, offline),
     )
 
 

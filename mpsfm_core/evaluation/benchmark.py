@@ -33,6 +33,7 @@ from mpsfm_core.extraction.runner import extract
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.providers import hookimpl
+from mpsfm_core.provision import provide
 from mpsfm_core.registry import Registry, core_version
 from mpsfm_core.stages import Stages
 
@@ -122,12 +123,14 @@ def problem_of_sets(
     """
     names = sorted({name for item in sets for name in item.images})
     settings = prior_settings(prior, scene, names, work / f"{prior}-depth")
+    stages = Stages(registry)
     loaded = load_config(config, (*settings, *overrides), registry=registry)
+    loaded = provide(loaded, registry, stages).config
     work.mkdir(parents=True, exist_ok=True)
     listed = work / "images.txt"
     listed.write_text("\n".join(names) + "\n", encoding="utf-8")
     images = load_images(scene.images, scene.intrinsics, listed, loaded.inputs)
-    extraction = extract(images, loaded, registry, Stages(registry))
+    extraction = extract(images, loaded, registry, stages)
     return extraction.problem, loaded.mapper_options()
 
 

@@ -113,7 +113,6 @@ class ActiveProvider:
         blocks = [(self.kind, self.backend), *(("wrapper", w) for w in self.backend.wrap)]
         described = []
         for kind, backend in blocks:
-            spec = self._registry.spec(kind, backend.use)
             options = self._registry.validate_options(kind, backend.use, backend.options)
             values = options.model_dump(mode="json") if options else {}
             described.append(
@@ -122,18 +121,19 @@ class ActiveProvider:
                     "name": backend.use,
                     "version": self._registry.version(kind, backend.use),
                     "options": values,
-                    "files": self._hashes(spec, values),
+                    "files": self._hashes(kind, backend.use, values),
                 }
             )
         return {"api": API_VERSION, "seed": self._runtime.seed, "providers": described}
 
-    def _hashes(self, spec: ProviderSpec, values: dict[str, Any]) -> dict[str, str]:
-        """SHA-256 of the files that options name, or else of the provider's default weights.
+    def _hashes(self, kind: Kind, name: str, values: dict[str, Any]) -> dict[str, str]:
+        """SHA-256 of the files that options name, and of the weights that these mean.
 
         What has to be downloaded is downloaded first, by constructing the provider.
         """
         named = [uri for uri in _texts(values) if is_remote(uri) or self._store.locate(uri)]
-        uris = named or [file.uri for file in spec.weights]
+        meant = [file.uri for file in self._registry.weights(kind, name, values)]
+        uris = list(dict.fromkeys((*named, *meant)))
         if any(is_remote(uri) and self._store.locate(uri) is None for uri in uris):
             self._local.provider = self._create()
         found = {uri: self._store.locate(uri) for uri in uris}

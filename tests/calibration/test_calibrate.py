@@ -74,8 +74,8 @@ def test_the_file_says_where_it_comes_from(calibrated: Path) -> None:
 def test_a_configuration_uses_it(calibrated: Path, tmp_path: Path) -> None:
     config = tmp_path / "run.yaml"
     config.write_text(
-        f"extends: demo\ndepth: {{options: {{directory: x}}, calibration: {calibrated}}}\n"
-        "normals: {options: {directory: y}}\n"
+        f"extends: demo\n"
+        f"depth: {{use: files, options: {{directory: x}}, calibration: {calibrated}}}\n"
     )
     expected = load_calibration(calibrated).model_dump(mode="json")
     assert load_config(config).depth.calibration == expected
@@ -229,7 +229,7 @@ def test_points_of_a_model(calibrated: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_nothing_but_photos(calibrated: Path, tmp_path: Path) -> None:
     """The points of our own reconstruction lead to about the same std as true depth."""
-    result = run(tmp_path / "own.yaml", *PRIOR, "--config", "demo", "--set", _normals())
+    result = run(tmp_path / "own.yaml", *PRIOR, "--config", "demo", *_normals())
     assert result.exit_code == 0, result.output
     own, true = load_calibration(tmp_path / "own.yaml"), load_calibration(calibrated)
     assert isinstance(own, DepthCalibration)
@@ -238,5 +238,6 @@ def test_nothing_but_photos(calibrated: Path, tmp_path: Path) -> None:
     assert provenance(tmp_path / "own.yaml")["truth"].startswith("own reconstruction")
 
 
-def _normals() -> str:
-    return f"normals.options.directory={SCENE / 'priors' / 'normals'}"
+def _normals() -> list[str]:
+    folder = SCENE / "priors" / "normals"
+    return ["--set", "normals.use=files", "--set", f"normals.options.directory={folder}"]

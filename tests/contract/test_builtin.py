@@ -12,6 +12,7 @@ BUILTIN.add(*mpsfm_providers())
 test_sift = contract_tests("features", "sift", registry=BUILTIN)
 test_mutual_nearest = contract_tests("matcher", "mutual-nearest", registry=BUILTIN)
 test_depth_files = contract_tests("depth", "files", registry=BUILTIN)
+test_flat_depth = contract_tests("depth", "flat", registry=BUILTIN)
 test_depth_of_matcher = contract_tests("depth", "matcher", registry=BUILTIN)
 test_normal_files = contract_tests("normals", "files", registry=BUILTIN)
 test_normals_from_depth = contract_tests("normals", "from-depth", registry=BUILTIN)
@@ -23,6 +24,7 @@ def test_all_of_them_are_here() -> None:
         ("features", "sift"),
         ("matcher", "mutual-nearest"),
         ("depth", "files"),
+        ("depth", "flat"),
         ("depth", "matcher"),
         ("normals", "files"),
         ("normals", "from-depth"),

@@ -3,27 +3,82 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
 from pathlib import Path
 
 import pytest
 
 from mpsfm_core.evaluation import evaluate, read_poses
 
-SCENE = Path(__file__).resolve().parents[2] / "examples" / "sample_scene"
+ROOT = Path(__file__).resolve().parents[2]
+SCENE = ROOT / "examples" / "sample_scene"
+PRIOR_FILES = [
+    part
+    for kind in ("depth", "normals")
+    for part in (
+        *("--set", f"{kind}.use=files"),
+        *("--set", f"{kind}.options.directory={SCENE / 'priors' / kind}"),
+    )
+]
 
 
-def test_the_demo_finds_the_poses_and_says_what_to_open(mpsfm, tmp_path: Path) -> None:
+def test_the_demo_needs_nothing_but_the_photos(mpsfm, tmp_path: Path) -> None:
     output = tmp_path / "demo"
     ended = mpsfm("demo", "--output", output)
     assert ended.code == 0, ended.err
     for text in ("8 of 8 images", "(paper convention)", "median error", "dense.ply", "sparse"):
         assert text in ended.out
+    providers = json.loads((output / "summary.json").read_text())["providers"]
+    depth = {line["block"]: line for line in providers}["depth"]
+    assert f"depth: {depth['name']}" in ended.err
+    # A constant depth, where our own network is not installed, leads to 89 %.
+    assert evaluate(read_poses(output), read_poses(SCENE / "gt"))["auc"]["20"] > 80
+
+
+def test_with_the_priors_of_the_scene_the_poses_are_right(mpsfm, tmp_path: Path) -> None:
+    output = tmp_path / "demo"
+    ended = mpsfm("demo", "--output", output, *PRIOR_FILES)
+    assert ended.code == 0, ended.err
+    assert "metric scale off by" in ended.out
     report = evaluate(read_poses(output), read_poses(SCENE / "gt"))
     assert report["auc"]["5"] > 80
     assert report["trajectory"]["rotation_median_deg"] < 0.5
     assert report["trajectory"]["ate_median"] < 0.05
     # The priors' scales spread by 4 %; their consensus is the metre of the model.
     assert report["trajectory"]["scale"] == pytest.approx(1, abs=0.08)
+
+
+@pytest.mark.slow
+def test_it_runs_from_a_wheel_somewhere_else(tmp_path: Path) -> None:
+    """The wheel has the configurations and the sample photos, and no scripts of the scene."""
+    source, installed = tmp_path / "source", tmp_path / "installed"
+    for name in ("mpsfm_core", "configs", "examples/sample_scene"):
+        shutil.copytree(ROOT / name, source / name)
+    for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE", "mpsfm_pytest.py"):
+        shutil.copy(ROOT / name, source)
+    wheel = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation"]
+    options = {"check": True, "cwd": tmp_path, "capture_output": True, "text": True}
+    subprocess.run([*wheel, "--wheel-dir", str(tmp_path), str(source)], **options)
+    (built,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(built) as archive:
+        archive.extractall(installed)
+        assert not [name for name in archive.namelist() if "make_scene" in name]
+    shutil.rmtree(source)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(installed),
+        "MPSFM_CACHE": str(tmp_path / "cache"),
+        "OMP_NUM_THREADS": "1",
+    }
+    code = "import mpsfm_core.cli as cli; print(cli.__file__); cli.main()"
+    command = [sys.executable, "-c", code, "demo", "--offline", "--output", "out"]
+    ended = subprocess.run(command, env=environment, **options)
+    assert ended.stdout.startswith(str(installed))
+    assert "8 of 8 images" in ended.stdout and "pose AUC" in ended.stdout
 
 
 def test_a_scene_of_the_same_layout_can_be_given(mpsfm, tmp_path: Path) -> None:
@@ -36,7 +91,8 @@ def test_a_scene_of_the_same_layout_can_be_given(mpsfm, tmp_path: Path) -> None:
 def test_without_priors_it_falls_apart(mpsfm, tmp_path: Path) -> None:
     """What makes the scene a demo: without lifting hardly anything can be registered."""
     output = tmp_path / "demo"
-    ended = mpsfm("demo", "--output", output, "--set", "mapping.registration.lifting=false")
+    lifting = ("--set", "mapping.registration.lifting=false")
+    ended = mpsfm("demo", "--output", output, *PRIOR_FILES, *lifting)
     assert ended.code in (0, 3), ended.err
     registered = json.loads((output / "summary.json").read_text())["images"]["registered"]
     assert len(registered) <= 3

@@ -51,8 +51,8 @@ def test_a_configuration_takes_the_file(tmp_path: Path) -> None:
     config = tmp_path / "run.yaml"
     config.write_text(
         "extends: demo\n"
-        "depth: {options: {directory: maps}, calibration: depth.yaml}\n"
-        "normals: {options: {directory: maps}}\n"
+        "depth: {use: files, options: {directory: maps}, calibration: depth.yaml}\n"
+        "normals: {use: files, options: {directory: maps}}\n"
     )
     assert load_config(config).depth.calibration == DEPTH.model_dump(mode="json")
 
@@ -62,10 +62,10 @@ def test_the_other_kind_is_refused_with_the_place(tmp_path: Path) -> None:
     config = tmp_path / "run.yaml"
     config.write_text(
         "extends: demo\n"
-        "depth: {options: {directory: maps}}\n"
-        "normals:\n  options: {directory: maps}\n  calibration: depth.yaml\n"
+        "depth: {use: files, options: {directory: maps}}\n"
+        "normals:\n  use: files\n  options: {directory: maps}\n  calibration: depth.yaml\n"
     )
-    with pytest.raises(ConfigError, match=r"run.yaml:5: .*is a calibration of depth, not of norm"):
+    with pytest.raises(ConfigError, match=r"run.yaml:6: .*is a calibration of depth, not of norm"):
         load_config(config)
 
 

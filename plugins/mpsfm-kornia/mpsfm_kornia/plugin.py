@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, hookimpl
+from mpsfm_core.providers import file_named_by
 from mpsfm_kornia import options as opt
 
 _REQUIRES = ("torch", "kornia")
@@ -24,7 +25,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_XFEAT_HINT,
             code_license="Apache-2.0",
             weights_license=opt.XFEAT.license,
-            weights=(opt.XFEAT,),
+            weights=file_named_by("weights", opt.XFEAT),
             tags=("xfeat",),
         ),
         ProviderSpec(
@@ -37,7 +38,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_LIGHTGLUE_HINT,
             code_license="Apache-2.0 AND BSD-3-Clause",
             weights_license="BSD-3-Clause",
-            weights=(opt.ALIKED["aliked-n16"],),
+            weights=opt.aliked_files,
             tags=("aliked",),
         ),
         ProviderSpec(
@@ -50,7 +51,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_LIGHTGLUE_HINT,
             code_license="Apache-2.0",
             weights_license=opt.DISK.license,
-            weights=(opt.DISK,),
+            weights=file_named_by("weights", opt.DISK),
             tags=("disk",),
         ),
         ProviderSpec(
@@ -64,7 +65,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint="pip install mpsfm-kornia",
             code_license="Apache-2.0",
             weights_license=opt.DEDODE_DESCRIPTOR.license,
-            weights=(opt.DEDODE_DETECTOR, opt.DEDODE_DESCRIPTOR),
+            weights=opt.dedode_files,
             tags=("dedode",),
         ),
         ProviderSpec(
@@ -89,7 +90,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_XFEAT_HINT,
             code_license="Apache-2.0",
             weights_license=opt.LIGHTERGLUE.license,
-            weights=(opt.LIGHTERGLUE,),
+            weights=file_named_by("weights", opt.LIGHTERGLUE),
             tags=("xfeat",),
         ),
         ProviderSpec(
@@ -103,7 +104,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_LIGHTGLUE_HINT,
             code_license="Apache-2.0",
             weights_license=opt.LIGHTGLUE_ALIKED.license,
-            weights=(opt.LIGHTGLUE_ALIKED,),
+            weights=file_named_by("weights", opt.LIGHTGLUE_ALIKED),
             tags=("aliked",),
         ),
         ProviderSpec(
@@ -117,7 +118,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_LIGHTGLUE_HINT,
             code_license="Apache-2.0",
             weights_license=opt.LIGHTGLUE_DISK.license,
-            weights=(opt.LIGHTGLUE_DISK,),
+            weights=file_named_by("weights", opt.LIGHTGLUE_DISK),
             tags=("disk",),
         ),
         ProviderSpec(
@@ -132,7 +133,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint="pip install mpsfm-kornia",
             code_license="Apache-2.0",
             weights_license=opt.LIGHTGLUE_DEDODE.license,
-            weights=(opt.LIGHTGLUE_DEDODE,),
+            weights=file_named_by("weights", opt.LIGHTGLUE_DEDODE),
             tags=("dedode",),
         ),
         ProviderSpec(
@@ -158,6 +159,6 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint="pip install mpsfm-kornia",
             code_license="Apache-2.0",
             weights_license=opt.LOFTR.license,
-            weights=(opt.LOFTR,),
+            weights=file_named_by("weights", opt.LOFTR),
         ),
     ]

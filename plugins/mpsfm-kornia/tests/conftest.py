@@ -33,7 +33,8 @@ def make(context: ProviderContext) -> Callable[..., Any]:
 
     def make(kind: str, name: str, **options: Any) -> Any:
         spec = SPECS[kind, name]
-        uri = options.get("weights") or next((file.uri for file in spec.weights), "")
+        files = spec.weights(spec.options(**options)) if spec.weights else ()
+        uri = next((file.uri for file in files), "")
         if uri.startswith("package:"):
             package = uri.removeprefix("package:").split("/")[0]
             if importlib.util.find_spec(package) is None:

@@ -35,7 +35,7 @@ def test_default_weights_are_intact(tmp_path):
         file
         for status in registry.status()
         if status.distribution == "mpsfm-kornia"
-        for file in registry.spec(status.kind, status.name).weights
+        for file in registry.weights(status.kind, status.name)
     }
     assert len(files) == 10
     here = [file for file in files if store.locate(file.uri)]

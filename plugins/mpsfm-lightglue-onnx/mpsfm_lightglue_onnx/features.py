@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.description import ImageInput, SideSize
-from mpsfm_onnx.model import Model, fetch
+from mpsfm_onnx.model import Model
 
 from mpsfm_core import Features, ProviderContext, View
 from mpsfm_core.data import Float32
@@ -28,7 +28,7 @@ class OnnxFeatures:
     """The sides of the network's image are multiples of this."""
 
     def __init__(self, options: FeatureOptions, context: ProviderContext, model: str) -> None:
-        self._model = Model(fetch(context, model, options.sha256), context)
+        self._model = Model(context.resolve_weights(model, options.sha256), context)
         self._model.require(("image",), _OUTPUTS, type(self).__name__)
         self._options = options
 

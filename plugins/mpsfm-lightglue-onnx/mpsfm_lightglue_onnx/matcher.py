@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from mpsfm_onnx.model import Model, fetch
+from mpsfm_onnx.model import Model
 from numpy.typing import NDArray
 
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
@@ -24,7 +24,7 @@ class LightGlue:
     """
 
     def __init__(self, options: LightGlueOptions, context: ProviderContext) -> None:
-        self._model = Model(fetch(context, options.model, options.sha256), context)
+        self._model = Model(context.resolve_weights(options.model, options.sha256), context)
         self._model.require(_INPUTS, _OUTPUTS, "LightGlue")
         self._min_score = options.min_score
 

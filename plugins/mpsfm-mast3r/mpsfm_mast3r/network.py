@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.description import ImageInput, SideSize
-from mpsfm_onnx.model import Model, fetch
+from mpsfm_onnx.model import Model
 from numpy.typing import NDArray
 
 from mpsfm_core import DepthPrior, ProviderContext, View
@@ -68,7 +68,7 @@ class PairNetwork:
     """
 
     def __init__(self, options: Mast3rOptions, context: ProviderContext) -> None:
-        self._model = Model(fetch(context, options.model, options.sha256), context)
+        self._model = Model(context.resolve_weights(options.model, options.sha256), context)
         self._outputs = [f"{name}_{side}" for side in (1, 2) for name in _TENSORS]
         self._model.require(("img1", "img2"), self._outputs, "MASt3R")
         self._rule = ImageInput(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mpsfm_core import Options, WeightsFile
+from mpsfm_core.providers import file_named_by
 from mpsfm_core.uncertainty.model import DepthCalibration
 
 WEIGHTS_LICENSE = "CC0-1.0 (export; the authors name none for their weights)"
@@ -67,6 +68,11 @@ class Size:
     options: type[Metric3dOptions]
     weights: tuple[WeightsFile, ...]
     calibration: DepthCalibration
+
+    def files(self, options: Metric3dOptions) -> tuple[WeightsFile, ...]:
+        """The files that these options mean."""
+        companions = (WeightsFile(uri, license=WEIGHTS_LICENSE) for uri in options.companions)
+        return (*companions, *file_named_by("weights", *self.weights)(options))
 
     @property
     def calibration_alone(self) -> DepthCalibration:

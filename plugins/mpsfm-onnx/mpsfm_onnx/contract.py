@@ -18,6 +18,7 @@ from mpsfm_core.testing.examples import outdoor_example
 from mpsfm_core.testing.painting import NORMALS_STD, RELATIVE_STD, decoder
 from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.description import Description, ImageInput, load_description
+from mpsfm_onnx.stand_in import save_model
 
 KAPPA = (1 + np.sqrt(1 - NORMALS_STD**2)) / NORMALS_STD
 """Concentration whose expected angle is the std of painted normals (``exp(-kappa pi)`` is 0)."""
@@ -38,9 +39,52 @@ outputs:
 """
 
 
+_MOGE = """
+moge (float[1,3,h,w] image, int64 num_tokens) => (
+    float[1,h,w,3] points, float[1,h,w,3] normal, float[1,h,w] mask, float[1] scale) {
+    gray = ReduceMean <axes = [1]> (image)
+    zeros = Mul (gray, none)
+    ones = Add (zeros, whole)
+    z = Add (gray, ones)
+    column = CumSum (ones, columns)
+    row = CumSum (ones, rows)
+    width = ReduceMax <axes = [3]> (column)
+    height = ReduceMax <axes = [2]> (row)
+    middle_u = Mul (width, half)
+    middle_v = Mul (height, half)
+    center_u = Sub (column, half)
+    center_v = Sub (row, half)
+    right = Sub (center_u, middle_u)
+    down = Sub (center_v, middle_v)
+    slope_u = Div (right, width)
+    slope_v = Div (down, width)
+    x = Mul (z, slope_u)
+    y = Mul (z, slope_v)
+    xyz = Concat <axis = 1> (x, y, z)
+    points = Transpose <perm = [0, 2, 3, 1]> (xyz)
+    towards = Neg (ones)
+    facing = Concat <axis = 1> (zeros, zeros, towards)
+    normal = Transpose <perm = [0, 2, 3, 1]> (facing)
+    mask = ReduceMax <axes = [1], keepdims = 0> (ones)
+    scale = Identity (metres)
+}
+"""
+
+
 def setup(folder: Path) -> Setup:
     """A network with a canonical camera, padding, a confidence and a concentration."""
     return Setup(options=_tiny(folder), knows="painted")
+
+
+def moge(folder: Path) -> Setup:
+    """A network with the tensors of MoGe-2's published file."""
+    return Setup(options={"weights": str(moge_stand_in(folder / "moge.onnx"))}, knows="nothing")
+
+
+def moge_stand_in(path: Path) -> Path:
+    """A model with the inputs and outputs of MoGe-2's published file: what is brighter is farther
+    away, 2 to 4 m, seen by a camera whose focal length is the image's width."""
+    return save_model(_MOGE, path, half=0.5, none=0.0, whole=1.0, rows=2, columns=3, metres=[2.0])
 
 
 def stand_in(description: Description, folder: Path) -> Path:

@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from mpsfm_core import Options
-from mpsfm_core.errors import ConfigError, did_you_mean
+from mpsfm_core import Options, WeightsFile
+from mpsfm_core.errors import ConfigError, WeightsError, did_you_mean
 from mpsfm_core.options import parse_settings
 from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 from mpsfm_core.yaml_text import parse_yaml
@@ -178,6 +178,8 @@ class Weights(Options):
 
     uri: str
     sha256: str | None = None
+    size: int | None = None
+    """In bytes, where it is known."""
     companions: tuple[str, ...] = ()
     """Further URIs of the same folder, for models with external data."""
 
@@ -195,6 +197,23 @@ class Description(Options):
     outputs: Outputs
     calibration: DepthCalibration = DepthCalibration()
     normals_calibration: NormalCalibration = NormalCalibration()
+
+    def files(self, model: str | None = None, sha256: str | None = None) -> tuple[WeightsFile, ...]:
+        """The files to load, the model last: ``model`` with its hash, else the public ones.
+
+        Raises:
+            WeightsError: there is no public file.
+        """
+        if model is not None:
+            return (WeightsFile(model, sha256, self.license),)
+        public = self.weights
+        if public is None:
+            raise WeightsError(
+                f"the description {self.name!r} has no public weights file: "
+                f"name yours with --set depth.options.model=FILE"
+            )
+        companions = (WeightsFile(uri, license=self.license) for uri in public.companions)
+        return (*companions, WeightsFile(public.uri, public.sha256, self.license, public.size))
 
 
 def shipped_descriptions() -> list[str]:

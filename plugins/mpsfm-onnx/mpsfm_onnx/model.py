@@ -72,15 +72,6 @@ class Model:
         return array
 
 
-def fetch(
-    context: ProviderContext, uri: str, sha256: str | None = None, companions: Iterable[str] = ()
-) -> Path:
-    """Path of a model file, after its companions (external data of the same folder) are there."""
-    for companion in companions:
-        context.resolve_weights(companion, None)
-    return context.resolve_weights(uri, sha256)
-
-
 def _open(path: Path, context: ProviderContext) -> onnxruntime.InferenceSession:
     settings = onnxruntime.SessionOptions()
     settings.intra_op_num_threads = context.threads

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from mpsfm_core import PinholeCamera, ProviderContext, View
 from mpsfm_core.data import Float32, Float64
-from mpsfm_core.errors import WeightsError
 from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.decode import planes
 from mpsfm_onnx.description import Description, IntrinsicsInput
-from mpsfm_onnx.model import Model, fetch
+from mpsfm_onnx.model import Model
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,9 @@ class Network:
         sha256: str | None = None,
     ) -> None:
         self.description = description
-        self._model = Model(_file(description, context, weights, sha256), context)
+        for file in description.files(weights, sha256):
+            path = context.resolve_weights(file.uri, file.sha256)
+        self._model = Model(path, context)
         rule = description.input
         self._image = rule.name or self._model.inputs[0]
         inputs = {self._image, *rule.constants}
@@ -75,17 +75,3 @@ def _matrix(camera: PinholeCamera, rule: IntrinsicsInput) -> Float64:
     matrix = camera.matrix
     matrix[:2, 2] -= 0.5 - rule.first_pixel
     return matrix[np.newaxis]
-
-
-def _file(
-    description: Description, context: ProviderContext, weights: str | None, sha256: str | None
-) -> Path:
-    if weights is not None:
-        return fetch(context, weights, sha256)
-    known = description.weights
-    if known is None:
-        raise WeightsError(
-            f"the description {description.name!r} has no public weights file: "
-            f"name yours with --set depth.options.model=FILE"
-        )
-    return fetch(context, known.uri, known.sha256, known.companions)

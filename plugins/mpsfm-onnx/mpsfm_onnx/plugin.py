@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pydantic import BaseModel
 
-from mpsfm_core import ProviderSpec, hookimpl
+from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
 from mpsfm_core.providers import Capability, Kind
 from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 from mpsfm_onnx.description import load_description
-from mpsfm_onnx.options import OnnxOptions
+from mpsfm_onnx.options import MOGE_2, Moge2Options, OnnxOptions
+
+_MOGE_ACCURACY = "not measured by us; std of depth declared as 8 %"
 
 
 @hookimpl
@@ -37,6 +39,8 @@ def mpsfm_providers() -> list[ProviderSpec]:
             "Normals",
             "normals of such a network, in the same pass as depth of the same options",
         ),
+        _moge("depth", "Moge2", "metric", "joint-normals"),
+        _moge("normals", "Moge2Normals"),
     ]
 
 
@@ -45,9 +49,12 @@ def mpsfm_calibration(
     kind: str, provider: str, options: BaseModel | None
 ) -> DepthCalibration | NormalCalibration | None:
     """The uncertainty that the chosen description declares."""
-    if not (provider in ("onnx", "onnx-joint") and isinstance(options, OnnxOptions)):
+    if isinstance(options, Moge2Options):
+        description = load_description(MOGE_2)
+    elif provider in ("onnx", "onnx-joint") and isinstance(options, OnnxOptions):
+        description = load_description(options.description)
+    else:
         return None
-    description = load_description(options.description)
     return description.calibration if kind == "depth" else description.normals_calibration
 
 
@@ -66,4 +73,32 @@ def _spec(
         install_hint="pip install mpsfm-onnx",
         code_license="Apache-2.0",
         weights_license="of the chosen model",
+        weights=_onnx_files,
+        accuracy="of the chosen network",
     )
+
+
+def _moge(kind: Kind, factory: str, *capabilities: Capability) -> ProviderSpec:
+    return ProviderSpec(
+        kind=kind,
+        name="moge-2-small",
+        factory=f"mpsfm_onnx.providers:{factory}",
+        contract="mpsfm_onnx.contract:moge",
+        options=Moge2Options,
+        capabilities=frozenset({"intrinsics-aware", *capabilities}),
+        summary="MoGe-2 ViT-S: metric depth and normals of photos of anything",
+        requires=("onnxruntime",),
+        install_hint="pip install mpsfm-onnx",
+        code_license="Apache-2.0",
+        weights_license="MIT",
+        weights=_moge_files,
+        accuracy=_MOGE_ACCURACY,
+    )
+
+
+def _onnx_files(options: OnnxOptions) -> tuple[WeightsFile, ...]:
+    return load_description(options.description).files(options.model, options.sha256)
+
+
+def _moge_files(options: Moge2Options) -> tuple[WeightsFile, ...]:
+    return load_description(MOGE_2).files(options.weights, options.sha256)

@@ -17,7 +17,7 @@ from mpsfm_onnx.description import (
     load_description,
 )
 from mpsfm_onnx.network import Answer, Network
-from mpsfm_onnx.options import OnnxOptions
+from mpsfm_onnx.options import MOGE_2, Moge2Options, OnnxOptions
 
 
 class DescribedDepth:
@@ -111,6 +111,20 @@ class OnnxDepth(DescribedDepth):
     def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
         description = load_description(options.description)
         super().__init__(description, context, options.model, options.sha256)
+
+
+class Moge2(DescribedJoint):
+    """Depth and normals of MoGe-2."""
+
+    def __init__(self, options: Moge2Options, context: ProviderContext) -> None:
+        super().__init__(load_description(MOGE_2), context, options.weights, options.sha256)
+
+
+class Moge2Normals(DescribedNormals):
+    """Normals of MoGe-2."""
+
+    def __init__(self, options: Moge2Options, context: ProviderContext) -> None:
+        super().__init__(load_description(MOGE_2), context, options.weights, options.sha256)
 
 
 class OnnxNormals(DescribedNormals):

@@ -248,11 +248,11 @@ def test_moge_interface(write_onnx, make_view, context):
     """Points of a plane at z = 2, in half metres and 0.3 too near, with a hole in the mask."""
     text = """
     moge (float[b,3,h,w] image, int64 num_tokens) => (
-        float[b,h,w,3] points, float[b,h,w,3] normal, float[b,h,w] mask, float[b] metric_scale) {
+        float[b,h,w,3] points, float[b,h,w,3] normal, float[b,h,w] mask, float[b] scale) {
         points = Identity (p)
         normal = Identity (n)
         mask = Identity (m)
-        metric_scale = Identity (s)
+        scale = Identity (s)
     }
     """
     view = make_view(8, 6, focal=(7.0, 7.5))

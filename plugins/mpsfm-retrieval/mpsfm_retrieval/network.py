@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.description import FixedSize, ImageInput, SideSize
-from mpsfm_onnx.model import Model, fetch
+from mpsfm_onnx.model import Model
 
 from mpsfm_core import ProviderContext, View
 from mpsfm_core.data import Float32
@@ -39,7 +39,7 @@ class GlobalNetwork:
     """
 
     def __init__(self, options: NetworkOptions, context: ProviderContext) -> None:
-        self._model = Model(fetch(context, options.model, options.sha256), context)
+        self._model = Model(context.resolve_weights(options.model, options.sha256), context)
         self._image, self._output = self._model.inputs[0], self._model.outputs[0]
         self._model.require([self._image], [self._output], "a retrieval network")
         self._rule = _INPUTS[options.network]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.description import FixedSize, ImageInput
-from mpsfm_onnx.model import Model, fetch
+from mpsfm_onnx.model import Model
 
 from mpsfm_core import ProviderContext, View
 from mpsfm_core.data import Bool, Float32, Float64, Int64
@@ -53,7 +53,7 @@ class WarpNetwork:
     """
 
     def __init__(self, options: RomaOptions, context: ProviderContext) -> None:
-        self._model = Model(fetch(context, options.model, options.sha256), context)
+        self._model = Model(context.resolve_weights(options.model, options.sha256), context)
         self._model.require(options.inputs, options.outputs, "RoMa")
         self._inputs, self._outputs = options.inputs, options.outputs
         self._rule = ImageInput(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.decode import planes
 from mpsfm_onnx.description import FixedSize, ImageInput
-from mpsfm_onnx.model import Model, fetch
+from mpsfm_onnx.model import Model
 
 from mpsfm_core import ProviderContext, View
 from mpsfm_core.data import Bool
@@ -31,7 +31,7 @@ class SkyNetwork:
     """
 
     def __init__(self, options: SkyOptions, context: ProviderContext) -> None:
-        self._model = Model(fetch(context, options.model, options.sha256), context)
+        self._model = Model(context.resolve_weights(options.model, options.sha256), context)
         self._image, self._sky = self._model.inputs[0], self._model.outputs[0]
         self._model.require([self._image], [self._sky], "a sky network")
         self._rule = _INPUTS[options.network]

@@ -1,4 +1,5 @@
 from mpsfm_core import ProviderSpec, hookimpl
+from mpsfm_core.providers import file_named_by
 
 
 @hookimpl
@@ -10,6 +11,7 @@ def mpsfm_providers():
             factory="$module.model:$Class",
             options="$module.model:${Class}Options",
             capabilities=frozenset({"metric"}),
+            weights=file_named_by("weights"),
             contract="$module.contract:contract",
             code_license="Apache-2.0",
         )

@@ -1,4 +1,5 @@
 from mpsfm_core import ProviderSpec, hookimpl
+from mpsfm_core.providers import file_named_by
 
 
 @hookimpl
@@ -9,6 +10,7 @@ def mpsfm_providers():
             name="$name",
             factory="$module.model:$Class",
             options="$module.model:${Class}Options",
+            weights=file_named_by("weights"),
             contract="$module.contract:contract",
             code_license="Apache-2.0",
         )
