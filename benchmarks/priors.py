@@ -1,15 +1,15 @@
 """How good depth and normal networks are where the truth is known, as they are shipped.
 
-    python -m benchmarks.priors [--depth NAME=KEY=VALUE,... ...] [--scenes ...] [--json FILE]
+    python -m benchmarks.priors [--scenes NAME ...] [--set KEY=VALUE ...] [--json FILE]
 
 On hololens_room (the sensor's depth), rendered_kitchen (exact depth and normals) and fountain
-(points triangulated from the true poses, up to scale). Depth after each image is scaled by the ratio of the
-medians: AbsRel and delta < 1.25, and the scale itself. What the declared std says of the errors of
-log depth after each image's own scale: share of errors within it, and area between its
-sparsification curve and the ideal one (AUSE) beside that of a constant std, which sorts at random.
-Normals: median angle to the truth. Every image counts the same; time a photo is CPU and wall time,
-in one thread. Writes benchmarks/results/priors.md; scenes and FastDepth
-are in $MPSFM_SHARED or ../shared.
+(points triangulated from the true poses, up to scale). Depth after each image is scaled by the
+ratio of the medians: AbsRel and delta < 1.25, and the scale itself. What the declared std says of
+the errors of log depth after each image's own scale: share of errors within it, and area between
+its sparsification curve and the ideal one (AUSE) beside that of a constant std, which sorts at
+random. Normals: median angle to the truth. Every image counts the same; time a photo is CPU and
+wall time, in one thread. Writes benchmarks/results/priors.md; scenes and FastDepth are in
+$MPSFM_SHARED or ../shared.
 """
 
 from __future__ import annotations
