@@ -89,8 +89,8 @@ def moge_stand_in(path: Path) -> Path:
 
 def stand_in(description: Description, folder: Path) -> Path:
     """A model that gives painted views their depth and normals, through a description with named
-    input, NCHW tensors, ``output: depth`` and an uncertainty of the normals; where no depth is painted is
-    not valid.
+    input, NCHW tensors, ``output: depth`` and an uncertainty of the normals; where no depth is
+    painted is not valid.
 
     A canonical camera has the focal length of the kit's main example on the network's input.
     """
