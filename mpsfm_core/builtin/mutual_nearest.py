@@ -11,9 +11,10 @@ from mpsfm_core.providers import ProviderContext, required_features
 
 _BLOCK = 1024
 """Rows compared at once: 32 MB for 8192 features on the other side."""
-_ROUNDING = np.float32(1e-3)
-"""Error of a small distance relative to the descriptors' length, as it is a difference of squares
-in float32."""
+_ROUNDING = np.float32(1e-5)
+"""Squared distances nearer to each other than this share of the descriptors' squared length
+count as equal: they are differences of squares in float32, 100 times as exact, and the order of sums
+depends on the processor."""
 
 
 class MutualNearest:
@@ -65,10 +66,10 @@ def _mutual(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
     mutual = back == rows
     rows = rows[mutual]
     pairs = np.stack([rows, best[rows]], axis=1)
-    distance = np.sqrt(nearest[rows])
-    limit = np.sqrt(np.minimum(second[rows], second_back[mutual]))
-    rounding = _ROUNDING * np.linalg.norm(a[rows], axis=1)  # equal ones have a ratio of 1
-    return pairs, distance, (distance + rounding) / (limit + rounding)
+    limit = np.minimum(second[rows], second_back[mutual])
+    rounding = _ROUNDING * np.einsum("ij,ij->i", a[rows], a[rows])  # equal ones have a ratio of 1
+    ratio = np.sqrt((nearest[rows] + rounding) / (limit + rounding))
+    return pairs, np.sqrt(nearest[rows]), ratio
 
 
 def _nearest_two(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:

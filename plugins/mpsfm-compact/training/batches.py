@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from training.network import CANONICAL_FOCAL
-from training.samples import HEIGHT, SURFACE, WIDTH, Shard
+from training.samples import HEIGHT, ROUGH, SURFACE, WIDTH, Shard
 
 _SIZES = ((256, 192), (256, 192), (256, 192), (192, 256), (224, 224))
 """Width and height of the network's input, drawn for each batch; about 49 000 pixels."""
@@ -138,7 +138,7 @@ def augmented(
     normals = maps[:, 2:5].clone()
     normals[:, :2] = torch.einsum("nij,njhw->nihw", forth, maps[:, 2:4])
     focal = np.sqrt(camera[:, 0] * camera[:, 1]) * zoom
-    known = (maps[:, 1:2] == SURFACE) & (maps[:, 0:1] > 0)
+    known = ((maps[:, 1:2] == SURFACE) | (maps[:, 1:2] == ROUGH)) & (maps[:, 0:1] > 0)
     shift = torch.from_numpy(np.log(focal)).float()[:, None, None, None]
     log_depth = (
         torch.where(known, maps[:, 0:1], torch.ones(())).log() - shift + np.log(CANONICAL_FOCAL)

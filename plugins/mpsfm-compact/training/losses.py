@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from training.batches import Batch
-from training.samples import EMPTY, UNKNOWN
+from training.samples import EMPTY, SURFACE, UNKNOWN
 
 _WEIGHTS = {
     "shape": 1.0,
@@ -30,8 +30,9 @@ def losses(out: Mapping[str, Tensor], batch: Batch) -> dict[str, Tensor]:
     """The parts of the loss, weighted.
 
     Depth is judged by the absolute difference of logs: its shape after each image is given its
-    own scale, and for metric samples the scale and the steps between pixels at four distances. A
-    std is that of a Laplace distribution of what remains, and moves nothing but itself.
+    own scale, for metric samples that scale, and where it is measured the steps between pixels at
+    four distances. A std is that of a Laplace distribution of what remains, and moves nothing
+    but itself.
     """
     known = batch.known
     residual = torch.where(known, out["log_depth"] - batch.log_depth, 0.0)
@@ -44,7 +45,7 @@ def losses(out: Mapping[str, Tensor], batch: Batch) -> dict[str, Tensor]:
     parts = {
         "shape": _mean(error, known),
         "scale": (offset.abs() * metric).sum() / metric.sum().clamp(min=1),
-        "edges": _edges(residual, known & batch.metric[:, None, None, None]),
+        "edges": _edges(residual, known & (batch.kind == SURFACE)),
         "std": _mean(error.detach() * torch.exp(-log_std) + log_std, known),
     }
     seen = batch.normals.square().sum(1, keepdim=True) > 0.5

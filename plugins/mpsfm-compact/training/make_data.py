@@ -16,10 +16,13 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from training.normals import normals_of_depth
-from training.samples import HEIGHT, SURFACE, UNKNOWN, WIDTH, Sample, write_shard
+from training.samples import HEIGHT, ROUGH, SURFACE, UNKNOWN, WIDTH, Sample, write_shard
 from training.synthetic.make import draw_samples
 
 PER_SHARD = 240
+_TEACHER_FOCAL = 0.888
+"""Over the width, of the photos that FastDepth was trained on: 518.9 px of 640, cut to 304 of 333
+(Wofk et al., 2019)."""
 _FIELD_DEG = 60.0
 """Horizontal field of view of photos that do not tell theirs."""
 
@@ -59,7 +62,8 @@ def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str
     none: then 60). ``teacher``: ONNX file with input (1, 3, 224, 224) RGB in 0..1 and output
     (1, 1, 224, 224), as FastDepth has. ``names``: photos whose name or folder begins so.
 
-    The teacher's edges and scale are not to be learned: these samples are not ``metric``.
+    The teacher takes every photo for one of NYU Depth v2, so its depth is multiplied by the ratio
+    of the focal lengths. Its edges are not to be learned: all pixels are ROUGH.
     """
     import onnxruntime
 
@@ -86,8 +90,10 @@ def _labelled(path: Path, field_deg: float, session: Any) -> Sample:
     depth = cv2.resize(session.run(None, feed)[0][0, 0], (width, height))
     focal = width / 2 / np.tan(np.radians(field_deg) / 2)
     camera = np.array([focal, focal, width / 2, height / 2], np.float32)
-    sample = _fitted(image, np.maximum(depth, 0.1), camera, metric=False)
-    return replace(sample, normals=np.zeros_like(sample.normals))
+    depth = np.maximum(depth, 0.1) * np.float32(focal / width / _TEACHER_FOCAL)
+    sample = _fitted(image, depth, camera, metric=True)
+    normals, kind = np.zeros_like(sample.normals), np.full_like(sample.kind, ROUGH)
+    return replace(sample, normals=normals, kind=kind)
 
 
 def _draw_shard(output: Path, seed: int, number: int, photos: list[Path]) -> None:

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 WIDTH, HEIGHT = 320, 240
-UNKNOWN, SURFACE, EMPTY = 0, 1, 2
+UNKNOWN, SURFACE, EMPTY, ROUGH = 0, 1, 2, 3
 """Of a pixel: nothing is known, there is a surface, there is none that one could measure (sky,
-mirrors, glass)."""
+mirrors, glass), there is a surface whose depth another network has guessed."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Sample:
 
     ``image`` (240, 320, 3) uint8 RGB; ``depth`` (240, 320) float32, metres along z, 0 where
     unknown; ``normals`` (240, 320, 3) in the camera's frame, 0 where unknown; ``kind`` (240, 320)
-    of UNKNOWN, SURFACE, EMPTY; ``camera``: fx, fy, cx, cy in pixels of the image, centre of the
-    first pixel (0.5, 0.5); ``metric``: whether the scale of depth is true.
+    of UNKNOWN, SURFACE, EMPTY, ROUGH; ``camera``: fx, fy, cx, cy in pixels of the image, centre of
+    the first pixel (0.5, 0.5); ``metric``: whether the scale of depth is true.
     """
 
     image: NDArray[np.uint8]
