@@ -12,9 +12,9 @@ from mpsfm_core.providers import ProviderContext, required_features
 _BLOCK = 1024
 """Rows compared at once: 32 MB for 8192 features on the other side."""
 _ROUNDING = np.float32(1e-5)
-"""Squared distances nearer to each other than this share of the descriptors' squared length
-count as equal: they are differences of squares in float32, 100 times as exact, and the order of sums
-depends on the processor."""
+"""Squared distances that differ by less than this share of the descriptors' squared length count
+as equal: they are differences of squares in float32, a hundred times as exact, and the order of
+their sums depends on the processor."""
 
 
 class MutualNearest:

@@ -35,10 +35,18 @@ def convert(data: Data, source: Path) -> None:
 
 @app.command("label")
 def label(data: Data, photos: Path, teacher: Path, names: list[str]) -> None:
-    """Label photos of rooms by another network."""
+    """Label the depth of photos of rooms by another network."""
     from training.make_data import make_labelled
 
     make_labelled(data, photos, teacher, names)
+
+
+@app.command("sky")
+def sky(data: Data, photos: Path, teacher: Path, names: list[str]) -> None:
+    """Label the sky of photos by another network."""
+    from training.make_data import make_sky
+
+    make_sky(data, photos, teacher, names)
 
 
 @app.command("train")
@@ -51,7 +59,7 @@ def train(
     start: Annotated[Path | None, typer.Option(help="weights to begin with")] = None,
     minutes: Annotated[float | None, typer.Option(help="stop then, to go on later")] = None,
     seed: int = 0,
-    real_share: float = 0.5,
+    real_share: float = 0.35,
 ) -> None:
     """Train, or go on with a run."""
     from training.train import Schedule

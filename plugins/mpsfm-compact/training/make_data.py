@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from training.normals import normals_of_depth
-from training.samples import HEIGHT, ROUGH, SURFACE, UNKNOWN, WIDTH, Sample, write_shard
+from training.samples import EMPTY, HEIGHT, ROUGH, SURFACE, UNKNOWN, WIDTH, Sample, write_shard
 from training.synthetic.make import draw_samples
 
 PER_SHARD = 240
@@ -65,9 +64,58 @@ def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str
     The teacher takes every photo for one of NYU Depth v2, so its depth is multiplied by the ratio
     of the focal lengths. Its edges are not to be learned: all pixels are ROUGH.
     """
+    teach = _teacher(teacher, 224)
+
+    def label(image: NDArray[np.uint8], camera: NDArray[np.float32]) -> Sample:
+        width = image.shape[1]
+        depth = np.maximum(teach(image), 0.1) * (camera[0] / width / _TEACHER_FOCAL)
+        sample = _fitted(image, depth.astype(np.float32), camera, metric=True)
+        normals, kind = np.zeros_like(sample.normals), np.full_like(sample.kind, ROUGH)
+        return replace(sample, normals=normals, kind=kind)
+
+    _label(output, "real-labelled", photos, names, label)
+
+
+def make_sky(output: Path, photos: Path, teacher: Path, names: Sequence[str]) -> None:
+    """Label the sky of photos by a network, as :func:`make_labelled`; their depth stays unknown.
+
+    ``teacher``: ONNX file with input (1, 3, 384, 384) RGB in 0..1 and output (1, 1, 384, 384), the
+    probability of sky.
+    """
+    teach = _teacher(teacher, 384)
+
+    def label(image: NDArray[np.uint8], camera: NDArray[np.float32]) -> Sample:
+        sky = teach(image)
+        sample = _fitted(image, np.where(sky > 0.5, 1, 2).astype(np.float32), camera, metric=False)
+        kind = np.where(sample.depth == 1, EMPTY, ROUGH).astype(np.uint8)
+        nothing = np.zeros_like(sample.depth)
+        return replace(sample, depth=nothing, normals=np.zeros_like(sample.normals), kind=kind)
+
+    _label(output, "sky", photos, names, label)
+
+
+def _teacher(path: Path, side: int) -> Callable[[NDArray[np.uint8]], NDArray[np.float32]]:
+    """A network that gives an image of any size (h, w, 3) a map (h, w)."""
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(str(teacher), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    name = session.get_inputs()[0].name
+
+    def teach(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        small = cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA)
+        feed = {name: small.astype(np.float32).transpose(2, 0, 1)[None] / 255}
+        return cv2.resize(session.run(None, feed)[0][0, 0], image.shape[1::-1])
+
+    return teach
+
+
+def _label(
+    output: Path,
+    prefix: str,
+    photos: Path,
+    names: Sequence[str],
+    label: Callable[[NDArray[np.uint8], NDArray[np.float32]], Sample],
+) -> None:
     for description in sorted(photos.rglob("licence.json")):
         folder = description.parent
         chosen = [
@@ -75,25 +123,18 @@ def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str
             for path in sorted(folder.glob("*.jpg"))
             if any(name.startswith(tuple(names)) for name in (path.name, folder.name))
         ]
-        name = f"real-labelled-{folder.name}"
+        name = f"{prefix}-{folder.name}"
         if chosen and not (output / name).exists():
             angles = json.loads(description.read_text(encoding="utf-8")).get("hfov_deg", {})
-            labelled = (_labelled(p, angles.get(p.name, _FIELD_DEG), session) for p in chosen)
+            labelled = (label(*_photo(p, angles.get(p.name, _FIELD_DEG))) for p in chosen)
             print(f"{name}: {write_shard(output / name, labelled)} photos")  # noqa: T201
 
 
-def _labelled(path: Path, field_deg: float, session: Any) -> Sample:
-    image = cv2.imread(str(path))[..., ::-1]
+def _photo(path: Path, field_deg: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    image = np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])
     height, width = image.shape[:2]
-    small = cv2.resize(image, (224, 224), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-    feed = {session.get_inputs()[0].name: small.transpose(2, 0, 1)[None]}
-    depth = cv2.resize(session.run(None, feed)[0][0, 0], (width, height))
     focal = width / 2 / np.tan(np.radians(field_deg) / 2)
-    camera = np.array([focal, focal, width / 2, height / 2], np.float32)
-    depth = np.maximum(depth, 0.1) * np.float32(focal / width / _TEACHER_FOCAL)
-    sample = _fitted(image, depth, camera, metric=True)
-    normals, kind = np.zeros_like(sample.normals), np.full_like(sample.kind, ROUGH)
-    return replace(sample, normals=normals, kind=kind)
+    return image, np.array([focal, focal, width / 2, height / 2], np.float32)
 
 
 def _draw_shard(output: Path, seed: int, number: int, photos: list[Path]) -> None:

@@ -32,8 +32,10 @@ class Schedule:
     decay: float = 1e-2
     average: float = 0.998
     """Of the running mean of the weights, which is what is exported."""
-    real_share: float = 0.5
-    """Of real frames among the samples."""
+    real_share: float = 0.35
+    """Of real frames, beside drawn samples."""
+    sky_share: float = 0.06
+    """Of photos that only tell where there is sky, beside both."""
 
 
 def train(
@@ -57,8 +59,10 @@ def train(
     kept = [s for s in shards if not any(name in s.name for name in held_out)]
     judged = [s for s in shards if s not in kept]
     real = [s for s in kept if s.name.startswith("real")]
-    drawn = [s for s in kept if not s.name.startswith("real")]
-    sources = [(drawn, 1 - schedule.real_share), (real, schedule.real_share)]
+    sky = [s for s in kept if s.name.startswith("sky")]
+    drawn = [s for s in kept if s.name.startswith("drawn")]
+    shares = (1 - schedule.real_share, schedule.real_share, schedule.sky_share)
+    sources = list(zip((drawn, real, sky), shares, strict=True))
     sampler = Sampler([source for source in sources if source[0]])
     network = CompactNetwork()
     _begin(network, start)
