@@ -1,4 +1,4 @@
-"""Features of the images, and which pairs their likeness suggests."""
+"""Features of the images."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ import numpy as np
 
 from mpsfm_core import validation
 from mpsfm_core.data import Bool, Features
-from mpsfm_core.errors import ConfigError
-from mpsfm_core.extraction import pairs
 from mpsfm_core.extraction.cache import digest
-from mpsfm_core.extraction.pairs import Pair
 from mpsfm_core.extraction.workbench import Workbench
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.inputs.recent import Recent
@@ -61,39 +58,6 @@ class FeatureTable:
         if mask is None:
             return features
         return _select(features, sample_nearest(mask, features.keypoints))
-
-
-def choose_pairs(bench: Workbench) -> tuple[list[Pair], int]:
-    """The pairs to match, and how many there were before the filters of plugins."""
-    options, count = bench.config.pairs, len(bench.images)
-    if options.mode == "exhaustive":
-        candidates = pairs.exhaustive(count)
-    elif options.mode == "sequential":
-        candidates = pairs.sequential(count, options)
-    else:
-        candidates = _similar(bench)
-    names = bench.images.names
-    named = [(names[a], names[b]) for a, b in candidates]
-    answers = bench.registry.call_hook("mpsfm_filter_pairs", pairs=named)
-    return pairs.apply_filters(candidates, names, answers), len(candidates)
-
-
-def _similar(bench: Workbench) -> list[Pair]:
-    backend = bench.config.retrieval
-    if backend is None:
-        raise ConfigError("pairs.mode: 'retrieval' needs a provider: set retrieval.use")
-    provider = bench.provider("retrieval", backend)
-
-    def describe(index: int) -> Any:
-        return bench.result(
-            provider,
-            np.ndarray,
-            bench.view_inputs(index, provider),
-            lambda instance: validation.run_retrieval(provider.spec, instance, bench.view(index)),
-        )
-
-    descriptors = bench.each("retrieval", range(len(bench.images)), describe, provider.workers)
-    return pairs.retrieval(descriptors, bench.config.pairs)
 
 
 def _select(features: Features, rows: Bool) -> Features:

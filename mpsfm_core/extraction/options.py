@@ -12,13 +12,19 @@ from mpsfm_core.options import Options
 class PairOptions(Options):
     """Which pairs of images are matched."""
 
-    mode: Literal["exhaustive", "sequential", "retrieval"] = "exhaustive"
-    """``exhaustive``: all. ``sequential``: neighbours in the order of the images. ``retrieval``:
-    the most similar by the retrieval provider (reference)."""
+    mode: Literal["auto", "exhaustive", "sequential", "retrieval"] = "exhaustive"
+    """``auto``: each image with its ``partners``, found by a first look at a few of its features
+    (or by the retrieval provider, if there is one), and with its neighbours where names are
+    numbered; what stays apart is tried again. ``exhaustive``: all. ``sequential``: neighbours in
+    the order of the images. ``retrieval``: the most similar by the retrieval provider
+    (reference)."""
+    partners: int = Field(30, ge=1)
+    """Auto: how many others an image is matched with at least, all where there are no more (ours:
+    30 are 17 to 19 pairs an image)."""
     overlap: int = Field(2, ge=1)
-    """Sequential: how many of the following images (reference: noverlap)."""
+    """Sequential and auto: how many of the following images (reference: noverlap)."""
     quadratic: bool = False
-    """Sequential: the 1st, 2nd, 4th, 8th ... following image instead (reference: off)."""
+    """Sequential and auto: the 1st, 2nd, 4th, 8th ... following image instead (reference: off)."""
     top_k: int = Field(20, ge=1)
     """Retrieval: how many for each image (reference: nquery)."""
     min_similarity: float = 0.0

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mpsfm_core.data import Float32
+from mpsfm_core.data import Float32, Float64
 from mpsfm_core.extraction.options import PairOptions
 
 Pair = tuple[int, int]
 """Positions of two images, the smaller first."""
+
+_NUMBERED = re.compile(r"(.*?)(\d+)(\D*)")
+_ABOVE_NOTHING = float(np.finfo(np.float64).tiny)
 
 
 def exhaustive(count: int) -> list[Pair]:
@@ -29,14 +32,34 @@ def sequential(count: int, options: PairOptions) -> list[Pair]:
 def retrieval(descriptors: Sequence[Float32], options: PairOptions) -> list[Pair]:
     """Each image with its most similar ones; descriptors (d,) are compared by dot product."""
     matrix = np.stack(descriptors).astype(np.float64)
-    similarity: NDArray[np.float64] = matrix @ matrix.T
-    np.fill_diagonal(similarity, -np.inf)
-    best = np.argsort(-similarity, axis=1, kind="stable")[:, : options.top_k]
+    least = max(options.min_similarity, -np.finfo(np.float64).max)
+    return most_alike(matrix @ matrix.T, options.top_k, least)
+
+
+def most_alike(likeness: Float64, count: int, least: float = _ABOVE_NOTHING) -> list[Pair]:
+    """Each image with the ``count`` others it is most like; ``likeness`` (n, n), those of a
+    smaller one than ``least`` are left out."""
+    others = likeness.copy()
+    np.fill_diagonal(others, -np.inf)
+    best = np.argsort(-others, axis=1, kind="stable")[:, :count]
     return _unordered(
-        (a, int(b))
-        for a, row in enumerate(best)
-        for b in row
-        if similarity[a, b] >= max(options.min_similarity, -np.finfo(np.float64).max)
+        (a, int(b)) for a, row in enumerate(best) for b in row if others[a, b] >= least
+    )
+
+
+def neighbours(names: Sequence[str], options: PairOptions) -> list[Pair]:
+    """Each image with the next ones in its sequence; images belong to one when their names differ
+    by the last number in them only, and follow each other by that number."""
+    sequences: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    for index, name in enumerate(names):
+        found = _NUMBERED.fullmatch(name)
+        if found is not None:
+            before, number, after = found.groups()
+            sequences.setdefault((before, after), []).append((int(number), index))
+    return _unordered(
+        (sequence[a][1], sequence[b][1])
+        for sequence in map(sorted, sequences.values())
+        for a, b in sequential(len(sequence), options)
     )
 
 

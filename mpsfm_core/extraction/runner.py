@@ -1,8 +1,8 @@
 """Runs the chosen providers over the images and assembles the mapper's problem.
 
-Order: masks, features, retrieval, matching, verification, depth, normals. Whatever a provider
-returns is validated, then cached; calibration and resizing come after the cache, so that a change
-of them predicts nothing anew.
+Order: masks, features, first look or retrieval, matching, verification (both again where photos
+stay apart), depth, normals. Whatever a provider returns is validated, then cached; calibration and
+resizing come after the cache, so that a change of them predicts nothing anew.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from mpsfm_core.config import Config
 from mpsfm_core.data import Features, MappingImage, MappingProblem
 from mpsfm_core.extraction.backends import thread_count
 from mpsfm_core.extraction.events import ExtractionEvents, Silent
-from mpsfm_core.extraction.features import FeatureTable, choose_pairs
+from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.matching import PairMatcher, PairVerifier, assemble
 from mpsfm_core.extraction.predictions import Predictions, check_depth_source
 from mpsfm_core.extraction.report import describe
+from mpsfm_core.extraction.selection import PairSelection
 from mpsfm_core.extraction.workbench import Workbench
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.registry import Registry
@@ -64,10 +65,14 @@ def _extract(bench: Workbench) -> Extraction:
     backend = bench.config.features
     table = None if backend is None else FeatureTable(bench, backend)
     located = [_NO_FEATURES] * len(bench.images) if table is None else table.extract()
-    pairs, proposed = choose_pairs(bench)
-    matcher = PairMatcher(bench, table)
-    candidates = matcher.match(pairs, located)
-    outcomes = PairVerifier(bench, located).verify(candidates)
+    selection = PairSelection(bench, table)
+    matcher, verifier = PairMatcher(bench, table), PairVerifier(bench, located)
+    candidates = matcher.match(selection.choose(), located)
+    outcomes = verifier.verify(candidates)
+    kept = zip(candidates, outcomes, strict=True)
+    if more := selection.choose_again([c.pair for c, outcome in kept if not outcome.reason]):
+        candidates += matcher.match(more, located)
+        outcomes += verifier.verify(candidates[len(outcomes) :])
     assembled = assemble(candidates, outcomes, located)
     priors = Predictions(bench, matcher, candidates).run()
     problem = MappingProblem(
@@ -84,7 +89,7 @@ def _extract(bench: Workbench) -> Extraction:
         ),
         assembled.pairs,
     )
-    return Extraction(problem, describe(bench, problem, proposed, candidates, outcomes))
+    return Extraction(problem, describe(bench, problem, selection.proposed, candidates, outcomes))
 
 
 _NO_FEATURES = Features(np.empty((0, 2)), np.empty((0, 0), dtype=np.float32))

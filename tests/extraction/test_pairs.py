@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from mpsfm_core.extraction.options import PairOptions
-from mpsfm_core.extraction.pairs import apply_filters, exhaustive, retrieval, sequential
+from mpsfm_core.extraction.pairs import (
+    apply_filters,
+    exhaustive,
+    most_alike,
+    neighbours,
+    retrieval,
+    sequential,
+)
 
 
 def test_exhaustive() -> None:
@@ -58,3 +65,16 @@ def test_filters_intersect_and_ignore_order() -> None:
     answers = [[("b", "a"), ("a", "c")], [("a", "b"), ("b", "c"), ("x", "y")]]
     assert apply_filters(pairs, names, answers) == [(0, 1)]
     assert apply_filters(pairs, names, [[]]) == []
+
+
+def test_most_alike_leaves_out_what_is_not_alike_at_all() -> None:
+    likeness = np.array([[9, 3, 0, 0], [3, 9, 1, 0], [0, 1, 9, 0], [0, 0, 0, 9]], dtype=np.float64)
+    assert most_alike(likeness, 1) == [(0, 1), (1, 2)]
+    assert most_alike(likeness, 3) == [(0, 1), (1, 2)]
+
+
+def test_neighbours_by_number() -> None:
+    """Two sequences, one with a gap and not in the order of its numbers, and a name by itself."""
+    names = ["a_9.png", "a_10.png", "a_3.png", "b1/7.jpg", "cover.png", "b1/8.jpg", "b2/9.jpg"]
+    assert neighbours(names, PairOptions(overlap=1)) == [(0, 1), (0, 2), (3, 5)]
+    assert neighbours(names, PairOptions(overlap=2)) == [(0, 1), (0, 2), (1, 2), (3, 5)]

@@ -9,6 +9,7 @@ import pytest
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.errors import ConfigError, ProviderOutputError, ProviderRunError
+from mpsfm_core.extraction import first_look, pairs
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.options import ExtractionOptions, PairOptions
 from mpsfm_core.extraction.priors import EDGE_VARIANCE
@@ -203,6 +204,43 @@ def test_retrieval(world) -> None:
     assert pairs_of(extraction.problem) == {(0, 1), (1, 2), (2, 3)}
     with pytest.raises(ConfigError, match=r"set retrieval\.use"):
         world.extract(pairs=options)
+
+
+def test_auto_matches_all_pairs_of_few_photos(world) -> None:
+    assert world.extract(pairs=PairOptions(mode="auto", partners=3)).report["pairs_matched"] == 6
+
+
+def test_auto_takes_a_first_look(world) -> None:
+    """All views share points, the neighbours most; the second time the look is remembered."""
+    options = PairOptions(mode="auto", partners=1, overlap=1)
+    first = world.extract(pairs=options)
+    assert pairs_of(first.problem) == {(0, 1), (1, 2), (2, 3)}
+    assert len(list((world.cache / "extraction" / "first-look").rglob("*.npz"))) == 1
+    again = world.extract(pairs=options, runtime=RuntimeOptions(cache_dir=world.cache, workers=1))
+    assert again.report["pairs"] == first.report["pairs"]
+
+
+def test_auto_by_retrieval(world) -> None:
+    options = PairOptions(mode="auto", partners=1, overlap=1)
+    extraction = world.extract(pairs=options, retrieval=Backend(use="truth"))
+    assert pairs_of(extraction.problem) == {(0, 1), (1, 2), (2, 3)}
+    assert world.asked()["retrieval"] == 4
+
+
+def test_auto_without_features_matches_all(world) -> None:
+    changes = {"features": None, "matcher": None, "dense_matcher": Backend(use="dense")}
+    extraction = world.extract(pairs=PairOptions(mode="auto", partners=1), **changes)
+    assert extraction.report["pairs_matched"] == 6
+
+
+def test_what_stays_apart_is_tried_again(world, monkeypatch) -> None:
+    """A first look that sees two halves only, and names that are not numbered."""
+    likeness = np.eye(4)[[1, 0, 3, 2]] + 1e-3 * np.eye(4)[[2, 3, 0, 1]]
+    monkeypatch.setattr(first_look, "likeness", lambda found: likeness)
+    monkeypatch.setattr(pairs, "neighbours", lambda names, options: [])
+    extraction = world.extract(pairs=PairOptions(mode="auto", partners=1))
+    assert extraction.report["pairs_matched"] == 3
+    assert {(0, 1), (2, 3)} < pairs_of(extraction.problem)
 
 
 def test_pair_filters_of_plugins(world) -> None:

@@ -11,6 +11,7 @@ from kornia.feature import LightGlue
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
 from mpsfm_core.errors import ProviderError
 from mpsfm_core.providers import required_features
+from mpsfm_kornia.attention import fuse_cross_attention
 from mpsfm_kornia.options import LightGlueOptions
 from mpsfm_kornia.runtime import fill, inference, load_weights, use_threads
 
@@ -48,6 +49,8 @@ class LightGlueMatcher:
         )
         state = load_weights(context, options.weights, options.sha256)
         fill(self._network, _renamed(state), options.weights)
+        if self._device == "cpu":
+            fuse_cross_attention(self._network)
         self._network.to(self._device)
 
     def match(
