@@ -32,6 +32,7 @@ from mpsfm_core.testing.halls import QUALITIES, Hall, hall_problem
 PEER = "colmap"
 VARIANTS: Mapping[str, Mapping[str, object]] = {
     "default": {},
+    "evidence not weighed": {"consistency": {"weigh_evidence": False}},
     "no depth check": {"consistency": {"enabled": False}},
 }
 CONVENTION = CONVENTIONS["paper"]

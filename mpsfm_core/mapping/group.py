@@ -10,7 +10,7 @@ from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.attempts import Attempts
 from mpsfm_core.mapping.correspondences import Correspondences, correspondences
-from mpsfm_core.mapping.depth_consistency import check_image, conflicting_images
+from mpsfm_core.mapping.depth_consistency import DepthCheck
 from mpsfm_core.mapping.failure_ladder import FailureLadder
 from mpsfm_core.mapping.filtering import disconnected_images, filter_points, lost_images
 from mpsfm_core.mapping.initialization import Start, Starts, place_first
@@ -302,7 +302,7 @@ class Group:
         if not options.enabled:
             return None
         with self.journal.timed("depth check"):
-            check = check_image(self.scene, image, options, self.refiner.std_factor)
+            check = DepthCheck(self.scene, options, self.refiner.std_factor).of_image(image)
         if check.share <= limit:
             return None
         self.attempts.blame(check.other, image)
@@ -346,7 +346,8 @@ class Group:
         if not options.enabled:
             return []
         with self.journal.timed("depth check"):
-            return conflicting_images(self.scene, limit, options, self.refiner.std_factor)
+            check = DepthCheck(self.scene, options, self.refiner.std_factor)
+            return check.conflicting_images(limit)
 
     def _check_all(self) -> None:
         """Deregister images until no two views contradict each other."""
