@@ -60,7 +60,7 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
                 # the points that it sees stay where it was
                 scene.tracks.point_of[scene.graph.keypoints_of(int(image))] = NO_POINT
             start = time.perf_counter()
-            check = DepthCheck(scene, options.consistency, std_factor).of_image(int(image))
+            check = DepthCheck(scene, options.consistency).of_image(int(image), std_factor)
             seconds = time.perf_counter() - start
             yield wrong, check.share > options.consistency.max_violations, seconds
             scene.translations[image], scene.registered = truth, everything

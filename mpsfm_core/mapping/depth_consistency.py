@@ -30,19 +30,23 @@ those that led an image to a wrong place look alike there, others tell.
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numba import njit
 
-from mpsfm_core.data import Bool, Float64
+from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.geometry import pixel_centers, unproject
 from mpsfm_core.mapping.depth_noise import local_noise, witnesses
 from mpsfm_core.mapping.options import ConsistencyOptions
+from mpsfm_core.optimize.depth_integration import RefinedDepth
 from mpsfm_core.optimize.thinning import thinned, thinned_camera, thinning_step
 from mpsfm_core.scene.scene import Scene
 
+MAX_GRIDS = 64
+"""Thinned maps that are kept: views that overlap come one after the other."""
 STEPS = 4
 """Errors tried to either side along a pixel's ray, evenly spaced up to the limit (ours)."""
 OVERLAP_GRID = 16
@@ -63,27 +67,25 @@ class Inconsistency(NamedTuple):
 
 
 class DepthCheck:
-    """The check in one state of a scene.
+    """The check of one scene; remembers what maps are worth as long as they stay what they are."""
 
-    ``std_factor``: how many times its declaration the std of depth is on the whole.
-    """
-
-    def __init__(self, scene: Scene, options: ConsistencyOptions, std_factor: float = 1.0) -> None:
+    def __init__(self, scene: Scene, options: ConsistencyOptions) -> None:
         self._scene = scene
         self._options = options
-        self._std_factor = std_factor
-        self._witnesses = witnesses(scene)
-        self._grids: dict[int, _Grid] = {}
+        self._grids: OrderedDict[int, tuple[_MapState, _Grid]] = OrderedDict()
 
-    def of_image(self, image: int) -> Inconsistency:
-        """How much an image contradicts the registered views that it overlaps with most."""
+    def of_image(self, image: int, std_factor: float = 1.0) -> Inconsistency:
+        """How much an image contradicts the registered views that it overlaps with most.
+
+        ``std_factor``: how many times its declaration the std of depth is on the whole.
+        """
         found = [
-            Inconsistency(self.between(image, other), other)
+            Inconsistency(self.between(image, other, std_factor), other)
             for other in overlapping_views(self._scene, image, self._options.num_views)
         ]
         return max(found, default=Inconsistency(0.0, -1))
 
-    def conflicting_images(self, limit: float) -> list[tuple[int, float]]:
+    def conflicting_images(self, limit: float, std_factor: float = 1.0) -> list[tuple[int, float]]:
         """Registered images to leave out so that no two contradict each other, and how much each
         did.
 
@@ -95,7 +97,8 @@ class DepthCheck:
         for image in map(int, scene.registered_images()):
             for other in overlapping_views(scene, image, self._options.num_views):
                 if not shares[image, other]:
-                    shares[image, other] = shares[other, image] = self.between(image, other)
+                    share = self.between(image, other, std_factor)
+                    shares[image, other] = shares[other, image] = share
         removed = []
         while (shares > limit).any():
             conflicts = (shares > limit).sum(axis=1)
@@ -104,36 +107,44 @@ class DepthCheck:
             shares[worst] = shares[:, worst] = 0
         return removed
 
-    def between(self, a: int, b: int) -> float:
+    def between(self, a: int, b: int, std_factor: float = 1.0) -> float:
         """Share of pixels of two views at which one sees empty space and the other a surface."""
         scene, options, total = self._scene, self._options, 0.0
         for source, target in ((a, b), (b, a)):
             rotation = scene.rotations[target] @ scene.rotations[source].T
             translation = scene.translations[target] - rotation @ scene.translations[source]
-            one, two = self._grid(source), self._grid(target)
+            one, two = self._grid(source, std_factor), self._grid(target, std_factor)
             count = count_unexplained(
                 one, two, rotation, translation, options.max_deviation, options.min_gap
             )
             total += count / one.depth.size
         return total
 
-    def _grid(self, image: int) -> _Grid:
-        """The depth map of an image, thinned out."""
-        if image not in self._grids:
-            depth_map = self._scene.maps[image]
-            step = thinning_step(depth_map.valid.shape[1], self._options.map_width)
-            depth = thinned(depth_map.depth, step).astype(np.float64)
-            valid = thinned(depth_map.valid, step)
-            factor = np.float32(self._std_factor)
-            if self._options.weigh_evidence:
-                local = local_noise(self._scene, image, self._witnesses, self._std_factor)
-                factor = thinned(local, step)
-            std = factor * thinned(depth_map.log_std, step).astype(np.float64)
-            # A pixel's error of place is one of depth at edges and where sight grazes a surface.
-            nearest = cv2.erode(np.where(valid, depth, np.inf), np.ones((3, 3)))
-            params = np.array(thinned_camera(depth_map.camera, step).params)
-            self._grids[image] = _Grid(depth, np.maximum(std, 1e-6), valid, nearest, params)
-        return self._grids[image]
+    def _grid(self, image: int, std_factor: float) -> _Grid:
+        """The depth map of an image, thinned out, with what it was worth when it came about."""
+        depth_map = self._scene.maps[image]
+        state = _MapState(depth_map.refined, depth_map.scale, std_factor)
+        known = self._grids.pop(image, None)
+        if known is None or known[0] != state:
+            known = state, self._make_grid(image, std_factor)
+        self._grids[image] = known
+        if len(self._grids) > MAX_GRIDS:
+            self._grids.popitem(last=False)
+        return known[1]
+
+    def _make_grid(self, image: int, std_factor: float) -> _Grid:
+        depth_map = self._scene.maps[image]
+        step = thinning_step(depth_map.valid.shape[1], self._options.map_width)
+        depth = thinned(depth_map.depth, step)
+        valid = thinned(depth_map.valid, step)
+        std = thinned(depth_map.log_std, step) * np.float32(std_factor)
+        if self._options.weigh_evidence:
+            local = local_noise(self._scene, image, witnesses(self._scene, image), std_factor)
+            std = thinned(depth_map.log_std, step) * thinned(local, step)
+        # A pixel's error of place is one of depth at edges and where sight grazes a surface.
+        nearest = cv2.erode(np.where(valid, depth, np.float32(np.inf)), np.ones((3, 3)))
+        params = np.array(thinned_camera(depth_map.camera, step).params)
+        return _Grid(depth, np.maximum(std, np.float32(1e-6)), valid, nearest, params)
 
 
 def overlapping_views(scene: Scene, image: int, limit: int) -> list[int]:
@@ -162,11 +173,22 @@ class _Grid(NamedTuple):
     """A depth map thinned out, (h, w): depth, the std of its logarithm, where it is valid, the
     least depth around each pixel; and the (fx, fy, cx, cy) that belong to it."""
 
-    depth: Float64
-    log_std: Float64
+    depth: Float32
+    log_std: Float32
     valid: Bool
-    nearest: Float64
+    nearest: Float32
     params: Float64
+
+
+class _MapState(NamedTuple):
+    """What a grid depends on: the refined map, its scale, and the std of depth on the whole.
+
+    The points that deny or confirm a prior also move on, but they are those that the map was
+    refined with."""
+
+    refined: RefinedDepth | None
+    scale: float
+    std_factor: float
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]

@@ -92,25 +92,27 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
     return DepthNoise(multiplier, *_clustering(clipped, groups))
 
 
-def witnesses(scene: Scene) -> Bool:
-    """(p,) bool, points that rays of several views hold without the help of depth."""
-    wide: Bool = scene.track_angles_deg() >= WITNESS_ANGLE_DEG
-    return wide & (scene.tracks.lengths() >= WITNESS_VIEWS)
+def witnesses(scene: Scene, image: int) -> Bool:
+    """(k,) bool, keypoints of an image whose points rays of several views hold without depth."""
+    points = scene.tracks.point_of[scene.graph.keypoints_of(image)]
+    seen = points >= 0
+    angles, lengths = scene.angles_deg_of(points[seen])
+    holds = np.zeros(len(points), dtype=np.bool_)
+    holds[seen] = (angles >= WITNESS_ANGLE_DEG) & (lengths >= WITNESS_VIEWS)
+    return holds
 
 
 def local_noise(scene: Scene, image: int, witness: Bool, least: float) -> Float32:
     """How many times its declaration the std of a prior is from place to place: (h, w) float32.
 
-    The robust spread of the errors at the nearest witnesses (``witness``: (p,) bool, of the points
-    of the scene). Those that lack within reach count as if they spread by ``least``, below which
-    the factor is nowhere.
+    The robust spread of the errors at the nearest witnesses (``witness``: (k,) bool, of the
+    image's keypoints). Those that lack within reach count as if they spread by ``least``, below
+    which the factor is nowhere.
     """
     graph, tracks, depth_map = scene.graph, scene.tracks, scene.maps[image]
     rows, columns = depth_map.valid.shape
-    mine = graph.keypoints_of(image)
-    point = tracks.point_of[mine]
-    seen = np.flatnonzero(depth_map.keypoint_valid & (point >= 0))
-    seen = seen[witness[point[seen]]]
+    point = tracks.point_of[graph.keypoints_of(image)]
+    seen = np.flatnonzero(depth_map.keypoint_valid & witness)
     z = tracks.xyz[point[seen]] @ scene.rotations[image, 2] + scene.translations[image, 2]
     prior = depth_map.scale * depth_map.prior_at_keypoints(seen)
     use = (z > 0) & (prior > 0)
@@ -131,13 +133,13 @@ def local_noise(scene: Scene, image: int, witness: Bool, least: float) -> Float3
 
 def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
     """Whitened log differences (m,) and the group of each: a cell of one view beside another."""
-    graph, tracks, maps = scene.graph, scene.tracks, scene.maps
+    graph, tracks = scene.graph, scene.tracks
     point = tracks.point_of[graph.source]
     same = (point >= 0) & (point == tracks.point_of[graph.target])
     source, target = graph.source[same], graph.target[same]
-    active = np.array([m.active for m in maps])[graph.image_of]
-    prior = np.concatenate([m.prior_at_keypoints() * m.scale for m in maps])
-    known = np.concatenate([m.keypoint_valid for m in maps]) & active & (prior > 0)
+    active = np.array([depth_map.active for depth_map in scene.maps])[graph.image_of]
+    prior = scene.keypoint_prior * scene.scales()[graph.image_of]
+    known = scene.keypoint_valid & active & (prior > 0)
     both = known[source] & known[target]
     source, target = source[both], target[both]
     a, b = graph.image_of[source], graph.image_of[target]

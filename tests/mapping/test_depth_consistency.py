@@ -66,7 +66,7 @@ HERE = np.eye(3, 4)
 
 
 def between(scene: Scene, a: int, b: int, **settings: float) -> float:
-    return DepthCheck(scene, OPTIONS, **settings).between(a, b)
+    return DepthCheck(scene, OPTIONS).between(a, b, **settings)
 
 
 def test_a_surface_in_seen_empty_space_is_a_violation_and_one_behind_is_not() -> None:
