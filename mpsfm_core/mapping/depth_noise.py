@@ -43,7 +43,7 @@ WITNESS_VIEWS, WITNESS_ANGLE_DEG = 3, 2.0
 agree on a point; the angle is that from which on points anchor the integration)."""
 NUM_WITNESSES = 7
 """Witnesses around a place, of whose errors the median counts: four of them have to deny a prior,
-so that no single wrong point nor the keypoints on one edge do (ours)."""
+so that no single wrong point does (ours)."""
 WITNESS_REACH = 1 / 8
 """Share of a map's width that errors have in common (as
 :class:`~mpsfm_core.testing.degraded_depth.DepthErrors`): farther witnesses say nothing."""
@@ -105,9 +105,10 @@ def witnesses(scene: Scene, image: int) -> Bool:
 def local_noise(scene: Scene, image: int, witness: Bool, least: float) -> Float32:
     """How many times its declaration the std of a prior is from place to place: (h, w) float32.
 
-    The robust spread of the errors at the nearest witnesses (``witness``: (k,) bool, of the
-    image's keypoints). Those that lack within reach count as if they spread by ``least``, below
-    which the factor is nowhere.
+    Witnesses (``witness``: (k,) bool, of the image's keypoints) that are near have an error in
+    common, of which the median of the nearest is a robust estimate: one observation of the std
+    there. ``least``, the std on the whole, is as good as another (a unit information prior), and
+    the factor is nowhere below it. Witnesses that lack within reach count as if off by ``least``.
     """
     graph, tracks, depth_map = scene.graph, scene.tracks, scene.maps[image]
     rows, columns = depth_map.valid.shape
@@ -124,8 +125,8 @@ def local_noise(scene: Scene, image: int, witness: Bool, least: float) -> Float3
     _, nearest = cKDTree(depth_map.keypoints[seen[use]]).query(
         places, NUM_WITNESSES, distance_upper_bound=WITNESS_REACH * columns
     )
-    around = np.append(errors, least / MAD_TO_STD)[nearest]
-    spread = np.maximum(MAD_TO_STD * np.median(around, axis=1), least)
+    error = np.median(np.append(errors, least)[nearest], axis=1)
+    spread = np.maximum(np.sqrt((least**2 + error**2) / 2), least)
     grid = spread.reshape(PLACES, PLACES).astype(np.float32)
     noise: Float32 = cv2.resize(grid, (columns, rows), interpolation=cv2.INTER_LINEAR)
     return noise

@@ -104,7 +104,7 @@ def test_noise_is_measured_where_a_prior_is_off() -> None:
     columns = noise.shape[1]
     middle = noise[round(0.4 * columns), round(0.45 * columns)]
     declared = DECLARED / np.exp(0.2)  # of the depth that is too far
-    assert middle == pytest.approx(1.4826 * 0.2 / declared, rel=0.1)
+    assert middle == pytest.approx(0.2 / declared / np.sqrt(2), rel=0.1)
     assert np.median(noise) == 1.0
     no_points = np.zeros(len(scene.maps[1].keypoints), np.bool_)
     assert (local_noise(scene, 1, no_points, 1.5) == 1.5).all()
