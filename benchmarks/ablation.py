@@ -31,6 +31,7 @@ VARIANTS: Mapping[str, Mapping[str, object]] = {
         "refinement": {"integrate": False, "depth_regularization": False}
     },
     "no depth check": {"consistency": {"enabled": False}},
+    "evidence not weighed": {"consistency": {"weigh_evidence": False}},
     "depth check not at the end": {"consistency": {"check_at_end": False}},
     "final robust pass": {"refinement": {"final_robust": True}},
     "next view by inlier matches": {"registration": {"next_view": "inlier-matches"}},

@@ -22,11 +22,12 @@ from benchmarks._scenes import percent
 from mpsfm_core.data import MappingProblem, VerifiedPair
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.geometry import camera_center
-from mpsfm_core.mapping.depth_consistency import check_image
+from mpsfm_core.mapping.depth_consistency import DepthCheck
 from mpsfm_core.mapping.events import Silent
 from mpsfm_core.mapping.group import Group
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.scene.tracks import NO_POINT
 from mpsfm_core.testing.degraded_depth import DepthErrors
 from mpsfm_core.testing.symmetric import SymmetricProblem, moved, twin_room_problem
 
@@ -46,21 +47,24 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
     options = MapperOptions(known_poses="fixed")
     mapper = Mapper(MappingProblem(images, pairs), options, Silent())
     mapper.reconstruct_next()
-    scene, noise = mapper.group.scene, mapper.group.refiner.noise.multiplier
+    scene, std_factor = mapper.group.scene, mapper.group.refiner.std_factor
     room = np.array(case.room)
     everything = scene.registered.copy()
     for image in np.flatnonzero(room >= 0):
         for wrong in (False, True):
             pose = moved(case.poses[image], 2 * int(room[image]) - 1) if wrong else None
-            truth = scene.translations[image].copy()
+            truth, seen = scene.translations[image].copy(), scene.tracks.point_of.copy()
             if pose is not None:
                 scene.registered = everything & (room != room[image])
                 scene.translations[image] = truth + pose[:, 3] - case.poses[image][:, 3]
+                # the points that it sees stay where it was
+                scene.tracks.point_of[scene.graph.keypoints_of(int(image))] = NO_POINT
             start = time.perf_counter()
-            check = check_image(scene, int(image), options.consistency, noise)
+            check = DepthCheck(scene, options.consistency).of_image(int(image), std_factor)
             seconds = time.perf_counter() - start
             yield wrong, check.share > options.consistency.max_violations, seconds
             scene.translations[image], scene.registered = truth, everything
+            scene.tracks.point_of = seen
 
 
 class Observed(Group):

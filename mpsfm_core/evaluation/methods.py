@@ -6,6 +6,7 @@ A mapper that crashes takes its process with it, not the benchmark.
 from __future__ import annotations
 
 import multiprocessing
+import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -38,13 +39,15 @@ class Outcome:
     """What a method made of a set.
 
     ``models``: poses by image name, of the largest model first. ``seconds``: wall clock;
-    ``cpu_seconds``: of the process, which other jobs on the machine do not stretch. ``error``: why
-    it failed, empty if it did not.
+    ``cpu_seconds``: of the process, which other jobs on the machine do not stretch.
+    ``peak_mib``: most memory that the process held, its problem and earlier tasks included; 0
+    where the system does not tell. ``error``: why it failed, empty if it did not.
     """
 
     models: Sequence[dict[str, Pose]] = ()
     seconds: float = 0.0
     cpu_seconds: float = 0.0
+    peak_mib: float = 0.0
     error: str = ""
 
 
@@ -82,7 +85,16 @@ def run_method(method: str, problem: MappingProblem, options: MapperOptions) -> 
     except Exception as raised:  # whatever a mapper raises is its result
         error = f"{type(raised).__name__}: {raised}"
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
-    return Outcome(models, seconds, cpu_seconds, error)
+    return Outcome(models, seconds, cpu_seconds, _peak_mib(), error)
+
+
+def _peak_mib() -> float:
+    if sys.platform == "win32":
+        return 0.0
+    import resource  # not on Windows
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def _models(method: str, problem: MappingProblem, options: MapperOptions) -> list[dict[str, Pose]]:

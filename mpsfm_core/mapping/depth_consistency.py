@@ -1,8 +1,28 @@
 """Dense depth consistency check between views (paper section 3.4).
 
-The refined map of one image is carried into another through a nearest-depth buffer. Where it
-lands clearly in front of the surface that the other image sees, the two contradict each other:
-something would have to float in space that was seen to be empty. Behind is an occlusion.
+Each pixel of one image's refined map is carried into another view. Where it lands clearly in front
+of the surface seen there, the two contradict each other: something would have to float in space
+that was seen to be empty. Behind is an occlusion. Two explanations compete for such a pixel:
+
+* The *priors* are off there. The surface then lies elsewhere on the pixel's own ray, and the other
+  surface elsewhere on its ray. If errors of log depth are normal with std ``s`` and ``s'``, those
+  that explain the pixel best have the likelihood ``exp(-m^2 / 2)`` relative to none, with
+  ``m^2 = min (e / s)^2 + (e' / s')^2`` over all ``e`` along the ray and the ``e'`` that bring the
+  other surface there. This is no matter of depth alone: of two views at a wide angle, an error of
+  depth in one is a shift to the side in the other.
+* The *pose* is wrong. Then whatever is seen there has nothing to do with the pixel, and one gap is
+  as likely as another.
+
+A pixel speaks for the second where ``m`` is above ``max_deviation`` (2.7: errors 38 times less
+likely than none); the share of such pixels decides. So all depends on what std is true at the
+place. A prior that is good on the whole may be far off in one spot, and only there. What a map is
+worth at a place is therefore measured: by the points around whose depth hangs on no prior and not
+on this image's pose alone, as three views or more hold them at wide angles
+(:func:`~mpsfm_core.mapping.depth_noise.local_noise`). Where they deny the prior, it is at fault,
+its std is what they say, and the pixel contradicts nothing. Where they confirm it, or where there
+are none, the std of the whole stands and so does the contradiction. This tells look-alikes from bad
+priors: an image that stands in the twin of its room has points only on what both rooms share, where
+depth is right; what differs has none to excuse it.
 
 An image is held against all views that it overlaps with, not only those it shares points with:
 those that led an image to a wrong place look alike there, others tell.
@@ -10,21 +30,26 @@ those that led an image to a wrong place look alike there, others tell.
 
 from __future__ import annotations
 
+import math
+from collections import OrderedDict
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numba import njit
 
-from mpsfm_core.data import Bool, Float32, Float64
+from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera
 from mpsfm_core.geometry import pixel_centers, unproject
+from mpsfm_core.mapping.depth_noise import local_noise, witnesses
 from mpsfm_core.mapping.options import ConsistencyOptions
+from mpsfm_core.optimize.depth_integration import RefinedDepth
 from mpsfm_core.optimize.thinning import thinned, thinned_camera, thinning_step
-from mpsfm_core.scene.depth_map import DepthMap
 from mpsfm_core.scene.scene import Scene
 
-WARP_NOISE_PX = 1.0
-"""Std of a pixel's position in the lift (reference: 1 px)."""
+MAX_GRIDS = 64
+"""Thinned maps that are kept: views that overlap come one after the other."""
+STEPS = 4
+"""Errors tried to either side along a pixel's ray, evenly spaced up to the limit (ours)."""
 OVERLAP_GRID = 16
 """Columns and rows of the pixels by which overlap is judged (ours)."""
 MIN_OVERLAP = 0.05
@@ -42,41 +67,85 @@ class Inconsistency(NamedTuple):
     other: int
 
 
-def check_image(
-    scene: Scene, image: int, options: ConsistencyOptions, std_factor: float = 1.0
-) -> Inconsistency:
-    """How much an image contradicts the registered views that it overlaps with most.
+class DepthCheck:
+    """The check of one scene; remembers what maps are worth as long as they stay what they are."""
 
-    ``std_factor``: how many times its declaration the std of depth is.
-    """
-    found = [
-        Inconsistency(contradiction(scene, image, other, options, std_factor), other)
-        for other in overlapping_views(scene, image, options.num_views)
-    ]
-    return max(found, default=Inconsistency(0.0, -1))
+    def __init__(self, scene: Scene, options: ConsistencyOptions) -> None:
+        self._scene = scene
+        self._options = options
+        self._grids: OrderedDict[int, tuple[_MapState, _Grid]] = OrderedDict()
 
+    def of_image(self, image: int, std_factor: float = 1.0) -> Inconsistency:
+        """How much an image contradicts the registered views that it overlaps with most.
 
-def conflicting_images(
-    scene: Scene, limit: float, options: ConsistencyOptions, std_factor: float = 1.0
-) -> list[tuple[int, float]]:
-    """Registered images to leave out so that no two contradict each other, and how much each did.
+        ``std_factor``: how many times its declaration the std of depth is on the whole.
+        """
+        found = [
+            Inconsistency(self.between(image, other, std_factor), other)
+            for other in overlapping_views(self._scene, image, self._options.num_views)
+        ]
+        return max(found, default=Inconsistency(0.0, -1))
 
-    ``limit``: share of contradicting pixels above which two do. The image with most conflicts goes
-    first.
-    """
-    shares = np.zeros((scene.num_images, scene.num_images))
-    for image in map(int, scene.registered_images()):
-        for other in overlapping_views(scene, image, options.num_views):
-            if not shares[image, other]:
-                share = contradiction(scene, image, other, options, std_factor)
-                shares[image, other] = shares[other, image] = share
-    removed = []
-    while (shares > limit).any():
-        conflicts = (shares > limit).sum(axis=1)
-        worst = int(np.lexsort((shares.sum(axis=1), conflicts))[-1])
-        removed.append((worst, float(shares[worst].max())))
-        shares[worst] = shares[:, worst] = 0
-    return removed
+    def conflicting_images(self, limit: float, std_factor: float = 1.0) -> list[tuple[int, float]]:
+        """Registered images to leave out so that no two contradict each other, and how much each
+        did.
+
+        ``limit``: share of contradicting pixels above which two do. The image with most conflicts
+        goes first.
+        """
+        scene = self._scene
+        shares = np.zeros((scene.num_images, scene.num_images))
+        for image in map(int, scene.registered_images()):
+            for other in overlapping_views(scene, image, self._options.num_views):
+                if not shares[image, other]:
+                    share = self.between(image, other, std_factor)
+                    shares[image, other] = shares[other, image] = share
+        removed = []
+        while (shares > limit).any():
+            conflicts = (shares > limit).sum(axis=1)
+            worst = int(np.lexsort((shares.sum(axis=1), conflicts))[-1])
+            removed.append((worst, float(shares[worst].max())))
+            shares[worst] = shares[:, worst] = 0
+        return removed
+
+    def between(self, a: int, b: int, std_factor: float = 1.0) -> float:
+        """Share of pixels of two views at which one sees empty space and the other a surface."""
+        scene, options, total = self._scene, self._options, 0.0
+        for source, target in ((a, b), (b, a)):
+            rotation = scene.rotations[target] @ scene.rotations[source].T
+            translation = scene.translations[target] - rotation @ scene.translations[source]
+            one, two = self._grid(source, std_factor), self._grid(target, std_factor)
+            count = count_unexplained(
+                one, two, rotation, translation, options.max_deviation, options.min_gap
+            )
+            total += count / one.depth.size
+        return total
+
+    def _grid(self, image: int, std_factor: float) -> _Grid:
+        """The depth map of an image, thinned out, with what it was worth when it came about."""
+        depth_map = self._scene.maps[image]
+        state = _MapState(depth_map.refined, depth_map.scale, depth_map.camera, std_factor)
+        known = self._grids.pop(image, None)
+        if known is None or known[0] != state:
+            known = state, self._make_grid(image, std_factor)
+        self._grids[image] = known
+        if len(self._grids) > MAX_GRIDS:
+            self._grids.popitem(last=False)
+        return known[1]
+
+    def _make_grid(self, image: int, std_factor: float) -> _Grid:
+        depth_map = self._scene.maps[image]
+        step = thinning_step(depth_map.valid.shape[1], self._options.map_width)
+        depth = thinned(depth_map.depth, step)
+        valid = thinned(depth_map.valid, step)
+        std = thinned(depth_map.log_std, step) * np.float32(std_factor)
+        if self._options.weigh_evidence:
+            local = local_noise(self._scene, image, witnesses(self._scene, image), std_factor)
+            std = thinned(depth_map.log_std, step) * thinned(local, step)
+        # A pixel's error of place is one of depth at edges and where sight grazes a surface.
+        nearest = cv2.erode(np.where(valid, depth, np.float32(np.inf)), np.ones((3, 3)))
+        params = np.array(thinned_camera(depth_map.camera, step).params)
+        return _Grid(depth, np.maximum(std, np.float32(1e-6)), valid, nearest, params)
 
 
 def overlapping_views(scene: Scene, image: int, limit: int) -> list[int]:
@@ -101,92 +170,78 @@ def overlapping_views(scene: Scene, image: int, limit: int) -> list[int]:
     return [int(others[k]) for k in order if share[k] >= MIN_OVERLAP]
 
 
-def contradiction(
-    scene: Scene, a: int, b: int, options: ConsistencyOptions, std_factor: float = 1.0
-) -> float:
-    """Share of pixels of two views at which one sees empty space and the other a surface."""
-    grids = {i: _Grid.of(scene.maps[i], options.map_width, std_factor) for i in (a, b)}
-    total = 0.0
-    for source, target in ((a, b), (b, a)):
-        rotation = scene.rotations[target] @ scene.rotations[source].T
-        translation = scene.translations[target] - rotation @ scene.translations[source]
-        one, two = grids[source], grids[target]
-        depth, variance = warp_depth(*one, rotation, translation, two.params, two.depth.shape)
-        seen = np.isfinite(depth) & two.valid
-        # A pixel's error of place is an error of depth at edges and where sight grazes a surface.
-        nearest = cv2.erode(np.where(two.valid, two.depth, np.float32(np.inf)), np.ones((3, 3)))
-        gap = nearest[seen] - depth[seen]
-        std = np.sqrt(variance[seen] + two.variance[seen])
-        violated = (gap > options.max_deviation * std) & (gap > options.min_gap * two.depth[seen])
-        total += float(violated.sum()) / two.depth.size
-    return total
-
-
 class _Grid(NamedTuple):
-    """A depth map thinned out, with the (fx, fy, cx, cy) that belong to it."""
+    """A depth map thinned out, (h, w): depth, the std of its logarithm, where it is valid, the
+    least depth around each pixel; and the (fx, fy, cx, cy) that belong to it."""
 
     depth: Float32
-    variance: Float32
+    log_std: Float32
     valid: Bool
+    nearest: Float32
     params: Float64
 
-    @staticmethod
-    def of(depth_map: DepthMap, width: int, std_factor: float) -> _Grid:
-        """Every n-th pixel, such that about ``width`` columns remain."""
-        step = thinning_step(depth_map.valid.shape[1], width)
-        depth = thinned(depth_map.depth, step)
-        variance = (std_factor * thinned(depth_map.log_std, step) * depth) ** 2
-        params = np.array(thinned_camera(depth_map.camera, step).params)
-        return _Grid(depth, variance, thinned(depth_map.valid, step), params)
+
+class _MapState(NamedTuple):
+    """What a grid depends on: the refined map, its scale and camera, the std of depth on the whole.
+
+    The points that deny or confirm a prior also move on, but they are those that the map was
+    refined with."""
+
+    refined: RefinedDepth | None
+    scale: float
+    camera: PinholeCamera
+    std_factor: float
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
-def warp_depth(
-    depth: Float32,
-    variance: Float32,
-    valid: Bool,
-    params: Float64,
+def count_unexplained(
+    source: _Grid,
+    target: _Grid,
     rotation: Float64,
     translation: Float64,
-    target_params: Float64,
-    target_shape: tuple[int, int],
-) -> tuple[Float64, Float64]:
-    """Carry a depth map into another view, keeping the nearest surface per pixel.
+    limit: float,
+    min_gap: float,
+) -> int:
+    """Pixels of one view that lie before what another sees, whatever errors of depth are likely.
 
     Args:
-        depth, variance, valid: (h, w) maps of the source. params: its (fx, fy, cx, cy) on the
-            grid. rotation, translation: ``target_from_source``. target_params, target_shape: the
-            target's grid.
-
-    Returns:
-        Depth (inf where nothing lands) and variance of the carried depth, target shape, float64.
-        The variance propagates that of the source's depth and of the pixel's position.
+        source, target: maps of the two. rotation, translation: ``target_from_source``. limit:
+            errors in terms of their std, of both maps together, up to which they are likely.
+        min_gap: share of the seen depth up to which before it is not in front of it.
     """
-    rows, columns = target_shape
-    buffer = np.full((rows, columns), np.inf)
-    spread = np.zeros((rows, columns))
-    r, t = rotation, translation
-    for row in range(depth.shape[0]):
-        y = (row + 0.5 - params[3]) / params[1]
-        for column in range(depth.shape[1]):
-            if not valid[row, column]:
+    rows, columns = target.depth.shape
+    r, t, count = rotation, translation, 0
+    for row in range(source.depth.shape[0]):
+        y = (row + 0.5 - source.params[3]) / source.params[1]
+        for column in range(source.depth.shape[1]):
+            if not source.valid[row, column]:
                 continue
-            d = float(depth[row, column])
-            x = (column + 0.5 - params[2]) / params[0]
-            slope = r[2, 0] * x + r[2, 1] * y + r[2, 2]
-            z = d * slope + t[2]
-            if z <= 1e-9:
-                continue
-            u = (d * (r[0, 0] * x + r[0, 1] * y + r[0, 2]) + t[0]) / z
-            v = (d * (r[1, 0] * x + r[1, 1] * y + r[1, 2]) + t[1]) / z
-            u = u * target_params[0] + target_params[2]
-            v = v * target_params[1] + target_params[3]
-            if not (0 <= u < columns and 0 <= v < rows):
-                continue
-            i, j = int(v), int(u)
-            if z < buffer[i, j]:
-                buffer[i, j] = z
-                across = (r[2, 0] / params[0]) ** 2 + (r[2, 1] / params[1]) ** 2
-                noise = WARP_NOISE_PX**2 * d * d * across
-                spread[i, j] = slope * slope * variance[row, column] + noise
-    return buffer, spread
+            x = (column + 0.5 - source.params[2]) / source.params[0]
+            across = r[0, 0] * x + r[0, 1] * y + r[0, 2]
+            down = r[1, 0] * x + r[1, 1] * y + r[1, 2]
+            along = r[2, 0] * x + r[2, 1] * y + r[2, 2]
+            explained = False
+            for step in range(2 * STEPS + 1):
+                # 0, then nearer and farther in turn: most pixels need no error at all
+                error = limit * ((step + 1) // 2) / STEPS * (1 - 2 * (step % 2))
+                depth = source.depth[row, column] * math.exp(error * source.log_std[row, column])
+                z = depth * along + t[2]
+                explained = z <= 1e-9
+                if explained:
+                    break
+                u = (depth * across + t[0]) / z * target.params[0] + target.params[2]
+                v = (depth * down + t[1]) / z * target.params[1] + target.params[3]
+                explained = not (0 <= u < columns and 0 <= v < rows)
+                if explained:
+                    break
+                i, j = int(v), int(u)
+                seen = target.nearest[i, j]
+                explained = not target.valid[i, j] or seen - z <= min_gap * seen
+                if explained:
+                    break
+                other = math.log(seen / z) / target.log_std[i, j]
+                explained = error * error + other * other <= limit * limit
+                if explained:
+                    break
+            count += not explained
+    return count

@@ -5,17 +5,25 @@ errors of neighbouring pixels have in common, shows when matched keypoints of tw
 compared: the depth of one, carried into the other, against the other's own. Bundle adjustment
 takes observations as independent; a hundred observations with one common error must not count a
 hundred times.
+
+How good a prior is at one place may be another matter (:func:`local_noise`): points that rays hold
+without its help tell.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
-from mpsfm_core.data import Float64, Int64
+from mpsfm_core.data import Bool, Float32, Float64, Int64
+from mpsfm_core.geometry import pixel_centers
 from mpsfm_core.scene.scene import Scene
 
+MAD_TO_STD = 1.4826
+"""Of normal errors: from the median of their absolute values to their std."""
 CELLS = 4
 """Residuals are compared in a grid of this many cells per side (ours)."""
 MIN_RESIDUALS = 50
@@ -30,6 +38,17 @@ poses. On hololens_room with sensor depth, AUC@20 of the triplets 50.9 -> 53.9, 
 leq10 28.7 -> 28.3, leq30 41.7 -> 42.3. For all views it takes `all` there from 54 to 36."""
 MULTIPLIER_RANGE = (0.1, 10.0)
 """Bounds of the multiplier (ours): a declaration is not off by more without being broken."""
+WITNESS_VIEWS, WITNESS_ANGLE_DEG = 3, 2.0
+"""Views and angle from which on a point hangs neither on depth nor on one pose (two views always
+agree on a point; the angle is that from which on points anchor the integration)."""
+NUM_WITNESSES = 7
+"""Witnesses around a place, of whose errors the median counts: four of them have to deny a prior,
+so that no single wrong point does (ours)."""
+WITNESS_REACH = 1 / 8
+"""Share of a map's width that errors have in common (as
+:class:`~mpsfm_core.testing.degraded_depth.DepthErrors`): farther witnesses say nothing."""
+PLACES = 16
+"""Columns and rows of the places at which noise is measured (ours; half the reach apart)."""
 
 
 class DepthNoise(NamedTuple):
@@ -67,21 +86,61 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
         return DepthNoise()
     if scene.registered.sum() <= FEW_VIEWS:
         residuals = residuals - _medians(residuals, groups // CELLS**2)
-    spread = 1.4826 * float(np.median(np.abs(residuals)))
+    spread = MAD_TO_STD * float(np.median(np.abs(residuals)))
     multiplier = float(np.clip(spread, *MULTIPLIER_RANGE))
     clipped = np.clip(residuals / max(spread, 1e-12), -3, 3)
     return DepthNoise(multiplier, *_clustering(clipped, groups))
 
 
+def witnesses(scene: Scene, image: int) -> Bool:
+    """(k,) bool, keypoints of an image whose points rays of several views hold without depth."""
+    points = scene.tracks.point_of[scene.graph.keypoints_of(image)]
+    seen = points >= 0
+    angles, lengths = scene.angles_deg_of(points[seen])
+    holds = np.zeros(len(points), dtype=np.bool_)
+    holds[seen] = (angles >= WITNESS_ANGLE_DEG) & (lengths >= WITNESS_VIEWS)
+    return holds
+
+
+def local_noise(scene: Scene, image: int, witness: Bool, least: float) -> Float32:
+    """How many times its declaration the std of a prior is from place to place: (h, w) float32.
+
+    Witnesses (``witness``: (k,) bool, of the image's keypoints) that are near have an error in
+    common, of which the median of the nearest is a robust estimate: one observation of the std
+    there. ``least``, the std on the whole, is as good as another (a unit information prior), and
+    the factor is nowhere below it. Witnesses that lack within reach count as if off by ``least``.
+    """
+    graph, tracks, depth_map = scene.graph, scene.tracks, scene.maps[image]
+    rows, columns = depth_map.valid.shape
+    point = tracks.point_of[graph.keypoints_of(image)]
+    seen = np.flatnonzero(depth_map.keypoint_valid & witness)
+    z = tracks.xyz[point[seen]] @ scene.rotations[image, 2] + scene.translations[image, 2]
+    prior = depth_map.scale * depth_map.prior_at_keypoints(seen)
+    use = (z > 0) & (prior > 0)
+    if use.sum() <= NUM_WITNESSES // 2:
+        return np.full((rows, columns), least, dtype=np.float32)
+    log_std = np.maximum(depth_map.keypoint_log_std[seen[use]], 1e-6)
+    errors = np.abs(np.log(z[use] / prior[use])) / log_std
+    places = pixel_centers(PLACES, PLACES).reshape(-1, 2) * [columns, rows] / PLACES
+    _, nearest = cKDTree(depth_map.keypoints[seen[use]]).query(
+        places, NUM_WITNESSES, distance_upper_bound=WITNESS_REACH * columns
+    )
+    error = np.median(np.append(errors, least)[nearest], axis=1)
+    spread = np.maximum(np.sqrt((least**2 + error**2) / 2), least)
+    grid = spread.reshape(PLACES, PLACES).astype(np.float32)
+    noise: Float32 = cv2.resize(grid, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    return noise
+
+
 def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
     """Whitened log differences (m,) and the group of each: a cell of one view beside another."""
-    graph, tracks, maps = scene.graph, scene.tracks, scene.maps
+    graph, tracks = scene.graph, scene.tracks
     point = tracks.point_of[graph.source]
     same = (point >= 0) & (point == tracks.point_of[graph.target])
     source, target = graph.source[same], graph.target[same]
-    active = np.array([m.active for m in maps])[graph.image_of]
-    prior = np.concatenate([m.prior_at_keypoints() * m.scale for m in maps])
-    known = np.concatenate([m.keypoint_valid for m in maps]) & active & (prior > 0)
+    active = np.array([depth_map.active for depth_map in scene.maps])[graph.image_of]
+    prior = scene.keypoint_prior * scene.scales()[graph.image_of]
+    known = scene.keypoint_valid & active & (prior > 0)
     both = known[source] & known[target]
     source, target = source[both], target[both]
     a, b = graph.image_of[source], graph.image_of[target]

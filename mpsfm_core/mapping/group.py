@@ -10,7 +10,7 @@ from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.attempts import Attempts
 from mpsfm_core.mapping.correspondences import Correspondences, correspondences
-from mpsfm_core.mapping.depth_consistency import check_image, conflicting_images
+from mpsfm_core.mapping.depth_consistency import DepthCheck
 from mpsfm_core.mapping.failure_ladder import FailureLadder
 from mpsfm_core.mapping.filtering import disconnected_images, filter_points, lost_images
 from mpsfm_core.mapping.initialization import Start, Starts, place_first
@@ -49,6 +49,7 @@ class Group:
         self._problem, self._options = problem, options
         self._starts, self.journal = starts, journal
         self._search = PoseSearch(self.scene, self.refiner, options)
+        self._check = DepthCheck(self.scene, options.consistency)
         self._ladder = FailureLadder(options.registration)
         self._last_size = (0, 0)
 
@@ -267,7 +268,7 @@ class Group:
             self.refiner.estimate_scale(image, bundle[1:])
             wide = options.refinement.first_reprojection_scale
             self.refiner.adjust([image], local=True, reprojection_scale=wide)
-            filter_points(scene, options.triangulation)
+            filter_points(scene, options.triangulation, [image])
             if image in lost_images(scene):
                 return "too few points are left after refinement"
             self.refiner.estimate_scale(image, bundle[1:])
@@ -298,11 +299,10 @@ class Group:
 
     def _contradiction(self, image: int, limit: float) -> str | None:
         """Why the depth of an image contradicts that of another view, if it does."""
-        options = self._options.consistency
-        if not options.enabled:
+        if not self._options.consistency.enabled:
             return None
         with self.journal.timed("depth check"):
-            check = check_image(self.scene, image, options, self.refiner.std_factor)
+            check = self._check.of_image(image, self.refiner.std_factor)
         if check.share <= limit:
             return None
         self.attempts.blame(check.other, image)
@@ -342,11 +342,10 @@ class Group:
 
     def _conflicts(self, limit: float) -> list[tuple[int, float]]:
         """Images to leave out so that no two views contradict each other, and how much each did."""
-        options = self._options.consistency
-        if not options.enabled:
+        if not self._options.consistency.enabled:
             return []
         with self.journal.timed("depth check"):
-            return conflicting_images(self.scene, limit, options, self.refiner.std_factor)
+            return self._check.conflicting_images(limit, self.refiner.std_factor)
 
     def _check_all(self) -> None:
         """Deregister images until no two views contradict each other."""

@@ -167,6 +167,9 @@ class ConsistencyOptions(Options):
     """Dense depth consistency check (paper section 3.4)."""
 
     enabled: bool = True
+    weigh_evidence: bool = True
+    """Take a prior's noise at a place from the points around that rays alone hold
+    (:func:`~mpsfm_core.mapping.depth_noise.local_noise`); off: from the whole scene."""
     check_at_end: bool = True
     """Also check every image once at the end (paper)."""
     max_violations: float = Field(0.05, gt=0)
@@ -179,8 +182,8 @@ class ConsistencyOptions(Options):
     """The same at the end. Ours: an image that was accepted, and those it holds, should go on
     clearer evidence only (``benchmarks/symmetry.py`` ends the same up to 0.1)."""
     max_deviation: float = Field(2.7, gt=0)
-    """Standard deviations in front of the seen surface that make a violation (paper gamma; the
-    reference's 0.6 x 15 / 3.33 in terms of the calibrated std)."""
+    """Standard deviations of error, of both priors together, that it takes at least to explain a
+    violation (paper gamma; the reference's 0.6 x 15 / 3.33 in terms of the calibrated std)."""
     min_gap: float = Field(0.05, ge=0)
     """Relative distance in front of it that a violation has at least: poses and maps are never as
     exact as the best priors say (ours, ``benchmarks/symmetry.py``)."""

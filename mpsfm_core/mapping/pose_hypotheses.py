@@ -105,9 +105,7 @@ class Hypotheses:
         if not self.options.lifting:
             return
         references = set(self.found.references.tolist())
-        for pair in self.scene.problem.pairs:
-            if self.image not in (pair.image_a, pair.image_b):
-                continue
+        for pair in self.scene.graph.pairs_of[self.image]:
             reference = pair.image_a if self.image == pair.image_b else pair.image_b
             if reference not in references:
                 continue

@@ -221,7 +221,10 @@ class Refiner:
         tracks.xyz[points] = result.points
 
     def refine_locally(self, image: int) -> None:
-        """Refine an image and its neighbours until little changes."""
+        """Refine an image and its neighbours until little changes.
+
+        Its map was refined when it was registered, and will be again with all others.
+        """
         options = self.options
         bundle = local_bundle(self.scene, image, options.local_images - 1, self.scores)
         complete_and_merge(self.scene, self.triangulation, images=bundle)
@@ -230,11 +233,10 @@ class Refiner:
             if self._alternates:
                 self.integrate([image])
             self.adjust(bundle, local=True)
-            changed = filter_points(self.scene, self.triangulation)
+            changed = filter_points(self.scene, self.triangulation, bundle)
             changed += complete_and_merge(self.scene, self.triangulation, images=bundle)
             if changed < options.local_max_change * max(self._num_observations(), 1):
                 break
-        self.integrate([image])
 
     def refine_globally(self, *, final: bool = False) -> None:
         """Refine everything until little changes; ``final`` sharpens the depth loss."""
@@ -352,19 +354,16 @@ class Refiner:
         """Log depth of the maps at observations (NaN where not to be used) and its std."""
         scene, tracks = self.scene, self.scene.tracks
         _, z = scene.project(observations, tracks.xyz[tracks.point_of[observations]])
-        log_depth = np.full(len(observations), np.nan)
-        log_std = np.ones(len(observations))
-        images = scene.graph.image_of[observations]
-        for image in np.unique(images):
-            mine = np.flatnonzero(images == image)
-            rows = observations[mine] - scene.graph.offsets[image]
-            depth_map = scene.maps[image]
-            scaled = depth_map.prior_at_keypoints(rows) * depth_map.scale
-            depth = depth_map.at_keypoints(rows) if refined else scaled
-            usable = depth_map.keypoint_valid[rows] & (depth > 0) & (z[mine] > 0)
-            usable[usable] &= self._near(z[mine][usable] / depth[usable])
-            log_depth[mine[usable]] = np.log(depth[usable])
-            log_std[mine[usable]] = scene.keypoint_log_std[observations[mine[usable]]]
+        if refined:
+            depth, _ = scene.depth_at(observations)
+        else:
+            scales = scene.scales()[scene.graph.image_of[observations]]
+            depth = scene.keypoint_prior[observations] * scales
+        usable = scene.keypoint_valid[observations] & (depth > 0) & (z > 0)
+        usable[usable] &= self._near(z[usable] / depth[usable])
+        log_depth, log_std = np.full(len(z), np.nan), np.ones(len(z))
+        log_depth[usable] = np.log(depth[usable])
+        log_std[usable] = scene.keypoint_log_std[observations[usable]]
         return log_depth, np.maximum(log_std, 1e-6)
 
     def _near(self, ratio: Float64) -> Bool:

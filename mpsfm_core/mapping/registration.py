@@ -37,10 +37,13 @@ class PoseSearch:
     def poses(self, image: int, found: Correspondences, *, attempt: int) -> list[AbsolutePose]:
         """A few distinct poses, bundle-adjusted beside their neighbours if that finds more support.
 
+        A lone one that nearly all matches support needs none: it is adjusted once registered.
         ``attempt`` counts how often the image was tried: see :func:`find_poses`.
         """
         options, seed = self._options.registration, self._options.seed
         poses = find_poses(self.scene, image, found, options, seed=seed, attempt=attempt)
+        if len(poses) == 1 and poses[0].inlier_share >= options.confident_share:
+            return poses
         snapshot = self.scene.snapshot()
         return [self._polished(image, pose, found, snapshot) for pose in poses]
 

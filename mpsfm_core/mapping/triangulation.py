@@ -36,13 +36,14 @@ def complete_and_merge(
     changed.
     """
     before = scene.tracks.point_of.copy()
-    for image in scene.registered_images() if images is None else images:
+    images = list(map(int, scene.registered_images())) if images is None else images
+    for image in images:
         edges = _registered_edges(scene, image)
         max_error = options.max_error_px * scene.keypoint_std_px[image]
         extend_tracks(scene, image, edges, max_error)
         if create:
             create_tracks(scene, edges, max_error, options)
-    merge_tracks(scene, options)
+    merge_tracks(scene, options, images)
     return int((before != scene.tracks.point_of).sum())
 
 
@@ -126,11 +127,21 @@ def hypothesize(
     return points, good
 
 
-def merge_tracks(scene: Scene, options: TriangulationOptions) -> None:
-    """Join points whose keypoints match, where the mean point fits all observations."""
+def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int]) -> None:
+    """Join points whose keypoints match, where the mean point fits all observations.
+
+    ``images``: one end at least of the matches is in one of them.
+    """
     tracks, graph = scene.tracks, scene.graph
-    p, q = tracks.point_of[graph.source], tracks.point_of[graph.target]
-    candidates = np.unique(np.stack([p, q], axis=1)[(p >= 0) & (q >= 0) & (p < q)], axis=0)
+    edges = [graph.edges_of(image) for image in images]
+    p, q = (
+        tracks.point_of[np.concatenate([ends[of_image] for of_image in edges] or [ends[:0]])]
+        for ends in (graph.source, graph.target)
+    )
+    apart = (p >= 0) & (q >= 0) & (p != q)
+    low, high = np.minimum(p, q)[apart], np.maximum(p, q)[apart]
+    count = len(tracks.xyz)
+    candidates = np.stack(np.divmod(np.unique(low * count + high), max(count, 1)), axis=1)
     if not len(candidates):
         return
     lengths = tracks.lengths()
@@ -144,9 +155,9 @@ def merge_tracks(scene: Scene, options: TriangulationOptions) -> None:
     errors, _ = scene.project(keypoints, mean[candidate])
     limit = options.max_error_px * scene.keypoint_std_px[graph.image_of[keypoints]]
     bad = np.bincount(candidate, errors > limit, minlength=len(candidates)) > 0
-    places = candidate * scene.num_images + graph.image_of[keypoints]
-    _, inverse, counts = np.unique(places, return_inverse=True, return_counts=True)
-    bad |= np.bincount(candidate, counts[inverse] > 1, minlength=len(candidates)) > 0
+    places = np.sort(candidate * scene.num_images + graph.image_of[keypoints])
+    twice = places[1:][places[1:] == places[:-1]] // scene.num_images
+    bad[twice] = True
     candidates, mean = candidates[~bad], mean[~bad]
     both = np.full(2 * len(candidates), False)
     both[_first_of_each(candidates.ravel())] = True

@@ -25,6 +25,7 @@ from mpsfm_core.optimize.integration_energy import (
     PointTerms,
     PriorTerms,
     majorise,
+    mean_point_energy,
     normal_terms,
 )
 from mpsfm_core.optimize.multigrid import Multigrid, Solution
@@ -86,10 +87,11 @@ class IntegrationOptions:
     tolerance: float = 2e-2
     """Stop when a re-weighting lowers the energy by less than this fraction. The reference has 5 %,
     with full solves between; our steps are shorter."""
-    skip_tolerance: float = 5e-2
-    """Refining again is skipped when the points' mean energy has changed by less than this
-    fraction since the last solve. The reference compares whole energies; most of ours belongs to
-    depth edges, whatever the points say."""
+    max_point_growth: float = 1.2
+    """Refining again is skipped while the points' mean energy has not grown by more than this
+    factor since the last solve: points that a map agrees with as well as with those before tell it
+    nothing (ours). The reference skips when the whole energy has changed by less than 5 %; most of
+    ours belongs to depth edges, whatever the points say."""
 
 
 DEFAULT_OPTIONS = IntegrationOptions()
@@ -120,8 +122,8 @@ class RefinedDepth:
     `initial_energy` is that of the map the refinement started from, under the same anchors;
     `energy` never exceeds it, and `point_energy` is the mean of its points' share. `converged`:
     stopped by the tolerance. `iterations` and `cg_iterations` count those on the whole map.
-    `skipped`: the points agree with the start as well as those it was refined with; its map is
-    returned, and `point_energy` remains that of the last solve.
+    `skipped`: the points agree with the start about as well as those it was refined with; its map
+    is returned, and the energies remain those of the last solve.
     """
 
     log_depth: Float64
@@ -220,24 +222,17 @@ class DepthIntegrator:
         Starts from the scaled prior, or from an earlier result of this instance (whose map is
         rescaled when the scale has changed), which is returned as it is when little is new.
         """
-        terms = self._terms(anchors, scale)
-        solver = self._solver(terms)
         if start is None:
-            z = terms.prior.log_depth
+            solver = self._solver(self._terms(anchors, scale))
+            z = self._log_depth + np.log(scale)
             return self._descend_from_prior(z, solver.majorise(z), solver, anchors, scale)
         z = start.log_depth + np.log(scale / start.scale)
-        here = solver.majorise(z)
-        change = abs(here.point_energy - start.point_energy)
-        if change <= self.options.skip_tolerance * start.point_energy:
-            return replace(
-                start,
-                log_depth=z,
-                scale=scale,
-                initial_energy=here.energy,
-                energy=here.energy,
-                skipped=True,
-            )
-        return self._descend(z, here, solver, scale)
+        points = self._point_terms(anchors, self._log_depth + np.log(scale))
+        energy = mean_point_energy(z, points, self.options.point_scale)
+        if energy <= self.options.max_point_growth * start.point_energy:
+            return replace(start, log_depth=z, scale=scale, skipped=True)
+        solver = self._solver(self._terms(anchors, scale))
+        return self._descend(z, solver.majorise(z), solver, scale)
 
     def variance(self, refined: RefinedDepth, anchors: Anchors = NO_ANCHORS) -> Float32:
         """Marginal variance of the refined log depth, (h, w) float32; infinite where not valid.

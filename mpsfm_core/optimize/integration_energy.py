@@ -121,6 +121,13 @@ def normal_terms(
     return terms
 
 
+def mean_point_energy(z: Float64, points: PointTerms, scale: float) -> float:
+    """Mean share of the sparse points in the energy of a map of log depth (h, w); 0 without any."""
+    offset = z[points.rows, points.columns] - points.log_depth
+    energies = scale**2 * np.log1p(points.precision * offset**2 / scale**2)
+    return float(energies.mean()) if len(energies) else 0.0
+
+
 def majorise(z: Float64, terms: EnergyTerms) -> Majoriser:
     """Energy of a map of log depth (h, w), and the quadratic that touches it there."""
     framed = np.zeros((z.shape[0] + 2, z.shape[1] + 2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpsfm_core.data import Float64, Int64, MappingProblem
+from mpsfm_core.data import Float64, Int64, MappingProblem, VerifiedPair
 
 MIN_SCORE = 0.05
 """A match of a lower score counts like one of this: it passed geometric verification (ours)."""
@@ -22,6 +22,7 @@ class CorrespondenceGraph:
         source, target: (e,) int64, global keypoints.
         score: (e,) float64 in [0.05, 1], what the matcher thinks of the match.
         pair_scores: (p,) float64, summed match scores of each pair.
+        pairs_of: for each image the pairs it is in, in their order.
         keypoint_weight: (k,) float64, score of a keypoint's best match in terms of the mean score
             of all matches: the weight of its squared reprojection error. Of XFeat + LighterGlue's
             matches the fifth of lowest score misses the true epipolar line by 2.3 px in the median
@@ -54,6 +55,10 @@ class CorrespondenceGraph:
         self.pair_scores: Float64 = np.array(
             [pair.scores.sum(dtype=np.float64) for pair in problem.pairs]
         )
+        self.pairs_of: list[list[VerifiedPair]] = [[] for _ in problem.images]
+        for pair in problem.pairs:
+            self.pairs_of[pair.image_a].append(pair)
+            self.pairs_of[pair.image_b].append(pair)
         self.keypoint_weight: Float64 = np.zeros(len(self.image_of))
         np.maximum.at(self.keypoint_weight, self.source, self.score)
         if len(self.score):

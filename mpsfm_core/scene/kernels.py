@@ -11,6 +11,26 @@ from mpsfm_core.data import Float64, Int64
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+def sorted_by_point(point_of: Int64, num_points: int) -> Int64:
+    """Keypoints that observe a point, sorted by point, then keypoint (counting sort).
+
+    ``point_of``: (k,) point of each keypoint or negative, below ``num_points``.
+    """
+    first = np.zeros(num_points + 1, np.int64)
+    for point in point_of:
+        if point >= 0:
+            first[point + 1] += 1
+    first = np.cumsum(first)
+    keypoints = np.empty(first[num_points], np.int64)
+    for keypoint in range(len(point_of)):
+        point = point_of[keypoint]
+        if point >= 0:
+            keypoints[first[point]] = keypoint
+            first[point] += 1
+    return keypoints
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
 def max_triangulation_angles(
     points: Float64, observation_points: Int64, centers: Float64
 ) -> Float64:

@@ -42,7 +42,8 @@ class Scene:
             length is a guess, and the same guess.
         keypoints: (k, 2) float64, of all images, numbered as in :attr:`graph`.
         maps: the depth map of each image.
-        keypoint_log_std: (k,) float64, std of the priors' log depth at the keypoints.
+        keypoint_prior, keypoint_log_std, keypoint_valid: (k,) unscaled prior depth at the
+            keypoints, std of its logarithm, and where they mean something.
     """
 
     def __init__(self, problem: MappingProblem, *, weigh_by_score: bool = True) -> None:
@@ -58,6 +59,12 @@ class Scene:
         self.maps = [DepthMap(image) for image in problem.images]
         self.keypoint_log_std: Float64 = np.concatenate(
             [np.zeros(0), *(depth_map.keypoint_log_std for depth_map in self.maps)]
+        )
+        self.keypoint_prior: Float64 = np.concatenate(
+            [np.zeros(0), *(depth_map.prior_at_keypoints() for depth_map in self.maps)]
+        )
+        self.keypoint_valid: Bool = np.concatenate(
+            [np.zeros(0, np.bool_), *(depth_map.keypoint_valid for depth_map in self.maps)]
         )
         self.rotations: Float64 = np.tile(np.eye(3), (count, 1, 1))
         self.translations: Float64 = np.zeros((count, 3))
@@ -160,6 +167,10 @@ class Scene:
         dy = fy * camera[:, 1] / z + cy - self.keypoints[keypoints, 1]
         return np.where(front, np.hypot(dx, dy), np.inf), camera[:, 2]
 
+    def scales(self) -> Float64:
+        """(n,) of the priors, 1 where not set yet."""
+        return np.array([depth_map.scale for depth_map in self.maps])
+
     def track_angles_deg(self) -> Float64:
         """(p,) largest triangulation angle of each point of the tracks, degrees."""
         observations = self.tracks.observations()
@@ -168,6 +179,13 @@ class Scene:
             self.tracks.xyz, self.tracks.point_of[observations], centers
         )
         return angles
+
+    def angles_deg_of(self, points: Int64) -> tuple[Float64, Int64]:
+        """Largest triangulation angle of some points (m,), each once, in degrees; track lengths."""
+        keypoints, rows = self.tracks.observations_of(points)
+        centers = self.centers()[self.graph.image_of[keypoints]]
+        angles: Float64 = max_triangulation_angles(self.tracks.xyz[points], rows, centers)
+        return angles, np.bincount(rows, minlength=len(points)).astype(np.int64)
 
     def resume(self, reconstruction: Reconstruction) -> None:
         """Start from a finished reconstruction: its poses, focal lengths, scales and points."""

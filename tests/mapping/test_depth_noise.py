@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera
-from mpsfm_core.mapping.depth_noise import DepthNoise, measure_depth_noise
+from mpsfm_core.mapping.depth_noise import (
+    DepthNoise,
+    local_noise,
+    measure_depth_noise,
+    witnesses,
+)
 from mpsfm_core.mapping.options import TriangulationOptions
 from mpsfm_core.mapping.triangulation import complete_and_merge
 from mpsfm_core.scene.scene import Scene
@@ -25,6 +30,11 @@ Errors = Callable[[np.random.Generator, tuple[int, int]], Float64]
 
 def measured(errors: Errors, scales: tuple[float, ...] = (1.0, 1.0, 1.0)) -> DepthNoise:
     """Of true poses, beside priors with relative errors and images with scales that are off."""
+    return measure_depth_noise(scene_with(errors, scales))
+
+
+def scene_with(errors: Errors, scales: tuple[float, ...] = (1.0, 1.0, 1.0)) -> Scene:
+    """True poses and their tracks beside such priors."""
     problem = mapping_problem(
         room_scene(), CAMERA, POSES, points_per_view=400, declared_depth_std=DECLARED
     )
@@ -41,7 +51,7 @@ def measured(errors: Errors, scales: tuple[float, ...] = (1.0, 1.0, 1.0)) -> Dep
         scene.register(image, pose[:, :3], pose[:, 3])
         scene.maps[image].set_scale(scale)
     complete_and_merge(scene, TriangulationOptions(), create=True)
-    return measure_depth_noise(scene)
+    return scene
 
 
 def independent(rng: np.random.Generator, shape: tuple[int, int]) -> Float64:
@@ -79,3 +89,22 @@ def test_scales_that_are_off_are_no_noise_while_there_are_few_views() -> None:
 def test_too_few_common_points_leave_the_declaration() -> None:
     problem = mapping_problem(room_scene(), CAMERA, POSES)
     assert measure_depth_noise(Scene(problem)) == DepthNoise()
+
+
+def test_noise_is_measured_where_a_prior_is_off() -> None:
+    """Depth 20 % too far in one spot; around it, and where no points are, the declaration holds."""
+
+    def spot(_: np.random.Generator, shape: tuple[int, int]) -> Float64:
+        y, x = np.mgrid[: shape[0], : shape[1]] / shape[1]
+        return np.where(np.hypot(x - 0.45, y - 0.4) < 0.15, 0.2, 0.0)
+
+    scene = scene_with(spot)
+    noise = local_noise(scene, 1, witnesses(scene, 1), 1.0)
+    assert noise.shape == scene.maps[1].valid.shape
+    columns = noise.shape[1]
+    middle = noise[round(0.4 * columns), round(0.45 * columns)]
+    declared = DECLARED / np.exp(0.2)  # of the depth that is too far
+    assert middle == pytest.approx(0.2 / declared / np.sqrt(2), rel=0.1)
+    assert np.median(noise) == 1.0
+    no_points = np.zeros(len(scene.maps[1].keypoints), np.bool_)
+    assert (local_noise(scene, 1, no_points, 1.5) == 1.5).all()

@@ -269,7 +269,7 @@ def test_a_warm_start_is_cheaper_and_as_good():
     integrator = DepthIntegrator(depth_prior(rough), normal_prior(normals), CAMERA)
     before = integrator.refine(exact_anchors(depth, 40))
     anchors = exact_anchors(depth, 80, seed=1)
-    options = replace(integrator.options, skip_tolerance=0.0)
+    options = replace(integrator.options, max_point_growth=0.0)
     eager = DepthIntegrator(depth_prior(rough), normal_prior(normals), CAMERA, options)
     cold, warm = eager.refine(anchors), eager.refine(anchors, start=before)
     assert warm.iterations < cold.iterations

@@ -1,0 +1,141 @@
+"""Ordinary photo sets: our mapper beside COLMAP's incremental one on the same verified matches.
+
+    python -m benchmarks.everyday [--views 49 100 ...] [--priors exact honest "locally wrong"]
+        [--only NAME ...] [--repeats 1] [--json] [--output FILE]
+
+Analytic halls with boxes (:mod:`mpsfm_core.testing.halls`): each view overlaps well with those
+around it, keypoints have 0.7 px of noise and 5 % of the matches are wrong. Each run has a process
+of its own, with one thread for linear algebra; compiled loops are loaded before. Times are medians
+of the repeats, in turn with COLMAP's; memory is the peak of the process, with the problem in it.
+``--only``: of :data:`VARIANTS`, settings below ``mapping`` that differ from the defaults. The last
+line is one JSON object with ``--json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks._scenes import percent
+from mpsfm_core.evaluation.methods import OURS, Outcome, Task, run_tasks
+from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.testing.halls import QUALITIES, Hall, hall_problem
+
+PEER = "colmap"
+VARIANTS: Mapping[str, Mapping[str, object]] = {
+    "default": {},
+    "evidence not weighed": {"consistency": {"weigh_evidence": False}},
+    "no depth check": {"consistency": {"enabled": False}},
+}
+CONVENTION = CONVENTIONS["paper"]
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--views", type=int, nargs="+", default=[49, 100])
+    parser.add_argument("--priors", nargs="+", choices=list(QUALITIES), default=list(QUALITIES))
+    parser.add_argument("--only", nargs="+", choices=list(VARIANTS), default=["default"])
+    parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--output", type=Path, help="also write the table to this file")
+    arguments = parser.parse_args()
+    rows = []
+    for views in arguments.views:
+        for prior in arguments.priors:
+            rows += measured(views, prior, arguments.only, arguments.repeats)
+    text = table(rows)
+    print(text)
+    if arguments.output:
+        arguments.output.write_text(text + "\n", encoding="utf-8")
+    if arguments.json:
+        print(json.dumps({"rows": rows, "growth": growth(rows)}))
+
+
+def measured(views: int, prior: str, variants: Sequence[str], repeats: int) -> list[dict[str, Any]]:
+    """A row for COLMAP and one for each variant of ours."""
+    hall = hall_problem(views, QUALITIES[prior])
+    methods = {PEER: (PEER, MapperOptions())}
+    for variant in variants:
+        methods[variant] = OURS, MapperOptions.model_validate(dict(VARIANTS[variant]))
+    outcomes: dict[str, list[Outcome]] = {label: [] for label in methods}
+    for _ in range(repeats):
+        for label, (method, options) in methods.items():
+            # one task at a time: the next one's memory is counted in a process of its own
+            tasks = [Task(label, method, hall.problem, options)]
+            outcomes[label] += [outcome for _, outcome in run_tasks(tasks, 1)]
+            print(f"{views} {prior} {label}: {outcomes[label][-1].seconds:.1f} s", file=sys.stderr)
+    base = _row(hall, outcomes[PEER])
+    shared = {
+        "views": views,
+        "priors": prior,
+        "pairs": len(hall.problem.pairs),
+        "matches": sum(len(pair) for pair in hall.problem.pairs),
+    }
+    rows = []
+    for label, of_label in outcomes.items():
+        row = {**shared, "method": label if label == PEER else f"ours, {label}"}
+        row |= _row(hall, of_label)
+        row["cpu_ratio"] = row["cpu_seconds"] / max(base["cpu_seconds"], 1e-9)
+        rows.append(row)
+    return rows
+
+
+def _row(hall: Hall, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Medians of the repeats; accuracy is that of the first, as it is the same in all."""
+    first = outcomes[0]
+    found = first.models[0] if first.models else {}
+    area = pose_auc(pose_errors_deg(found, hall.truth, CONVENTION), CONVENTION)
+    return {
+        "registered": len(found),
+        "auc": {str(threshold): value for threshold, value in area.items()},
+        "auc_percent": percent(area),
+        "seconds": statistics.median(o.seconds for o in outcomes),
+        "cpu_seconds": statistics.median(o.cpu_seconds for o in outcomes),
+        "peak_mib": statistics.median(o.peak_mib for o in outcomes),
+        "error": first.error,
+    }
+
+
+def growth(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Exponent of CPU time over views, by method and prior, where there are several sizes."""
+    points: dict[str, list[tuple[int, float]]] = {}
+    for row in rows:
+        name = f"{row['method']}, {row['priors']}"
+        points.setdefault(name, []).append((row["views"], row["cpu_seconds"]))
+    return {
+        name: float(np.polyfit(*np.log(np.array(of_name).T), 1)[0])
+        for name, of_name in points.items()
+        if len(of_name) > 1
+    }
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown: a line a run, and the exponents of growth."""
+    lines = [
+        "| views | priors | method | registered | AUC@1/5/20 | CPU, s | wall, s | CPU / COLMAP | "
+        "peak, MiB |",
+        "|---" * 9 + "|",
+    ]
+    lines += [
+        f"| {row['views']} | {row['priors']} | {row['method']} | {row['registered']} | "
+        f"{row['auc_percent']} | {row['cpu_seconds']:.1f} | {row['seconds']:.1f} | "
+        f"{row['cpu_ratio']:.2f}x | {row['peak_mib']:.0f} |"
+        for row in rows
+    ]
+    exponents = [f"{name}: n^{value:.2f}" for name, value in growth(rows).items()]
+    if exponents:
+        lines += ["", "Growth of CPU time: " + "; ".join(exponents) + "."]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
