@@ -70,10 +70,17 @@ def train(
 
 
 @app.command("export")
-def export(checkpoint: Path, output: Path) -> None:
+def export(
+    checkpoint: Path,
+    output: Path,
+    weights: Annotated[Path | None, typer.Option(help="also the weights alone, here")] = None,
+) -> None:
     """Write the network of a checkpoint as ONNX, and say how far it is from torch's."""
     from training.export import export as run_export
+    from training.export import keep
 
+    if weights is not None:
+        keep(checkpoint, weights)
     for name, gap in run_export(checkpoint, output).items():
         typer.echo(f"{name}: {gap:.1e}")
 

@@ -92,6 +92,13 @@ def export(checkpoint: Path, output: Path) -> dict[str, float]:
     return _difference(module, output)
 
 
+def keep(checkpoint: Path, output: Path) -> None:
+    """Write the averaged weights alone, as float16, for ``train --start``."""
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    weights = averaged(state)
+    torch.save({k: v.half() if v.is_floating_point() else v for k, v in weights.items()}, output)
+
+
 def averaged(state: dict) -> dict[str, Tensor]:
     """The running mean of the weights of a checkpoint of training, or the weights as they are."""
     mean = state.get("mean")
