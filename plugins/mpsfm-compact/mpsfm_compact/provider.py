@@ -48,7 +48,7 @@ def describe(options: CompactOptions) -> Description:
     general = load_description(str(Path(__file__).with_name("description.yaml")))
     size = general.input.size.model_copy(update={"side": options.size})
     update = {
-        "weights": Weights(uri=options.weights),
+        "weights": Weights(uri=options.weights, sha256=options.sha256),
         "input": general.input.model_copy(update={"size": size}),
     }
     return general.model_copy(update=update)
