@@ -59,6 +59,11 @@ matcher: {use: lightglue-aliked}
 )
 FASTDEPTH = "depth: {{use: onnx, options: {{model: {model}}}}}\n"
 COMPACT = "depth: {use: compact}\nnormals: {use: compact}\n"
+NETWORK_BUCKETS: Mapping[str, tuple[str, ...]] = {
+    "rendered_kitchen": ("minimal", "leq30", "all"),
+    "hololens_room": ("leq5", "leq10", "leq30", "all"),
+}
+"""Where networks are compared with each other."""
 UNCONFIRMED = "unconfirmed", "mapping: {place_unconfirmed: true}\n"
 COMPARISONS: Mapping[str, Comparison] = {
     "rendered_kitchen": Comparison(
@@ -83,10 +88,12 @@ COMPARISONS: Mapping[str, Comparison] = {
         "their matches fit best, and count.",
     ),
     **{
-        f"{scene}-compact": Comparison(
-            scene, priors=("config",), depth=COMPACT, note="Depth and normals of `compact`."
+        f"{scene}-{network}": Comparison(scene, buckets, ("config",), depth=depth, note=note)
+        for scene, buckets in NETWORK_BUCKETS.items()
+        for network, depth, note in (
+            ("compact", COMPACT, "Depth and normals of `compact`."),
+            ("fastdepth", None, "FastDepth, and normals from it."),
         )
-        for scene in ("rendered_kitchen", "hololens_room")
     },
 }
 """Name of the table -> what is in it."""
