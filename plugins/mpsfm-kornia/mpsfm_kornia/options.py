@@ -187,13 +187,10 @@ class DedodeLightGlueOptions(LightGlueOptions):
 class LighterGlueOptions(LightGlueOptions):
     """LighterGlue, the small LightGlue for XFeat.
 
-    Points that are 99 % certainly unmatchable are dropped, which takes a quarter of the time; the
-    matches stay (46 pairs of three scenes with 10 to 50 % overlap, 4096 keypoints: 629 inliers a
-    pair and 26 right poses with and without). Not its published 0.95: that verifies 2 to 3 % fewer.
+    Its published ``width_confidence`` is 0.95, for speed. Without, 3 % more matches are verified on
+    rendered_kitchen, and pose AUC at 1 degree of all its images is 75 instead of 68 % (ours).
     """
 
-    width_confidence: float = Field(0.99, le=1)
-    """Drop points that are this certainly unmatchable; -1 never (ours)."""
     weights: str = LIGHTERGLUE.uri
 
 
