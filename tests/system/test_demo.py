@@ -35,8 +35,9 @@ def test_the_demo_needs_nothing_but_the_photos(mpsfm, tmp_path: Path) -> None:
     providers = json.loads((output / "summary.json").read_text())["providers"]
     depth = {line["block"]: line for line in providers}["depth"]
     assert f"depth: {depth['name']}" in ended.err
-    # A constant depth, where our own network is not installed, leads to 89 %.
-    assert evaluate(read_poses(output), read_poses(SCENE / "gt"))["auc"]["20"] > 80
+    # 92 % with our own network; a constant depth, where that is not installed, leads to 58 %.
+    wanted = 80 if depth["name"] == "compact" else 40
+    assert evaluate(read_poses(output), read_poses(SCENE / "gt"))["auc"]["5"] > wanted
 
 
 def test_with_the_priors_of_the_scene_the_poses_are_right(mpsfm, tmp_path: Path) -> None:
