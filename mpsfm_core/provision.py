@@ -216,7 +216,7 @@ class _Downloads:
     @contextmanager
     def announced(self, file: WeightsFile, store: WeightStore) -> Iterator[None]:
         """Around what may download a file."""
-        if not is_remote(file.uri) or store.locate(file.uri) is not None:
+        if store.offline or not is_remote(file.uri) or store.locate(file.uri) is not None:
             yield
             return
         self._stage = f"fetch {file.uri.rpartition('/')[2]}"
