@@ -15,6 +15,7 @@ from mpsfm_core.config import Config, load_config
 from mpsfm_core.evaluation.peers import PEERS, write_database
 from mpsfm_core.extraction.runner import extract
 from mpsfm_core.inputs.images import load_images
+from mpsfm_core.provision import provide
 from mpsfm_core.registry import Registry
 from mpsfm_core.stages import Stages
 from mpsfm_core.uncertainty.model import DepthCalibration
@@ -96,8 +97,9 @@ def test_so_do_the_points_of_a_model_by_colmap(
     room: Room, by_sensor: Calibrated, tmp_path: Path
 ) -> None:
     photos, registry = room.frames, Registry.discover()
-    images = load_images(photos.folder, photos.intrinsics, photos.image_list, room.config.inputs)
-    problem = extract(images, room.config, registry, Stages(registry)).problem
+    config = provide(room.config, registry).config
+    images = load_images(photos.folder, photos.intrinsics, photos.image_list, config.inputs)
+    problem = extract(images, config, registry, Stages(registry)).problem
     write_database(problem, tmp_path / "database.db")
     models = PEERS["colmap"](tmp_path / "database.db", tmp_path)
     largest = max(models, key=lambda number: models[number].num_reg_images())
