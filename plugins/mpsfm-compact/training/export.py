@@ -85,8 +85,8 @@ def export(checkpoint: Path, output: Path) -> dict[str, float]:
     model = onnx.load(output)
     _halve(model)
     model.producer_name = "mpsfm-compact"
-    steps = {"samples": int(state["step"]) * int(state.get("batch", 16))}
-    model.metadata_props.add(key="training", value=json.dumps(steps))
+    samples = {"samples": int(state["samples"])}
+    model.metadata_props.add(key="training", value=json.dumps(samples))
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, output)
     return _difference(module, output)

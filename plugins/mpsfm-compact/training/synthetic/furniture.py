@@ -16,7 +16,7 @@ from training.synthetic.raycast import BALL, BOX, CYLINDER
 Furniture = Callable[[Builder, float, float, float], None]
 
 
-class _Frame:
+class Frame:
     """Coordinates of a piece: ``u`` along the wall, ``v`` away from it."""
 
     def __init__(self, build: Builder, x: float, y: float, yaw: float) -> None:
@@ -53,7 +53,7 @@ def _between(b: Builder, low: float, high: float) -> float:
     return float(b.rng.uniform(low, high))
 
 
-def clutter(f: _Frame, u: float, v: float, z: float, largest: float = 0.35) -> None:
+def clutter(f: Frame, u: float, v: float, z: float, largest: float = 0.35) -> None:
     """One small thing on a surface."""
     b, look = f.build, f.build.look((0.05, 0.5))
     kind = b.rng.integers(6)
@@ -86,13 +86,13 @@ def clutter(f: _Frame, u: float, v: float, z: float, largest: float = 0.35) -> N
         f.ball(u, v, z + h, (r * 1.5, r * 1.5, r), b.look(glow=_between(b, 0, 1)))
 
 
-def _scatter(f: _Frame, z: float, width: float, v0: float, v1: float, most: int) -> None:
+def _scatter(f: Frame, z: float, width: float, v0: float, v1: float, most: int) -> None:
     for _ in range(f.build.rng.integers(0, most + 1)):
         clutter(f, _between(f.build, -width / 2, width / 2), _between(f.build, v0, v1), z)
 
 
 def table(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, top, leg = _Frame(b, x, y, yaw), b.look(), b.look()
+    f, top, leg = Frame(b, x, y, yaw), b.look(), b.look()
     w, d, h = _between(b, 0.6, 2.0), _between(b, 0.5, 1.0), _between(b, 0.4, 0.78)
     f.box(0, d / 2, h - 0.04, w, d, 0.04, top)
     if b.rng.random() < 0.25:
@@ -110,7 +110,7 @@ def table(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def desk(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, top, side = _Frame(b, x, y, yaw), b.look(), b.look()
+    f, top, side = Frame(b, x, y, yaw), b.look(), b.look()
     w, d, h = _between(b, 1.0, 1.8), _between(b, 0.6, 0.8), _between(b, 0.7, 0.78)
     f.box(0, d / 2, h - 0.03, w, d, 0.03, top)
     f.box(-w / 2 + 0.2, d / 2, 0, 0.4, d * 0.95, h - 0.03, side)
@@ -130,7 +130,7 @@ def desk(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def chair(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, look = _Frame(b, x, y, yaw), b.look()
+    f, look = Frame(b, x, y, yaw), b.look()
     seat = b.look() if b.rng.random() < 0.5 else look
     h, w = _between(b, 0.42, 0.48), _between(b, 0.38, 0.48)
     f.box(0, w / 2, h - 0.04, w, w, 0.04, seat)
@@ -142,7 +142,7 @@ def chair(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def office_chair(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, look, dark = _Frame(b, x, y, yaw), b.look(), b.look()
+    f, look, dark = Frame(b, x, y, yaw), b.look(), b.look()
     f.pole(0, 0.25, 0.06, 0.03, 0.38, dark)
     for turn in range(5):
         f.box(
@@ -160,7 +160,7 @@ def office_chair(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def sofa(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, look = _Frame(b, x, y, yaw), b.look()
+    f, look = Frame(b, x, y, yaw), b.look()
     w, d = _between(b, 0.9, 2.4), _between(b, 0.8, 1.0)
     f.box(0, d / 2, 0.06, w, d, 0.34, look)
     f.box(0, 0.12, 0.3, w, 0.22, _between(b, 0.4, 0.6), look)
@@ -171,7 +171,7 @@ def sofa(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def bed(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, frame = _Frame(b, x, y, yaw), b.look()
+    f, frame = Frame(b, x, y, yaw), b.look()
     w, d = _between(b, 0.9, 1.9), 2.05
     f.box(0, 0.03, 0, w + 0.1, 0.06, _between(b, 0.6, 1.2), frame)
     f.box(0, d / 2, 0.1, w, d, 0.2, frame)
@@ -182,7 +182,7 @@ def bed(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def cabinet(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, look, knob = _Frame(b, x, y, yaw), b.look(), b.look()
+    f, look, knob = Frame(b, x, y, yaw), b.look(), b.look()
     w, d, h = _between(b, 0.4, 2.2), _between(b, 0.3, 0.65), _between(b, 0.4, 2.2)
     f.box(0, d / 2, 0, w, d, h, look)
     front = look if b.rng.random() < 0.5 else b.look()
@@ -198,7 +198,7 @@ def cabinet(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def shelves(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, look = _Frame(b, x, y, yaw), b.look()
+    f, look = Frame(b, x, y, yaw), b.look()
     w, d, levels = _between(b, 0.5, 1.8), _between(b, 0.22, 0.4), int(b.rng.integers(2, 7))
     gap = _between(b, 0.28, 0.42)
     for u in (-w / 2, w / 2):
@@ -227,7 +227,7 @@ def shelves(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def counter(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, front, top = _Frame(b, x, y, yaw), b.look(), b.look((0.2, 1.5), shine=0.3)
+    f, front, top = Frame(b, x, y, yaw), b.look(), b.look((0.2, 1.5), shine=0.3)
     units = int(b.rng.integers(2, 6))
     w = units * 0.6
     f.box(0, 0.3, 0.08, w, 0.58, 0.78, front)
@@ -249,7 +249,7 @@ def counter(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def fridge(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, look = _Frame(b, x, y, yaw), b.look((1, 4), shine=0.4)
+    f, look = Frame(b, x, y, yaw), b.look((1, 4), shine=0.4)
     h = _between(b, 0.85, 2.0)
     f.box(0, 0.33, 0, 0.62, 0.64, h, look)
     f.box(0, 0.66, h * 0.35, 0.6, 0.03, h * 0.63, look)
@@ -257,7 +257,7 @@ def fridge(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def plant(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, leaf = _Frame(b, x, y, yaw), b.look((0.05, 0.3))
+    f, leaf = Frame(b, x, y, yaw), b.look((0.05, 0.3))
     h, r = _between(b, 0.3, 1.6), _between(b, 0.1, 0.22)
     f.pole(0, 0.25, 0, r, r * 1.8, b.look())
     f.pole(0, 0.25, 0, 0.015, h, b.look())
@@ -268,7 +268,7 @@ def plant(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def floor_lamp(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, look = _Frame(b, x, y, yaw), b.look()
+    f, look = Frame(b, x, y, yaw), b.look()
     h = _between(b, 1.2, 1.8)
     f.pole(0, 0.2, 0, 0.14, 0.03, look)
     f.pole(0, 0.2, 0, 0.012, h, look)
@@ -276,7 +276,7 @@ def floor_lamp(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def heap(b: Builder, x: float, y: float, yaw: float) -> None:
-    f = _Frame(b, x, y, yaw)
+    f = Frame(b, x, y, yaw)
     for _ in range(b.rng.integers(1, 6)):
         size = b.rng.uniform(0.12, 0.55, 3)
         u, v = _between(b, -0.5, 0.5), _between(b, 0.2, 0.8)
@@ -286,14 +286,14 @@ def heap(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def radiator(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, look = _Frame(b, x, y, yaw), b.look((1, 4))
+    f, look = Frame(b, x, y, yaw), b.look((1, 4))
     n, h = int(b.rng.integers(6, 20)), _between(b, 0.4, 0.8)
     for i in range(n):
         f.box((i - n / 2) * 0.06, 0.08, 0.12, 0.045, 0.1, h, look)
 
 
 def person(b: Builder, x: float, y: float, yaw: float) -> None:
-    f, top, legs, skin = _Frame(b, x, y, yaw), b.look((0.1, 1)), b.look((0.1, 1)), b.look((0.5, 2))
+    f, top, legs, skin = Frame(b, x, y, yaw), b.look((0.1, 1)), b.look((0.1, 1)), b.look((0.5, 2))
     h = _between(b, 1.5, 1.9)
     v = 0.4
     for u in (-0.1, 0.1):
@@ -306,14 +306,14 @@ def person(b: Builder, x: float, y: float, yaw: float) -> None:
 
 def screen(b: Builder, x: float, y: float, yaw: float) -> None:
     """A television on a low board."""
-    f, w = _Frame(b, x, y, yaw), _between(b, 0.7, 1.5)
+    f, w = Frame(b, x, y, yaw), _between(b, 0.7, 1.5)
     f.box(0, 0.22, 0, w * 1.2, 0.4, 0.45, b.look())
     f.box(0, 0.2, 0.5, w, 0.05, w * 0.56, Look(0, 5, (0.05, 0.05, 0.06), (0, 0), 0.8))
 
 
 def odd(b: Builder, x: float, y: float, yaw: float) -> None:
     """Something that has no name: solids in any orientation."""
-    f = _Frame(b, x, y, yaw)
+    f = Frame(b, x, y, yaw)
     look = b.look()
     for _ in range(b.rng.integers(1, 7)):
         half = b.rng.uniform(0.03, 0.35, 3)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from training.synthetic.builder import Builder, Look
-from training.synthetic.furniture import FURNITURE, _Frame, clutter, person
+from training.synthetic.furniture import FURNITURE, Frame, clutter, person
 from training.synthetic.raycast import BALL, BOX, CYLINDER, MIRROR, WINDOW
 
 
@@ -43,7 +43,7 @@ def room(b: Builder) -> Callable[[], Shot]:
     skirting = b.look((1, 5))
     for x, y, yaw, wide in sides:
         look = walls if rng.random() < 0.6 else b.look((0.5, 4))
-        f = _Frame(b, x, y, yaw)
+        f = Frame(b, x, y, yaw)
         b.box(f.at(0, -0.05, 0), (0.1, wide + 0.2, height), look, yaw, **shell)
         f.box(0, 0.008, 0, wide, 0.016, 0.1, skirting)
         _wall(b, f, wide, height)
@@ -69,7 +69,7 @@ def room(b: Builder) -> Callable[[], Shot]:
         along = -wide / 2 + rng.uniform(0.2, 0.9)
         while along < wide / 2 - 0.3:
             if rng.random() < dense:
-                f = _Frame(b, x, y, yaw)
+                f = Frame(b, x, y, yaw)
                 place = f.at(along, 0.03 + (0 if rng.random() < 0.8 else rng.uniform(0, 0.6)), 0)
                 FURNITURE[rng.integers(len(FURNITURE))](b, place[0], place[1], yaw)
             along += rng.uniform(0.7, 1.9)
@@ -107,7 +107,7 @@ def street(b: Builder) -> Callable[[], Shot]:
     if rng.random() < 0.6:
         fronts.append((0.0, rng.uniform(10, 40), -np.pi / 2))
     for x, y, yaw in fronts:
-        f, along = _Frame(b, x, y, yaw), -rng.uniform(8, 20)
+        f, along = Frame(b, x, y, yaw), -rng.uniform(8, 20)
         while along < 15 and b.count < 900:
             wide = rng.uniform(5, 18)
             if rng.random() < 0.9:
@@ -140,9 +140,9 @@ def table_top(b: Builder) -> Callable[[], Shot]:
     b.box((0, 0, -0.05), (rng.uniform(0.6, 3), rng.uniform(0.6, 3), 0.05), b.look((0.2, 2)))
     b.box((0, 0, -0.9), (8, 8, 0.1), b.look((0.4, 3)), shadow=False)
     for x, y, yaw in ((3, 0, np.pi), (0, 3, -np.pi / 2), (-3, 0, 0.0), (0, -3, np.pi / 2)):
-        f = _Frame(b, x * rng.uniform(0.3, 1), y * rng.uniform(0.3, 1), yaw)
+        f = Frame(b, x * rng.uniform(0.3, 1), y * rng.uniform(0.3, 1), yaw)
         b.box(f.at(0, -0.05, -0.8), (0.1, 8, 3), b.look((0.5, 4)), yaw, shadow=False)
-    f = _Frame(b, 0, 0, rng.uniform(0, 6.3))
+    f = Frame(b, 0, 0, rng.uniform(0, 6.3))
     for _ in range(rng.integers(3, 25)):
         spread = rng.uniform(0.1, 0.6)
         clutter(f, rng.normal(0, spread), rng.normal(0, spread), 0.0)
@@ -198,7 +198,7 @@ def _sky(b: Builder) -> None:
     b.sky = np.array([np.ones(3) * grey, zenith, sun / np.linalg.norm(sun)])
 
 
-def _wall(b: Builder, f: _Frame, wide: float, height: float) -> None:
+def _wall(b: Builder, f: Frame, wide: float, height: float) -> None:
     """What hangs on a wall or is let into it."""
     rng = b.rng
     frame = b.look((1, 5))
@@ -241,7 +241,7 @@ def _wall(b: Builder, f: _Frame, wide: float, height: float) -> None:
             b.box(f.at(u, 0.023, z), pane, b.look((w, 1.5 * w)), f.yaw)
 
 
-def _house(b: Builder, f: _Frame, u: float, wide: float) -> None:
+def _house(b: Builder, f: Frame, u: float, wide: float) -> None:
     rng = b.rng
     floors, storey = int(rng.integers(1, 6)), rng.uniform(2.7, 4.2)
     high, deep = floors * storey + rng.uniform(0, 1), rng.uniform(5, 12)
@@ -299,7 +299,7 @@ def _tree(b: Builder, x: float, y: float) -> None:
 
 def _car(b: Builder, x: float, y: float) -> None:
     look, yaw = b.look((2, 6), shine=0.5), b.rng.uniform(0, 6.28)
-    f = _Frame(b, x, y, yaw)
+    f = Frame(b, x, y, yaw)
     f.box(0, 0, 0.3, 4.2, 1.75, 0.55, look)
     f.box(-0.1, 0, 0.8, 2.3, 1.55, 0.6, b.look(shine=0.7))
     for u in (-1.3, 1.3):
@@ -329,7 +329,7 @@ def _basin(b: Builder, x: float, y: float) -> None:
 
 def _wall_or_fence(b: Builder, x: float, y: float) -> None:
     rng, yaw = b.rng, b.rng.uniform(0, 6.28)
-    f, wide, high = _Frame(b, x, y, yaw), rng.uniform(2, 8), rng.uniform(0.4, 2)
+    f, wide, high = Frame(b, x, y, yaw), rng.uniform(2, 8), rng.uniform(0.4, 2)
     if rng.random() < 0.5:
         f.box(0, 0, 0, wide, 0.25, high, b.look())
         return
@@ -345,7 +345,7 @@ def _passer_by(b: Builder, x: float, y: float) -> None:
 
 def _steps(b: Builder, x: float, y: float) -> None:
     rng, look = b.rng, b.look()
-    f, wide = _Frame(b, x, y, rng.uniform(0, 6.28)), rng.uniform(1.5, 6)
+    f, wide = Frame(b, x, y, rng.uniform(0, 6.28)), rng.uniform(1.5, 6)
     for k in range(rng.integers(2, 9)):
         f.box(0, 0.3 * k, 0, wide, 0.3, 0.16 * (k + 1), look)
 
