@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import platform
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,15 +18,15 @@ from mpsfm_core.data import MappingProblem, Pose
 from mpsfm_core.errors import InputError, ReconstructionError
 from mpsfm_core.extraction.focal import estimate_focals
 from mpsfm_core.extraction.runner import Extraction, extract
-from mpsfm_core.inputs.images import ImageSet, find_images, load_images
+from mpsfm_core.files import claimed
+from mpsfm_core.inputs.images import SUMMARY, ImageSet, check_apart, find_images, load_images
 from mpsfm_core.inputs.models import match_names, read_poses
 from mpsfm_core.mapping import mapper
 from mpsfm_core.provision import Provision, provide
 from mpsfm_core.registry import Registry, core_version
-from mpsfm_core.results.folder import check_writable
 from mpsfm_core.results.photos import Photos
 from mpsfm_core.results.summary import describe_images, describe_pairs, describe_reconstructions
-from mpsfm_core.results.writer import SUMMARY, Component, write_failure, write_results
+from mpsfm_core.results.writer import Component, write_failure, write_results
 from mpsfm_core.scene.reconstruction import MappingResult
 from mpsfm_core.stages import Stages
 
@@ -67,6 +68,7 @@ def reconstruct(
     Args:
         images: folder of photos, subfolders included.
         output: folder to write (see :mod:`mpsfm_core.results.writer`), nothing is written if None.
+            A run has it to itself.
         config: name of a shipped configuration, a YAML file, or a loaded one.
         intrinsics: ``intrinsics.yaml``, a COLMAP model or ``transforms.json``; else the cameras
             of ``poses``, else EXIF, else what the depth provider sees, else a default focal length.
@@ -87,9 +89,14 @@ def reconstruct(
         config = load_config(config, overrides, registry)
     elif overrides:
         raise TypeError("overrides go into load_config(), this configuration is loaded already")
-    run = _Run(config, registry, None if output is None else Path(output))
-    with threadpool_limits(config.runtime.workers):
-        return run(Path(images), _path(intrinsics), _path(image_list), _path(poses))
+    folder, target = Path(images), _path(output)
+    run = _Run(config, registry, target)
+    with ExitStack() as stack:
+        stack.enter_context(threadpool_limits(config.runtime.workers))
+        if target is not None:
+            check_apart(target, folder)
+            stack.enter_context(claimed(target))
+        return run(folder, _path(intrinsics), _path(image_list), _path(poses))
 
 
 class _Run:
@@ -110,14 +117,19 @@ class _Run:
         poses: Path | None,
     ) -> ReconstructionResult:
         stage = self._stages.stage
-        if self._output is not None:
-            check_writable(self._output)
         find_images(folder)  # no folder, no downloads
         with stage("providers"):
             self._provision = provide(self._config, self._registry, self._stages)
         config = self._provision.config
         with stage("inputs"):
-            images = load_images(folder, intrinsics, image_list, config.inputs, model=poses)
+            images = load_images(
+                folder,
+                intrinsics,
+                image_list,
+                config.inputs,
+                model=poses,
+                without=self._output,
+            )
             known = {} if poses is None else _known_poses(poses, images)
         with stage("extraction"):
             images = estimate_focals(images, config, self._registry, self._stages)

@@ -38,6 +38,7 @@ import platformdirs
 from filelock import FileLock
 
 from mpsfm_core.errors import WeightsError
+from mpsfm_core.files import write_file
 
 CACHE_VARIABLE = "MPSFM_CACHE"
 """Environment variable that names the cache directory."""
@@ -197,9 +198,7 @@ class WeightStore:
         record = self._record_path
         with FileLock(record.with_suffix(".lock")):
             entries = self._entries() | {uri: {"sha256": sha256, "stamp": _stamp(path)}}
-            temporary = record.with_suffix(".tmp")
-            temporary.write_text(json.dumps(entries, indent=1, sort_keys=True), encoding="utf-8")
-            temporary.replace(record)
+            write_file(record, json.dumps(entries, indent=1, sort_keys=True))
 
     @property
     def _record_path(self) -> Path:

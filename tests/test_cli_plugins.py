@@ -186,3 +186,18 @@ class TestEndings:
     def test_version(self) -> None:
         code, text, _ = mpsfm("--version")
         assert code == 0 and text.strip()
+
+
+def test_checking_a_plugin_of_hooks_says_which(install_plugin: Callable[..., str]) -> None:
+    source = """
+        from mpsfm_core import hookimpl
+        @hookimpl
+        def mpsfm_notice(text):
+            pass
+    """
+    module = install_plugin("mpsfm-hooks", source)
+    entries = f"[mpsfm.plugins]\nlistener = {module}\n"
+    install_plugin("mpsfm-hooks", source, version="2.0", entry_points=entries)
+    code, out, _ = mpsfm("plugins", "check", "listener")
+    assert code == 0
+    assert "listener (mpsfm-hooks 2.0) loads and brings hooks, notice" in out

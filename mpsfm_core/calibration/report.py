@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mpsfm_core.calibration.metrics import NORMAL_COVERAGE
+from mpsfm_core.files import write_file
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
@@ -48,10 +49,10 @@ def write_report(calibration_file: Path, report: Mapping[str, Any]) -> tuple[Pat
     page = calibration_file.with_suffix(".report.html")
     numbers = calibration_file.with_suffix(".report.json")
     svg, png = _plots(report)
-    page.write_text(_page(report, svg), encoding="utf-8")
-    numbers.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    write_file(page, _page(report, svg))
+    write_file(numbers, json.dumps(report, indent=2) + "\n")
     if png is not None:
-        calibration_file.with_suffix(".report.png").write_bytes(png)
+        write_file(calibration_file.with_suffix(".report.png"), png)
     return page, numbers
 
 

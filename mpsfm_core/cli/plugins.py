@@ -50,9 +50,23 @@ def check(
 ) -> None:
     """Check whether providers keep the contract; exit code 1 if one does not."""
     from mpsfm_core.registry import Registry
-    from mpsfm_core.testing.contract import find_providers, known_checks, run_checks, setup_from
+    from mpsfm_core.testing.contract import (
+        find_plugin,
+        find_providers,
+        known_checks,
+        run_checks,
+        setup_from,
+    )
 
     registry = Registry.discover()
+    plugin = find_plugin(registry, name)
+    if plugin is not None and plugin.available and not as_json:
+        hooks = ", ".join(plugin.capabilities)
+        typer.echo(
+            f"{plugin.name} ({plugin.distribution} {plugin.version}) loads and brings hooks, "
+            f"{hooks}, all of them known; it has no provider whose contract could be checked"
+        )
+        return
     wanted = None if only is None else known_checks(only)
     results: list[CheckResult] = []
     for kind, provider in find_providers(registry, name):

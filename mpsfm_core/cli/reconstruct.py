@@ -90,6 +90,8 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
         typer.echo(f"  {refined}")
     for name, reason in images["unconfirmed"].items():
         typer.echo(f"  not confirmed: {name}: {reason}")
+    for name, reason in images["left_out"].items():
+        typer.echo(f"  left out: {name}: {reason}")
     for name, reason in images["unregistered"].items():
         typer.echo(f"  not registered: {name}: {reason}")
     seconds = sum(stage["seconds"] for stage in result.summary["stages"].values())

@@ -30,6 +30,7 @@ from mpsfm_core.evaluation.records import Record, read_record, record_file, writ
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
 from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.runner import extract
+from mpsfm_core.files import write_file
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.providers import hookimpl
@@ -126,10 +127,10 @@ def problem_of_sets(
     stages = Stages(registry)
     loaded = load_config(config, (*settings, *overrides), registry=registry)
     loaded = provide(loaded, registry, stages).config
-    work.mkdir(parents=True, exist_ok=True)
     listed = work / "images.txt"
-    listed.write_text("\n".join(names) + "\n", encoding="utf-8")
-    images = load_images(scene.images, scene.intrinsics, listed, loaded.inputs)
+    write_file(listed, "\n".join(names) + "\n")
+    inputs = loaded.inputs.model_copy(update={"strict": True})  # a set is compared as a whole
+    images = load_images(scene.images, scene.intrinsics, listed, inputs)
     extraction = extract(images, loaded, registry, stages)
     return extraction.problem, loaded.mapper_options()
 

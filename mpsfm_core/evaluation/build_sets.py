@@ -12,6 +12,7 @@ from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.sampling import SamplingOptions, sample_buckets
 from mpsfm_core.evaluation.scene_folder import TESTSETS, SceneFolder, read_scene, write_sets
 from mpsfm_core.inputs.images import load_images
+from mpsfm_core.inputs.options import InputOptions
 
 SOURCES = ("auto", "depth", "model")
 
@@ -56,7 +57,7 @@ def _from_depth(scene: SceneFolder) -> Overlap:
     folder = scene.depth
     files = {name: folder / PurePosixPath(name).with_suffix(".png") for name in scene.truth}
     names = [name for name in sorted(files) if files[name].is_file()]
-    images = load_images(scene.images, scene.intrinsics)
+    images = load_images(scene.images, scene.intrinsics, options=InputOptions(strict=True))
     cameras = {image.name: image.pinhole for image in images}
     return overlap_from_depth(names, scene.truth, cameras, lambda name: read_depth(files[name]))
 

@@ -20,6 +20,7 @@ import numpy as np
 from mpsfm_core.data import Float32
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.scene_folder import SceneFolder
+from mpsfm_core.files import write_file
 from mpsfm_core.testing.degraded_depth import DepthErrors, degrade_depth
 
 QUALITIES = ("sensor", "degraded", "config")
@@ -71,12 +72,9 @@ def write_depth(path: Path, depth: Float32) -> None:
     """Write depth in metres as 16-bit PNG in millimetres; what does not fit becomes 0."""
     stored = np.rint(np.nan_to_num(depth, nan=0.0, posinf=0.0) / _MILLIMETRE)
     stored = np.where((stored > 0) & (stored <= np.iinfo(np.uint16).max), stored, 0)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}")
     ok, data = cv2.imencode(".png", stored.astype(np.uint16))
     assert ok
-    temporary.write_bytes(data.tobytes())
-    temporary.replace(path)
+    write_file(path, data.tobytes())
 
 
 def _from_files(folder: Path, std: float) -> tuple[str, ...]:

@@ -6,7 +6,6 @@ Poses are kept, not numbers made of them, so that any convention can be applied 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.pose_auc import PoseConvention, pose_errors_deg
+from mpsfm_core.files import write_file
 
 RUNS = "runs"
 """Folder of the records below a benchmark's output folder."""
@@ -72,14 +72,11 @@ def record_file(scene: str, config: str, set_name: str, label: str) -> Path:
 def write_record(output: Path, record: Record) -> None:
     """Write a record; a reader sees the whole of it or nothing."""
     path = output / record.file
-    path.parent.mkdir(parents=True, exist_ok=True)
     content = asdict(record)
     content["estimated"] = _packed(record.estimated)
     content["others"] = [_packed(model) for model in record.others]
     content["truth"] = _packed(record.truth)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(content, indent=1), encoding="utf-8")
-    temporary.replace(path)
+    write_file(path, json.dumps(content, indent=1))
 
 
 def read_record(path: Path) -> Record:

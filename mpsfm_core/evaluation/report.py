@@ -18,6 +18,7 @@ from mpsfm_core.evaluation.pose_auc import (
     pose_auc,
 )
 from mpsfm_core.evaluation.records import Record
+from mpsfm_core.files import write_file
 
 ALL_SCENES = "all scenes"
 _COLORS = ("#1b6ca8", "#d1495b", "#2e8b57", "#e08e0b", "#7b4fa3", "#5c5c5c", "#17a2b8", "#a0522d")
@@ -120,7 +121,7 @@ def write_report(output: Path, records: Sequence[Record]) -> None:
     text = markdown(rows, convention)
     if failed:
         text += "\n### Failed\n\n" + "".join(f"- {line}\n" for line in failed)
-    (output / "report.md").write_text(text, encoding="utf-8")
+    write_file(output / "report.md", text)
     content = {
         name: {
             "description": other.description,
@@ -131,8 +132,8 @@ def write_report(output: Path, records: Sequence[Record]) -> None:
     }
     errors = [[*record.name, record.error] for record in records if record.error]
     text = json.dumps({"conventions": content, "errors": errors}, indent=1)
-    (output / "report.json").write_text(text + "\n", encoding="utf-8")
-    (output / "report.html").write_text(_page(rows, records, convention), encoding="utf-8")
+    write_file(output / "report.json", text + "\n")
+    write_file(output / "report.html", _page(rows, records, convention))
 
 
 def _cells(row: Row) -> list[str]:

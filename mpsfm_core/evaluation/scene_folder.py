@@ -24,6 +24,7 @@ import yaml
 
 from mpsfm_core.data import Pose
 from mpsfm_core.errors import InputError
+from mpsfm_core.files import write_file
 from mpsfm_core.inputs.images import find_images
 from mpsfm_core.inputs.models import match_names, read_poses
 from mpsfm_core.yaml_text import write_yaml
@@ -116,7 +117,7 @@ def read_scene(path: Path, *, with_sets: bool = True) -> SceneFolder:
 
 def write_sets(path: Path, buckets: Mapping[str, Sequence[Mapping[str, Any]]], note: str) -> None:
     """Write ``testsets.yaml`` of a scene folder; ``note`` becomes its first line, a comment."""
-    (path / TESTSETS).write_text(f"# {note}\n{write_yaml(dict(buckets))}", encoding="utf-8")
+    write_file(path / TESTSETS, f"# {note}\n{write_yaml(dict(buckets))}")
 
 
 def _answers(bucket: str, wanted: str) -> bool:

@@ -13,18 +13,18 @@ import io
 import json
 import logging
 import os
-import tempfile
 import zipfile
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 import numpy as np
 import platformdirs
 from numpy.typing import NDArray
 
 from mpsfm_core.errors import DataError, OutputError
+from mpsfm_core.files import remove_unfinished, write_file
 from mpsfm_core.weights import CACHE_VARIABLE
 
 _log = logging.getLogger(__name__)
@@ -49,6 +49,8 @@ class Cache:
     def __init__(self, folder: Path | None = None) -> None:
         root = folder or os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("mpsfm")
         self.folder = Path(root).expanduser() / "extraction"
+        self._unfinished = self.folder / "unfinished"
+        remove_unfinished(self._unfinished)
 
     def load(self, kind: str, key: str, cls: type[T]) -> T | None:
         """The entry as an object of ``cls``, None when there is none that can be read."""
@@ -69,10 +71,9 @@ class Cache:
 
     def store(self, kind: str, key: str, value: object) -> None:
         """Keep an object; raises :class:`OutputError` when the disk is full or fails."""
-        path = self._path(kind, key)
+        path, arrays = self._path(kind, key), cast(Any, pack(value))
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            _write_atomically(path, pack(value))
+            write_file(path, lambda file: np.savez(file, **arrays), self._unfinished)
         except OSError as error:
             reason = "the disk is full" if error.errno == errno.ENOSPC else str(error)
             raise OutputError(
@@ -133,16 +134,3 @@ def _data_class(hint: object) -> type | None:
     """The data class that a field's annotation names, alone or ``| None``."""
     kinds = (hint, *get_args(hint))
     return next((k for k in kinds if isinstance(k, type) and is_dataclass(k)), None)
-
-
-def _write_atomically(path: Path, arrays: Arrays) -> None:
-    handle, temporary = tempfile.mkstemp(prefix=".", suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

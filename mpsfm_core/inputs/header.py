@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MAX_ASPECT_DIFFERENCE = 0.02
 """Pixel rounding of a resized photo stays far below; a crop to another format far above."""
 
+_TIFF_WIDTH, _TIFF_HEIGHT = 0x0100, 0x0101
 _ORIENTATION, _EXIF_IFD = 0x0112, 0x8769
 _FOCAL_MM, _FOCAL_35MM = 0x920A, 0xA405
 _PIXELS_X, _PIXELS_Y = 0xA002, 0xA003
@@ -55,6 +57,66 @@ class Header:
             return None
         reduction = max(width, height) / max(recorded) if max(recorded) > 0 else 1.0
         return focal_mm * resolution / unit_mm * reduction
+
+
+def declared_pixels(data: bytes) -> int | None:
+    """Number of pixels that an encoded image says it has, None where it does not say so plainly."""
+    if data[:4] in (b"II*\x00", b"MM\x00*"):
+        tags = _read_tags(data)
+        size = tags.get(_TIFF_WIDTH), tags.get(_TIFF_HEIGHT)
+        return None if None in size else int(size[0] or 0) * int(size[1] or 0)
+    sizes = read_header(data).size or _bmp_size(data) or _webp_size(data) or _pnm_size(data)
+    sizes = sizes or _jp2_size(data)
+    return None if sizes is None else sizes[0] * sizes[1]
+
+
+def is_cut_jpeg(data: bytes) -> bool:
+    """Whether a JPEG ends before its pixels do; decoders fill the rest with grey."""
+    if data[:2] != b"\xff\xd8":
+        return False
+    pixels = 2 + sum(4 + len(payload) for _, payload in _jpeg_segments(data))
+    return data.rfind(b"\xff\xd9", pixels) < 0
+
+
+def _bmp_size(data: bytes) -> tuple[int, int] | None:
+    if data[:2] != b"BM" or len(data) < 26:
+        return None
+    width, height = struct.unpack_from("<ii", data, 18)
+    return abs(width), abs(height)
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    """Of the canvas, or of the first frame."""
+    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
+        return None
+    if data[12:16] == b"VP8X":
+        return _three_bytes(data, 24) + 1, _three_bytes(data, 27) + 1
+    if data[12:16] == b"VP8L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    width, height = struct.unpack_from("<HH", data, 26)
+    return width & 0x3FFF, height & 0x3FFF
+
+
+def _three_bytes(data: bytes, place: int) -> int:
+    return int.from_bytes(data[place : place + 3], "little")
+
+
+def _pnm_size(data: bytes) -> tuple[int, int] | None:
+    gap = rb"(?:\s|#[^\n]*\n)+"
+    found = re.match(rb"P[1-7]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s", data[:4096])
+    return None if found is None else (int(found[1]), int(found[2]))
+
+
+def _jp2_size(data: bytes) -> tuple[int, int] | None:
+    """Of the image header box, or of the SIZ marker of a bare codestream."""
+    box = data.find(b"ihdr", 0, 4096)
+    if data[4:8] == b"jP  " and box > 0 and len(data) >= box + 12:
+        height, width = struct.unpack_from(">II", data, box + 4)
+        return width, height
+    if data[:4] == b"\xff\x4f\xff\x51" and len(data) >= 16:
+        return struct.unpack_from(">II", data, 8)
+    return None
 
 
 def read_header(data: bytes) -> Header:

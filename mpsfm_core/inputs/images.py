@@ -20,7 +20,15 @@ from mpsfm_core.errors import InputError, did_you_mean
 from mpsfm_core.inputs.header import Header, read_header
 from mpsfm_core.inputs.intrinsics import Intrinsics, read_intrinsics
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.inputs.pixels import EXTENSIONS, decode_rgb, read_bytes, read_mask, upright_size
+from mpsfm_core.inputs.pixels import (
+    EXTENSIONS,
+    check_size,
+    check_whole,
+    decode_rgb,
+    read_bytes,
+    read_mask,
+    upright_size,
+)
 from mpsfm_core.inputs.recent import Recent
 from mpsfm_core.inputs.undistortion import (
     Warp,
@@ -43,6 +51,8 @@ _CACHED_WARPS = 2
 _READERS = 4
 """Threads that read and hash files."""
 _MENTIONED = 5
+SUMMARY = "summary.json"
+"""The file that tells a folder of results from one of photos."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,10 +108,17 @@ class ImageSet:
     """Images of a run in a fixed order, with their views on demand.
 
     At most about 512 MB of decoded views are kept. Methods may be called from several threads.
+    ``left_out``: damaged photos -> what is wrong with them.
     """
 
-    def __init__(self, images: Sequence[SourceImage], options: InputOptions) -> None:
+    def __init__(
+        self,
+        images: Sequence[SourceImage],
+        options: InputOptions,
+        left_out: Mapping[str, str] | None = None,
+    ) -> None:
         self.images = tuple(images)
+        self.left_out = dict(left_out or {})
         self._options = options
         self._views: Recent[int, View] = Recent(_CACHED_BYTES, _bytes)
         self._warps: Recent[str, Warp] = Recent(_CACHED_WARPS, lambda _: 1)
@@ -141,7 +158,8 @@ class ImageSet:
             pinhole = _view_camera(camera, self._options)
             return replace(image, camera=camera, pinhole=pinhole, focal_source="provider")
 
-        return ImageSet([changed(image) for image in self.images], self._options)
+        images = [changed(image) for image in self.images]
+        return ImageSet(images, self._options, self.left_out)
 
     def mask(self, index: int) -> Bool | None:
         """The mask of a view; does not decode the image when there is none."""
@@ -197,7 +215,7 @@ class ImageSet:
         path = self._mask_path(image)
         if path is None:
             return None
-        mask = read_mask(path)
+        mask = read_mask(path, self._options.max_pixels)
         if (mask.shape[1], mask.shape[0]) != image.original_size:
             raise InputError(
                 f"mask {path} has {mask.shape[1]}x{mask.shape[0]} pixels, its image "
@@ -213,8 +231,9 @@ def load_images(
     options: InputOptions | None = None,
     *,
     model: Path | None = None,
+    without: Path | None = None,
 ) -> ImageSet:
-    """Find the images of a folder (and its subfolders) and their cameras; decodes no pixels yet.
+    """Find the images of a folder (and its subfolders), check them, and find their cameras.
 
     Args:
         folder: images, in any of the formats of :data:`mpsfm_core.inputs.pixels.EXTENSIONS`.
@@ -233,7 +252,7 @@ def load_images(
     options = options or InputOptions()
     if options.masks is not None and not options.masks.is_dir():
         raise InputError(f"masks folder {options.masks} does not exist")
-    names = find_images(folder)
+    names = find_images(folder, without)
     if image_list is not None:
         names = _listed(image_list, names, folder)
     if len(names) < 2:
@@ -243,11 +262,14 @@ def load_images(
     known = _read_cameras(intrinsics, names)
     partial = _read_cameras(model, names) if known is None else None
     with ThreadPoolExecutor(_READERS) as pool:
-        files = list(pool.map(lambda name: _probe(folder / name), names))
-    _raise_unreadable(files)
+        files = list(pool.map(lambda name: _probe(folder / name, options), names))
+    left_out = {name: file.fault for name, file in zip(names, files, strict=True) if file.fault}
+    _judge(left_out, len(names), options)
     guesses = _CameraGuesses(options, partial.max_id if partial else 0)
     images = []
     for name, file in zip(names, files, strict=True):
+        if file.fault:
+            continue
         focal: FocalSource = "intrinsics"
         if known is not None:
             camera = known.camera(name, file.size)
@@ -257,7 +279,7 @@ def load_images(
             camera, focal = guesses.camera(file)
         images.append(_source_image(name, folder / name, file, camera, focal, options))
     _warn_of_default(images, options)
-    return ImageSet(images, options)
+    return ImageSet(images, options, left_out)
 
 
 def _read_cameras(path: Path | None, names: Sequence[str]) -> Intrinsics | None:
@@ -320,17 +342,49 @@ def _view_camera(camera: pycolmap.Camera, options: InputOptions) -> PinholeCamer
     return pinhole_camera(reduced, options.blank_pixels)
 
 
-def find_images(folder: Path) -> list[str]:
-    """Names of all images below the folder, in natural order; hidden files are left out."""
+def find_images(folder: Path, without: Path | None = None) -> list[str]:
+    """Names of all images below the folder, in natural order.
+
+    Hidden files are left out, and what lies in the subfolder ``without`` or in one that has a
+    :data:`SUMMARY`: that holds results.
+    """
     if not folder.is_dir():
         raise InputError(f"images folder {folder} does not exist")
     found = []
+    own = _below(without, folder)
     for path in folder.rglob("*"):
         relative = path.relative_to(folder)
         hidden = any(part.startswith(".") for part in relative.parts)
-        if path.suffix.lower() in EXTENSIONS and not hidden and path.is_file():
+        if path.suffix.lower() not in EXTENSIONS or hidden or not path.is_file():
+            continue
+        parents = [folder / parent for parent in relative.parents[:-1]]
+        if not any(parent == own or (parent / SUMMARY).is_file() for parent in parents):
             found.append(relative.as_posix())
     return sorted(found, key=_natural)
+
+
+def check_apart(output: Path, folder: Path) -> None:
+    """Raise :class:`InputError` if results in ``output`` would lie among photos."""
+    if output.resolve() == folder.resolve():
+        raise InputError(
+            f"{output} is the folder of the photos: results must not lie among them; choose "
+            f"another output folder, as {output / 'reconstruction'}"
+        )
+    inside = _below(output, folder)
+    if inside is None or not inside.is_dir() or (inside / SUMMARY).is_file():
+        return
+    if photos := find_images(inside):
+        raise InputError(
+            f"{output} is a subfolder of the photos and holds {len(photos)} of them, as "
+            f"{photos[0]}: results must not lie among them; choose another output folder"
+        )
+
+
+def _below(inner: Path | None, folder: Path) -> Path | None:
+    """A folder as a path that begins with ``folder``, None if it is not below it."""
+    if inner is None or not inner.resolve().is_relative_to(folder.resolve()):
+        return None
+    return folder / inner.resolve().relative_to(folder.resolve())
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
@@ -364,9 +418,14 @@ def _listed(image_list: Path, names: list[str], folder: Path) -> list[str]:
     return listed
 
 
-def _probe(path: Path) -> _File:
+def _probe(path: Path, options: InputOptions) -> _File:
     try:
         data = read_bytes(path)
+    except InputError as error:
+        return _File((0, 0), Header(None, 1, {}), "", str(error))
+    check_size(data, path, options.max_pixels)
+    try:
+        check_whole(data, path)
         header = read_header(data)
         size = upright_size(data, header, path)
     except InputError as error:
@@ -374,12 +433,18 @@ def _probe(path: Path) -> _File:
     return _File(size, header, hashlib.sha256(data).hexdigest())
 
 
-def _raise_unreadable(files: Sequence[_File]) -> None:
-    faults = [file.fault for file in files if file.fault]
-    if faults:
-        rest = len(faults) - _MENTIONED
-        more = f"; and {rest} more" if rest > 0 else ""
-        raise InputError("; ".join(faults[:_MENTIONED]) + more)
+def _judge(left_out: Mapping[str, str], total: int, options: InputOptions) -> None:
+    """Warn of damaged photos, or raise if they end the run."""
+    if not left_out:
+        return
+    faults = list(left_out.values())
+    rest = len(faults) - _MENTIONED
+    text = "; ".join(faults[:_MENTIONED]) + (f"; and {rest} more" if rest > 0 else "")
+    if options.strict:
+        raise InputError(f"{text} (inputs.strict=false leaves damaged photos out)")
+    if len(faults) > total / 2 or total - len(faults) < 2:
+        raise InputError(f"{len(faults)} of {total} photos are damaged: {text}")
+    _log.warning("%d of %d photos are damaged and left out: %s", len(faults), total, text)
 
 
 def _warn_of_default(images: Sequence[SourceImage], options: InputOptions) -> None:

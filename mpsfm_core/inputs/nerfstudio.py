@@ -20,7 +20,8 @@ import pycolmap
 from mpsfm_core.data import Float64
 from mpsfm_core.errors import InputError
 from mpsfm_core.inputs.header import read_header
-from mpsfm_core.inputs.pixels import EXTENSIONS, read_bytes, upright_size
+from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.inputs.pixels import EXTENSIONS, check_size, read_bytes, upright_size
 from mpsfm_core.inputs.undistortion import camera_key
 
 _COEFFICIENTS: Mapping[str, tuple[str, ...]] = {
@@ -198,5 +199,6 @@ def _picture_size(where: str, picture: Path) -> dict[str, float]:
     if found is None:
         raise InputError(f"{where}: neither 'w' and 'h' nor the picture is there")
     data = read_bytes(found)
+    check_size(data, found, InputOptions().max_pixels)
     width, height = upright_size(data, read_header(data), found)
     return {"w": width, "h": height}

@@ -15,6 +15,12 @@ class InputOptions(Options):
     max_image_size: int | None = Field(None, ge=32)
     """Longer side in pixels to which larger images are reduced, null keeps their size (the paper's
     evaluation; the published command reduces to 1200)."""
+    max_pixels: int = Field(250_000_000, ge=1024)
+    """Larger photos and masks are refused before they are decoded: a file of a few kilobytes can
+    stand for gigabytes (ours: above every camera, 0.75 GB decoded)."""
+    strict: bool = False
+    """A damaged photo ends the run; else it is left out, with a warning and the reason in the
+    summary, as long as no more than half of the photos are damaged."""
     masks: Path | None = None
     """Folder of masks of the original images, ``NAME.png`` or the name with ``.png`` for its own
     extension; black pixels are not used (COLMAP's convention)."""

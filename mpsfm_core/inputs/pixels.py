@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, UInt8
 from mpsfm_core.errors import InputError
-from mpsfm_core.inputs.header import Header, read_header
+from mpsfm_core.inputs.header import Header, declared_pixels, is_cut_jpeg, read_header
 
 EXTENSIONS = frozenset(
     (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".webp", ".bmp", ".jp2", ".ppm", ".pgm")
@@ -25,6 +25,23 @@ def read_bytes(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"image {path} cannot be read: {error.strerror or error}") from error
+
+
+def check_whole(data: bytes, path: Path) -> None:
+    """Decode an image once, coarsely; raises :class:`InputError` when it is damaged or none."""
+    if is_cut_jpeg(data):
+        raise InputError(f"image {path} is cut off: its end is missing; copy it again")
+    _decode(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
+
+
+def check_size(data: bytes, path: Path, max_pixels: int) -> None:
+    """Raise :class:`InputError` for an image that would take too much memory to decode."""
+    pixels = declared_pixels(data)
+    if pixels is not None and pixels > max_pixels:
+        raise InputError(
+            f"image {path} has {pixels / 1e6:.0f} million pixels, more than inputs.max_pixels="
+            f"{max_pixels}; reduce the image or raise the limit"
+        )
 
 
 def upright_size(data: bytes, header: Header, path: Path) -> tuple[int, int]:
@@ -59,9 +76,10 @@ def decode_rgb(data: bytes, header: Header, path: Path) -> UInt8:
     return orient(rgb.astype(np.uint8), header.orientation)
 
 
-def read_mask(path: Path) -> Bool:
+def read_mask(path: Path, max_pixels: int) -> Bool:
     """(H, W) bool from a mask image, upright: False where it is black."""
     data = read_bytes(path)
+    check_size(data, path, max_pixels)
     rgb = decode_rgb(data, read_header(data), path)
     return np.asarray(rgb.any(axis=2))
 
@@ -77,12 +95,12 @@ def orient(image: UInt8, orientation: int) -> UInt8:
     return np.ascontiguousarray(image)
 
 
-def _decode(data: bytes, path: Path) -> NDArray[Any]:
+def _decode(data: bytes, path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
     if not data:
         raise InputError(f"image {path} is empty")
     try:
         # Unchanged: OpenCV's own rotation and depth conversion differ between formats.
-        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error as error:
         raise InputError(f"image {path} cannot be decoded: {error.err}") from error
     if pixels is None:

@@ -41,6 +41,7 @@ def describe_images(
         "registered": [name for name in images.names if name not in reasons],
         "unconfirmed": {name: reason for name, reason in reasons.items() if name in placed},
         "unregistered": {name: reason for name, reason in reasons.items() if name not in placed},
+        "left_out": images.left_out,
         "details": {
             image.name: {
                 **_focal_length(image, cameras.get(image.name)),

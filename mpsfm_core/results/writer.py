@@ -26,17 +26,17 @@ from typing import Any
 import pycolmap
 
 from mpsfm_core.data import UInt8
+from mpsfm_core.files import replacing
+from mpsfm_core.inputs.images import SUMMARY
 from mpsfm_core.inputs.nerfstudio import can_hold, write_transforms
 from mpsfm_core.results.colmap_model import build_model, pinhole, point_colors, write_model
 from mpsfm_core.results.dense_cloud import fuse_depth_maps
 from mpsfm_core.results.depth_maps import write_depth_maps
-from mpsfm_core.results.folder import replacing
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos
 from mpsfm_core.results.ply import write_ply
 from mpsfm_core.scene.reconstruction import Reconstruction
 
-SUMMARY = "summary.json"
 ENTRIES = (
     "sparse",
     "sparse_text",
@@ -90,7 +90,7 @@ def write_results(
 
     ``components``: one at least, largest first. ``summarize``: gives the plain data of the
     summary, called when all else is written. ``seed``: of the choice of pixels for ``dense.ply``.
-    Raises what :func:`mpsfm_core.results.folder.replacing` raises.
+    Raises what :func:`mpsfm_core.files.replacing` raises.
     """
     best, rest = components[0], components[1:]
     with replacing(output, ENTRIES) as folder:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from mpsfm_core.errors import InputError, MpsfmError, ProviderError, did_you_mean
 from mpsfm_core.providers import Kind, ProviderSpec
-from mpsfm_core.registry import Registry
+from mpsfm_core.registry import ProviderStatus, Registry
 from mpsfm_core.testing import (
     checks_depth,
     checks_features,
@@ -217,14 +217,21 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
         if name in (line.name, f"{line.kind}/{line.name}", line.distribution)
     ]
     if not found:
-        plugin = next((line for line in registry.status() if line.distribution == name), None)
+        plugin = find_plugin(registry, name)
         if plugin is not None and plugin.available:
             raise ProviderError(f"{name} brings hooks and no providers to check")
         if plugin is not None:
             raise ProviderError(f"{name} {plugin.reason}; {plugin.install_hint}")
-        candidates = {n for line in known for n in (line.name, line.distribution)}
+        candidates = {n for line in registry.status() for n in (line.name, line.distribution)}
         raise InputError(f"no provider or plugin {name!r}{did_you_mean(name, candidates)}")
     return [(kind, name) for kind, name in found if kind != "plugin"]
+
+
+def find_plugin(registry: Registry, name: str) -> ProviderStatus | None:
+    """The plugin without providers (it brings hooks only, or fails) of this entry point or
+    distribution, if there is one."""
+    plugins = (line for line in registry.status() if line.kind == "plugin")
+    return next((line for line in plugins if name in (line.name, line.distribution)), None)
 
 
 def setup_from(assignments: Sequence[str]) -> Setup | None:

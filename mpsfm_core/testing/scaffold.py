@@ -9,6 +9,7 @@ from pathlib import Path
 from string import Template
 
 from mpsfm_core.errors import InputError
+from mpsfm_core.files import write_file
 from mpsfm_core.providers import Kind
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -48,8 +49,7 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> list[Path]:
     texts = {path: _filled(source, words) for path, source in files.items()}
     texts[target / module / "__init__.py"] = ""
     for path, text in texts.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        write_file(path, text)
     return sorted(texts)
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from mpsfm_core.errors import ConfigError
+from mpsfm_core.files import write_file
 from mpsfm_core.options import Options, SettingsError, parse_settings
 from mpsfm_core.uncertainty.model import Calibration, DepthCalibration, NormalCalibration
 from mpsfm_core.yaml_text import parse_yaml, write_yaml
@@ -76,7 +77,7 @@ class CalibrationFile(Options):
             text = self.model_dump_json(indent=2) + "\n"
         else:
             text = write_yaml(self.model_dump(mode="json"))
-        path.write_text(text, encoding="utf-8")
+        write_file(path, text)
 
 
 def read_values(path: Path, kind: str) -> Mapping[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ import pytest
 
 from mpsfm_core.errors import InputError
 from mpsfm_core.inputs import images as module
-from mpsfm_core.inputs.images import ImageSet, load_images
+from mpsfm_core.inputs.images import ImageSet, check_apart, find_images, load_images
 from mpsfm_core.inputs.options import InputOptions
 
 INTRINSICS = "1: {params: [70, 70, 40, 30], images: all}"
@@ -80,19 +81,70 @@ def test_bad_folders(tmp_path: Path, write_image) -> None:
     assert "only one image, 'one.png'" in message and "two or more" in message
 
 
-def test_unreadable_files_are_all_named(folder: Path, intrinsics: Path) -> None:
+def test_damaged_photos_are_left_out_with_their_reasons(
+    folder: Path, intrinsics: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = load_images(folder, intrinsics).names
     (folder / "broken.jpg").write_bytes(b"hello")
     (folder / "empty.png").write_bytes(b"")
-    message = refused(folder, intrinsics)
-    assert "broken.jpg" in message and "empty.png" in message
-
-
-def test_truncated_file_is_refused_when_decoded(folder: Path, intrinsics: Path) -> None:
-    path = folder / "img2.jpg"
-    path.write_bytes(path.read_bytes()[:-400])
     found = load_images(folder, intrinsics)
-    with pytest.raises(InputError, match=r"img2\.jpg cannot be decoded"):
-        found.view(0)
+    assert found.names == whole
+    assert found.left_out.keys() == {"broken.jpg", "empty.png"}
+    assert "is empty" in found.left_out["empty.png"]
+    assert "broken.jpg" in caplog.text and "empty.png" in caplog.text
+    assert found.with_focals({}).left_out == found.left_out
+    with pytest.raises(InputError, match=r"broken\.jpg.*empty\.png"):
+        load_images(folder, intrinsics, options=InputOptions(strict=True))
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9])
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp", ".bmp", ".jp2"])
+def test_a_cut_photo_is_left_out(tmp_path: Path, write_image, suffix: str, share: float) -> None:
+    for name in ("a.png", "b.png", "c.png", f"cut{suffix}"):
+        write_image(name)
+    path = tmp_path / "images" / f"cut{suffix}"
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    found = load_images(tmp_path / "images")
+    assert list(found.left_out) == [path.name]
+
+
+def test_more_than_half_damaged_ends_the_run(folder: Path, intrinsics: Path) -> None:
+    count = len(load_images(folder, intrinsics))
+    for number in range(count + 1):
+        (folder / f"broken{number}.jpg").write_bytes(b"hello")
+    text = refused(folder, intrinsics)
+    assert f"{count + 1} of {2 * count + 1} photos are damaged" in text
+    assert "broken0.jpg" in text
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp", ".bmp", ".jp2", ".ppm"])
+def test_too_many_pixels_are_refused_before_decoding(
+    tmp_path: Path, write_image, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    write_image(f"a{suffix}")
+    write_image(f"b{suffix}")
+    monkeypatch.setattr("cv2.imdecode", None)
+    with pytest.raises(InputError, match=r"inputs\.max_pixels=1024"):
+        load_images(tmp_path / "images", options=InputOptions(max_pixels=1024))
+
+
+def test_results_below_the_photos_are_no_input(folder: Path) -> None:
+    names = find_images(folder)
+    inner = folder / "out" / "undistorted" / "images"
+    inner.mkdir(parents=True)
+    shutil.copy(folder / names[0], inner)
+    assert len(find_images(folder)) == len(names) + 1
+    assert find_images(folder, folder / "out") == names
+    with pytest.raises(InputError, match="holds 1 of them"):
+        check_apart(folder / "out", folder)
+    (folder / "out" / "summary.json").write_text("{}")
+    assert find_images(folder) == names
+    check_apart(folder / "out", folder)
+    check_apart(folder / "new", folder)
+    check_apart(folder.parent / "elsewhere", folder)
+    with pytest.raises(InputError, match="the folder of the photos"):
+        check_apart(folder / ".", folder)
 
 
 def test_focal_length_from_exif(tmp_path: Path, write_image) -> None:

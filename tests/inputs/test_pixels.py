@@ -139,4 +139,4 @@ def test_missing_file(tmp_path: Path) -> None:
 def test_mask(photo, write_image) -> None:
     drawn = np.zeros(photo.shape[:2], dtype=np.uint8)
     drawn[10:20, 30:50] = 255
-    assert np.array_equal(read_mask(write_image("m.png", drawn)), drawn > 0)
+    assert np.array_equal(read_mask(write_image("m.png", drawn), 4800), drawn > 0)

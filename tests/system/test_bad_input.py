@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mpsfm_core.files import claimed
+
 
 @pytest.fixture
 def output(tmp_path: Path) -> Path:
@@ -59,16 +61,29 @@ def test_one_image(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
     check(ended, 2, "only one image", "0.png")
 
 
-def test_an_unreadable_file(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
+def test_an_unreadable_file_if_that_is_to_end_the_run(
+    photo_scene, mpsfm, output: Path, tmp_path: Path
+) -> None:
     images = tmp_path / "images"
     shutil.copytree(photo_scene.images, images)
     data = (images / "2.png").read_bytes()
     (images / "2.png").write_bytes(data[: len(data) // 3])
     (images / "9.jpg").write_text("this is no picture")
     arguments = ["reconstruct", images, *photo_scene.arguments[2:], "--output", output]
+    arguments += ["--set", "inputs.strict=true"]
     check(mpsfm(*arguments), 2, "9.jpg")
     (images / "9.jpg").unlink()
     check(mpsfm(*arguments), 2, "2.png")
+
+
+def test_results_among_the_photos(photo_scene, mpsfm) -> None:
+    ended = mpsfm(*photo_scene.arguments, "--output", photo_scene.images)
+    check(ended, 2, "is the folder of the photos")
+
+
+def test_a_folder_that_another_run_has(photo_scene, mpsfm, output: Path) -> None:
+    with claimed(output):
+        check(mpsfm(*photo_scene.arguments, "--output", output), 2, "another run is writing")
 
 
 def test_intrinsics_of_another_size(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
