@@ -108,6 +108,7 @@ class _Run:
         self._output = output
         self._stages = Stages(registry)
         self._provision = Provision(config, ())
+        self._folder = Path()
 
     def __call__(
         self,
@@ -121,6 +122,7 @@ class _Run:
         with stage("providers"):
             self._provision = provide(self._config, self._registry, self._stages)
         config = self._provision.config
+        self._folder = folder
         with stage("inputs"):
             images = load_images(
                 folder,
@@ -180,6 +182,7 @@ class _Run:
     ) -> dict[str, Any]:
         return {
             "status": status,
+            "photos": str(self._folder.resolve()),
             "images": describe_images(images, extraction.report, mapping),
             "pairs": describe_pairs(extraction.report, mapping),
             "reconstructions": describe_reconstructions(mapping, models),

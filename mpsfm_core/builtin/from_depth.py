@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from mpsfm_core.builtin.options import FromDepthOptions
-from mpsfm_core.data import Bool, DepthPrior, Float64, NormalPrior, View
+from mpsfm_core.data import Bool, DepthPrior, Float64, NormalPrior, PinholeCamera, View
 from mpsfm_core.errors import ProviderError
 from mpsfm_core.geometry import pixel_centers, rays
 from mpsfm_core.providers import ProviderContext
@@ -45,27 +45,37 @@ class FromDepth:
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         """Normals with variance; invalid at depth edges, holes and the border of the map."""
-        if depth is None or depth.variance is None:
+        if depth is None:
             raise ProviderError("from-depth needs a depth prior with its variance")
-        rows, columns = depth.shape
-        xy = rays(view.camera.resized(columns, rows), pixel_centers(columns, rows))[..., :2]
-        inverse = 1.0 / np.where(depth.valid, depth.depth, 1.0).astype(np.float64)
-        bends = _relative_bends(inverse, depth.valid)
-        roughness = float(np.median(bends[depth.valid])) / _MEDIAN_BEND if depth.valid.any() else 0
-        edges = bends > max(self._options.edge, _NOISE_MARGIN * roughness)
-        noise = (roughness / _BEND_NOISE * inverse) ** 2
-        radius = max(1, round(self._options.radius * max(rows, columns)))
-        fit = _fit_without_edges(xy, inverse, noise, depth.valid & ~edges, edges, radius)
-        squared_length = np.maximum((fit.plane**2).sum(axis=-1), 1e-300)
-        relative = depth.variance / np.maximum(depth.depth.astype(np.float64), 1e-12) ** 2
-        # A surface seen at a grazing angle is tilted less by the same error along the ray.
-        tilt = self._options.slope_std**2 * relative * inverse**2
-        return NormalPrior.from_arrays(
-            -fit.plane / np.sqrt(squared_length)[..., None],
-            np.clip((tilt + fit.variance) / squared_length, *_VARIANCE_RANGE),
-            fit.solved,
-            camera=view.camera,
-        )
+        return fit_normals(view.camera, depth, self._options)
+
+
+def fit_normals(camera: PinholeCamera, depth: DepthPrior, options: FromDepthOptions) -> NormalPrior:
+    """What :class:`FromDepth` predicts for a depth map that covers the view of a camera.
+
+    Raises :class:`ProviderError` when the map has no variance.
+    """
+    if depth.variance is None:
+        raise ProviderError("from-depth needs a depth prior with its variance")
+    rows, columns = depth.shape
+    xy = rays(camera.resized(columns, rows), pixel_centers(columns, rows))[..., :2]
+    inverse = 1.0 / np.where(depth.valid, depth.depth, 1.0).astype(np.float64)
+    bends = _relative_bends(inverse, depth.valid)
+    roughness = float(np.median(bends[depth.valid])) / _MEDIAN_BEND if depth.valid.any() else 0
+    edges = bends > max(options.edge, _NOISE_MARGIN * roughness)
+    noise = (roughness / _BEND_NOISE * inverse) ** 2
+    radius = max(1, round(options.radius * max(rows, columns)))
+    fit = _fit_without_edges(xy, inverse, noise, depth.valid & ~edges, edges, radius)
+    squared_length = np.maximum((fit.plane**2).sum(axis=-1), 1e-300)
+    relative = depth.variance / np.maximum(depth.depth.astype(np.float64), 1e-12) ** 2
+    # A surface seen at a grazing angle is tilted less by the same error along the ray.
+    tilt = options.slope_std**2 * relative * inverse**2
+    return NormalPrior.from_arrays(
+        -fit.plane / np.sqrt(squared_length)[..., None],
+        np.clip((tilt + fit.variance) / squared_length, *_VARIANCE_RANGE),
+        fit.solved,
+        camera=camera,
+    )
 
 
 class _Fit(NamedTuple):

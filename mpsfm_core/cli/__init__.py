@@ -20,6 +20,7 @@ from mpsfm_core.cli import (
     config,
     demo,
     evaluate,
+    export,
     models,
     plugins,
     reconstruct,
@@ -44,6 +45,7 @@ def build_app() -> typer.Typer:
     )
     app.command("reconstruct")(reconstruct.reconstruct)
     app.command("demo")(demo.demo)
+    app.command("export")(export.export)
     app.command("evaluate")(evaluate.evaluate)
     app.command("benchmark")(benchmark.benchmark)
     app.command("calibrate")(calibrate.calibrate)

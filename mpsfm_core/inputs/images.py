@@ -232,6 +232,7 @@ def load_images(
     *,
     model: Path | None = None,
     without: Path | None = None,
+    names: Sequence[str] | None = None,
 ) -> ImageSet:
     """Find the images of a folder (and its subfolders), check them, and find their cameras.
 
@@ -244,6 +245,7 @@ def load_images(
         options: see :class:`InputOptions`.
         model: COLMAP model or ``transforms.json`` of some of the images. Without ``intrinsics``
             they have its cameras, and the others too if it has just one of their size.
+        names: these images only, instead of all or of those of ``image_list``; one is enough.
 
     Raises:
         InputError: no or only one image, unreadable files, names of the list that do not exist
@@ -252,13 +254,14 @@ def load_images(
     options = options or InputOptions()
     if options.masks is not None and not options.masks.is_dir():
         raise InputError(f"masks folder {options.masks} does not exist")
-    names = find_images(folder, without)
-    if image_list is not None:
-        names = _listed(image_list, names, folder)
-    if len(names) < 2:
-        found = f"only one image, {names[0]!r}" if names else "no images"
-        source = image_list or folder
-        raise InputError(f"{source} has {found}: a reconstruction needs two or more")
+    if names is None:
+        names = find_images(folder, without)
+        if image_list is not None:
+            names = _listed(image_list, names, folder)
+        if len(names) < 2:
+            found = f"only one image, {names[0]!r}" if names else "no images"
+            source = image_list or folder
+            raise InputError(f"{source} has {found}: a reconstruction needs two or more")
     known = _read_cameras(intrinsics, names)
     partial = _read_cameras(model, names) if known is None else None
     with ThreadPoolExecutor(_READERS) as pool:

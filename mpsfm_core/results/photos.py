@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import cv2
 import pycolmap
 
 from mpsfm_core.data import Float64, MappingProblem, View
+from mpsfm_core.inputs.header import read_header
 from mpsfm_core.inputs.images import ImageSet, SourceImage
+from mpsfm_core.inputs.pixels import read_bytes
 from mpsfm_core.inputs.undistortion import is_pinhole
 from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
+
+_PORTABLE = frozenset((".jpg", ".jpeg", ".png"))
+_QUALITY = 95
+"""Of JPEG files that are encoded again (OpenCV's default)."""
 
 
 class Photos:
@@ -49,8 +55,29 @@ class Photos:
         return any(not is_pinhole(self.source(image).camera) for image in reconstruction.images)
 
     def write_view(self, image: RegisteredImage, path: Path) -> None:
-        """Write the undistorted view in the photo's own format."""
-        bgr = cv2.cvtColor(self.view(image.name).image, cv2.COLOR_RGB2BGR)
-        _, data = cv2.imencode(path.suffix, bgr)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data.tobytes())
+        """Write the undistorted view as :func:`copy_view` does."""
+        copy_view(self._images, self._rows[image.name], path)
+
+
+def portable_name(name: str) -> str:
+    """What an undistorted view is called: as its photo, with ``.jpg`` behind what not every
+    program reads."""
+    return name if PurePosixPath(name).suffix.lower() in _PORTABLE else f"{name}.jpg"
+
+
+def copy_view(images: ImageSet, index: int, path: Path) -> None:
+    """Write the undistorted view of a photo, upright, in the format that ``path`` ends in.
+
+    A photo that is already so is copied as it is.
+    """
+    image = images[index]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unchanged = is_pinhole(image.camera) and image.pinhole.size == image.original_size
+    if unchanged and path.suffix == image.path.suffix:
+        data = read_bytes(image.path)
+        if read_header(data).orientation == 1:
+            path.write_bytes(data)
+            return
+    bgr = cv2.cvtColor(images.view(index).image, cv2.COLOR_RGB2BGR)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    path.write_bytes(cv2.imencode(path.suffix, bgr, quality)[1].tobytes())

@@ -7,6 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from mpsfm_core.data import Float64, UInt8
+from mpsfm_core.errors import InputError
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4"},
+    **{"uint32": "<u4", "float": "<f4", "double": "<f8", "float32": "<f4", "float64": "<f8"},
+}
+_LONGEST_HEADER = 1 << 16
 
 
 def write_ply(path: Path, points: Float64, colors: UInt8) -> None:
@@ -22,3 +30,43 @@ def write_ply(path: Path, points: Float64, colors: UInt8) -> None:
         "end_header",
     ]
     path.write_bytes("\n".join([*header, ""]).encode("ascii") + vertices.tobytes())
+
+
+def read_ply(path: Path) -> tuple[Float64, UInt8]:
+    """Points (n, 3) and RGB colours (n, 3) of a binary little-endian PLY; grey without colours.
+
+    Raises :class:`InputError` when it is another kind of file, or cut off.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
+    end = data.find(b"end_header\n", 0, _LONGEST_HEADER)
+    lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
+    if lines[:2] != ["ply", "format binary_little_endian 1.0"]:
+        raise InputError(f"{path}: is no binary little-endian PLY file")
+    layout: list[tuple[str, str]] = []
+    count = 0
+    for line in lines[2:]:
+        match line.split():
+            case ["element", "vertex", number] if number.isdecimal():
+                count = int(number)
+            case ["element", *_]:
+                break  # vertices come first
+            case ["property", kind, name] if kind in _TYPES:
+                layout.append((name, _TYPES[kind]))
+    vertex = np.dtype(layout)
+    names = vertex.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise InputError(f"{path}: its points have no x, y and z")
+    body = memoryview(data)[end + len(b"end_header\n") :]
+    if len(body) < count * vertex.itemsize:
+        raise InputError(f"{path}: is cut off, {count} points are announced")
+    vertices = np.frombuffer(body, vertex, count)
+    points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: has points that are not finite")
+    rgb = ("red", "green", "blue")
+    if not set(rgb) <= set(names):
+        return points, np.full((count, 3), 128, np.uint8)
+    return points, np.stack([vertices[color] for color in rgb], axis=1).astype(np.uint8)

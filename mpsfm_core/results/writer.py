@@ -19,7 +19,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,18 +33,20 @@ from mpsfm_core.results.colmap_model import build_model, pinhole, point_colors, 
 from mpsfm_core.results.dense_cloud import fuse_depth_maps
 from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.options import ResultOptions
-from mpsfm_core.results.photos import Photos
+from mpsfm_core.results.photos import Photos, portable_name
 from mpsfm_core.results.ply import write_ply
 from mpsfm_core.scene.reconstruction import Reconstruction
 
+DENSE = "dense.ply"
+DEPTH = "depth"
 ENTRIES = (
     "sparse",
     "sparse_text",
     "components",
     "undistorted",
     "points.ply",
-    "dense.ply",
-    "depth",
+    DENSE,
+    DEPTH,
     "transforms.json",
     SUMMARY,
 )
@@ -75,7 +77,9 @@ class Component:
         """The model of the undistorted views."""
         cameras = [pinhole(image.camera) for image in self.reconstruction.images]
         keypoints = photos.keypoints(self.reconstruction)
-        return build_model(self.reconstruction, cameras, keypoints, self.colors)
+        images = (replace(i, name=portable_name(i.name)) for i in self.reconstruction.images)
+        renamed = replace(self.reconstruction, images=tuple(images))
+        return build_model(renamed, cameras, keypoints, self.colors)
 
 
 def write_results(
@@ -102,9 +106,9 @@ def write_results(
         write_ply(folder / "points.ply", best.reconstruction.points, best.colors)
         if options.dense_cloud:
             dense = fuse_depth_maps(best.reconstruction, photos.view, options, seed)
-            write_ply(folder / "dense.ply", *dense)
+            write_ply(folder / DENSE, *dense)
         if options.depth_maps:
-            write_depth_maps(folder / "depth", best.reconstruction)
+            write_depth_maps(folder / DEPTH, best.reconstruction)
         if photos.any_distorted(best.reconstruction):
             _write_undistorted(folder / "undistorted", best, photos)
         if options.nerfstudio:
@@ -121,7 +125,7 @@ def write_failure(output: Path, summary: Mapping[str, Any]) -> None:
 def _write_undistorted(folder: Path, component: Component, photos: Photos) -> None:
     write_model(folder / "sparse", component.undistorted(photos))
     for image in component.reconstruction.images:
-        photos.write_view(image, folder / "images" / image.name)
+        photos.write_view(image, folder / "images" / portable_name(image.name))
 
 
 def _write_nerfstudio(path: Path, output: Path, component: Component, photos: Photos) -> None:
@@ -132,7 +136,8 @@ def _write_nerfstudio(path: Path, output: Path, component: Component, photos: Ph
         files = {image.name: os.path.relpath(photos.source(image).path, output) for image in images}
     else:
         model = component.undistorted(photos)
-        files = {image.name: f"undistorted/images/{image.name}" for image in images}
+        names = [portable_name(image.name) for image in images]
+        files = {name: f"undistorted/images/{name}" for name in names}
     write_transforms(path, model, files)
 
 

@@ -1,0 +1,37 @@
+"""Bundler's ``bundle.out`` (version 0.3) and ``list.txt``, with undistorted photos.
+
+Its cameras look along -z with y up; keypoints are relative to the principal point, y up.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mpsfm_core.results.exports.source import Source
+from mpsfm_core.results.exports.tracks import describe_points, numbers, rows_of_images
+
+ENTRIES = ("bundle.out", "list.txt", "images")
+_FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+def write(source: Source, folder: Path) -> None:
+    """Write the folder. Raises :class:`~mpsfm_core.errors.InputError` without the photos.
+
+    The format has one focal length a camera: the mean of both, which differ by little.
+    """
+    model = source.undistorted()
+    source.write_photos(folder / "images")
+    images = rows_of_images(model)
+    lines = ["# Bundle file v0.3", f"{len(images)} {model.num_points3D()}"]
+    for image in images:
+        pose = image.cam_from_world()
+        focal = model.cameras[image.camera_id].mean_focal_length()
+        lines += [f"{focal:.12g} 0 0", *map(numbers, _FLIP @ pose.rotation.matrix())]
+        lines.append(numbers(_FLIP @ pose.translation))
+    for point in describe_points(model, y_sign=-1):
+        lines += point
+    (folder / "bundle.out").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    names = [f"images/{image.name}" for image in images]
+    (folder / "list.txt").write_text("\n".join([*names, ""]), encoding="utf-8")

@@ -1,0 +1,90 @@
+"""A folder for Gaussian splatting, as gsplat, Inria's code and nerfstudio's splatfacto read it.
+
+::
+
+    images/NAME          undistorted photos
+    sparse/0/            COLMAP model of them, pinhole cameras, points with colour
+    gaussians.ply        a Gaussian for each point: centre, colour and size
+    maps/NAME.npz        refined depth and normals with their std
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mpsfm_core.data import Float64, UInt8
+from mpsfm_core.results.colmap_model import write_model
+from mpsfm_core.results.exports.source import Source
+
+ENTRIES = ("images", "sparse", "gaussians.ply", "maps")
+_NEIGHBOURS = 3
+"""Size of a Gaussian: root mean square distance to so many neighbours (Kerbl et al. 2023)."""
+_OPACITY = 0.1
+"""Of a Gaussian at first (Kerbl et al. 2023)."""
+_MAX_GAUSSIANS = 500_000
+_SH_0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+
+def write(source: Source, folder: Path) -> None:
+    """Write the folder. Raises :class:`~mpsfm_core.errors.InputError` without the photos."""
+    source.write_photos(folder / "images")
+    write_model(folder / "sparse" / "0", source.undistorted())
+    write_maps(source, folder / "maps")
+    points, colors = source.dense_points()
+    if len(points) > _MAX_GAUSSIANS:
+        chosen = np.random.default_rng(0).choice(len(points), _MAX_GAUSSIANS, replace=False)
+        points, colors = points[chosen], colors[chosen]
+    if len(points) > _NEIGHBOURS:
+        write_gaussians(folder / "gaussians.ply", points, colors)
+
+
+def write_maps(source: Source, folder: Path) -> None:
+    """Write ``folder/NAME.npz`` for each image that has refined depth.
+
+    Arrays: ``depth`` and ``depth_std`` (h, w) float32, z in units of the world; ``normals``
+    (h, w, 3) float32, unit, camera frame (x right, y down, z forward), and ``normals_std`` (h, w)
+    float32, radians, along each tangent; ``depth_valid``, ``normals_valid`` (h, w) bool;
+    ``camera`` (4,) float64, fx, fy, cx, cy on this grid, which covers the undistorted photo.
+    """
+    for name in source.names:
+        maps = source.maps(name)
+        if maps is None:
+            continue
+        path = folder / f"{name}.npz"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        assert maps.depth.variance is not None and maps.normals.variance is not None
+        np.savez_compressed(
+            path,
+            depth=maps.depth.depth,
+            depth_std=np.sqrt(maps.depth.variance),
+            depth_valid=maps.depth.valid,
+            normals=maps.normals.normals,
+            normals_std=np.sqrt(maps.normals.variance),
+            normals_valid=maps.normals.valid,
+            camera=maps.camera.params,
+        )
+
+
+def write_gaussians(path: Path, points: Float64, colors: UInt8) -> None:
+    """Write isotropic Gaussians in the PLY layout of Kerbl et al. (2023), which viewers read.
+
+    ``points``: (n, 3), more than three. ``colors``: (n, 3) RGB.
+    """
+    distance = cKDTree(points).query(points, k=_NEIGHBOURS + 1)[0][:, 1:]
+    size = np.sqrt((distance**2).mean(axis=1))
+    size = np.maximum(size, np.median(size) * 1e-3 + 1e-12)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    rows = np.zeros((len(points), len(names)), dtype="<f4")
+    rows[:, 0:3] = points
+    rows[:, 6:9] = (colors / 255.0 - 0.5) / _SH_0
+    rows[:, 9] = np.log(_OPACITY / (1 - _OPACITY))
+    rows[:, 10:13] = np.log(size)[:, None]
+    rows[:, 13] = 1.0
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [*(f"property float {name}" for name in names), "end_header", ""]
+    path.write_bytes("\n".join(header).encode("ascii") + rows.tobytes())

@@ -1,0 +1,38 @@
+"""VisualSFM's N-View Match file, with undistorted photos.
+
+Its keypoints are relative to the principal point, x right and y down.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mpsfm_core.errors import InputError
+from mpsfm_core.results.exports.source import Source
+from mpsfm_core.results.exports.tracks import describe_points, numbers, rows_of_images
+
+ENTRIES = ("reconstruction.nvm", "images")
+
+
+def write(source: Source, folder: Path) -> None:
+    """Write the folder. Raises :class:`InputError` without the photos, or when the name of one has
+    a space, which the format cannot hold.
+
+    The format has one focal length a camera: the mean of both, which differ by little.
+    """
+    model = source.undistorted()
+    images = rows_of_images(model)
+    for image in images:
+        if len(str(image.name).split()) != 1:
+            raise InputError(f"NVM files cannot name {image.name!r}: a name must have no space")
+    source.write_photos(folder / "images")
+    lines = ["NVM_V3", "", str(len(images))]
+    for image in images:
+        x, y, z, w = image.cam_from_world().rotation.quat
+        focal = model.cameras[image.camera_id].mean_focal_length()
+        place = numbers([w, x, y, z, *image.projection_center()])
+        lines.append(f"images/{image.name}\t{focal:.12g} {place} 0 0")
+    lines += ["", str(model.num_points3D())]
+    lines += [" ".join(point) for point in describe_points(model, y_sign=1)]
+    text = "\n".join([*lines, "", "0", ""])
+    (folder / "reconstruction.nvm").write_text(text, encoding="utf-8")

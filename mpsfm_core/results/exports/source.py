@@ -1,0 +1,260 @@
+"""What is exported: a result folder or a COLMAP model, read and checked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.builtin.from_depth import fit_normals
+from mpsfm_core.builtin.options import FromDepthOptions
+from mpsfm_core.data import DepthPrior, Float64, NormalPrior, PinholeCamera, UInt8
+from mpsfm_core.errors import InputError
+from mpsfm_core.inputs.images import ImageSet, find_images, load_images
+from mpsfm_core.inputs.models import match_names, model_folder, read_model
+from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.results.colmap_model import pinhole
+from mpsfm_core.results.orientation import Gravity, estimate_gravity, rotation_to_z
+from mpsfm_core.results.photos import copy_view, portable_name
+from mpsfm_core.results.ply import read_ply
+from mpsfm_core.results.writer import DENSE, DEPTH, SUMMARY
+
+_NORMALS_AN_IMAGE = 2000
+"""Normals of an image that are asked for the direction of gravity."""
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """Refined depth of an image and the normals of its surfaces, on one grid.
+
+    ``camera``: of that grid. Depth is in the units of the exported world.
+    """
+
+    camera: PinholeCamera
+    depth: DepthPrior
+    normals: NormalPrior
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A reconstruction to be exported, and what lies beside it.
+
+    ``model``: of the original photos; images whose pose is only a guess are left out.
+    ``photos``: the folder of the photos, None if nobody knows. ``summary``: of the run, empty for a
+    COLMAP model. ``world_from_model``: what was applied to the model in the folder.
+    ``gravity``: None if the world is as it was.
+    """
+
+    folder: Path
+    model: pycolmap.Reconstruction
+    photos: Path | None
+    summary: Mapping[str, Any]
+    left_out: tuple[str, ...] = ()
+    world_from_model: pycolmap.Sim3d = field(default_factory=pycolmap.Sim3d)
+    gravity: Gravity | None = None
+
+    @classmethod
+    def read(cls, folder: Path, photos: Path | None = None) -> Source:
+        """Read a folder; ``photos`` if they are not where the run found them.
+
+        Raises :class:`InputError` when there is no model, or what is there is damaged.
+        """
+        summary = _read_summary(folder / SUMMARY)
+        model = read_model(folder)
+        guesses = tuple(summary.get("images", {}).get("unconfirmed", ()))
+        for image in list(model.images.values()):
+            if image.name in guesses:
+                model.deregister_frame(image.frame_id)
+        if not model.num_reg_images():
+            raise InputError(f"{folder}: the model has no image with a pose")
+        if photos is None:
+            known = summary.get("photos")
+            beside = model_folder(folder).parent / "images"
+            candidates = [Path(known)] if known else [folder / "images", beside]
+            photos = next((path for path in candidates if path.is_dir()), None)
+        return cls(folder, model, photos, summary, guesses)
+
+    @property
+    def metres_per_unit(self) -> float | None:
+        """Metres in a unit of the exported world, None if unknown."""
+        described = self.summary.get("reconstructions") or [{}]
+        metric = described[0].get("metric_scale")
+        if metric is None:
+            return None
+        before = 1.0 if metric["trusted"] else float(metric["metres_per_unit"])
+        return before / float(self.world_from_model.scale)
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of the images that have a pose, sorted."""
+        return sorted(str(self.model.images[i].name) for i in self.model.reg_image_ids())
+
+    @cached_property
+    def images(self) -> ImageSet:
+        """The photos of the registered images in the order of :attr:`names`.
+
+        Raises :class:`InputError` when they are not there.
+        """
+        if self.photos is None:
+            known = self.summary.get("photos", "")
+            where = f" (the run had them in {known})" if known else ""
+            raise InputError(
+                f"{self.folder}: its photos are not known{where}; say where they are with --images"
+            )
+        found = match_names(self.names, find_images(self.photos))
+        missing = [name for name in self.names if name not in found]
+        if missing:
+            raise InputError(
+                f"{self.photos}: has no photo {missing[0]!r}"
+                + (f" and {len(missing) - 1} more of the model" if len(missing) > 1 else "")
+            )
+        settings = self.summary.get("config", {}).get("inputs", {})
+        options = InputOptions(
+            max_image_size=settings.get("max_image_size"),
+            blank_pixels=settings.get("blank_pixels", 0.0),
+        )
+        names = [found[name] for name in self.names]
+        return load_images(self.photos, model_folder(self.folder), options=options, names=names)
+
+    def turned(self) -> Source:
+        """With gravity along -z, and the middle of the points, else of the cameras, as origin."""
+        gravity = estimate_gravity(self._rotations(), self._world_normals())
+        first = self._rotations()[0]
+        rotation = rotation_to_z(gravity.up, first[0])
+        points = self.points()[0]
+        if not len(points):
+            points = np.stack([image.projection_center() for image in self.registered()])
+        moved = pycolmap.Sim3d(
+            1.0, pycolmap.Rotation3d(rotation), -rotation @ np.median(points, axis=0)
+        )
+        return replace(self._transformed(moved), gravity=gravity)
+
+    def registered(self) -> list[pycolmap.Image]:
+        """The images with a pose, in the order of :attr:`names`."""
+        by_name = {str(image.name): image for image in self.model.images.values()}
+        return [by_name[name] for name in self.names]
+
+    def points(self) -> tuple[Float64, UInt8]:
+        """Positions (n, 3) and RGB colours (n, 3) of the model's points, in the order of ids."""
+        ids = sorted(self.model.points3D)
+        points = [self.model.points3D[i] for i in ids]
+        xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
+        return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
+
+    def dense_points(self) -> tuple[Float64, UInt8]:
+        """The fused depth maps as :meth:`points`, else the points of the model."""
+        path = self.folder / DENSE
+        if not path.is_file():
+            return self.points()
+        points, colors = read_ply(path)
+        moved: Float64 = self.world_from_model * points
+        return moved, colors
+
+    def maps(self, name: str) -> Maps | None:
+        """Depth and normals of an image, None if the folder has none.
+
+        Raises :class:`InputError` when the file is damaged.
+        """
+        path = self.folder / DEPTH / f"{name}.npz"
+        if not path.is_file():
+            return None
+        camera, depth = _read_depth(path, float(self.world_from_model.scale))
+        return Maps(camera, depth, fit_normals(camera, depth, FromDepthOptions()))
+
+    def undistorted(self) -> pycolmap.Reconstruction:
+        """A model of pinhole cameras for what :meth:`write_photos` writes.
+
+        Image and point ids are the model's; keypoints without a point are left out.
+        """
+        model = pycolmap.Reconstruction()
+        cameras: dict[str, int] = {}
+        rows: dict[int, dict[int, int]] = {}
+        for image, photo in zip(self.registered(), self.images, strict=True):
+            camera = pinhole(photo.pinhole)
+            key = str(camera.todict())
+            if key not in cameras:
+                cameras[key] = camera.camera_id = len(cameras) + 1
+                model.add_camera_with_trivial_rig(camera)
+            seen = [k for k, point in enumerate(image.points2D) if point.has_point3D()]
+            xy = np.array([image.points2D[k].xy for k in seen], dtype=np.float64).reshape(-1, 2)
+            xy = photo.view_pixels(xy)
+            kept = np.flatnonzero(np.isfinite(xy).all(axis=1))
+            rows[image.image_id] = {seen[k]: row for row, k in enumerate(kept)}
+            new = pycolmap.Image(
+                name=portable_name(str(image.name)),
+                keypoints=xy[kept],
+                camera_id=cameras[key],
+                image_id=image.image_id,
+            )
+            model.add_image_with_trivial_frame(new, image.cam_from_world())
+        for number, point in sorted(self.model.points3D.items()):
+            track = [
+                pycolmap.TrackElement(element.image_id, rows[element.image_id][element.point2D_idx])
+                for element in point.track.elements
+                if element.point2D_idx in rows.get(element.image_id, ())
+            ]
+            if track:
+                model.add_point3D_with_id(
+                    number,
+                    pycolmap.Point3D(xyz=point.xyz, color=point.color, track=pycolmap.Track(track)),
+                )
+        model.update_point_3d_errors()
+        return model
+
+    def write_photos(self, folder: Path) -> None:
+        """The photos upright, undistorted, and in a format that everybody reads."""
+        for index, name in enumerate(self.names):
+            copy_view(self.images, index, folder / portable_name(name))
+
+    def _transformed(self, similarity: pycolmap.Sim3d) -> Source:
+        model = pycolmap.Reconstruction(self.model)
+        model.transform(similarity)
+        return replace(self, model=model, world_from_model=similarity * self.world_from_model)
+
+    def _rotations(self) -> Float64:
+        return np.stack([image.cam_from_world().rotation.matrix() for image in self.registered()])
+
+    def _world_normals(self) -> Float64:
+        """Normals (n, 3) of the surfaces in all photos that have depth."""
+        found = [np.zeros((0, 3))]
+        for image in self.registered():
+            maps = self.maps(str(image.name))
+            if maps is None:
+                continue
+            normals = maps.normals.normals[maps.normals.valid].astype(np.float64)
+            step = max(1, len(normals) // _NORMALS_AN_IMAGE)
+            found.append(normals[::step] @ image.cam_from_world().rotation.matrix())
+        return np.concatenate(found)
+
+
+def _read_summary(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from error
+    if not isinstance(summary, dict):
+        raise InputError(f"{path}: is no summary of a run")
+    if summary.get("status") == "failed":
+        raise InputError(f"{path.parent}: the run made no reconstruction; {SUMMARY} says why")
+    return summary
+
+
+def _read_depth(path: Path, scale: float) -> tuple[PinholeCamera, DepthPrior]:
+    """A file of :func:`mpsfm_core.results.depth_maps.write_depth_maps`, depth times ``scale``."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            depth, variance = file["depth"], file["variance"]
+            valid, camera = file["valid"], file["camera"]
+        rows, columns = depth.shape
+        grid = PinholeCamera(columns, rows, *map(float, camera))
+        return grid, DepthPrior(depth * np.float32(scale), variance * np.float32(scale**2), valid)
+    except Exception as error:  # numpy has no base class for what damaged archives raise
+        raise InputError(f"{path}: is no depth map of a run, or damaged: {error}") from error

@@ -1,0 +1,39 @@
+"""What Bundler's and VisualSFM's files share: pinhole images in a row, points with their views."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pycolmap
+
+
+def rows_of_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """The images by name: their places are what the formats number them by."""
+    return sorted(model.images.values(), key=lambda image: str(image.name))
+
+
+def describe_points(model: pycolmap.Reconstruction, y_sign: int) -> list[tuple[str, str, str]]:
+    """For each point its position, its colour, and its views as text.
+
+    Views: their number, then for each the image's row, the keypoint's row and its x and y in
+    pixels relative to the principal point. ``y_sign``: 1 for y down, -1 for y up.
+    """
+    rows = {image.image_id: row for row, image in enumerate(rows_of_images(model))}
+    described = []
+    for _, point in sorted(model.points3D.items()):
+        views = []
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            camera = model.cameras[image.camera_id]
+            x, y = image.points2D[element.point2D_idx].xy
+            x, y = x - camera.principal_point_x, y_sign * (y - camera.principal_point_y)
+            views.append(f"{rows[element.image_id]} {element.point2D_idx} {x:.8g} {y:.8g}")
+        color = " ".join(str(int(value)) for value in point.color)
+        described.append((numbers(point.xyz), color, " ".join([str(len(views)), *views])))
+    return described
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Numbers in a line, to twelve digits."""
+    return " ".join(f"{value:.12g}" for value in np.asarray(values))
