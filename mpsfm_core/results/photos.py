@@ -15,8 +15,6 @@ from mpsfm_core.inputs.undistortion import is_pinhole
 from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
 
 _PORTABLE = frozenset((".jpg", ".jpeg", ".png"))
-_QUALITY = 95
-"""Of JPEG files that are encoded again (OpenCV's default)."""
 
 
 class Photos:
@@ -79,5 +77,4 @@ def copy_view(images: ImageSet, index: int, path: Path) -> None:
             path.write_bytes(data)
             return
     bgr = cv2.cvtColor(images.view(index).image, cv2.COLOR_RGB2BGR)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
-    path.write_bytes(cv2.imencode(path.suffix, bgr, quality)[1].tobytes())
+    path.write_bytes(cv2.imencode(path.suffix, bgr)[1].tobytes())

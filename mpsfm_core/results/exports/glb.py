@@ -32,7 +32,8 @@ def write(source: Source, folder: Path) -> None:
     scene, y_up = _Scene(), _FLIP if source.gravity is None else _Y_UP_FROM_Z
     points, colors = source.dense_points()
     if len(points):
-        scene.add("points", scene.mesh(_POINTS, points @ y_up.T, np.asarray(colors)), {})
+        mesh = scene.mesh("points", _POINTS, points @ y_up.T, np.asarray(colors))
+        scene.add({"name": "points", "mesh": mesh})
     spread = _spread(np.vstack([points, [i.projection_center() for i in source.registered()]]))
     for image in source.registered():
         camera = source.model.cameras[image.camera_id]
@@ -42,9 +43,12 @@ def write(source: Source, folder: Path) -> None:
         node = np.eye(4)
         node[:3, :3] = y_up @ pose.rotation.matrix() @ _FLIP
         node[:3, 3] = y_up @ pose.translation
-        outline = scene.mesh(_LINES, _outline(half) * spread * _OUTLINE, None)
-        place = {"matrix": node.T.ravel().tolist(), "camera": scene.camera(half)}
-        scene.add(str(image.name), outline, place)
+        name = str(image.name)
+        outline = scene.mesh(f"{name} outline", _LINES, _outline(half) * spread * _OUTLINE, None)
+        child = scene.add({"name": f"{name} outline", "mesh": outline}, root=False)
+        camera_id = scene.camera(name, half)
+        place = {"matrix": node.T.ravel().tolist(), "camera": camera_id, "children": [child]}
+        scene.add({"name": name, **place})
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scene.glb").write_bytes(scene.encode())
 
@@ -75,12 +79,15 @@ class _Scene:
             **{name: [] for name in ("nodes", "meshes", "cameras", "accessors", "bufferViews")},
         }
 
-    def add(self, name: str, mesh: int, further: dict[str, Any]) -> None:
-        """A node of the scene."""
-        self._json["scenes"][0]["nodes"].append(len(self._json["nodes"]))
-        self._json["nodes"].append({"name": name, "mesh": mesh, **further})
+    def add(self, node: dict[str, Any], root: bool = True) -> int:
+        """A node, of the scene itself or of another node; its number."""
+        number = len(self._json["nodes"])
+        self._json["nodes"].append(node)
+        if root:
+            self._json["scenes"][0]["nodes"].append(number)
+        return number
 
-    def mesh(self, mode: int, points: Float64, colors: NDArray[np.uint8] | None) -> int:
+    def mesh(self, name: str, mode: int, points: Float64, colors: NDArray[np.uint8] | None) -> int:
         """Points (n, 3), or the ends of lines, maybe with RGB colours (n, 3); its number."""
         positions = points.astype("<f4")
         bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
@@ -89,17 +96,19 @@ class _Scene:
             opaque = np.concatenate([colors, np.full((len(colors), 1), 255, np.uint8)], axis=1)
             described = {"normalized": True}
             attributes["COLOR_0"] = self._accessor(opaque, "VEC4", _BYTE, described)
-        self._json["meshes"].append({"primitives": [{"mode": mode, "attributes": attributes}]})
+        primitive = {"mode": mode, "attributes": attributes}
+        self._json["meshes"].append({"name": name, "primitives": [primitive]})
         return len(self._json["meshes"]) - 1
 
-    def camera(self, half: Float64) -> int:
+    def camera(self, name: str, half: Float64) -> int:
         """A camera that sees so far to the sides and up at z = -1; its number."""
         described = {
             "aspectRatio": float(half[0] / half[1]),
             "yfov": float(2 * np.arctan(half[1])),
             "znear": 0.01,
         }
-        self._json["cameras"].append({"type": "perspective", "perspective": described})
+        camera = {"name": name, "type": "perspective", "perspective": described}
+        self._json["cameras"].append(camera)
         return len(self._json["cameras"]) - 1
 
     def encode(self) -> bytes:

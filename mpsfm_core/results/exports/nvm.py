@@ -26,7 +26,7 @@ def write(source: Source, folder: Path) -> None:
         if len(str(image.name).split()) != 1:
             raise InputError(f"NVM files cannot name {image.name!r}: a name must have no space")
     source.write_photos(folder / "images")
-    lines = ["NVM_V3", "", str(len(images))]
+    lines = ["NVM_V3 ", " ", str(len(images))]  # VisualSFM has the spaces, MeshLab needs them
     for image in images:
         x, y, z, w = image.cam_from_world().rotation.quat
         focal = model.cameras[image.camera_id].mean_focal_length()

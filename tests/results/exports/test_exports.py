@@ -1,0 +1,256 @@
+"""Every format, opened by the program or library that reads it where that can be installed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import trimesh
+
+from mpsfm_core.errors import InputError
+from mpsfm_core.geometry import angle_between_deg
+from mpsfm_core.inputs.nerfstudio import read_transforms
+from mpsfm_core.results.exports.formats import FORMATS, export
+from mpsfm_core.results.ply import read_ply
+
+REGISTERED = ["2.webp.jpg", "a/0.png", "a/1.jpg"]
+"""As the undistorted photos are called; the fourth is not confirmed."""
+
+
+def model_of(result: Path) -> pycolmap.Reconstruction:
+    return pycolmap.Reconstruction(str(result / "sparse"))
+
+
+def median_error(image, camera, depth, points) -> float:
+    """Relative error of a depth map that covers the photo, at the points that project into it."""
+    local = image.cam_from_world() * points
+    scale = depth.shape[1] / camera.width
+    column, row = (camera.img_from_cam(local) * scale).astype(int).T
+    return float(np.median(np.abs(depth[row, column] / local[:, 2] - 1)))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_format_writes_what_it_says_and_leaves_guesses_out(
+    result: Path, tmp_path: Path, name: str
+) -> None:
+    described = export(result, name, tmp_path / "out")
+    written = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert written == sorted((*FORMATS[name].entries, "export.json"))
+    assert described["left_out"] == ["guess.png"]
+    assert described["images"] == 3
+    assert described["metres_per_unit"] == 1.0
+    saved = json.loads((tmp_path / "out" / "export.json").read_text())
+    assert saved == {key: value for key, value in described.items() if key != "output"}
+
+
+@pytest.mark.parametrize("turn", [True, False])
+def test_gsplat_reads_the_folder(result: Path, tmp_path: Path, turn: bool) -> None:
+    """What gsplat's examples/datasets/colmap.py asks for, step by step."""
+    export(result, "gsplat", tmp_path, turn=turn)
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    names = [model.images[i].name for i in model.reg_image_ids()]
+    assert sorted(names) == REGISTERED
+    folder = tmp_path / "images"
+    files = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+    assert sorted(files) == REGISTERED
+    assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        assert cv2.imread(str(folder / image.name)).shape == (camera.height, camera.width, 3)
+    assert model.num_points3D() == 60
+    assert model.compute_mean_reprojection_error() < 1e-3
+    colors = np.array([point.color for point in model.points3D.values()])
+    assert colors.std(axis=0).min() > 1
+
+
+def test_gaussians_have_place_colour_and_size(result: Path, tmp_path: Path) -> None:
+    export(result, "gsplat", tmp_path, turn=False)
+    data = (tmp_path / "gaussians.ply").read_bytes()
+    header, _, body = data.partition(b"end_header\n")
+    fields = [line.split()[-1].decode() for line in header.splitlines() if b"property" in line]
+    rows = np.frombuffer(body, "<f4").reshape(-1, len(fields))
+    points, colors = read_ply(result / "dense.ply")
+    assert len(rows) == len(points)
+    column = {name: rows[:, index] for index, name in enumerate(fields)}
+    np.testing.assert_allclose(rows[:, :3], points, atol=1e-6)
+    red = 0.28209479177387814 * column["f_dc_0"] + 0.5
+    np.testing.assert_allclose(red * 255, colors[:, 0], atol=1e-3)
+    nearest = np.median(np.exp(column["scale_0"]))
+    assert 0.001 < nearest < 0.2  # metres, in a room seen by 80 x 60 pixels
+    assert (column["rot_0"] == 1).all()
+
+
+@pytest.mark.parametrize("turn", [True, False])
+def test_maps_lift_to_the_surfaces_of_the_exported_world(
+    result: Path, tmp_path: Path, turn: bool
+) -> None:
+    export(result, "gsplat", tmp_path, turn=turn)
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    image = model.find_image_with_name("a/0.png")
+    with np.load(tmp_path / "maps" / "a" / "0.png.npz") as maps:
+        camera = model.cameras[image.camera_id]
+        scale = maps["depth"].shape[1] / camera.width
+        assert maps["camera"][0] == pytest.approx(camera.focal_length_x * scale)
+        points = np.array([point.xyz for point in model.points3D.values()])
+        assert median_error(image, camera, maps["depth"], points) < 0.01
+        length = np.linalg.norm(maps["normals"][maps["normals_valid"]], axis=1)
+        np.testing.assert_allclose(length, 1, atol=1e-3)
+        assert np.median(maps["depth_std"] / maps["depth"]) == pytest.approx(0.01, rel=0.01)
+        assert (maps["normals_std"][maps["normals_valid"]] > 0).all()
+
+
+def test_nerfstudio_has_a_depth_for_every_frame_and_keeps_our_up(
+    result: Path, tmp_path: Path
+) -> None:
+    export(result, "nerfstudio", tmp_path)
+    transforms = json.loads((tmp_path / "transforms.json").read_text())
+    assert transforms["orientation_override"] == "none"
+    assert transforms["camera_model"] == "OPENCV"
+    points, _ = read_ply(tmp_path / transforms["ply_file_path"])
+    assert len(points) == 60
+    poses = read_transforms(tmp_path / "transforms.json")
+    for frame in transforms["frames"]:
+        assert (tmp_path / frame["file_path"]).is_file()
+        depth = np.load(tmp_path / frame["depth_file_path"]) * 0.001
+        image = poses.find_image_with_name(frame["file_path"])
+        camera = poses.cameras[image.camera_id]
+        assert median_error(image, camera, depth, points) < 0.01
+
+
+def test_colmap_reads_the_text_model(result: Path, tmp_path: Path) -> None:
+    export(result, "colmap-text", tmp_path)
+    model, original = pycolmap.Reconstruction(str(tmp_path)), model_of(result)
+    assert model.num_reg_images() == 3
+    for number, point in model.points3D.items():
+        np.testing.assert_allclose(point.xyz, original.points3D[number].xyz)
+
+
+def test_colmap_maps_from_the_database(result: Path, tmp_path: Path) -> None:
+    export(result, "colmap-db", tmp_path / "db")
+    path = tmp_path / "db" / "database.db"
+    with pycolmap.Database.open(str(path)) as database:
+        assert database.num_images() == 4  # the guess has keypoints, but no matches
+        assert database.num_verified_image_pairs() == 3
+    options = pycolmap.IncrementalPipelineOptions()
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    options.random_seed, options.num_threads = 0, 1
+    options.mapper.init_min_tri_angle = 5
+    options.mapper.init_min_num_inliers = 30
+    photos = result.parent / "photos"
+    models = pycolmap.incremental_mapping(str(path), str(photos), str(tmp_path), options)
+    assert [model.num_reg_images() for model in models.values()] == [3]
+    assert models[0].compute_mean_reprojection_error() < 0.1
+
+
+def test_trimesh_reads_the_glb(result: Path, tmp_path: Path) -> None:
+    """Blender 5.0 was tried by hand: it has points with colour, and a camera for each photo."""
+    export(result, "glb", tmp_path)
+    scene = trimesh.load(tmp_path / "scene.glb")
+    points, colors = read_ply(result / "dense.ply")
+    cloud = scene.geometry["points"]
+    assert isinstance(cloud, trimesh.PointCloud)
+    np.testing.assert_array_equal(np.asarray(cloud.colors)[:, :3], colors)
+    described = json.loads((tmp_path / "export.json").read_text())
+    turned = pycolmap.Sim3d(np.array(described["world_from_model"])) * points
+    np.testing.assert_allclose(cloud.vertices, turned[:, [0, 2, 1]] * [1, 1, -1], atol=1e-5)
+    cameras = {"2.webp", "a/0.png", "a/1.jpg"}
+    assert cameras <= set(scene.graph.nodes)
+    model = model_of(result)
+    for name in cameras:
+        center = model.find_image_with_name(name).projection_center()
+        turned = pycolmap.Sim3d(np.array(described["world_from_model"])) * center
+        place = scene.graph[name][0][:3, 3]
+        np.testing.assert_allclose(place, turned[[0, 2, 1]] * [1, 1, -1], atol=1e-5)
+
+
+def test_bundler_projects_by_its_own_formula(result: Path, tmp_path: Path) -> None:
+    """x = f * -P / P.z with P = R X + t (Snavely's manual). MeshLab was tried by hand."""
+    export(result, "bundler", tmp_path)
+    names = (tmp_path / "list.txt").read_text().split()
+    assert names == [f"images/{name}" for name in REGISTERED]
+    assert all((tmp_path / name).is_file() for name in names)
+    lines = iter((tmp_path / "bundle.out").read_text().splitlines())
+    assert next(lines) == "# Bundle file v0.3"
+    cameras, points = map(int, next(lines).split())
+    blocks = [[[*map(float, next(lines).split())] for _ in range(5)] for _ in range(cameras)]
+    for _ in range(points):
+        xyz, color = np.array(next(lines).split(), float), next(lines).split()
+        assert len(color) == 3
+        count, *views = next(lines).split()
+        assert len(views) == 4 * int(count)
+        for view in np.array(views, float).reshape(-1, 4):
+            (focal, k1, k2), *rotation, translation = blocks[int(view[0])]
+            assert (k1, k2) == (0, 0)
+            local = np.array(rotation) @ xyz + translation
+            np.testing.assert_allclose(-focal * local[:2] / local[2], view[2:], atol=0.5)
+    assert next(lines, None) is None
+
+
+def test_nvm_projects_by_its_own_formula(result: Path, tmp_path: Path) -> None:
+    """x = f * (R (X - C)), R from the quaternion (VisualSFM's page). MeshLab was tried by hand."""
+    export(result, "nvm", tmp_path)
+    lines = (tmp_path / "reconstruction.nvm").read_text().splitlines()
+    assert lines[0].strip() == "NVM_V3"
+    count = int(lines[2])
+    cameras = []
+    for line in lines[3 : 3 + count]:
+        name, numbers = line.split("\t")
+        assert (tmp_path / name).is_file()
+        focal, w, x, y, z, *center = map(float, numbers.split()[:8])
+        cameras.append((focal, pycolmap.Rotation3d([x, y, z, w]).matrix(), np.array(center)))
+    points = int(lines[4 + count])
+    assert points == 60
+    for line in lines[5 + count : 5 + count + points]:
+        values = [float(value) for value in line.split()]
+        for view in np.array(values[7:]).reshape(int(values[6]), 4):
+            focal, rotation, center = cameras[int(view[0])]
+            local = rotation @ (np.array(values[:3]) - center)
+            np.testing.assert_allclose(focal * local[:2] / local[2], view[2:], atol=0.5)
+
+
+def test_turned_worlds_have_gravity_down_and_their_middle_at_the_origin(
+    result: Path, tmp_path: Path
+) -> None:
+    described = export(result, "gsplat", tmp_path)
+    assert "gravity from cameras and surfaces" in described["orientation"]
+    turned = np.array(described["world_from_model"])
+    truth = np.array([0.0, 0.0, 1.0])  # z is up in the analytic room
+    assert angle_between_deg(turned[:, :3] @ truth, np.array([0, 0, 1.0])) < 0.5
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    middle = np.median([point.xyz for point in model.points3D.values()], axis=0)
+    np.testing.assert_allclose(middle, 0, atol=1e-9)
+
+
+def test_a_colmap_model_is_exported_with_the_photos_that_are_named(
+    result: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    model_of(result).write_binary(str(folder))
+    with pytest.raises(InputError, match="say where they are with --images"):
+        export(folder, "gsplat")
+    described = export(folder, "gsplat", photos=result.parent / "photos")
+    assert described["images"] == 4  # nobody says here that one is a guess
+    assert described["metres_per_unit"] is None
+    assert "gravity from how the cameras are held" in described["orientation"]
+    assert not (folder / "exports" / "gsplat" / "maps").exists()
+
+
+def test_another_export_replaces_the_last_one_and_nothing_else(
+    result: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "old.png").write_text("")
+    export(result, "bundler", tmp_path)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert not (tmp_path / "images" / "old.png").exists()
+
+
+def test_an_unknown_format_is_told_with_the_nearest_one(result: Path) -> None:
+    with pytest.raises(InputError, match="did you mean 'gsplat'"):
+        export(result, "gsplt")
