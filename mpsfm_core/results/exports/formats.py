@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.files import replacing
 from mpsfm_core.results.exports import (
     bundler,
     colmap_database,
@@ -19,7 +20,6 @@ from mpsfm_core.results.exports import (
     nvm,
 )
 from mpsfm_core.results.exports.source import Source
-from mpsfm_core.results.folder import replacing
 
 DESCRIPTION = "export.json"
 """Beside every export: what it holds, its unit, which way is up, and how it came from the run."""

@@ -16,14 +16,14 @@ from mpsfm_core.builtin.from_depth import fit_normals
 from mpsfm_core.builtin.options import FromDepthOptions
 from mpsfm_core.data import DepthPrior, Float64, NormalPrior, PinholeCamera, UInt8
 from mpsfm_core.errors import InputError
-from mpsfm_core.inputs.images import ImageSet, find_images, load_images
+from mpsfm_core.inputs.images import SUMMARY, ImageSet, find_images, load_images
 from mpsfm_core.inputs.models import match_names, model_folder, read_model
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.results.colmap_model import pinhole
 from mpsfm_core.results.orientation import Gravity, estimate_gravity, rotation_to_z
 from mpsfm_core.results.photos import copy_view, portable_name
 from mpsfm_core.results.ply import read_ply
-from mpsfm_core.results.writer import DENSE, DEPTH, SUMMARY
+from mpsfm_core.results.writer import DENSE, DEPTH
 
 _NORMALS_AN_IMAGE = 2000
 """Normals of an image that are asked for the direction of gravity."""
@@ -118,6 +118,7 @@ class Source:
         options = InputOptions(
             max_image_size=settings.get("max_image_size"),
             blank_pixels=settings.get("blank_pixels", 0.0),
+            strict=True,
         )
         names = [found[name] for name in self.names]
         return load_images(self.photos, model_folder(self.folder), options=options, names=names)
@@ -130,9 +131,8 @@ class Source:
         points = self.points()[0]
         if not len(points):
             points = np.stack([image.projection_center() for image in self.registered()])
-        moved = pycolmap.Sim3d(
-            1.0, pycolmap.Rotation3d(rotation), -rotation @ np.median(points, axis=0)
-        )
+        middle = np.median(points @ rotation.T, axis=0)
+        moved = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation), -middle)
         return replace(self._transformed(moved), gravity=gravity)
 
     def registered(self) -> list[pycolmap.Image]:
