@@ -56,6 +56,9 @@ class RuntimeOptions(Options):
     """Where providers compute; ``auto`` takes a GPU when there is one."""
     cache_dir: Path | None = None
     """Folder of weights and extraction results, null for the platform's cache folder."""
+    checkpoint_s: float | None = Field(60.0, ge=0)
+    """Seconds between checkpoints of the mapping, more where writing one takes long; a run that
+    was killed goes on from the last. Null writes none."""
     offline: bool = False
     """Never download; a missing weights file is an error."""
 

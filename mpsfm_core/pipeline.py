@@ -13,6 +13,7 @@ from typing import Any
 import pycolmap
 from threadpoolctl import threadpool_limits
 
+from mpsfm_core.checkpoints import DiskCheckpoints
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import MappingProblem, Pose
 from mpsfm_core.errors import InputError, ReconstructionError
@@ -62,6 +63,7 @@ def reconstruct(
     poses: PathLike | None = None,
     overrides: Sequence[str] = (),
     registry: Registry | None = None,
+    fresh: bool = False,
 ) -> ReconstructionResult:
     """Reconstruct a folder of photos.
 
@@ -77,6 +79,7 @@ def reconstruct(
             ``mapping.known_poses`` says whether they are a start or stay.
         overrides: settings such as ``"runtime.workers=2"``; not with a loaded configuration.
         registry: the providers to choose from, by default those of all installed plugins.
+        fresh: do not go on from the checkpoint that a run left which was killed while mapping.
 
     Raises:
         InputError: images, intrinsics, poses, configuration, weights or output are wrong. What
@@ -90,7 +93,7 @@ def reconstruct(
     elif overrides:
         raise TypeError("overrides go into load_config(), this configuration is loaded already")
     folder, target = Path(images), _path(output)
-    run = _Run(config, registry, target)
+    run = _Run(config, registry, target, fresh)
     with ExitStack() as stack:
         stack.enter_context(threadpool_limits(config.runtime.workers))
         if target is not None:
@@ -102,10 +105,13 @@ def reconstruct(
 class _Run:
     """One reconstruction: the rooms in their order."""
 
-    def __init__(self, config: Config, registry: Registry, output: Path | None) -> None:
+    def __init__(
+        self, config: Config, registry: Registry, output: Path | None, fresh: bool
+    ) -> None:
         self._config = config
         self._registry = registry
         self._output = output
+        self._fresh = fresh
         self._stages = Stages(registry)
         self._provision = Provision(config, ())
         self._folder = Path()
@@ -138,8 +144,11 @@ class _Run:
             extraction = extract(images, config, self._registry, self._stages)
         problem = _with_poses(extraction.problem, known)
         with stage("mapping"):
-            mapping = mapper.reconstruct(problem, config.mapper_options(), self._stages)
+            options, checkpoints = config.mapper_options(), self._checkpoints(problem)
+            mapping = mapper.reconstruct(problem, options, self._stages, checkpoints)
         if not mapping.reconstructions:
+            if checkpoints is not None:
+                checkpoints.forget()
             self._give_up(images, extraction, mapping)
         summary: dict[str, Any] = {}
         with stage("results"):
@@ -156,7 +165,24 @@ class _Run:
             else:
                 seed = config.runtime.seed
                 write_results(self._output, components, photos, config.results, summarize, seed)
+        if checkpoints is not None:
+            checkpoints.forget()
         return ReconstructionResult(models[0], models[1:], mapping, summary, self._output)
+
+    def _checkpoints(self, problem: MappingProblem) -> DiskCheckpoints | None:
+        config = self._provision.config
+        if config.runtime.checkpoint_s is None:
+            return None
+        checkpoints = DiskCheckpoints(
+            config.runtime.cache_dir,
+            problem,
+            config.mapper_options(),
+            self._stages,
+            config.runtime.checkpoint_s,
+        )
+        if self._fresh:
+            checkpoints.forget()
+        return checkpoints
 
     def _give_up(self, images: ImageSet, extraction: Extraction, mapping: MappingResult) -> None:
         """Leave the reasons in the summary and raise."""

@@ -37,6 +37,9 @@ def reconstruct(
         ),
     ] = None,
     overrides: Overrides = None,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Do not go on from where a killed run was.")
+    ] = False,
     offline: Offline = False,
     quiet: Quiet = False,
 ) -> None:
@@ -46,7 +49,8 @@ def reconstruct(
 
     Writes a COLMAP model (DIR/sparse), point clouds (DIR/points.ply, DIR/dense.ply), refined
     depth (DIR/depth) and DIR/summary.json. Exits with 0 on success, 2 on wrong input, 3 when no
-    reconstruction was possible; the summary then has the reasons.
+    reconstruction was possible; the summary then has the reasons. After a run that was killed the
+    same command goes on where it was.
     """
     run(
         images,
@@ -57,6 +61,7 @@ def reconstruct(
         image_list=image_list,
         poses=poses,
         overrides=settings(overrides, offline),
+        fresh=fresh,
     )
 
 

@@ -47,8 +47,7 @@ class Cache:
     """
 
     def __init__(self, folder: Path | None = None) -> None:
-        root = folder or os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("mpsfm")
-        self.folder = Path(root).expanduser() / "extraction"
+        self.folder = cache_folder(folder) / "extraction"
         self._unfinished = self.folder / "unfinished"
         remove_unfinished(self._unfinished)
 
@@ -83,6 +82,12 @@ class Cache:
 
     def _path(self, kind: str, key: str) -> Path:
         return self.folder / kind / key[:2] / f"{key}.npz"
+
+
+def cache_folder(folder: Path | None = None) -> Path:
+    """The given folder, else ``$MPSFM_CACHE``, else the platform's user cache."""
+    root = folder or os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("mpsfm")
+    return Path(root).expanduser()
 
 
 def content_key(*parts: object) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 
 import numpy as np
 
@@ -31,6 +32,10 @@ _WITHOUT = {
     True: "the scale of their depth is unknown",
     False: "starting without these poses, in another world",
 }
+
+
+def nothing() -> None:
+    """Nobody wants to know."""
 
 
 class Group:
@@ -101,11 +106,12 @@ class Group:
             if not pairs or not self._ladder.relax():
                 return False
 
-    def grow(self, available: Bool) -> None:
-        """Register images until none of the available ones can be."""
+    def grow(self, available: Bool, paused: Callable[[], None] = nothing) -> None:
+        """Register images until none of the available ones can be; ``paused`` after each."""
         while self._register_next(available):
             if self._grown():
                 self._refine_globally()
+            paused()
 
     def finish(self) -> None:
         """Last refinements, and the depth check once more for every image."""

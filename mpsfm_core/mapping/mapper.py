@@ -3,13 +3,17 @@ random choices decide."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from mpsfm_core.data import Bool, MappingProblem
+from mpsfm_core.mapping.checkpoints import Checkpoints, Keeper
 from mpsfm_core.mapping.completion import with_unconfirmed
 from mpsfm_core.mapping.events import MappingEvents, Silent
 from mpsfm_core.mapping.finishing import finished
-from mpsfm_core.mapping.group import Group
+from mpsfm_core.mapping.group import Group, nothing
 from mpsfm_core.mapping.initialization import Starts
 from mpsfm_core.mapping.journal import Journal
 from mpsfm_core.mapping.options import MapperOptions
@@ -24,20 +28,24 @@ def reconstruct(
     problem: MappingProblem,
     options: MapperOptions | None = None,
     events: MappingEvents | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> MappingResult:
     """Pose as many images as can be posed confidently, with points and refined depth.
 
     Disconnected groups of images become reconstructions of their own, the largest first. Where
     much of the matches stays unexplained, other random choices may come to more: then there are
     several runs, and that counts which explains most. The result is the same bit for bit for the
-    same problem, options and machine.
+    same problem, options and machine, also where a run that ended early goes on from one of its
+    ``checkpoints``.
     """
-    options = options or MapperOptions()
-    runs: list[Run] = []
-    for number in range(options.max_runs):
+    options, events = options or MapperOptions(), events or Silent()
+    keeper = Keeper(checkpoints, problem, events)
+    runs, unfinished = keeper.load()
+    for number in range(len(runs), options.max_runs):
         own = options.model_copy(update={"seed": options.seed + number})
-        mapper = Mapper(problem, own, events or Silent())
-        runs.append(mapper.run())
+        mapper = unfinished or Mapper(problem, own, events)
+        runs.append(mapper.run(partial(keeper.save, runs, mapper)))
+        unfinished = None
         if mapper.keeps_poses or settled(runs, options.enough_explained):
             break
     best = max(runs, key=lambda run: run.of_largest)
@@ -48,7 +56,11 @@ def reconstruct(
 
 
 class Mapper:
-    """One run. ``models`` are the groups, ``left`` the images in none, ``group`` the last one."""
+    """One run. ``models`` are the groups, ``left`` the images in none, ``group`` the last one.
+
+    All that decides how a run goes on is in its attributes: between two images it can be kept and
+    taken up again.
+    """
 
     group: Group
     group_type: type[Group] = Group
@@ -62,6 +74,8 @@ class Mapper:
         self.models: list[Reconstruction] = []
         self.left: Bool = np.ones(len(problem.images), dtype=np.bool_)
         self._starts = Starts(options)
+        self._tried = 0
+        self._growing = False
         self._poses_hold = sum(image.known_pose is not None for image in problem.images) >= 2
 
     @property
@@ -69,29 +83,35 @@ class Mapper:
         """Whether known poses stay as they are, so that nothing is left to chance."""
         return self._poses_hold and self.options.known_poses == "fixed"
 
-    def run(self) -> Run:
-        """Reconstruct all groups."""
-        models = sorted(self.components(), key=lambda model: -len(model.images))
+    def run(self, paused: Callable[[], None] = nothing) -> Run:
+        """Reconstruct all groups; ``paused`` is called where the run could be taken up again."""
+        models = sorted(self.components(paused), key=lambda model: -len(model.images))
         return Run(models, explained_shares(models, self.problem), self.journal.report(models))
 
-    def components(self) -> list[Reconstruction]:
+    def components(self, paused: Callable[[], None] = nothing) -> list[Reconstruction]:
         """Reconstruct one group of images after the other."""
         most = self.options.max_components
-        for _ in range(most):
-            if not self.reconstruct_next():
+        while self._tried < most:
+            if not self.reconstruct_next(paused):
                 return self.models
+            self._tried += 1
         self._reject(self.left, f"not tried: there are {most} groups")
         return self.models
 
-    def reconstruct_next(self) -> bool:
-        """Reconstruct a group among the images that are left; False when there is none."""
-        self.group = self._new_group()
-        known = self._start_from_known_poses()
-        if not known and not self.group.start_from_pair(self.left):
-            return False
+    def reconstruct_next(self, paused: Callable[[], None] = nothing) -> bool:
+        """Reconstruct a group among the images that are left, or go on with the one that grows;
+        False when there is none."""
+        if not self._growing:
+            self.group = self._new_group()
+            if not self._start_from_known_poses() and not self.group.start_from_pair(self.left):
+                return False
+            self._growing = True
+        paused()
+        known = self._poses_hold
         fixed = known and self.options.known_poses == "fixed"
         if not fixed:
-            self.group.grow(self.left)
+            self.group.grow(self.left, paused)
+        self._growing = False
         if known or not self._outgrow():
             self.group.finish()
         self._keep(in_users_world=known)

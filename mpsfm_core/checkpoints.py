@@ -1,0 +1,152 @@
+"""States of the mapper on disk, so that a run that was killed goes on where it was.
+
+One file a problem, in the cache. It counts for the same problem and options and the same code and
+numerical libraries; anything else is a new start, as results are to be those of a run that was
+never disturbed.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import logging
+import platform
+import time
+import zipfile
+from importlib import metadata
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.extraction.cache import cache_folder, content_key
+from mpsfm_core.files import remove_unfinished, write_file
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.state import Frozen, freeze
+from mpsfm_core.registry import core_version
+from mpsfm_core.stages import Stages
+
+_log = logging.getLogger(__name__)
+
+FORMAT = 1
+"""Raised when the meaning of the files changes."""
+
+_HEADER = "header"
+_SHARE = 0.02
+"""Of the time of a run that saving may take (ours)."""
+_KEPT_S = 30 * 24 * 3600.0
+"""Checkpoints that nobody came back to are taken away then (ours)."""
+_LIBRARIES = ("numpy", "scipy", "numba")
+_NUMERICS = ("data.py", "geometry.py", "mapping", "optimize", "scene")
+
+
+class DiskCheckpoints:
+    """The checkpoints of one problem.
+
+    ``every_s``: seconds between two of them at least; more where writing takes long.
+    """
+
+    def __init__(
+        self,
+        cache_dir: Path | None,
+        problem: MappingProblem,
+        options: MapperOptions,
+        stages: Stages,
+        every_s: float,
+    ) -> None:
+        self._folder = cache_folder(cache_dir) / "mapping"
+        self._path = self._folder / f"{_problem_key(problem, options)}.npz"
+        self._stages = stages
+        self._every_s = self._wait_s = every_s
+        self._total = len(problem.images)
+        self._last = time.monotonic()
+        self._failed = False
+
+    def forget(self) -> None:
+        """Start anew next time: the run is finished, or that is wanted."""
+        self._path.unlink(missing_ok=True)
+
+    def load(self) -> Frozen | None:
+        """As :class:`mpsfm_core.mapping.checkpoints.Checkpoints`."""
+        self._clear_up()
+        if not self._path.is_file():
+            return None
+        try:
+            with self._path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+            header = json.loads(arrays.pop(_HEADER).tobytes())
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            self.unreadable(f"it is damaged ({error})")
+            return None
+        if header.get("code") != code_key():
+            self.unreadable(f"it is of other code ({header.get('version')}, format or libraries)")
+            return None
+        placed = f"{header['registered']} of {self._total} images placed in the last group"
+        self._stages.notice(
+            f"mapping goes on from a checkpoint of {header['time']}: {placed} (--fresh starts anew)"
+        )
+        return arrays
+
+    def unreadable(self, reason: str) -> None:
+        """As :class:`mpsfm_core.mapping.checkpoints.Checkpoints`."""
+        self._stages.notice(f"the checkpoint of this mapping is not used: {reason}; starting anew")
+
+    def due(self) -> bool:
+        """As :class:`mpsfm_core.mapping.checkpoints.Checkpoints`."""
+        return not self._failed and time.monotonic() - self._last >= self._wait_s
+
+    def save(self, state: Frozen, registered: int) -> None:
+        """As :class:`mpsfm_core.mapping.checkpoints.Checkpoints`.
+
+        A disk that is full ends no run: it goes on without checkpoints, and says so.
+        """
+        started = time.monotonic()
+        header = {
+            "code": code_key(),
+            "version": core_version(),
+            "registered": registered,
+            "time": time.strftime("%Y-%m-%d %H:%M:%S"),
+        }
+        text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+        arrays = cast(Any, {_HEADER: text, **state})
+        try:
+            write_file(self._path, lambda file: np.savez(file, **arrays), self._unfinished)
+        except OSError as error:
+            _log.warning("%s: no checkpoints from now on: %s", self._folder, error)
+            self._failed = True
+        self._last = time.monotonic()
+        self._wait_s = max(self._every_s, (self._last - started) / _SHARE)
+
+    @property
+    def _unfinished(self) -> Path:
+        return self._folder / "unfinished"
+
+    def _clear_up(self) -> None:
+        remove_unfinished(self._unfinished)
+        for path in self._folder.glob("*.npz"):
+            if time.time() - path.stat().st_mtime > _KEPT_S:
+                path.unlink(missing_ok=True)
+
+
+@functools.cache
+def code_key() -> str:
+    """Names the code that decides the mapper's result to the last bit."""
+    package = Path(__file__).parent
+    found = hashlib.sha256()
+    for name in _NUMERICS:
+        path = package / name
+        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+            found.update(f"{file.relative_to(package)}\n".encode() + file.read_bytes())
+    versions = [metadata.version(name) for name in _LIBRARIES]
+    return content_key(FORMAT, found.hexdigest(), versions, platform.machine())
+
+
+def _problem_key(problem: MappingProblem, options: MapperOptions) -> str:
+    """SHA-256 of all that the mapper is given."""
+    found = hashlib.sha256()
+    for name, array in freeze((problem, options)).items():
+        found.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        found.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+    return found.hexdigest()

@@ -1,0 +1,322 @@
+"""The state of the mapper as plain arrays and back, so that a run can go on where it was.
+
+All of it is kept, down to which objects are one and which arrays share memory, since results are to
+be the same bit for bit: there is no list of attributes to forget one in. What cannot be kept, as a
+lock or an open file, is an error that names its place. Nothing is executed when a state is read:
+only data of the classes of the numerics comes back.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections import Counter, OrderedDict, defaultdict
+from collections.abc import Iterator, Mapping
+from enum import Enum
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from mpsfm_core.errors import DataError
+
+Frozen: TypeAlias = Mapping[str, NDArray[Any]]
+"""The arrays of a state by name; ``tree`` says how they belong together."""
+
+FORMAT = 1
+"""Raised when the meaning of frozen states changes."""
+
+_TREE = "tree"
+_ROOMS = ("mapping", "scene", "optimize", "data", "geometry")
+_PLAIN = (bool, int, float, str)
+_FACTORIES = {"int": int, "float": float, "list": list, "set": set, "dict": dict}
+_MAPS: dict[str, type[dict[Any, Any]]] = {
+    cls.__name__: cls for cls in (dict, Counter, OrderedDict, defaultdict)
+}
+_GENERATORS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
+
+
+def freeze(state: object, shared: object = None) -> Frozen:
+    """Take an object apart.
+
+    ``shared``: what the reader has as well, as the problem; objects and arrays of it are not kept
+    but found again. Raises :class:`TypeError` for what cannot be kept, with its place.
+    """
+    writer = _Writer(shared)
+    tree = writer.node(state, "state")
+    text = json.dumps({"format": FORMAT, "state": tree}, separators=(",", ":"))
+    return {_TREE: np.frombuffer(text.encode(), dtype=np.uint8), **writer.arrays}
+
+
+def thaw(frozen: Frozen, shared: object = None) -> Any:
+    """The object that :func:`freeze` took apart, beside an equal ``shared``.
+
+    Raises :class:`DataError` when that is no such state or one of another format.
+    """
+    try:
+        stored = json.loads(frozen[_TREE].tobytes())
+        if stored["format"] != FORMAT:
+            raise ValueError(f"has format {stored['format']}, {FORMAT} is known")
+        return _Reader(frozen, shared)(stored["state"])
+    except DataError:
+        raise
+    except Exception as error:  # arbitrary content: whatever it leads to, it is no state of ours
+        raise DataError("state", f"is damaged: {type(error).__name__}: {error}") from error
+
+
+class _Writer:
+    """Numbers the objects as it meets them; one that it met before is only named."""
+
+    def __init__(self, shared: object) -> None:
+        self.arrays: dict[str, NDArray[Any]] = {}
+        self._shared = {id(found): number for number, found in enumerate(_parts(shared))}
+        self._met: dict[int, int] = {}
+        self._alive: list[object] = [shared]  # so that no number is given to two objects
+
+    def node(self, value: Any, place: str) -> Any:
+        """The description of a value, as JSON has it."""
+        if value is None or type(value) in _PLAIN:
+            return value
+        if id(value) in self._shared:
+            return {"shared": self._shared[id(value)]}
+        if id(value) in self._met:
+            return {"met": self._met[id(value)]}
+        number = self._met[id(value)] = len(self._met)
+        self._alive.append(value)
+        return {"id": number, **self._described(value, place)}
+
+    def _described(self, value: Any, place: str) -> dict[str, Any]:
+        cls = type(value)
+        if cls is np.ndarray:
+            return self._array(value, place)
+        if isinstance(value, np.generic):
+            return {"scalar": self._store(np.array(value))}
+        if cls is bytes:
+            return {"bytes": self._store(np.frombuffer(value, dtype=np.uint8))}
+        if cls in (list, tuple, set):
+            return {cls.__name__: self._items(value, place)}
+        if cls in _MAPS.values():
+            factory = getattr(value, "default_factory", None)
+            if factory is not None and factory not in _FACTORIES.values():
+                raise TypeError(f"{place}: a factory of defaults {factory!r} cannot be kept")
+            keys = self._items(value, f"{place} keys")
+            found = [self.node(item, f"{place}[{key!r}]") for key, item in value.items()]
+            name = "" if factory is None else factory.__name__
+            return {"map": cls.__name__, "factory": name, "keys": keys, "values": found}
+        if cls is np.random.Generator:
+            generator = value.bit_generator
+            name = type(generator).__name__
+            return {"random": name, "state": self.node(generator.state, f"{place}.state")}
+        if isinstance(value, type) and _is_ours(value):
+            return {"class": _path(value)}
+        if not _is_ours(cls):
+            raise TypeError(f"{place}: a {cls.__module__}.{cls.__qualname__} cannot be kept")
+        if isinstance(value, Enum):
+            return {"member": _path(cls), "name": value.name}
+        if isinstance(value, tuple):  # of names
+            return {"names": _path(cls), "items": self._items(value, place)}
+        attributes = {name: self.node(item, f"{place}.{name}") for name, item in _attributes(value)}
+        return {"object": _path(cls), "attributes": attributes}
+
+    def _items(self, values: Any, place: str) -> list[Any]:
+        return [self.node(item, f"{place}[{index}]") for index, item in enumerate(values)]
+
+    def _array(self, array: NDArray[Any], place: str) -> dict[str, Any]:
+        if array.dtype.hasobject:
+            raise TypeError(f"{place}: an array of objects cannot be kept")
+        if isinstance(array.base, np.ndarray) and array.size:
+            owner = array.base
+            while isinstance(owner.base, np.ndarray):
+                owner = owner.base
+            if type(owner) is np.ndarray and _memory(owner) is not None:
+                return {
+                    "view": self.node(owner, place),
+                    "offset": _address(array) - _address(owner),
+                    "dtype": array.dtype.str,
+                    "shape": array.shape,
+                    "strides": array.strides,
+                    "writeable": array.flags.writeable,
+                }
+        dense = array if array.base is None else array.copy(order="K")
+        axes = _order(dense)
+        name = self._store(np.ascontiguousarray(dense.transpose(axes)).reshape(-1))
+        return {
+            "array": name,
+            "shape": [dense.shape[axis] for axis in axes],
+            "axes": np.argsort(axes).tolist(),
+            "writeable": array.flags.writeable,
+        }
+
+    def _store(self, array: NDArray[Any]) -> str:
+        name = f"a{len(self.arrays)}"
+        self.arrays[name] = array
+        return name
+
+
+class _Reader:
+    def __init__(self, frozen: Frozen, shared: object) -> None:
+        self._arrays = frozen
+        self._shared = list(_parts(shared))
+        self._met: dict[int, Any] = {}
+        self._read_only: list[NDArray[Any]] = []
+
+    def __call__(self, tree: Any) -> Any:
+        """The whole state."""
+        made = self.value(tree)
+        for array in self._read_only:  # last, as views of such an array may be written to
+            array.flags.writeable = False
+        return made
+
+    def value(self, node: Any) -> Any:
+        """What a node of the tree describes."""
+        if not isinstance(node, dict):
+            return node
+        if "shared" in node:
+            return self._shared[node["shared"]]
+        if "met" in node:
+            return self._met[node["met"]]
+        return self._made(node, node["id"])
+
+    def _made(self, node: dict[str, Any], number: int) -> Any:
+        for kind in ("list", "set", "map", "object"):  # may hold themselves: known before filled
+            if kind in node:
+                filled: Any = getattr(self, f"_{kind}")(node, number)
+                return filled
+        if "tuple" in node:
+            made: Any = tuple(map(self.value, node["tuple"]))
+        elif "names" in node:
+            made = _class(node["names"])._make(map(self.value, node["items"]))  # type: ignore[attr-defined]
+        elif "scalar" in node:
+            made = self._arrays[node["scalar"]][()]
+        elif "bytes" in node:
+            made = self._arrays[node["bytes"]].tobytes()
+        elif "class" in node:
+            made = _class(node["class"])
+        elif "member" in node:
+            made = _class(node["member"])[node["name"]]  # type: ignore[index]
+        elif "random" in node:
+            if node["random"] not in _GENERATORS:
+                raise ValueError(f"unknown generator {node['random']!r}")
+            made = np.random.Generator(getattr(np.random, node["random"])())
+            made.bit_generator.state = self.value(node["state"])
+        else:
+            made = self._array(node)
+        self._met[number] = made
+        return made
+
+    def _list(self, node: dict[str, Any], number: int) -> list[Any]:
+        made: list[Any] = []
+        self._met[number] = made
+        made.extend(map(self.value, node["list"]))
+        return made
+
+    def _set(self, node: dict[str, Any], number: int) -> set[Any]:
+        made: set[Any] = set()
+        self._met[number] = made
+        made.update(map(self.value, node["set"]))
+        return made
+
+    def _map(self, node: dict[str, Any], number: int) -> dict[Any, Any]:
+        made: dict[Any, Any] = _MAPS[node["map"]]()
+        if node["factory"]:
+            made = defaultdict(_FACTORIES[node["factory"]])
+        self._met[number] = made
+        for key, item in zip(node["keys"], node["values"], strict=True):
+            made[self.value(key)] = self.value(item)
+        return made
+
+    def _object(self, node: dict[str, Any], number: int) -> Any:
+        cls = _class(node["object"])
+        if issubclass(cls, BaseModel):
+            values = {name: self.value(item) for name, item in node["attributes"].items()}
+            made: Any = cls.model_construct(**values)
+            self._met[number] = made
+            return made
+        made = self._met[number] = object.__new__(cls)
+        for name, item in node["attributes"].items():
+            object.__setattr__(made, name, self.value(item))
+        return made
+
+    def _array(self, node: dict[str, Any]) -> NDArray[Any]:
+        if "view" in node:
+            owner = self.value(node["view"])
+            # Unlike as_strided, the constructor checks that the view lies within its owner.
+            made: NDArray[Any] = np.ndarray(
+                tuple(node["shape"]),
+                node["dtype"],
+                _memory(owner),
+                node["offset"],
+                tuple(node["strides"]),
+            )
+        else:
+            flat = self._arrays[node["array"]]
+            made = np.array(flat.reshape(node["shape"]).transpose(node["axes"]), order="K")
+        if not node["writeable"]:
+            self._read_only.append(made)
+        return made
+
+
+def _parts(value: object, met: set[int] | None = None) -> Iterator[object]:
+    """All objects of a tree of data classes, sequences and arrays, in a fixed order."""
+    met = set() if met is None else met
+    if value is None or type(value) in _PLAIN or id(value) in met:
+        return
+    met.add(id(value))
+    yield value
+    if isinstance(value, np.ndarray):
+        yield from _parts(value.base, met) if isinstance(value.base, np.ndarray) else ()
+    elif isinstance(value, (tuple, list)):
+        for item in value:
+            yield from _parts(item, met)
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from _parts(item, met)
+    elif _is_ours(type(value)):
+        for _, item in _attributes(value):
+            yield from _parts(item, met)
+
+
+def _attributes(value: Any) -> Iterator[tuple[str, Any]]:
+    for cls in type(value).__mro__:
+        for name in getattr(cls, "__slots__", ()):
+            if hasattr(value, name) and not name.startswith("__"):
+                yield name, getattr(value, name)
+    yield from getattr(value, "__dict__", {}).items()
+
+
+def _is_ours(cls: type) -> bool:
+    package, _, rest = cls.__module__.partition(".")
+    return package == __name__.partition(".")[0] and rest.partition(".")[0] in _ROOMS
+
+
+def _path(cls: type) -> str:
+    return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def _class(path: str) -> type:
+    module, _, name = path.partition(":")
+    package, _, rest = module.partition(".")
+    if package != __name__.partition(".")[0] or rest.partition(".")[0] not in _ROOMS:
+        raise ValueError(f"{path!r} is no class of the numerics")
+    found = getattr(importlib.import_module(module), name)
+    if not (isinstance(found, type) and _is_ours(found)):
+        raise ValueError(f"{path!r} is no class of the numerics")
+    return found
+
+
+def _order(array: NDArray[Any]) -> list[int]:
+    """The axes as they follow each other in memory."""
+    long = [axis for axis in range(array.ndim) if array.shape[axis] > 1 and array.size]
+    rest = [axis for axis in range(array.ndim) if axis not in long]
+    return sorted(long, key=lambda axis: -array.strides[axis]) + rest
+
+
+def _memory(array: NDArray[Any]) -> NDArray[Any] | None:
+    """The bytes of an array that has no gaps, as a view; None if it has."""
+    ordered = array.transpose(_order(array))
+    return ordered.reshape(-1).view(np.uint8) if ordered.flags.c_contiguous else None
+
+
+def _address(array: NDArray[Any]) -> int:
+    return int(array.__array_interface__["data"][0])
