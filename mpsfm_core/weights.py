@@ -13,7 +13,8 @@ URI                                    means
 Downloads continue where they were cut, appear in their place only when complete and checked, and
 are compared with the SHA-256 that the plugin or the user gives. Where nobody gives one, the hash
 of the first download is recorded in ``hashes.json`` of the cache, and a file that differs from it
-later is refused. Nothing here executes code from a weights file.
+later is refused. Files that lie in the Hub's own cache are taken from there, and checked alike.
+Nothing here executes code from a weights file.
 """
 
 from __future__ import annotations
@@ -109,6 +110,8 @@ class WeightStore:
         path = self._cached_path(uri)
         if self._is_trusted(uri, path, expected):
             return path
+        if (shared := self._in_hub_cache(uri)) is not None and not path.is_file():
+            return self._from_hub_cache(uri, shared, expected)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with FileLock(path.with_name(path.name + ".lock")):
@@ -126,7 +129,7 @@ class WeightStore:
             except WeightsError:
                 return None
         path = self._cached_path(uri)
-        return path if path.is_file() else None
+        return path if path.is_file() else self._in_hub_cache(uri)
 
     def verify(self, uri: str, sha256: str | None = None) -> str:
         """Hash the file that is on this machine, compare, and return its SHA-256.
@@ -144,6 +147,29 @@ class WeightStore:
         if expected not in (None, found):
             raise _mismatch(uri, path, str(expected), found)
         return found
+
+    @staticmethod
+    def _in_hub_cache(uri: str) -> Path | None:
+        """The file in the Hub's own cache, where other programs have left it; no network."""
+        parts = _HUB.match(uri)
+        if parts is None:
+            return None
+        hub = importlib.import_module("huggingface_hub")
+        cache = importlib.import_module("huggingface_hub.constants").HF_HUB_CACHE
+        found = hub.try_to_load_from_cache(
+            parts["repo"], parts["path"], cache_dir=cache, revision=parts["revision"]
+        )
+        return Path(found) if isinstance(found, str) else None
+
+    def _from_hub_cache(self, uri: str, path: Path, expected: str | None) -> Path:
+        """The file as it lies there, its hash checked or recorded as if it had been downloaded."""
+        if not self._is_trusted(uri, path, expected):
+            found, wanted = file_sha256(path), expected or self._recorded(uri)
+            if wanted not in (None, found):
+                raise _mismatch(uri, path, str(wanted), found)
+            self.cache_dir.mkdir(parents=True, exist_ok=True)
+            self._record(uri, path, found)
+        return path
 
     def _obtain(self, uri: str, path: Path, expected: str | None) -> None:
         """Put the file in its place: the one that is there if it is right, else a download."""

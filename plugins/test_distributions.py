@@ -23,7 +23,7 @@ DISTRIBUTIONS = {"cv2": "opencv-python-headless"}
 WITH_THE_CORE = {"mpsfm_core", "pydantic"}
 """Options are pydantic models."""
 FOR_TESTS_ONLY = ("contract.py", "stand_in.py")
-HEAVY = {"torch", "onnxruntime", "kornia", "cv2", "scipy", "onnx"}
+HEAVY = {"torch", "transformers", "onnxruntime", "kornia", "cv2", "scipy", "onnx"}
 
 each_plugin = pytest.mark.parametrize("folder", PLUGINS, ids=lambda folder: folder.name)
 

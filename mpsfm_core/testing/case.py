@@ -54,7 +54,8 @@ class Setup:
     * ``"told"``: ``tell`` is called with every example before the provider is asked about it, for
       instance to write files;
     * ``"seen"``: the provider sees what is in a textured view, with real weights or without any;
-    * ``"nothing"``: answers cannot be compared with the truth, and checks that would are skipped.
+    * ``"nothing"``: answers cannot be compared with the truth, and checks that would are skipped;
+      ``tell``, where it is given, writes what the provider reads beside the view.
 
     ``expected_failures``: ids of checks that are known to fail, each with the reason; a check that
     then passes is a failure.
@@ -66,8 +67,8 @@ class Setup:
     expected_failures: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if (self.knows == "told") != (self.tell is not None):
-            raise ValueError("tell belongs to knows='told', and that needs it")
+        if self.knows == "told" and self.tell is None:
+            raise ValueError("knows='told' needs tell")
         for check, reason in self.expected_failures.items():
             if not reason.strip():
                 raise ValueError(f"expected failure of {check!r} needs a reason")
@@ -243,8 +244,14 @@ class Case:
         return self._detected[view]
 
     def _detector_spec(self) -> ProviderSpec:
+        """Of the matcher's family, if it has one, and then of its own plugin rather; else SIFT."""
         family = set(self.spec.tags)
-        for name in sorted(self.registry.names("features"), key=lambda name: name != "sift"):
+        home = self.registry.version(self.spec.kind, self.spec.name)
+
+        def less_fitting(name: str) -> bool:
+            return self.registry.version("features", name) != home if family else name != "sift"
+
+        for name in sorted(self.registry.names("features"), key=less_fitting):
             spec = self.registry.spec("features", name)
             if not family or family & set(spec.tags):
                 return spec

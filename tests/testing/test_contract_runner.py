@@ -67,7 +67,7 @@ def test_expected_failures_need_a_reason_and_a_check() -> None:
 
 
 def test_told_needs_somebody_to_tell() -> None:
-    with pytest.raises(ValueError, match="tell belongs to"):
+    with pytest.raises(ValueError, match="needs tell"):
         Setup(knows="told")
 
 

@@ -14,6 +14,7 @@ from kornia.color import rgb_to_grayscale
 from kornia.feature import ALIKED, DISK, DeDoDe, SIFTFeature, XFeat, get_laf_center
 
 from mpsfm_core import Features, ProviderContext, View
+from mpsfm_core.torch_runtime import inference, use_threads
 from mpsfm_kornia.options import (
     AlikedOptions,
     DedodeOptions,
@@ -22,7 +23,7 @@ from mpsfm_kornia.options import (
     SiftOptions,
     XFeatOptions,
 )
-from mpsfm_kornia.runtime import Grid, fill, inference, load_weights, usable, use_threads
+from mpsfm_kornia.runtime import Grid, fill, load_weights, usable
 
 _Detections = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 

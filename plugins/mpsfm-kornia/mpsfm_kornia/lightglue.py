@@ -11,9 +11,10 @@ from kornia.feature import LightGlue
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
 from mpsfm_core.errors import ProviderError
 from mpsfm_core.providers import required_features
+from mpsfm_core.torch_runtime import inference, use_threads
 from mpsfm_kornia.attention import fuse_cross_attention
 from mpsfm_kornia.options import LightGlueOptions
-from mpsfm_kornia.runtime import fill, inference, load_weights, use_threads
+from mpsfm_kornia.runtime import fill, load_weights
 
 # Every key that shapes the network is named: kornia's defaults are a class attribute, which
 # other packages are known to overwrite.

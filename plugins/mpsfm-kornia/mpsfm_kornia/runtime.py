@@ -1,9 +1,7 @@
-"""What the networks share: device and threads, weights, and the network's pixel grid."""
+"""What the networks share: weights, and the network's pixel grid."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,21 +17,6 @@ from mpsfm_kornia.options import KNOWN_HASHES
 
 _SMALLEST_SIDE = 32
 """The networks shrink their input by up to 32."""
-
-
-def use_threads(context: ProviderContext) -> None:
-    """Give torch the context's threads. This setting is torch's, for the whole process."""
-    torch.set_num_threads(context.threads)
-
-
-@contextmanager
-def inference() -> Iterator[None]:
-    """No gradients, and the same result for the same input."""
-    with (
-        torch.inference_mode(),
-        torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True),
-    ):
-        yield
 
 
 def load_weights(context: ProviderContext, uri: str, sha256: str | None) -> dict[str, Any]:

@@ -1,0 +1,141 @@
+"""Depth by any model that ``AutoModelForDepthEstimation`` loads."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.ndimage import distance_transform_edt
+from transformers import AutoModelForDepthEstimation
+
+from mpsfm_core import DepthPrior, ProviderContext, View
+from mpsfm_core.builtin.files import DepthFiles
+from mpsfm_core.builtin.options import DepthFileOptions
+from mpsfm_core.data import Float32, Float64
+from mpsfm_core.errors import ConfigError
+from mpsfm_core.torch_runtime import inference
+from mpsfm_transformers.hub import LoadedModel
+from mpsfm_transformers.options import DepthOptions, Output, PromptOptions, known
+from mpsfm_transformers.placement import Preparation, preparation_for
+
+_PROMPTED = "prompt_depth_anything"
+_FARTHEST_M = 250.0
+"""Of Depth Pro (reference)."""
+_NO_SPREAD_M = 1e-6
+"""What the library adds to one value of a prompt without any spread, which cannot be normalised."""
+
+_METRIC = ("glpn", "zoedepth", "tipsv2_dpt")
+"""Families of models that predict metres."""
+
+
+class HubDepth:
+    """Depth on the network's own grid."""
+
+    def __init__(self, options: DepthOptions, context: ProviderContext) -> None:
+        self._model = LoadedModel(AutoModelForDepthEstimation, options, context)
+        config = self._model.network.config
+        if config.model_type == _PROMPTED:
+            raise ConfigError(
+                f"{options.model} wants the depth of a sensor: use the provider "
+                f"prompt-depth-anything"
+            )
+        self._output, self._metric = meaning(config, options)
+        self._preparation = preparation_for(self._model)
+        self._by_focal = config.model_type == "depth_pro"
+
+    def predict(self, view: View) -> DepthPrior:
+        """Depth; of Depth Pro for the focal length of the view's camera."""
+        value, _ = self._run(view)
+        if self._by_focal:
+            inverse = value.astype(np.float64) * (view.camera.width / view.camera.fx)
+            return _inverse(inverse, self._metric, 1 / _FARTHEST_M)
+        if self._output == "disparity":
+            return _inverse(value.astype(np.float64), self._metric)
+        return DepthPrior.from_arrays(value, metric=self._metric)
+
+    def estimate_focal(self, view: View) -> float | None:
+        """The horizontal focal length that Depth Pro guesses, in pixels of the view; None of
+        models that do not say."""
+        if not self._by_focal:
+            return None
+        angle = self._run(view)[1]
+        if angle is None:
+            return None
+        return 0.5 * view.camera.width / float(np.tan(0.5 * np.radians(angle)))
+
+    def _run(self, view: View) -> tuple[Float32, float | None]:
+        """The network's map of the view, and the angle of view in degrees if it says."""
+        prepared = self._preparation(view)
+        with inference():
+            found = self._model.network(pixel_values=prepared.pixels.to(self._model.device))
+        angle = getattr(found, "field_of_view", None)
+        value = prepared.cut(found.predicted_depth[0].float().cpu().numpy())
+        return value, None if angle is None else float(angle.reshape(-1)[0])
+
+
+class PromptDepth:
+    """Prompt Depth Anything: the sensor's depth with the detail of the photo."""
+
+    def __init__(self, options: PromptOptions, context: ProviderContext) -> None:
+        self._model = LoadedModel(AutoModelForDepthEstimation, options, context)
+        family = self._model.network.config.model_type
+        if family != _PROMPTED:
+            raise ConfigError(f"{options.model} is of the family {family!r}, not {_PROMPTED!r}")
+        files = DepthFileOptions(
+            directory=options.directory,
+            suffix=options.suffix,
+            scale=options.scale,
+            relative_std=1.0,  # of the maps, which nobody asks for here
+        )
+        self._sensor = DepthFiles(files, context)
+        self._preparation: Preparation = preparation_for(self._model)
+
+    def predict(self, view: View) -> DepthPrior:
+        """Metric depth; nothing is valid where the sensor saw nothing at all."""
+        sensor = self._sensor.predict(view)
+        if not sensor.valid.any():
+            return sensor
+        prompt = torch.from_numpy(_without_holes(sensor))[None, None].to(self._model.device)
+        prepared = self._preparation(view)
+        pixels = prepared.pixels.to(self._model.device)
+        with inference():
+            found = self._model.network(pixel_values=pixels, prompt_depth=prompt)
+        return DepthPrior.from_arrays(prepared.cut(found.predicted_depth[0].cpu().numpy()))
+
+
+def meaning(config: Any, options: DepthOptions) -> tuple[Output, bool]:
+    """What a model predicts, and whether in metres: as the options say, else the table of known
+    models, else its configuration.
+
+    Raises:
+        ConfigError: its family predicts something else than depth.
+    """
+    family = config.model_type
+    if family == "chmv2":
+        raise ConfigError(f"{options.model} predicts the height of trees, not depth")
+    metric = family in _METRIC or family == "depth_pro"
+    if family == "depth_anything":
+        metric = config.depth_estimation_type == "metric"
+    output: Output = "depth" if metric and family != "depth_pro" else "disparity"
+    entry = known(options.model)
+    told = [(entry.output, entry.metric), (options.output, options.metric)]
+    for said_output, said_metric in told:
+        output = said_output or output
+        metric = metric if said_metric is None else said_metric
+    return output, metric
+
+
+def _inverse(inverse: Float64, metric: bool, smallest: float = 0.0) -> DepthPrior:
+    with np.errstate(divide="ignore"):
+        depth = np.where(inverse > smallest, 1 / inverse, 0)
+    return DepthPrior.from_arrays(depth, metric=metric)
+
+
+def _without_holes(sensor: DepthPrior) -> Float32:
+    """Each invalid pixel with the value of the nearest valid one; never the same everywhere."""
+    nearest = distance_transform_edt(~sensor.valid, return_distances=False, return_indices=True)
+    filled: Float32 = sensor.depth[tuple(nearest)]
+    if filled.min() == filled.max():
+        filled[0, 0] += np.float32(_NO_SPREAD_M)
+    return filled

@@ -1,0 +1,52 @@
+"""SuperPoint as feature provider."""
+
+from __future__ import annotations
+
+import numpy as np
+from transformers import SuperPointForKeypointDetection
+
+from mpsfm_core import Features, ProviderContext, View
+from mpsfm_core.geometry import scale_pixels
+from mpsfm_core.torch_runtime import inference
+from mpsfm_transformers.grid import gray_image, network_size, usable
+from mpsfm_transformers.hub import LoadedModel
+from mpsfm_transformers.options import SuperPointOptions
+
+_CELL = 8
+"""The network's scores are of cells of 8 x 8 pixels."""
+
+
+class SuperPointFeatures:
+    """Keypoints where the network is surest; their pixels have integers for centres there."""
+
+    def __init__(self, options: SuperPointOptions, context: ProviderContext) -> None:
+        config: dict[str, float] = {"max_keypoints": -1}  # a mask may take some away
+        if options.detection_threshold is not None:
+            config |= {"keypoint_threshold": options.detection_threshold}
+        self._model = LoadedModel(SuperPointForKeypointDetection, options, context, **config)
+        self._options = options
+
+    def extract(self, view: View) -> Features:
+        """The strongest keypoints inside of the view's mask, best first.
+
+        ``std_px`` is 1, or the size of a pixel of the resized image if that is more.
+        """
+        size = network_size(view, self._options.resize, _CELL)
+        with inference():
+            found = self._model.network(gray_image(view, size, self._model.device))
+        count = int(found.mask[0].sum())
+        relative, scores, descriptors = (
+            tensor[0, :count].cpu().numpy()
+            for tensor in (found.keypoints, found.scores, found.descriptors)
+        )
+        pixels = np.round(relative.astype(np.float64) * size) + 0.5
+        keypoints = scale_pixels(pixels, size, view.camera.size)
+        order = np.argsort(-scores, kind="stable")
+        order = order[usable(view, keypoints[order])][: self._options.max_keypoints]
+        pixel_size = max(v / n for v, n in zip(view.camera.size, size, strict=True))
+        return Features(
+            keypoints=keypoints[order],
+            descriptors=descriptors[order],
+            scores=scores[order],
+            std_px=max(1.0, pixel_size),
+        )

@@ -1,0 +1,105 @@
+"""From options to a loaded model: safetensors and configuration only, no code of a repository."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from transformers.utils import logging as hub_logging
+
+from mpsfm_core import ProviderContext
+from mpsfm_core.errors import WeightsError
+from mpsfm_core.torch_runtime import use_threads
+from mpsfm_transformers.options import CONFIG, FILES, PROCESSOR, WEIGHTS, HubOptions
+
+
+class LoadedModel:
+    """A model in evaluation mode on the context's device, in float32.
+
+    ``network``: the module, made by ``family.from_pretrained``. ``preprocessor``: the content of
+    ``preprocessor_config.json``. ``folder()``: the files in one folder, for as long as needed.
+
+    Raises:
+        WeightsError: a file is missing or damaged, is for another family of models, or wants code
+            of its repository to be run.
+    """
+
+    def __init__(
+        self, family: Any, options: HubOptions, context: ProviderContext, **config: Any
+    ) -> None:
+        use_threads(context)
+        hashes = (None, None, options.sha256)
+        self._name = options.model
+        self._paths = [
+            context.resolve_weights(uri, sha256)
+            for uri, sha256 in zip(options.uris(), hashes, strict=True)
+        ]
+        self.device = context.device
+        text = self._paths[FILES.index(PROCESSOR)].read_text(encoding="utf-8")
+        self.preprocessor: dict[str, Any] = json.loads(text)
+        with self.folder() as folder, _explained(options.model), quiet():
+            network, report = family.from_pretrained(
+                folder,
+                local_files_only=True,
+                use_safetensors=True,
+                dtype=torch.float32,
+                trust_remote_code=False,
+                output_loading_info=True,
+                **config,
+            )
+        missing = sorted(report["missing_keys"])
+        if missing:
+            raise WeightsError(
+                f"{options.model}: {WEIGHTS} does not fit {CONFIG}: it lacks {missing[0]!r} and "
+                f"{len(missing) - 1} more"
+            )
+        self.network = network.eval().to(context.device)
+
+    @contextmanager
+    def folder(self) -> Iterator[Path]:
+        """A folder in which the files have their own names."""
+        with ExitStack() as stack:
+            folder = self._paths[0].parent
+            if any(path != folder / name for path, name in zip(self._paths, FILES, strict=True)):
+                folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mpsfm-hub-")))
+                for path, name in zip(self._paths, FILES, strict=True):
+                    (folder / name).symlink_to(path.absolute())
+            yield folder
+
+    def processor(self, family: Any) -> Any:
+        """The model's own image processor, on PIL (torchvision is not needed)."""
+        with self.folder() as folder, _explained(self._name), quiet():
+            return family.from_pretrained(
+                folder, local_files_only=True, backend="pil", trust_remote_code=False
+            )
+
+
+@contextmanager
+def _explained(model: str) -> Iterator[None]:
+    """What goes wrong inside of the library, as one error of ours."""
+    try:
+        yield
+    except Exception as error:  # its errors share no base class
+        reason = str(error).strip().splitlines() or [""]
+        raise WeightsError(
+            f"{model} cannot be loaded by transformers: {type(error).__name__}: {reason[0]}"
+        ) from error
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """No progress bars and advice of the library in somebody's terminal."""
+    level, bars = hub_logging.get_verbosity(), hub_logging.is_progress_bar_enabled()
+    hub_logging.set_verbosity_error()
+    hub_logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        hub_logging.set_verbosity(level)
+        if bars:
+            hub_logging.enable_progress_bar()

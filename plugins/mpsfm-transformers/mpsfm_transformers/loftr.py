@@ -1,0 +1,88 @@
+"""Efficient LoFTR as a dense matcher."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from transformers import EfficientLoFTRForKeypointMatching
+
+from mpsfm_core import DenseMatches, Features, PairMatches, ProviderContext, View
+from mpsfm_core.geometry import scale_pixels
+from mpsfm_core.torch_runtime import inference
+from mpsfm_transformers.grid import gray_image, network_size, usable
+from mpsfm_transformers.hub import LoadedModel
+from mpsfm_transformers.options import EfficientLoftrOptions
+
+_MULTIPLE = 32
+_STD_NETWORK_PX = 0.5
+"""Localisation noise in network pixels (reference: half that of sparse keypoints)."""
+
+
+class _Paired(EfficientLoFTRForKeypointMatching):  # type: ignore[misc]  # is untyped
+    """The library's class lists the partners of the cells of either image, each in the order of the
+    other image's cells, and refines and returns them as if both lists had one order (5.23): right
+    only where no two matches cross. Here both are in the order of the first image's cells."""
+
+    def _get_matches_from_scores(self, scores: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        indices, certainty = super()._get_matches_from_scores(scores)
+        partners, certain = indices[:, 1], certainty[:, 1]
+        cells = torch.arange(partners.shape[1], device=partners.device).expand_as(partners)
+        cells = torch.where(partners >= 0, cells, -1)
+        return torch.stack([cells, partners], dim=1), torch.stack([certain, certain], dim=1)
+
+
+class EfficientLoftrMatcher:
+    """Matches in COLMAP's frame: as of LoFTR, its training projected the corners of pixels, so
+    nothing is added to its positions.
+
+    Both views lie in the upper left corner of a canvas that holds either.
+    """
+
+    def __init__(self, options: EfficientLoftrOptions, context: ProviderContext) -> None:
+        config = {}
+        if options.min_score is not None:
+            config["coarse_matching_threshold"] = options.min_score
+        self._model = LoadedModel(_Paired, options, context, **config)
+        self._longest = options.resize
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """Matches of cells of both views, refined; each with its coarse score."""
+        views = (view_a, view_b)
+        sizes = [network_size(view, self._longest, _MULTIPLE) for view in views]
+        canvas = max(width for width, _ in sizes), max(height for _, height in sizes)
+        with inference():
+            found = self._model.network(self._pair(views, sizes, canvas))
+        scores = found.matching_scores[0].cpu().numpy()
+        chosen = (found.matches[0].cpu().numpy() >= 0) & (scores > 0)
+        relative = found.keypoints[0].double().cpu().numpy()
+        points = [
+            scale_pixels(relative[side][chosen[side]] * canvas, size, view.camera.size)
+            for side, (view, size) in enumerate(zip(views, sizes, strict=True))
+        ]
+        certain = np.clip(scores[0][chosen[0]], 0, 1).astype(np.float32)
+        keep = usable(view_a, points[0]) & usable(view_b, points[1])
+        pixel_size = max(
+            v / n
+            for view, size in zip(views, sizes, strict=True)
+            for v, n in zip(view.camera.size, size, strict=True)
+        )
+        std_px = max(1.0, _STD_NETWORK_PX * pixel_size)
+        dense = DenseMatches(points[0][keep], points[1][keep], certain[keep], std_px)
+        return PairMatches(dense=dense)
+
+    def _pair(
+        self, views: tuple[View, View], sizes: list[tuple[int, int]], canvas: tuple[int, int]
+    ) -> torch.Tensor:
+        """Both views, (1, 2, 3, h, w)."""
+        images = torch.zeros(1, 2, 3, canvas[1], canvas[0], device=self._model.device)
+        for side, (view, (width, height)) in enumerate(zip(views, sizes, strict=True)):
+            images[0, side, :, :height, :width] = gray_image(
+                view, (width, height), self._model.device
+            )[0]
+        return images
