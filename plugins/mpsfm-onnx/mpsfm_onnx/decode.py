@@ -18,6 +18,9 @@ from mpsfm_onnx.description import (
     NormalsOutput,
 )
 
+_GRID = np.arange(64)
+"""Of pixels that tell the shift (MoGe: 64 x 64)."""
+_GAUSS_NEWTON_STEPS = 20
 _SMALLEST_RELATIVE_STD = 1e-4
 """A network that is perfectly sure still needs a positive variance; calibration has its floor."""
 
@@ -86,17 +89,34 @@ def _network_depth(
 def z_shift(points: Float64, xy: Float64, valid: Bool | None = None) -> float:
     """What z of points (h, w, 3) lacks, given the rays ``(x, y, 1)`` they must lie on.
 
-    The shift t minimises ``sum |(x_i, y_i) - xy_i (z_i + t)|^2 / z_i^2``: the reprojection error,
-    but for the shift in its weight, in closed form.
+    The shift t minimises the reprojection error ``sum |(x_i, y_i) / (z_i + t) - xy_i|^2`` over a
+    grid of 64 x 64 pixels, as MoGe's own inference does: by Gauss-Newton, from the minimum of
+    ``sum |(x_i, y_i) - xy_i (z_i + t)|^2 / z_i^2``, which is the same but for the shift in its
+    weight.
     """
     usable = np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
     if valid is not None:
         usable &= valid
-    if not usable.any():
+    height, width = usable.shape
+    grid = np.ix_(_GRID * height // len(_GRID), _GRID * width // len(_GRID))
+    chosen = usable[grid]
+    if not chosen.any():
         return 0.0
-    (x_y, z), on_ray = np.split(points[usable], [2], axis=-1), xy[usable]
-    miss = (x_y - on_ray * z) / z
+    (x_y, z), on_ray = np.split(points[grid][chosen], [2], axis=-1), xy[grid][chosen]
     slope = on_ray / z
+    shift = _step((x_y - on_ray * z) / z, slope)
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        shift = max(shift, -0.99 * float(z.min()))  # all points stay in front of the camera
+        depth = z + shift
+        step = _step(x_y / depth - on_ray, x_y / depth**2)
+        shift += step
+        if abs(step) < 1e-9 * float(depth.mean()):
+            break
+    return max(shift, -0.99 * float(z.min()))
+
+
+def _step(miss: Float64, slope: Float64) -> float:
+    """Of one unknown that ``miss`` falls with by ``slope``."""
     return float((miss * slope).sum() / max((slope**2).sum(), 1e-12))
 
 
