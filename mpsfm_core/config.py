@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
+from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.errors import ConfigError, ProviderError, did_you_mean
 from mpsfm_core.extraction.options import ExtractionOptions, PairOptions, VerificationOptions
 from mpsfm_core.inputs.options import InputOptions
@@ -84,6 +85,7 @@ class Config(Options):
     verification: VerificationOptions = Field(default_factory=VerificationOptions)
     extraction: ExtractionOptions = Field(default_factory=ExtractionOptions)
     mapping: MappingOptions = Field(default_factory=MappingOptions)
+    dense: DenseOptions = Field(default_factory=DenseOptions)
     results: ResultOptions = Field(default_factory=ResultOptions)
     runtime: RuntimeOptions = Field(default_factory=RuntimeOptions)
 

@@ -7,6 +7,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from threadpoolctl import threadpool_limits
 from mpsfm_core.checkpoints import DiskCheckpoints
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import MappingProblem, Pose
+from mpsfm_core.dense.stage import densify
 from mpsfm_core.errors import InputError, ReconstructionError
 from mpsfm_core.extraction.focal import estimate_focals
 from mpsfm_core.extraction.runner import Extraction, extract
@@ -115,6 +117,7 @@ class _Run:
         self._stages = Stages(registry)
         self._provision = Provision(config, ())
         self._folder = Path()
+        self._dense: list[dict[str, Any]] | None = None
 
     def __call__(
         self,
@@ -150,9 +153,10 @@ class _Run:
             if checkpoints is not None:
                 checkpoints.forget()
             self._give_up(images, extraction, mapping)
+        photos = Photos(images, problem)
+        mapping, self._dense = self._densified(mapping, photos)
         summary: dict[str, Any] = {}
         with stage("results"):
-            photos = Photos(images, problem)
             components = [Component.of(part, photos) for part in mapping.reconstructions]
             models = tuple(component.model for component in components)
 
@@ -184,6 +188,27 @@ class _Run:
             checkpoints.forget()
         return checkpoints
 
+    def _densified(
+        self, mapping: MappingResult, photos: Photos
+    ) -> tuple[MappingResult, list[dict[str, Any]] | None]:
+        """The groups with depth measured in the photos, and what to say of each."""
+        config = self._provision.config
+        if not config.dense.enabled:
+            return mapping, None
+        parts, reports = [], []
+        with self._stages.stage("dense"):
+            for part in mapping.reconstructions:
+                dense, report = densify(
+                    part,
+                    photos.view,
+                    config.dense,
+                    config.runtime.workers,
+                    partial(self._stages.stage_progress, "dense"),
+                )
+                parts.append(dense)
+                reports.append(asdict(report))
+        return replace(mapping, reconstructions=tuple(parts)), reports
+
     def _give_up(self, images: ImageSet, extraction: Extraction, mapping: MappingResult) -> None:
         """Leave the reasons in the summary and raise."""
         summary = self._summary("failed", images, extraction, mapping, ())
@@ -213,6 +238,7 @@ class _Run:
             "pairs": describe_pairs(extraction.report, mapping),
             "reconstructions": describe_reconstructions(mapping, models),
             "stages": {name: asdict(record) for name, record in self._stages.report().items()},
+            "dense": self._dense,
             "mapping_runs": mapping.report.runs,
             "mapping_steps": {
                 name: {"seconds": seconds, "calls": mapping.report.counts.get(name)}

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "mpsfm_core"
 FRONT_DOOR = "__init__"
 """Imports the rooms when one of its functions is called, see there."""
-NUMERICS = {"optimize", "scene", "mapping"}
+NUMERICS = {"optimize", "scene", "mapping", "dense"}
 BELOW_NUMERICS = {"errors", "options", "data", "geometry", *NUMERICS}
 
 

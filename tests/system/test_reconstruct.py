@@ -69,7 +69,7 @@ def test_the_summary_says_what_was_used_and_what_came_out(output: Path) -> None:
         "depth",
         "normals",
     }
-    rooms = {"providers", "inputs", "extraction", "mapping", "results"}
+    rooms = {"providers", "inputs", "extraction", "mapping", "dense", "results"}
     assert set(summary["stages"]) == rooms
     for stage in summary["stages"].values():
         assert stage["seconds"] > 0

@@ -1,0 +1,267 @@
+"""Dense geometry before and after the stage ``dense``, with the same poses.
+
+    python -m benchmarks.dense [--cases kitchen-all ...] [--json] [--output DIR]
+
+A case is a scene, a bucket of its sets and a depth prior. The mapped sets (poses, points, refined
+depth) are kept in the output folder, so that only what comes after the mapper is run again. Depth
+is compared in the scale of the cameras, the cloud after aligning the cameras' centres, with all
+true depth maps of the set as the scan. ``fountain`` has no true depth: there it is the share of the
+true model's points whose depth is right to 1 %. The last line of ``--json`` is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pickle
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks._scenes import shared_folder
+from benchmarks.accuracy import FASTDEPTH, PRIORS
+from mpsfm_core.data import DepthPrior, Float64, NormalPrior
+from mpsfm_core.evaluation.alignment import trajectory_errors
+from mpsfm_core.evaluation.benchmark import PairsOfSets, problem_of_sets
+from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy, thinned
+from mpsfm_core.evaluation.prior_quality import read_depth
+from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
+from mpsfm_core.geometry import (
+    camera_center,
+    pixel_centers,
+    sample_bilinear,
+    transform,
+    unproject,
+)
+from mpsfm_core.inputs.images import ImageSet, load_images
+from mpsfm_core.inputs.models import read_model
+from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.mapping.mapper import reconstruct
+from mpsfm_core.registry import Registry
+from mpsfm_core.results.dense_cloud import fuse_depth_maps
+from mpsfm_core.results.options import ResultOptions
+from mpsfm_core.scene.reconstruction import Reconstruction
+
+TOLERANCES = (0.02, 0.05)
+"""Metres, of the clouds."""
+NEAR = 0.1
+"""Relative error of depth that counts as near."""
+POINT_NEAR = 0.01
+"""The same at points of a true model."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Sets of a scene, mapped with a prior of :mod:`mpsfm_core.evaluation.prior_quality`."""
+
+    scene: str
+    bucket: str
+    prior: str
+
+
+CASES: Mapping[str, Case] = {
+    f"{short}-{bucket}-{prior}": Case(scene, bucket, prior)
+    for short, scene, buckets, priors in (
+        (
+            "kitchen",
+            "rendered_kitchen",
+            ("all", "leq30", "minimal"),
+            PRIORS,
+        ),
+        ("hololens", "hololens_room", ("all", "leq30"), ("config",)),
+        ("fountain", "fountain", ("all",), ("config",)),
+    )
+    for bucket in buckets
+    for prior in priors
+}
+"""``config`` is FastDepth."""
+
+
+@dataclass(frozen=True, eq=False)
+class MappedSet:
+    """The largest model of a set, and the normal priors of its images by name."""
+
+    reconstruction: Reconstruction
+    normals: Mapping[str, NormalPrior]
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=CASES, metavar="CASE")
+    parser.add_argument("--output", type=Path, default=Path("build/benchmarks/dense"))
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    rows = []
+    for name in arguments.cases:
+        case = CASES[name]
+        scene = read_scene(shared_folder() / "data" / case.scene)
+        mapped = mapped_sets(name, arguments.output)
+        rows += measured(name, scene, mapped)
+        print(table(rows[-1:]), file=sys.stderr)
+    print(table(rows))
+    if arguments.json:
+        print(json.dumps({"rows": rows}))
+
+
+def mapped_sets(name: str, output: Path) -> list[MappedSet]:
+    """What the mapper makes of the sets of a case, now or earlier."""
+    kept = output / f"{name}.pickle"
+    if kept.is_file():
+        return list(pickle.loads(kept.read_bytes()))
+    case = CASES[name]
+    scene = read_scene(shared_folder() / "data" / case.scene)
+    sets = scene.chosen([case.bucket])
+    output.mkdir(parents=True, exist_ok=True)
+    config = output / "fastdepth.yaml"
+    model = shared_folder() / "models" / "fastdepth_224.onnx"
+    config.write_text(f"extends: benchmark\n{FASTDEPTH.format(model=model)}", encoding="utf-8")
+    registry, only = Registry.discover(), PairsOfSets()
+    only.allow(sets)
+    registry.register(only, name="pairs of sets")
+    problem, options = problem_of_sets(
+        scene, sets, case.prior, str(config), ("runtime.workers=1",), output / name, registry
+    )
+    mapped = []
+    for item in sets:
+        subset = problem.subset(list(item.images))
+        best = reconstruct(subset, options).reconstructions[0]
+        normals = {image.name: image.normals for image in subset.images}
+        mapped.append(MappedSet(best, normals))
+    kept.write_bytes(pickle.dumps(mapped))
+    return mapped
+
+
+def measured(name: str, scene: SceneFolder, mapped: Sequence[MappedSet]) -> list[dict[str, Any]]:
+    """Means over the sets of a case, a row for each way to make the maps."""
+    photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
+    rows = []
+    for way in ("mapper",):
+        found = []
+        for item in mapped:
+            images = {image.name: image.depth for image in item.reconstruction.images}
+            cloud, _ = fuse_depth_maps(item.reconstruction, view_of(photos), ResultOptions())
+            found.append(set_errors(scene, item.reconstruction, images, cloud))
+        rows.append({"case": name, "maps": way, **_means(found)})
+    return rows
+
+
+def view_of(photos: ImageSet) -> Any:
+    """Views by name."""
+    index = {name: number for number, name in enumerate(photos.names)}
+    return lambda name: photos.view(index[name])
+
+
+def set_errors(
+    scene: SceneFolder,
+    reconstruction: Reconstruction,
+    maps: Mapping[str, DepthPrior],
+    cloud: Float64,
+) -> dict[str, float]:
+    """Errors of the depth maps and of the cloud (n, 3) of one set; empty if it has no scale."""
+    errors = trajectory_errors(reconstruction.poses, scene.truth)
+    if errors is None:
+        return {}
+    aligned = errors.truth_from_estimate
+    if scene.depth is None:
+        return {"points_near": points_near(scene, reconstruction, maps, aligned.scale)}
+    found = [
+        map_errors(depth, aligned.scale, read_depth(scene.depth / f"{Path(name).stem}.png"))
+        for name, depth in maps.items()
+    ]
+    result = {key: float(np.mean([each[key] for each in found])) for key in found[0]}
+    accuracy = cloud_accuracy(aligned.apply(cloud), scan_of(scene, tuple(maps)), TOLERANCES)
+    for tolerance in map(str, TOLERANCES):
+        centimetres = round(100 * float(tolerance))
+        for key in ("accuracy", "completeness", "f1"):
+            result[f"{key}_{centimetres}cm"] = accuracy[key][tolerance]
+    result["points"] = accuracy["points"]
+    return result
+
+
+def map_errors(depth: DepthPrior, scale: float, truth: Float64) -> dict[str, float]:
+    """AbsRel, the share that is near, and the share within the stated std, of one map."""
+    assert depth.variance is not None  # of a refined map always
+    known = truth > 0
+    height, width = truth.shape
+    grid = depth.shape
+    xy = pixel_centers(width, height)[known] * (np.array(grid[::-1]) / (width, height))
+    found, ok = sample_bilinear(depth.depth, depth.valid, xy)
+    variance, _ = sample_bilinear(depth.variance, depth.valid, xy)
+    ok &= found > 0
+    true = truth[known][ok]
+    error = np.abs(scale * found[ok] - true)
+    return {
+        "abs_rel": float((error / true).mean()),
+        "near": float((error <= NEAR * true).mean()),
+        "within_std": float((error <= scale * np.sqrt(variance[ok])).mean()),
+        "coverage": float(ok.mean()),
+    }
+
+
+def scan_of(scene: SceneFolder, names: Sequence[str]) -> Float64:
+    """World points of all true depth maps of the images."""
+    assert scene.depth is not None
+    photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
+    parts = []
+    for name in names:
+        truth = read_depth(scene.depth / f"{Path(name).stem}.png")
+        height, width = truth.shape
+        camera = photos[photos.names.index(name)].pinhole.resized(width, height)
+        known = truth > 0
+        local = unproject(camera, pixel_centers(width, height)[known], truth[known])
+        rotation, translation = scene.truth[name]
+        world = local @ rotation + camera_center(rotation, translation)
+        parts.append(thinned(world, min(TOLERANCES) / 2))
+    return np.concatenate(parts)
+
+
+def points_near(
+    scene: SceneFolder,
+    reconstruction: Reconstruction,
+    maps: Mapping[str, DepthPrior],
+    scale: float,
+) -> float:
+    """Share of the true model's observations whose depth in the map is right to 1 %."""
+    model = read_model(scene.path / "gt")
+    right = total = 0
+    for image in model.images.values():
+        if image.name not in maps:
+            continue
+        seen = [p for p in image.points2D if p.has_point3D()]
+        xyz = np.array([model.points3D[p.point3D_id].xyz for p in seen])
+        true = transform(*scene.truth[image.name], xyz)[:, 2]
+        depth = maps[image.name]
+        size = model.cameras[image.camera_id]
+        xy = np.array([p.xy for p in seen]) * (
+            np.array(depth.shape[::-1]) / (size.width, size.height)
+        )
+        found, ok = sample_bilinear(depth.depth, depth.valid, xy)
+        right += int((ok & (np.abs(scale * found - true) <= POINT_NEAR * true)).sum())
+        total += len(seen)
+    return right / total
+
+
+def _means(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    usable = [each for each in found if each]
+    means = {key: float(np.mean([each[key] for each in usable])) for key in usable[0]}
+    return {"sets": len(usable), **means}
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown."""
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    lines = ["| " + " | ".join(keys) + " |", "|" + " --- |" * len(keys)]
+    for row in rows:
+        cells = [row.get(key, "") for key in keys]
+        texts = [f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in cells]
+        lines.append("| " + " | ".join(texts) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Dense geometry of a finished reconstruction: multi-view depth with honest variance."""

@@ -1,0 +1,85 @@
+"""Joins what the photos say with what was known before, and says how sure that is.
+
+The error of the known log depth is a smooth random field: its std is the declared one, and it hangs
+together over some distance, but not across depth edges. Measured depth observes it. The mean of the
+field given these observations moves the known depth everywhere; where nothing is near it stays as
+it was, with the std that it had. The field is a Gaussian Markov random field (Lindgren et al.,
+2011): one sparse system on the pixels.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mpsfm_core.data import Bool, Float32
+from mpsfm_core.geometry import resize_map
+from mpsfm_core.optimize.depth_variance import inverse_diagonal
+from mpsfm_core.optimize.multigrid import Multigrid
+
+_REDUCTION = 4
+"""Of the grid that the field lives on, and of the one that its variance is computed on beyond."""
+_VARIANCE_REDUCTION = 2
+_EDGE = 0.03
+"""Step of log depth between neighbours of the field's grid that halves their coupling (ours)."""
+_ITERATIONS, _TOLERANCE = 30, 1e-3
+
+
+class Observed(NamedTuple):
+    """Measured log depth and its std, (h, w) float32; not measured where the std is infinite."""
+
+    log_depth: Float32
+    log_std: Float32
+
+    @property
+    def known(self) -> Bool:
+        """(h, w), where something was measured."""
+        return np.isfinite(self.log_std)
+
+
+def posterior(known: Observed, measured: Observed, correlation_px: float) -> Observed:
+    """Log depth everywhere: ``known`` before, moved by what was ``measured``.
+
+    ``correlation_px``: distance over which errors of the known depth hang together.
+    """
+    height, width = known.log_depth.shape
+    small = max(2, width // _REDUCTION), max(2, height // _REDUCTION)
+    which = measured.known
+    weight = np.where(which, 1 / measured.log_std**2, 0).astype(np.float32)
+    error = np.where(which, measured.log_depth - known.log_depth, 0) * weight
+    precision = resize_map(weight, *small)
+    best = resize_map(np.where(which, measured.log_depth, known.log_depth), *small)
+    std = resize_map(known.log_std, *small)
+    length = max(correlation_px / _REDUCTION, 1.0)
+    east, south, mass = _field(std, best, length)
+    grid = Multigrid(small[1], small[0])
+    grid.update(east, south, mass + precision)
+    rhs = resize_map(error, *small).astype(np.float64)
+    correction = grid.solve(rhs, _ITERATIONS, _TOLERANCE).x.astype(np.float32)
+    tiny = max(2, small[0] // _VARIANCE_REDUCTION), max(2, small[1] // _VARIANCE_REDUCTION)
+    length = max(length / _VARIANCE_REDUCTION, 1.0)
+    east, south, mass = _field(resize_map(std, *tiny), resize_map(best, *tiny), length)
+    variance = inverse_diagonal(east, south, mass + resize_map(precision, *tiny))
+    spread = np.sqrt(resize_map(variance.astype(np.float32), width, height))
+    moved = known.log_depth + resize_map(correction, width, height)
+    return Observed(
+        np.where(which, measured.log_depth, moved),
+        np.where(which, measured.log_std, spread),
+    )
+
+
+def _field(std: Float32, log_depth: Float32, length: float) -> tuple[Float32, Float32, Float32]:
+    """Couplings (east, south) and mass of a field of this std and correlation length in pixels.
+
+    In the plane the variance of such a field is about log(3 length) / (2 pi coupling), the mass
+    coupling / length^2.
+    """
+    strength = (np.log(3 * length) / (2 * np.pi * std**2)).astype(np.float32)
+    east, south = np.zeros_like(strength), np.zeros_like(strength)
+    for axis, couplings in ((1, east), (0, south)):
+        step = np.diff(log_depth, axis=axis) / _EDGE
+        here = np.moveaxis(strength, axis, 0)
+        joined = np.minimum(here[1:], here[:-1]) / (1 + np.moveaxis(step, axis, 0) ** 2)
+        np.moveaxis(couplings, axis, 0)[:-1] = joined
+    return east, south, (strength / length**2).astype(np.float32)

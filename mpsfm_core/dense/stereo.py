@@ -1,0 +1,124 @@
+"""Depth of one view from its source views: a search along the known surface, coarse to fine.
+
+A label is an offset of log depth from the surface that is known before. All pixels of a label are
+warped together into a source view, so that windows are slanted as that surface is and a label costs
+a few dozen operations a pixel whatever the window. Semi-global matching (Hirschmueller, PAMI 2008)
+joins the costs; smooth is what runs along the known surface. Then the same around what was found,
+on the next finer grid, with a few labels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mpsfm_core.data import Float32, Float64
+from mpsfm_core.dense.matching_kernels import (
+    aggregated_costs,
+    best_labels,
+    correlation_costs,
+    joined_costs,
+)
+from mpsfm_core.dense.options import DenseOptions
+from mpsfm_core.dense.view import DenseView
+from mpsfm_core.geometry import resize_map
+
+_LEVELS = (2, 1)
+"""Reductions of the grid, coarse to fine."""
+_FINE_LABELS = 5
+"""Labels to each side on all grids but the coarsest; one is about a pixel of parallax (ours)."""
+_UNSEEN_COST = 0.6
+"""Of a depth at which no view sees the pixel: about that of texture that does not match (ours)."""
+_EDGE = 10 / 255
+"""Step of grey values that halves the penalty of a step of depth (ours)."""
+_MAX_PRIOR = 9.0
+"""Squared deviation from the known depth, in std, above which more costs no more."""
+_SAMPLES = 8
+"""Pixels along each side at which parallax is measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class StereoDepth:
+    """What the photos say. All (h, w) float32.
+
+    ``log_depth``; ``cost``: 1 - correlation of the better views, 0 to 1; ``log_std``: of the log
+    depth of a right match, by its parallax.
+    """
+
+    log_depth: Float32
+    cost: Float32
+    log_std: Float32
+
+
+def match_depth(
+    view: DenseView, sources: Sequence[DenseView], options: DenseOptions
+) -> StereoDepth:
+    """Search the depth of ``view`` in one or more source views."""
+    log_depth = np.zeros((0, 0), np.float32)
+    for factor in _LEVELS:
+        own, others = view.reduced(factor), [source.reduced(factor) for source in sources]
+        parallax = _parallax(own, others)
+        step = 1 / max(float(np.median(parallax)), 1e-6)
+        if factor == _LEVELS[0]:
+            log_depth = own.log_depth
+            reach = options.range_stds * float(np.median(own.log_std))
+            count = int(np.clip(np.ceil(2 * reach / step), 2, options.max_labels - 1))
+            offsets: Float64 = np.linspace(-reach, reach, count + 1)
+        else:
+            log_depth = resize_map(cv2.medianBlur(log_depth, 3), *own.camera.size)
+            offsets = (np.arange(-_FINE_LABELS, _FINE_LABELS + 1) * step).astype(np.float64)
+        log_depth, cost = _search(own, others, log_depth, offsets, options)
+    return StereoDepth(log_depth, cost, (options.match_std_px / parallax).astype(np.float32))
+
+
+def _search(
+    view: DenseView,
+    sources: Sequence[DenseView],
+    surface: Float32,
+    offsets: Float64,
+    options: DenseOptions,
+) -> tuple[Float32, Float32]:
+    """Log depth and cost of the best offsets from a surface."""
+    base = np.where(view.usable, np.exp(surface), np.float32(0))
+    costs = np.empty((len(sources), len(offsets), *base.shape), np.uint8)
+    noise = (options.grey_noise / 255) ** 2
+    for source, plane in zip(sources, costs, strict=True):
+        turned, shift = source.pixels_from(view)
+        own, their = (view.grey, base, offsets), (source.grey, turned, shift)
+        correlation_costs(*own, *their, options.window_radius, noise, plane)
+    joined = np.empty((*base.shape, len(offsets)), np.float32)
+    joined_costs(costs, options.view_share, _UNSEEN_COST, joined)
+    deviation = ((surface - view.log_depth) / view.log_std)[..., None]
+    deviation = deviation + offsets.astype(np.float32) / view.log_std[..., None]
+    weighed = joined + np.float32(options.prior_weight) * np.minimum(deviation**2, _MAX_PRIOR)
+    total = np.zeros_like(joined)
+    steps = options.small_step, options.large_step
+    aggregated_costs(weighed.astype(np.float32), view.grey, *steps, _EDGE, total)
+    offset, cost = np.empty_like(base), np.empty_like(base)
+    best_labels(total, joined, offsets, offset, cost)
+    return surface + offset, cost
+
+
+def _parallax(view: DenseView, sources: Sequence[DenseView]) -> Float32:
+    """Pixels that a point moves in the source views when its log depth changes by one, (h, w).
+
+    The largest among the views; far from all of them the small number that it is.
+    """
+    width, height = view.camera.size
+    y, x = ((np.arange(_SAMPLES) + 0.5) * size / _SAMPLES for size in (height, width))
+    pixels = np.stack([*np.meshgrid(x, y), np.ones((_SAMPLES, _SAMPLES))], axis=-1)
+    depth = np.exp(view.log_depth[np.ix_(y.astype(int), x.astype(int))]).astype(np.float64)
+    found = np.zeros((_SAMPLES, _SAMPLES))
+    for source in sources:
+        turned, shift = source.pixels_from(view)
+        ray = depth[..., None] * (pixels @ turned.T)
+        seen = ray + shift
+        z = np.maximum(seen[..., 2:], 1e-9)
+        moved = ray[..., :2] / z - seen[..., :2] * ray[..., 2:] / z**2
+        ahead = seen[..., 2] > 1e-6
+        found = np.maximum(found, np.where(ahead, np.linalg.norm(moved, axis=-1), 0))
+    smallest = max(float(np.median(found)) * 0.05, 1e-3)
+    return resize_map(np.maximum(found, smallest), width, height)

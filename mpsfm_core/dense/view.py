@@ -1,0 +1,93 @@
+"""One posed photo as the dense stage sees it: grey values and depth on one grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, PinholeCamera, View
+from mpsfm_core.geometry import resize_map
+from mpsfm_core.scene.reconstruction import RegisteredImage
+
+
+@dataclass(frozen=True, eq=False)
+class DenseView:
+    """A photo on the grid of its ``camera``.
+
+    ``grey``: (h, w) float32 in [0, 1]. ``usable``: (h, w) bool, False where the photo is masked.
+    ``log_depth``, ``log_std``: (h, w) float32, depth known before and its std, natural logarithm of
+    world units; where nothing was known the median, with a std that says so. ``rotation`` (3, 3),
+    ``translation`` (3,): ``cam_from_world``.
+    """
+
+    name: str
+    camera: PinholeCamera
+    rotation: Float64
+    translation: Float64
+    grey: Float32
+    usable: Bool
+    log_depth: Float32
+    log_std: Float32
+
+    @classmethod
+    def of(cls, image: RegisteredImage, view: View, max_size: int) -> DenseView:
+        """A registered image with its photo, the longer side ``max_size`` at most."""
+        rows, columns = view.image.shape[:2]
+        factor = min(1.0, max_size / max(rows, columns))
+        width, height = max(2, round(columns * factor)), max(2, round(rows * factor))
+        grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+        usable = np.ones((height, width), np.bool_)
+        if view.mask is not None:
+            usable = resize_map(view.mask, width, height, linear=False) > 0
+        log_depth, log_std = _known(image.depth)
+        return cls(
+            image.name,
+            image.camera.resized(width, height),
+            image.rotation,
+            image.translation,
+            resize_map(grey, width, height) / np.float32(255),
+            usable,
+            resize_map(log_depth, width, height),
+            resize_map(log_std, width, height),
+        )
+
+    def reduced(self, factor: int) -> DenseView:
+        """On a grid with so many times fewer rows and columns."""
+        if factor == 1:
+            return self
+        width, height = (max(2, size // factor) for size in self.camera.size)
+        return DenseView(
+            self.name,
+            self.camera.resized(width, height),
+            self.rotation,
+            self.translation,
+            resize_map(self.grey, width, height),
+            resize_map(self.usable, width, height, linear=False) > 0,
+            resize_map(self.log_depth, width, height),
+            resize_map(self.log_std, width, height),
+        )
+
+    def pixels_from(self, other: DenseView) -> tuple[Float64, Float64]:
+        """``(turned, shift)``: pixel (x, y, 1) of ``other`` with depth d is here at the homogeneous
+        pixel ``d * turned @ (x, y, 1) + shift``."""
+        rotation = self.rotation @ other.rotation.T
+        translation = self.translation - rotation @ other.translation
+        matrix = self.camera.matrix
+        return matrix @ rotation @ np.linalg.inv(other.camera.matrix), matrix @ translation
+
+
+UNKNOWN_LOG_STD = 1.0
+"""Of depth that nothing is known of but the median of the map."""
+
+
+def _known(depth: DepthPrior) -> tuple[Float32, Float32]:
+    assert depth.variance is not None  # a refined map always has one
+    valid = depth.valid
+    if not valid.any():
+        zero = np.zeros(depth.shape, np.float32)
+        return zero, zero + np.float32(UNKNOWN_LOG_STD)
+    known = np.log(np.where(valid, depth.depth, np.median(depth.depth[valid])))
+    std = np.sqrt(depth.variance) / np.where(valid, depth.depth, 1)
+    return known.astype(np.float32), np.where(valid, std, UNKNOWN_LOG_STD).astype(np.float32)

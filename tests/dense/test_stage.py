@@ -1,0 +1,87 @@
+"""The dense stage on an analytic room, and on what photos can be like."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import View
+from mpsfm_core.dense.options import DenseOptions
+from mpsfm_core.dense.stage import densify
+
+OPTIONS = DenseOptions(correlation_px=20)
+
+
+def changed(room, change: Callable[[int, np.ndarray], np.ndarray]) -> Callable[[str], View]:
+    """The photos with other grey values."""
+
+    def view_of(name: str) -> View:
+        view = room.views[name]
+        return replace(view, image=change(int(name[0]), view.image))
+
+    return view_of
+
+
+def test_depth_is_measured_where_views_overlap(room) -> None:
+    dense, report = densify(room.reconstruction, room.views.__getitem__, OPTIONS)
+    before, after = room.errors(room.reconstruction), room.errors(dense)
+    for name, error in after.items():
+        assert np.median(error) < 0.006 < 0.03 < np.median(before[name])
+        assert error.mean() < 0.35 * before[name].mean()
+        assert report.confirmed[name] > 0.6 and name not in report.sources[name]
+
+
+def test_the_stated_std_is_about_the_error(room) -> None:
+    dense, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS)
+    error = np.concatenate([e.ravel() for e in room.errors(dense).values()])
+    depths = [image.depth for image in dense.images]
+    std = np.concatenate([(np.sqrt(d.variance) / d.depth).ravel() for d in depths])
+    assert 0.55 < (error < std).mean() < 0.9
+    certain = std < np.median(std)
+    assert error[certain].mean() < error[~certain].mean()
+
+
+def test_threads_do_not_change_the_result(room) -> None:
+    one, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS, workers=1)
+    two, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS, workers=2)
+    for a, b in zip(one.images, two.images, strict=True):
+        np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
+
+
+def test_exposure_may_change_from_photo_to_photo(room) -> None:
+    def exposed(index: int, image: np.ndarray) -> np.ndarray:
+        return np.clip(image * (0.6 + 0.2 * index) + 8 * index, 0, 255).astype(np.uint8)
+
+    dense, _ = densify(room.reconstruction, changed(room, exposed), OPTIONS)
+    assert max(np.median(error) for error in room.errors(dense).values()) < 0.01
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_photos_that_show_nothing_leave_depth_as_it_is(room, value: int) -> None:
+    blank = changed(room, lambda _, image: np.full_like(image, value))
+    dense, _ = densify(room.reconstruction, blank, OPTIONS)
+    before, after = room.errors(room.reconstruction), room.errors(dense)
+    for name in before:
+        assert after[name].mean() < 1.1 * before[name].mean()
+
+
+def test_one_photo_or_none_that_overlaps_keeps_its_map(room) -> None:
+    first = room.reconstruction.images[0]
+    away = replace(first, name="1.png", translation=first.translation + 100)
+    for images in ((first,), (first, away)):
+        alone = replace(room.reconstruction, images=images)
+        dense, report = densify(alone, room.views.__getitem__, OPTIONS)
+        assert dense.images[0].depth is first.depth
+        assert report.confirmed["0.png"] == 0 and not report.sources["0.png"]
+
+
+def test_an_unconfirmed_pose_is_not_used(room) -> None:
+    images = list(room.reconstruction.images)
+    images[1] = replace(images[1], confirmed=False)
+    guessed = replace(room.reconstruction, images=tuple(images))
+    dense, report = densify(guessed, room.views.__getitem__, OPTIONS)
+    assert dense.images[1].depth is images[1].depth
+    assert all("1.png" not in sources for sources in report.sources.values())
