@@ -9,7 +9,7 @@ PLUGINS := $(patsubst %/pyproject.toml,%,$(wildcard plugins/*/pyproject.toml))
 TEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow test-all lint bench clean
+.PHONY: help install demo test test-slow test-all lint three bench clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -42,6 +42,11 @@ lint: $(INSTALLED) ## Run ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+three: ## Bundle what the report uses of three.js anew (needs npm)
+	npm --prefix mpsfm_core/report/assets ci
+	npm --prefix mpsfm_core/report/assets run three
+	rm -r mpsfm_core/report/assets/node_modules
 
 bench: $(INSTALLED) ## Run the benchmarks, or those that BENCH names
 	$(BIN)/python -m benchmarks $(BENCH)

@@ -19,6 +19,7 @@ setup(
         "mpsfm_core.configs": ["*.yaml"],
         "mpsfm_core.sample_scene.images": ["*.jpg"],
         "mpsfm_core.sample_scene.gt": ["*.txt"],
+        "mpsfm_core.report": ["assets/page.*", "assets/three.min.js", "assets/three.LICENSE"],
         "mpsfm_core.testing": ["templates/*/*", "templates/*/tests/*"],
     },
 )

@@ -27,6 +27,7 @@ from mpsfm_core.inputs.models import match_names, read_poses
 from mpsfm_core.mapping import mapper
 from mpsfm_core.provision import Provision, provide
 from mpsfm_core.registry import Registry, core_version
+from mpsfm_core.report.page import write_report
 from mpsfm_core.results.photos import Photos
 from mpsfm_core.results.summary import describe_images, describe_pairs, describe_reconstructions
 from mpsfm_core.results.writer import Component, write_failure, write_results
@@ -149,11 +150,11 @@ class _Run:
         with stage("mapping"):
             options, checkpoints = config.mapper_options(), self._checkpoints(problem)
             mapping = mapper.reconstruct(problem, options, self._stages, checkpoints)
+        photos = Photos(images, problem)
         if not mapping.reconstructions:
             if checkpoints is not None:
                 checkpoints.forget()
-            self._give_up(images, extraction, mapping)
-        photos = Photos(images, problem)
+            self._give_up(images, extraction, mapping, photos)
         mapping, self._dense = self._densified(mapping, photos)
         summary: dict[str, Any] = {}
         with stage("results"):
@@ -171,6 +172,7 @@ class _Run:
                 write_results(self._output, components, photos, config.results, summarize, seed)
         if checkpoints is not None:
             checkpoints.forget()
+        self._report()
         return ReconstructionResult(models[0], models[1:], mapping, summary, self._output)
 
     def _checkpoints(self, problem: MappingProblem) -> DiskCheckpoints | None:
@@ -209,19 +211,33 @@ class _Run:
                 reports.append(asdict(report))
         return replace(mapping, reconstructions=tuple(parts)), reports
 
-    def _give_up(self, images: ImageSet, extraction: Extraction, mapping: MappingResult) -> None:
+    def _give_up(
+        self, images: ImageSet, extraction: Extraction, mapping: MappingResult, photos: Photos
+    ) -> None:
         """Leave the reasons in the summary and raise."""
         summary = self._summary("failed", images, extraction, mapping, ())
         where = ""
         if self._output is not None:
-            write_failure(self._output, summary)
+            write_failure(self._output, photos, self._provision.config.results, summary)
             where = f"; the reasons per image and pair are in {self._output / SUMMARY}"
+            self._report()
         pairs = summary["pairs"]
         raise ReconstructionError(
             f"no reconstruction was possible from {len(images)} images: {pairs['verified']} of "
             f"{pairs['matched']} matched pairs could be verified{where}",
             summary,
         )
+
+    def _report(self) -> None:
+        """Write the page; whatever goes wrong there, the results are safe."""
+        if self._output is None or not self._provision.config.results.report:
+            return
+        with self._stages.stage("report"):
+            try:
+                write_report(self._output)
+            except Exception as error:
+                _log.warning("no report was written, all results were: %s", error)
+                _log.debug("the report", exc_info=True)
 
     def _summary(
         self,

@@ -24,6 +24,7 @@ from mpsfm_core.cli import (
     models,
     plugins,
     reconstruct,
+    report,
     testsets,
 )
 from mpsfm_core.cli.errors import GuardedGroup
@@ -46,6 +47,7 @@ def build_app() -> typer.Typer:
     app.command("reconstruct")(reconstruct.reconstruct)
     app.command("demo")(demo.demo)
     app.command("export")(export.export)
+    app.command("report")(report.report)
     app.command("evaluate")(evaluate.evaluate)
     app.command("benchmark")(benchmark.benchmark)
     app.command("calibrate")(calibrate.calibrate)

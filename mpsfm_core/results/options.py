@@ -16,6 +16,8 @@ class ResultOptions(Options):
     """Also write ``transforms.json`` for nerfstudio and tools that read its format."""
     depth_maps: bool = True
     """Write the refined depth maps into ``depth/``."""
+    report: bool = True
+    """Write ``report.html``, and into ``views/`` what it shows: small photos, priors, matches."""
     dense_cloud: bool = True
     """Write ``dense.ply``."""
     dense_max_points: int = Field(2_000_000, ge=1)

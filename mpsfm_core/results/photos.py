@@ -21,8 +21,8 @@ class Photos:
     """The photos of the images of a problem, found by name."""
 
     def __init__(self, images: ImageSet, problem: MappingProblem) -> None:
+        self.problem = problem
         self._images = images
-        self._problem = problem
         self._rows = {name: row for row, name in enumerate(images.names)}
 
     def source(self, image: RegisteredImage) -> SourceImage:
@@ -35,7 +35,7 @@ class Photos:
 
     def keypoints(self, reconstruction: Reconstruction) -> list[Float64]:
         """For each registered image its keypoints (n, 2), pixels of the view."""
-        return [self._problem.images[image.index].keypoints for image in reconstruction.images]
+        return [self.problem.images[image.index].keypoints for image in reconstruction.images]
 
     def original_keypoints(self, reconstruction: Reconstruction) -> list[Float64]:
         """For each registered image its keypoints (n, 2), pixels of the upright photo."""

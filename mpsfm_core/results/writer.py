@@ -11,6 +11,7 @@
            dense.ply        the refined depth maps, fused
            depth/NAME.npz   refined depth, variance and camera of each registered image
            transforms.json  for nerfstudio, if asked for
+           views/           small views, priors and matches of all images, for the report
            summary.json     what was used, what came out, and why not more
 """
 
@@ -35,10 +36,13 @@ from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos, portable_name
 from mpsfm_core.results.ply import write_ply
+from mpsfm_core.results.views import write_views
 from mpsfm_core.scene.reconstruction import Reconstruction
 
 DENSE = "dense.ply"
 DEPTH = "depth"
+VIEWS = "views"
+REPORT = "report.html"
 ENTRIES = (
     "sparse",
     "sparse_text",
@@ -48,9 +52,11 @@ ENTRIES = (
     DENSE,
     DEPTH,
     "transforms.json",
+    VIEWS,
+    REPORT,
     SUMMARY,
 )
-"""What belongs to us in an output folder."""
+"""What belongs to us in an output folder. The report is made from the rest of it, later."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +119,18 @@ def write_results(
             _write_undistorted(folder / "undistorted", best, photos)
         if options.nerfstudio:
             _write_nerfstudio(folder / "transforms.json", output, best, photos)
+        if options.report:
+            write_views(folder / VIEWS, photos.problem, photos.view)
         _write_json(folder / SUMMARY, summarize())
 
 
-def write_failure(output: Path, summary: Mapping[str, Any]) -> None:
-    """Write the summary of a run without reconstruction; earlier results stay where they are."""
-    with replacing(output, (SUMMARY,)) as folder:
+def write_failure(
+    output: Path, photos: Photos, options: ResultOptions, summary: Mapping[str, Any]
+) -> None:
+    """Write summary and views of a run without reconstruction; earlier results stay."""
+    with replacing(output, (VIEWS, REPORT, SUMMARY)) as folder:
+        if options.report:
+            write_views(folder / VIEWS, photos.problem, photos.view)
         _write_json(folder / SUMMARY, summary)
 
 

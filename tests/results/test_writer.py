@@ -84,6 +84,7 @@ def test_the_default_output_is_what_the_contract_says(solved, tmp_path: Path) ->
         "points.ply",
         "sparse",
         "summary.json",
+        "views",
     ]
     assert json.loads((output / "summary.json").read_text()) == {"status": "success"}
     model = pycolmap.Reconstruction(str(output / "sparse"))
@@ -169,8 +170,22 @@ def test_a_refined_focal_length_reaches_the_photos_camera(solved, tmp_path: Path
     assert "refined_focal_length_px" not in details["images/3.png"], "it is not registered"
 
 
+def test_views_show_what_the_mapper_was_given(solved, tmp_path: Path) -> None:
+    output = write(solved, tmp_path, DISTORTED, ResultOptions())
+    given = solved.problem.images[3]  # not registered
+    size = given.camera.size
+    picture = cv2.imread(str(output / "views" / f"{given.name}.webp"))
+    assert picture.shape == (*pinhole_camera(DISTORTED, 0.0).size[::-1], 3)
+    with np.load(output / "views" / f"{given.name}.npz") as maps:
+        assert maps["camera"].tolist() == [*size, *given.camera.params]
+        np.testing.assert_array_equal(maps["depth"], given.depth.depth)
+        np.testing.assert_allclose(maps["normals"], given.normals.normals, atol=1e-3)
+        std = np.sqrt(given.depth.variance) / given.depth.depth
+        np.testing.assert_allclose(maps["relative_std"], std, rtol=1e-3)
+
+
 def test_everything_that_can_be_left_out_is(solved, tmp_path: Path) -> None:
-    options = ResultOptions(depth_maps=False, dense_cloud=False, text_model=True)
+    options = ResultOptions(depth_maps=False, dense_cloud=False, text_model=True, report=False)
     output = write(solved, tmp_path, PINHOLE, options)
     names = sorted(path.name for path in output.iterdir())
     assert names == ["points.ply", "sparse", "sparse_text", "summary.json"]
@@ -230,7 +245,11 @@ def test_the_summary_tells_which_images_nothing_confirms(solved, tmp_path: Path)
 def test_a_failed_run_leaves_its_summary_and_the_earlier_model(solved, tmp_path: Path) -> None:
     output = write(solved, tmp_path, PINHOLE, ResultOptions())
     before = (output / "sparse" / "points3D.bin").read_bytes()
-    write_failure(output, {"status": "failed"})
+    (output / "report.html").write_text("of the run before")
+    photos = Photos(photos_of(solved, tmp_path / "photos", PINHOLE), solved.problem)
+    write_failure(output, photos, ResultOptions(), {"status": "failed"})
+    assert not (output / "report.html").exists()
+    assert (output / "views" / "images" / "3.png.npz").exists()
     assert json.loads((output / "summary.json").read_text()) == {"status": "failed"}
     assert (output / "sparse" / "points3D.bin").read_bytes() == before
 

@@ -30,7 +30,8 @@ def output(photo_scene, mpsfm, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 def test_the_contract_of_the_output_folder(output: Path) -> None:
     names = {path.name for path in output.iterdir()}
-    assert names == {"sparse", "points.ply", "dense.ply", "depth", "summary.json"}
+    report = {"views", "report.html"}
+    assert names == {"sparse", "points.ply", "dense.ply", "depth", "summary.json"} | report
     assert {path.name for path in (output / "depth").iterdir()} == {
         f"{number}.png.npz" for number in range(5)
     }

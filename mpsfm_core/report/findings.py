@@ -1,0 +1,234 @@
+"""What a person should know of a run: whether it is good, what is wrong, and what to do."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from mpsfm_core.report.reasons import NOTHING_TO_HOLD_ON, explain, pair_kind
+
+Level = Literal["bad", "warning", "note"]
+_ORDER: tuple[Level, ...] = ("bad", "warning", "note")
+_REFINED_FAR = 0.1
+"""A focal length that changed by more was no good guess (ours)."""
+
+_NETWORKLESS = {"flat", "from-depth"}
+"""Providers that stand in where no network could be had."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """``title``: in a line. ``text``: what is the matter. ``remedy``: what to do, may be empty.
+    ``images``: the photos that it is about."""
+
+    level: Level
+    title: str
+    text: str
+    remedy: str = ""
+    images: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """``level``: good, partial or failed. ``text``: a sentence."""
+
+    level: Literal["good", "partial", "failed"]
+    text: str
+
+
+def verdict(summary: Mapping[str, Any]) -> Verdict:
+    """Whether the run is good, in one look. ``summary``: of ``summary.json``."""
+    images = summary["images"]
+    registered, total = len(images["registered"]), images["total"]
+    if summary["status"] != "success":
+        return Verdict("failed", f"No reconstruction was possible from {_count(total, 'photo')}.")
+    if registered == total:
+        return Verdict("good", f"All {total} photos have their place.")
+    missing = total - registered
+    return Verdict("partial", f"{registered} of {total} photos have their place, {missing} not.")
+
+
+def findings(summary: Mapping[str, Any]) -> list[Finding]:
+    """The worst first. ``summary``: of ``summary.json``."""
+    found = [
+        *_failure(summary),
+        *_missing(summary),
+        *_unconfirmed(summary),
+        *_providers(summary),
+        *_scale(summary),
+        *_focal_lengths(summary),
+        *_weak(summary),
+    ]
+    return sorted(found, key=lambda finding: _ORDER.index(finding.level))
+
+
+def _failure(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    if summary["status"] == "success":
+        return
+    pairs = summary["pairs"]
+    if not pairs["verified"]:
+        kinds = Counter(pair_kind(pair["dropped"]) for pair in pairs["all"] if "dropped" in pair)
+        causes = ", ".join(f"{kind} in {_count(n, 'pair')}" for kind, n in kinds.most_common())
+        yield Finding(
+            "bad",
+            "No two photos could be matched",
+            f"{_count(pairs['matched'], 'pair')} of photos compared, none shows the same place for "
+            f"certain: {causes or 'no pair was proposed'}.",
+            "Photos must overlap: about half of each should be in the next. Check that they are "
+            "sharp and of one place, and that --intrinsics belongs to them. With little overlap "
+            "try --config robust; with walls without texture --config dense.",
+        )
+        return
+    starts = [explain(pair["cannot_start"]) for pair in pairs["all"] if "cannot_start" in pair]
+    usual, count = Counter(start.plain for start in starts).most_common(1)[0] if starts else ("", 0)
+    yield Finding(
+        "bad",
+        "Photos match, but no two of them can be the start",
+        f"{pairs['verified']} of {_count(pairs['matched'], 'pair')} of photos could be verified, "
+        f"but a reconstruction could start from none. In {_count(count, 'pair')}: {usual}",
+        "Look at the matches and at the prior depth of these photos below. Depth that is wrong "
+        "(glass, mirrors, a weak network) or a wrong focal length does this: try another depth "
+        "network (mpsfm config show default says which are to be had), or give --intrinsics. More "
+        "photos of the same place help in any case.",
+    )
+
+
+def _missing(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    groups = defaultdict(list)
+    for name, reason in summary["images"]["unregistered"].items():
+        groups[explain(reason).kind].append((name, explain(reason)))
+    failed = summary["status"] != "success"
+    if failed:  # of course
+        groups.pop(explain(NOTHING_TO_HOLD_ON).kind, None)
+    for kind, members in sorted(groups.items(), key=lambda item: -len(item[1])):
+        names = tuple(name for name, _ in members)
+        first = members[0][1]
+        title = f"{_count(len(names), 'photo')} missing: {kind}"
+        level: Level = "note" if failed else "warning"
+        yield Finding(level, title, first.plain, "" if failed else first.remedy, names)
+
+
+def _unconfirmed(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    names = tuple(summary["images"]["unconfirmed"])
+    if names:
+        yield Finding(
+            "warning",
+            f"{_count(len(names), 'photo')} placed without proof",
+            "They lie where their matches fit best, as mapping.place_unconfirmed asks for. Nothing "
+            "confirms that.",
+            "Do not trust their poses without a look.",
+            names,
+        )
+
+
+def _providers(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    for provider in summary["providers"]:
+        passed = provider["passed_over"]
+        if provider["name"] in _NETWORKLESS and provider["block"] == "depth":
+            yield Finding(
+                "warning",
+                "No depth network was used",
+                "Depth was taken as flat, so photos must overlap as for any other program.",
+                "pip install mpsfm-compact, or see mpsfm doctor.",
+            )
+        elif passed:
+            reasons = "; ".join(f"{name}: {_short(why)}" for name, why in passed.items())
+            yield Finding(
+                "note",
+                f"{provider['block']}: {provider['name']} stood in for {', '.join(passed)}",
+                f"What is preferred could not be had. {reasons}.",
+                "mpsfm doctor says what is missing and how to get it.",
+            )
+
+
+def _scale(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    for reconstruction in summary["reconstructions"][:1]:
+        metric = reconstruction["metric_scale"]
+        if metric is None:
+            yield Finding(
+                "note",
+                "The scale is unknown",
+                "No depth in metres was used: distances are right only relative to each other.",
+                "Use a depth provider that is metric (mpsfm plugins list).",
+            )
+        elif not metric["trusted"]:
+            yield Finding(
+                "warning",
+                "The scale is uncertain",
+                f"The depth maps of {_count(metric['num_images'], 'photo')} disagree by "
+                f"{metric['spread']:.0%} on how large a metre is; one unit is about "
+                f"{metric['metres_per_unit']:.3g} m.",
+                "Measure one distance, or use a better metric depth network.",
+            )
+
+
+def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    details = summary["images"]["details"]
+    guessed = [name for name, image in details.items() if image["focal_length_from"] == "default"]
+    if guessed:
+        yield Finding(
+            "warning",
+            f"The focal length of {_count(len(guessed), 'photo')} was guessed",
+            "Neither EXIF nor --intrinsics nor a network tells it. It was refined where the views "
+            "tell it, but a wrong one bends everything.",
+            "Give it with --intrinsics, or use photos as they come from the camera, with EXIF.",
+            tuple(guessed),
+        )
+    far = [
+        name
+        for name, image in details.items()
+        if abs(image.get("refined_focal_length_px", image["focal_length_px"]))
+        and abs(
+            image.get("refined_focal_length_px", image["focal_length_px"])
+            / image["focal_length_px"]
+            - 1
+        )
+        > _REFINED_FAR
+    ]
+    if far:
+        image = details[far[0]]
+        yield Finding(
+            "note",
+            "The focal length changed much",
+            f"From {image['focal_length_px']:.0f} ({image['focal_length_from']}) to "
+            f"{image['refined_focal_length_px']:.0f} px. The photos may be cropped or zoomed.",
+            "If you know the true one, give it with --intrinsics.",
+            tuple(far),
+        )
+
+
+def _weak(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Photos that hang on one other photo."""
+    partners = partner_counts(summary)
+    weak = tuple(name for name in summary["images"]["registered"] if partners[name] == 1)
+    if weak and len(summary["images"]["registered"]) > 2:
+        yield Finding(
+            "note",
+            f"{_count(len(weak), 'photo')} held by one other photo only",
+            "Nothing else confirms their poses.",
+            "Look at them first if something seems off; a further photo nearby makes them safe.",
+            weak,
+        )
+
+
+def partner_counts(summary: Mapping[str, Any]) -> Counter[str]:
+    """For each registered image how many others of them it has verified matches with."""
+    registered = set(summary["images"]["registered"])
+    return Counter(
+        name
+        for pair in summary["pairs"]["all"]
+        if "inliers" in pair and registered.issuperset(pair["images"])
+        for name in pair["images"]
+    )
+
+
+def _short(reason: str) -> str:
+    """The first sentence of a reason, of addresses the file only."""
+    return re.sub(r"\w+://\S*/", "", reason.split(". ")[0]).rstrip(".")
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"

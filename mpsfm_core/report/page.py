@@ -1,0 +1,330 @@
+"""``report.html``: one file with everything in it."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpsfm_core.data import Float64
+from mpsfm_core.files import write_file
+from mpsfm_core.report import pictures
+from mpsfm_core.report.findings import findings, partner_counts, verdict
+from mpsfm_core.report.points import PointSet, dense_points, sparse_points
+from mpsfm_core.report.reasons import explain
+from mpsfm_core.report.result_folder import PairLines, PriorMaps, RefinedMap, ResultFolder
+from mpsfm_core.results.writer import REPORT
+from mpsfm_core.yaml_text import write_yaml
+
+DENSE_POINTS = 280_000
+SPARSE_POINTS = 40_000
+"""12 bytes a point, 16 in base64: 5 MB together, and quick to turn on a laptop."""
+PICTURE_BYTES = 9_000_000
+"""Of all pictures together; where there are many photos, each gets a smaller picture."""
+_PHOTO_SIDE = (192, 800)
+_MAP_SIDE = (128, 360)
+_BYTES_A_PIXEL = 0.16
+"""Of WebP at our quality in base64, photos and maps of real rooms (measured)."""
+_PICTURES_OF_MAPS = 4
+_COORDINATES = 0xFFFF
+_USUAL_STD = 0.2
+"""Relative std that is brightest where nothing was reconstructed (ours)."""
+
+
+def write_report(folder: Path) -> Path:
+    """Make the page of a finished result folder anew; returns its path.
+
+    Raises :class:`~mpsfm_core.errors.InputError` when the folder holds no results or damaged
+    ones, :class:`OSError` when the disk is full.
+    """
+    text = render(ResultFolder.open(folder))
+    write_file(folder / REPORT, text.encode("utf-8"))
+    return folder / REPORT
+
+
+def render(result: ResultFolder) -> str:
+    """The page as text."""
+    parts = {
+        "TITLE": html.escape(result.path.resolve().name),
+        "STYLE": _asset("page.css"),
+        "THREE": _asset("three.min.js"),
+        "SCRIPT": _asset("page.js"),
+        "DATA": _script_safe(json.dumps(_payload(result), separators=(",", ":"), allow_nan=False)),
+    }
+    page = _asset("page.html")
+    head, *rest = page.split("{{")
+    filled = [head]
+    for piece in rest:
+        name, _, after = piece.partition("}}")
+        filled += [parts[name], after]
+    return "".join(filled)
+
+
+def _asset(name: str) -> str:
+    return (resources.files("mpsfm_core.report") / "assets" / name).read_text(encoding="utf-8")
+
+
+def _script_safe(data: str) -> str:
+    """JSON that nothing in it can end the script element around it."""
+    return data.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+def _payload(result: ResultFolder) -> dict[str, Any]:
+    summary = result.summary
+    maps = {name: result.refined(name) for name in result.names}
+    used = [refined for refined in maps.values() if refined is not None]
+    photos = _Photos(result, maps)
+    ids = {name: row for row, name in enumerate(result.names)}
+    return {
+        "folder": result.path.resolve().name,
+        "verdict": asdict(verdict(summary)),
+        "findings": [asdict(finding) for finding in findings(summary)],
+        "photos": [photos.describe(name) for name in result.names],
+        "pairs": _pairs(summary, ids),
+        "lines": {
+            f"{ids[pair.image_a]} {ids[pair.image_b]}": photos.lines(pair)
+            for pair in result.lines()
+            if pair.image_a in ids and pair.image_b in ids
+        },
+        "points": {
+            "sparse": _points(sparse_points(result.model, used, SPARSE_POINTS)),
+            "dense": _points(dense_points(result.dense_cloud(), used, DENSE_POINTS)),
+        },
+        "up": _up(used),
+        "reconstructions": summary["reconstructions"],
+        "providers": summary["providers"],
+        "stages": {name: stage["seconds"] for name, stage in summary["stages"].items()},
+        "steps": {name: step["seconds"] for name, step in summary["mapping_steps"].items()},
+        "memory_mb": _peak(summary),
+        "config": write_yaml(summary["config"]),
+        "versions": summary["versions"],
+    }
+
+
+class _Photos:
+    """What the page says and shows of each photo."""
+
+    def __init__(self, result: ResultFolder, maps: Mapping[str, RefinedMap | None]) -> None:
+        self._result = result
+        self._maps = maps
+        self._images = {image.name: image for image in result.model.images.values()}
+        self._partners = partner_counts(result.summary)
+        self._matched = Counter(
+            name
+            for pair in result.summary["pairs"]["all"]
+            if "inliers" in pair
+            for name in pair["images"]
+        )
+        self._sizes = _PictureSizes.of(len(result.names))
+        stds = [
+            float(np.percentile(refined.relative_std[refined.valid], 95))
+            for refined in maps.values()
+            if refined is not None and refined.valid.any()
+        ]
+        self._most_std = max(stds, default=_USUAL_STD)
+        self._views: dict[str, tuple[int, int]] = {}
+
+    def describe(self, name: str) -> dict[str, Any]:
+        images = self._result.summary["images"]
+        reason = {**images["unregistered"], **images["unconfirmed"]}.get(name)
+        explained = None if reason is None else explain(reason)
+        status = "registered"
+        if name in images["unconfirmed"]:
+            status = "unconfirmed"
+        elif explained is not None:
+            status = "missing"
+        prior, refined = self._result.prior(name), self._maps[name]
+        if prior is not None:
+            self._views[name] = prior.camera.size
+        details = images["details"][name]
+        return {
+            "name": name,
+            "status": status,
+            "reason": reason,
+            "plain": explained and explained.plain,
+            "remedy": explained and explained.remedy,
+            "keypoints": details["keypoints"],
+            "partners": self._partners[name] if explained is None else self._matched[name],
+            "depth_std": details["median_relative_depth_std"],
+            "valid_depth": details["valid_depth"],
+            "focal": details["focal_length_px"],
+            "focal_from": details["focal_length_from"],
+            "refined_focal": details.get("refined_focal_length_px"),
+            **self._in_model(name),
+            **self._camera(name, prior),
+            "pictures": self._pictures(name, prior, refined),
+        }
+
+    def lines(self, pair: PairLines) -> str:
+        """Matches in shares of the widths and heights of both views: ax, ay, bx, by, uint16."""
+        sides = []
+        for name, points in ((pair.image_a, pair.points_a), (pair.image_b, pair.points_b)):
+            size = np.array(self._views.get(name, (1, 1)))
+            sides.append(np.clip(points / size, 0, 1) * _COORDINATES)
+        return _base64(np.concatenate(sides, axis=1).astype("<u2"))
+
+    def _in_model(self, name: str) -> dict[str, Any]:
+        """Its points in the model and their mean reprojection error there."""
+        image = self._images.get(name)
+        if image is None:
+            return {"points": 0, "error": None}
+        model = self._result.model
+        errors = [
+            model.points3D[point.point3D_id].error
+            for point in image.points2D
+            if point.has_point3D()
+        ]
+        return {"points": len(errors), "error": float(np.mean(errors)) if errors else None}
+
+    def _camera(self, name: str, prior: PriorMaps | None) -> dict[str, Any]:
+        """Where it stands (world from camera, 3 x 4 by rows) and what it sees at depth 1."""
+        image = self._images.get(name)
+        if image is None:
+            return {"pose": None}
+        pose = image.cam_from_world().inverse().matrix()
+        if prior is not None:
+            width, height = prior.camera.size
+            (fx, fy, cx, cy) = prior.camera.params.tolist()
+        else:
+            camera = self._result.model.cameras[image.camera_id]
+            width, height = camera.width, camera.height
+            fx, fy = camera.focal_length_x, camera.focal_length_y
+            cx, cy = camera.principal_point_x, camera.principal_point_y
+        edges = [-cx / fx, -cy / fy, (width - cx) / fx, (height - cy) / fy]
+        return {"pose": _rounded(pose.ravel()), "edges": _rounded(np.array(edges))}
+
+    def _pictures(
+        self, name: str, prior: PriorMaps | None, refined: RefinedMap | None
+    ) -> dict[str, Any]:
+        sizes, made = self._sizes, {}
+        picture = self._result.picture(name)
+        if picture is not None:
+            made["photo"] = {"src": pictures.photo(picture, sizes.photo)}
+        seen = None
+        if refined is not None:
+            seen = pictures.range_of(refined.depth, refined.valid)
+        if prior is not None:
+            factor = _scale_between(prior, refined)
+            depth = (prior.depth * factor).astype(np.float32)
+            span = seen or pictures.range_of(depth, prior.valid)
+            legend = f"{span[0]:.3g} to {span[1]:.3g}"
+            made["prior"] = {
+                "src": pictures.depth_map(depth, prior.valid, span, sizes.maps),
+                "legend": f"red {legend} blue, scaled to the reconstruction" if seen else legend,
+            }
+        if refined is not None and seen is not None:
+            made["refined"] = {
+                "src": pictures.depth_map(refined.depth, refined.valid, seen, sizes.maps),
+                "legend": f"red {seen[0]:.3g} to {seen[1]:.3g} blue",
+            }
+        std = refined or prior
+        if std is not None:
+            made["std"] = {
+                "src": pictures.std_map(std.relative_std, std.valid, self._most_std, sizes.maps),
+                "legend": f"dark 0 to {self._most_std:.0%} of the depth bright",
+            }
+        if prior is not None:
+            made["normals"] = {
+                "src": pictures.normal_map(prior.normals, prior.valid, sizes.maps),
+                "legend": "red faces right, green up, blue the camera",
+            }
+        return made
+
+
+@dataclass(frozen=True)
+class _PictureSizes:
+    """Longer sides in pixels of a photo and of a map."""
+
+    photo: int
+    maps: int
+
+    @classmethod
+    def of(cls, count: int) -> _PictureSizes:
+        """As large as so many photos can be within :data:`PICTURE_BYTES`."""
+        full = 0.75 * (_PHOTO_SIDE[1] ** 2 + _PICTURES_OF_MAPS * _MAP_SIDE[1] ** 2)
+        share = (PICTURE_BYTES / (max(count, 1) * full * _BYTES_A_PIXEL)) ** 0.5
+        return cls(
+            int(np.clip(share * _PHOTO_SIDE[1], *_PHOTO_SIDE)),
+            int(np.clip(share * _MAP_SIDE[1], *_MAP_SIDE)),
+        )
+
+
+def _scale_between(prior: PriorMaps, refined: RefinedMap | None) -> float:
+    """What brings the prior to the scale of the refined depth."""
+    if refined is None or refined.depth.shape != prior.depth.shape:
+        return 1.0
+    both = refined.valid & prior.valid
+    return float(np.median(refined.depth[both] / prior.depth[both])) if both.any() else 1.0
+
+
+def _pairs(summary: Mapping[str, Any], ids: Mapping[str, int]) -> list[list[Any]]:
+    """Rows of both images, matches, inliers, and why the pair was dropped or cannot start."""
+    return [
+        [
+            *(ids[name] for name in pair["images"]),
+            pair["matches"],
+            pair.get("inliers", 0),
+            pair.get("dropped") or pair.get("cannot_start") or "",
+        ]
+        for pair in summary["pairs"]["all"]
+    ]
+
+
+def _points(points: PointSet) -> dict[str, Any]:
+    """Positions on a grid of 16 bits, colours and values in bytes."""
+    count = len(points.xyz)
+    low = np.zeros(3)
+    step = np.ones(3)
+    if count:
+        low = points.xyz.min(axis=0)
+        step = np.maximum(np.ptp(points.xyz, axis=0), 1e-9) / _COORDINATES
+    return {
+        "count": count,
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "xyz": _base64(np.round((points.xyz - low) / step).astype("<u2")),
+        "rgb": _base64(points.rgb),
+        "values": {
+            "error": _values(points.error, points.error_unit),
+            "std": _values(points.std, "%"),
+            "views": _values(points.views, ""),
+        },
+    }
+
+
+def _values(values: NDArray[np.float32], unit: str) -> dict[str, Any]:
+    """In 255 steps from the least to nearly the most, 255 where there is none."""
+    known = values[np.isfinite(values)]
+    low, high = np.percentile(known, [0, 98]).tolist() if len(known) else (0.0, 0.0)
+    share = (np.nan_to_num(values, nan=high) - low) / max(high - low, 1e-9)
+    steps = np.where(np.isfinite(values), np.clip(np.round(254 * share), 0, 254), 255)
+    return {"bytes": _base64(steps.astype(np.uint8)), "low": low, "high": high, "unit": unit}
+
+
+def _up(maps: list[RefinedMap]) -> list[float]:
+    """Where up is in the world for people who hold cameras upright, a unit vector."""
+    mean: Float64 = -np.sum([refined.rotation[1] for refined in maps], axis=0, dtype=np.float64)
+    length = np.linalg.norm(mean)
+    return _rounded(mean / length) if length > 1e-6 else [0.0, -1.0, 0.0]
+
+
+def _peak(summary: Mapping[str, Any]) -> float | None:
+    peaks = [stage["peak_memory_mb"] for stage in summary["stages"].values()]
+    return max((peak for peak in peaks if peak is not None), default=None)
+
+
+def _rounded(values: NDArray[Any]) -> list[float]:
+    return [float(f"{value:.7g}") for value in values]
+
+
+def _base64(values: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")

@@ -1,0 +1,83 @@
+"""What the mapper was given, as files: small views, priors and verified matches.
+
+They are what a report is made from, and tell why a run failed when there is nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mpsfm_core.data import Float64, MappingImage, MappingProblem, UInt8, View
+
+PICTURE_SIDE = 960
+"""Longer side of the pictures in pixels: enough to judge a photo on a screen."""
+PICTURE_QUALITY = 80
+MATCHES_A_PAIR = 100
+"""Of a pair at most; enough to see what was matched."""
+MATCHES = "matches.npz"
+
+
+def write_views(folder: Path, problem: MappingProblem, view_of: Callable[[str], View]) -> None:
+    """Write ``NAME.webp`` and ``NAME.npz`` for every image, and ``matches.npz``.
+
+    ``NAME.webp``: the undistorted view, reduced. ``NAME.npz``: ``depth`` (h, w) float32, the
+    prior in its own units; ``relative_std`` (h, w) float16, of that depth; ``normals`` (h, w, 3)
+    float16, unit, camera frame; ``valid`` (h, w) bool, of the depth; ``camera`` (6,) float64,
+    width, height, fx, fy, cx, cy of the view. ``matches.npz``: ``names`` (n,) of all images,
+    ``pairs`` (p, 2) int64 rows of names, ``starts`` (p + 1,) int64 rows where the matches of each
+    pair begin in ``points_a`` and ``points_b``, (m, 2) float32, pixels of the views.
+    """
+    for image in problem.images:
+        path = folder / f"{image.name}.npz"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(
+            path,
+            depth=image.depth.depth,
+            relative_std=_relative_std(image),
+            normals=image.normals.normals.astype(np.float16),
+            valid=image.depth.valid,
+            camera=np.array([*image.camera.size, *image.camera.params]),
+        )
+        _write_picture(folder / f"{image.name}.webp", view_of(image.name).image)
+    _write_matches(folder / MATCHES, problem)
+
+
+def _relative_std(image: MappingImage) -> NDArray[np.float16]:
+    assert image.depth.variance is not None  # MappingImage checks it
+    depth = np.where(image.depth.valid, image.depth.depth, 1)
+    std = np.sqrt(np.where(image.depth.valid, image.depth.variance, 0)) / depth
+    return np.asarray(np.minimum(std, np.finfo(np.float16).max), np.float16)
+
+
+def _write_picture(path: Path, rgb: UInt8) -> None:
+    factor = min(1.0, PICTURE_SIDE / max(rgb.shape[:2]))
+    if factor < 1:
+        size = (max(1, round(rgb.shape[1] * factor)), max(1, round(rgb.shape[0] * factor)))
+        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, PICTURE_QUALITY])
+    path.write_bytes(data.tobytes())
+
+
+def _write_matches(path: Path, problem: MappingProblem) -> None:
+    points: list[list[Float64]] = [[np.zeros((0, 2))], [np.zeros((0, 2))]]
+    counts = []
+    for pair in problem.pairs:
+        step = -(-len(pair.matches) // MATCHES_A_PAIR)
+        rows = pair.matches[:: max(1, step)]
+        counts.append(len(rows))
+        for side, image in enumerate((pair.image_a, pair.image_b)):
+            points[side].append(problem.images[image].keypoints[rows[:, side]])
+    np.savez_compressed(
+        path,
+        names=np.array([image.name for image in problem.images], dtype=np.str_),
+        pairs=np.array([(p.image_a, p.image_b) for p in problem.pairs], np.int64).reshape(-1, 2),
+        starts=np.cumsum([0, *counts]),
+        points_a=np.concatenate(points[0]).astype(np.float32),
+        points_b=np.concatenate(points[1]).astype(np.float32),
+    )

@@ -1,0 +1,101 @@
+"""What goes into the page, and what it is made from."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mpsfm_core.errors import InputError
+from mpsfm_core.report.page import render, write_report
+from mpsfm_core.report.result_folder import ResultFolder
+from mpsfm_core.results.writer import REPORT
+
+
+def data_of(page: str) -> dict[str, Any]:
+    (text,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page)
+    return json.loads(text)
+
+
+def test_a_run_writes_its_report_and_what_it_is_made_from(finished: Path) -> None:
+    assert (finished / REPORT).is_file()
+    assert (finished / "views" / "1.png.webp").is_file()
+    with np.load(finished / "views" / "1.png.npz") as maps:
+        assert maps["normals"].shape == (*maps["depth"].shape, 3)
+        assert maps["camera"].tolist() == [320, 240, 280, 280, 160, 120]
+    with np.load(finished / "views" / "matches.npz") as matches:
+        assert matches["starts"][-1] == len(matches["points_a"]) == len(matches["points_b"]) > 0
+
+
+def test_it_is_made_anew_from_the_folder_alone(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / finished.name)
+    again = write_report(tmp_path / finished.name)
+    assert again.read_text(encoding="utf-8") == (finished / REPORT).read_text(encoding="utf-8")
+
+
+def test_it_names_no_server(finished: Path) -> None:
+    page = (finished / REPORT).read_text(encoding="utf-8")
+    assert "default-src 'none'" in page
+    assert not re.search(r"""(src|href)=["']?(https?:)?//""", page)
+    assert "url(http" not in page
+
+
+def test_points_survive_their_thinning(finished: Path) -> None:
+    result = ResultFolder.open(finished)
+    points = data_of(render(result))["points"]["sparse"]
+    assert points["count"] == result.model.num_points3D()
+    steps = np.frombuffer(base64.b64decode(points["xyz"]), "<u2").reshape(-1, 3)
+    xyz = steps * np.array(points["step"]) + points["low"]
+    truth = np.array([result.model.points3D[key].xyz for key in sorted(result.model.points3D)])
+    assert np.abs(xyz - truth).max() < 1e-4 * np.ptp(truth)
+
+
+def test_it_says_who_is_missing_and_what_to_do(finished: Path) -> None:
+    data = data_of((finished / REPORT).read_text(encoding="utf-8"))
+    assert data["verdict"]["level"] == "partial"
+    (missing,) = [photo for photo in data["photos"] if photo["status"] == "missing"]
+    assert missing["name"] == "noise.png"
+    assert missing["remedy"]
+    assert any("noise.png" in finding["images"] for finding in data["findings"])
+
+
+def test_views_can_be_left_out(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "out")
+    shutil.rmtree(tmp_path / "out" / "views")
+    (tmp_path / "out" / "dense.ply").unlink()
+    data = data_of(write_report(tmp_path / "out").read_text(encoding="utf-8"))
+    assert data["points"]["dense"]["count"] == 0
+    assert all("photo" not in photo["pictures"] for photo in data["photos"])
+
+
+def test_a_failed_run_does_not_show_the_results_before_it(
+    finished: Path, failed: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(finished, tmp_path / "out")
+    shutil.copy(failed / "summary.json", tmp_path / "out")
+    data = data_of(write_report(tmp_path / "out").read_text(encoding="utf-8"))
+    assert data["verdict"]["level"] == "failed"
+    assert data["points"]["sparse"]["count"] == 0
+
+
+@pytest.mark.parametrize(
+    "name", ["summary.json", "dense.ply", "depth/1.png.npz", "views/1.png.npz", "views/1.png.webp"]
+)
+def test_a_damaged_file_is_named(finished: Path, tmp_path: Path, name: str) -> None:
+    shutil.copytree(finished, tmp_path / "out")
+    file = tmp_path / "out" / name
+    file.write_bytes(file.read_bytes()[:40])
+    with pytest.raises(InputError, match=re.escape(name.rpartition("/")[2])):
+        write_report(tmp_path / "out")
+    assert (tmp_path / "out" / REPORT).read_bytes() == (finished / REPORT).read_bytes()
+
+
+def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"summary\.json"):
+        write_report(tmp_path)
