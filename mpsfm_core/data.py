@@ -357,6 +357,29 @@ class MappingImage:
 
 
 @dataclass(frozen=True, eq=False)
+class PosedImage:
+    """An image that has a place, as viewers see it.
+
+    ``rotation`` (3, 3), ``translation`` (3,) float64: ``cam_from_world``. ``depth``: in world
+    units on a grid of any size that covers the view, None where there is none.
+    """
+
+    name: str
+    camera: PinholeCamera
+    rotation: Float64
+    translation: Float64
+    depth: DepthPrior | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneState:
+    """What is reconstructed so far. ``points``: (p, 3) float64, world units."""
+
+    images: tuple[PosedImage, ...]
+    points: Float64
+
+
+@dataclass(frozen=True, eq=False)
 class VerifiedPair:
     """Geometrically verified matches of two images.
 

@@ -17,7 +17,7 @@ the method of its kind's protocol below.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, get_args, runtime_checkable
@@ -32,6 +32,7 @@ from mpsfm_core.data import (
     Float32,
     NormalPrior,
     PairMatches,
+    SceneState,
     View,
 )
 from mpsfm_core.errors import ProviderError
@@ -292,6 +293,15 @@ class Hooks:
     @hookspec
     def mpsfm_image_registered(self, name: str, registered: int, total: int) -> None:
         """The mapper accepted an image."""
+
+    @hookspec
+    def mpsfm_scene_changed(self, scene: Callable[[], SceneState]) -> None:
+        """Images or points have moved; ``scene()`` gives a copy of how they are now."""
+
+    @hookspec
+    def mpsfm_viewers(self) -> Mapping[str, str]:  # type: ignore[empty-body]
+        """The viewers of this plugin: name -> ``"package.module:Class"``, imported when one is
+        wanted; see :mod:`mpsfm_core.viewing`."""
 
     @hookspec
     def mpsfm_image_rejected(self, name: str, reason: str) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from mpsfm_core.data import SceneState
 from mpsfm_core.registry import Registry
 
 _PROC = Path("/proc/self")
@@ -85,6 +86,10 @@ class Stages:
         self._registry.call_hook(
             "mpsfm_image_registered", name=name, registered=registered, total=total
         )
+
+    def scene_changed(self, scene: Callable[[], SceneState]) -> None:
+        """Images or points have moved."""
+        self._registry.call_hook("mpsfm_scene_changed", scene=scene)
 
     def image_rejected(self, name: str, reason: str) -> None:
         """The mapper tried an image and rejected it."""

@@ -16,9 +16,11 @@ import typer
 
 from mpsfm_core.cli import (
     benchmark,
+    cache,
     calibrate,
     config,
     demo,
+    doctor,
     evaluate,
     export,
     models,
@@ -26,6 +28,7 @@ from mpsfm_core.cli import (
     reconstruct,
     report,
     testsets,
+    view,
 )
 from mpsfm_core.cli.errors import GuardedGroup
 
@@ -48,12 +51,15 @@ def build_app() -> typer.Typer:
     app.command("demo")(demo.demo)
     app.command("export")(export.export)
     app.command("report")(report.report)
+    app.command("view")(view.view)
+    app.command("doctor")(doctor.doctor)
     app.command("evaluate")(evaluate.evaluate)
     app.command("benchmark")(benchmark.benchmark)
     app.command("calibrate")(calibrate.calibrate)
     app.add_typer(plugins.app, name="plugins")
     app.add_typer(config.app, name="config")
     app.add_typer(models.app, name="models")
+    app.add_typer(cache.app, name="cache")
     app.add_typer(testsets.app, name="testsets")
     return app
 

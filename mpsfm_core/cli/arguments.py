@@ -22,6 +22,10 @@ Offline: TypeAlias = Annotated[
 Quiet: TypeAlias = Annotated[
     bool, typer.Option("--quiet", "-q", help="No progress, no summary; errors only.")
 ]
+ViewerName: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--viewer", metavar="NAME", help="Of a viewer plugin: viser, rerun."),
+]
 
 
 def settings(overrides: list[str] | None, offline: bool) -> list[str]:

@@ -15,6 +15,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from mpsfm_core.cli.time_left import TimeLeft, in_words
 from mpsfm_core.providers import hookimpl
 from mpsfm_core.registry import Registry
 
@@ -30,6 +31,7 @@ def showing_progress(registry: Registry, quiet: bool) -> Iterator[None]:
         registry.register(Lines(console), name="progress lines")
         yield
         return
+    left = TimeLeft()
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -37,15 +39,19 @@ def showing_progress(registry: Registry, quiet: bool) -> Iterator[None]:
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=console) as progress:
-        registry.register(Bars(progress), name="progress bars")
+        registry.register(Bars(progress, left), name="progress bars")
         yield
+        left.keep()
 
 
 class Bars:
-    """One bar a stage, for people who watch."""
+    """One bar a stage, and one for the whole run, for people who watch."""
 
-    def __init__(self, progress: Progress) -> None:
+    def __init__(self, progress: Progress, left: TimeLeft) -> None:
         self._progress = progress
+        self._left = left
+        self._registered = ""
+        self._run = progress.add_task("run", total=None)
         self._tasks: dict[str, TaskID] = {}
 
     @hookimpl
@@ -57,16 +63,22 @@ class Bars:
     def mpsfm_stage_started(self, stage: str, total: int | None) -> None:
         """Add a bar."""
         self._tasks[stage] = self._progress.add_task(stage, total=total)
+        self._left.started(stage, total)
+        self._tell()
 
     @hookimpl
     def mpsfm_stage_progress(self, stage: str, done: int, total: int) -> None:
         """Advance it."""
         if stage in self._tasks:
             self._progress.update(self._tasks[stage], completed=done, total=total)
+        self._left.progress(stage, done, total)
+        self._tell()
 
     @hookimpl
     def mpsfm_stage_finished(self, stage: str, seconds: float) -> None:
         """Fill it."""
+        self._left.finished(stage)
+        self._tell()
         task = self._tasks.pop(stage, None)
         if task is not None:
             total = self._progress.tasks[task].total or 1
@@ -75,7 +87,13 @@ class Bars:
     @hookimpl
     def mpsfm_image_registered(self, name: str, registered: int, total: int) -> None:
         """Registered images are the mapper's progress."""
+        self._registered = f"{registered} of {total} images registered"
         self.mpsfm_stage_progress("mapping", registered, total)
+
+    def _tell(self) -> None:
+        """The line of the whole run."""
+        known = (in_words(self._left.seconds()), self._registered)
+        self._progress.update(self._run, description=" - ".join(("run", *filter(None, known))))
 
 
 class Lines:

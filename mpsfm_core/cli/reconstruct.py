@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mpsfm_core.cli.arguments import ConfigName, Offline, Overrides, Quiet, settings
+from mpsfm_core.cli.arguments import ConfigName, Offline, Overrides, Quiet, ViewerName, settings
 
 if TYPE_CHECKING:
     from mpsfm_core.pipeline import ReconstructionResult
@@ -41,6 +41,7 @@ def reconstruct(
         bool, typer.Option("--fresh", help="Do not go on from where a killed run was.")
     ] = False,
     offline: Offline = False,
+    viewer: ViewerName = None,
     quiet: Quiet = False,
 ) -> None:
     """Reconstruct a folder of photos.
@@ -66,41 +67,82 @@ def reconstruct(
 
 
 def run(
-    images: Path, output: Path, config: str, quiet: bool, **further: Any
+    images: Path,
+    output: Path,
+    config: str,
+    quiet: bool,
+    viewer: str | None = None,
+    **further: Any,
 ) -> ReconstructionResult:
     """Reconstruct with progress bars and print what came out, neither if ``quiet``.
 
-    ``further``: keyword arguments of :func:`mpsfm_core.pipeline.reconstruct`.
+    ``viewer``: name of a viewer that shows the run as it goes on. ``further``: keyword arguments
+    of :func:`mpsfm_core.pipeline.reconstruct`.
     """
     from mpsfm_core.cli.progress import showing_progress
+    from mpsfm_core.cli.view import showing_run
+    from mpsfm_core.errors import ReconstructionError
     from mpsfm_core.pipeline import reconstruct
     from mpsfm_core.registry import Registry
 
     registry = Registry.discover()
-    with showing_progress(registry, quiet):
-        result = reconstruct(images, output, config, registry=registry, **further)
-    if not quiet:
-        _print_outcome(result, output)
+    with showing_run(registry, viewer, images, output):
+        try:
+            with showing_progress(registry, quiet):
+                result = reconstruct(images, output, config, registry=registry, **further)
+        except ReconstructionError as error:
+            if error.summary and not quiet:
+                _print_failure(error.summary, output)
+            raise
+        if not quiet:
+            _print_outcome(result, output)
     return result
 
 
+def _print_failure(summary: Mapping[str, Any], output: Path) -> None:
+    """What went wrong and what to do, on stderr."""
+    from mpsfm_core.report.findings import findings
+
+    for finding in findings(summary):
+        typer.echo(f"{finding.title}. {finding.text}", err=True)
+        if finding.remedy:
+            typer.echo(f"  what to do: {finding.remedy}", err=True)
+    if (output / "report.html").is_file():
+        typer.echo(f"open {output}/report.html to see photos, depth and matches", err=True)
+
+
 def _print_outcome(result: ReconstructionResult, output: Path) -> None:
+    """In one look: is it good, what is weak, what to open."""
+    from mpsfm_core.report.findings import findings, verdict, weakest
+
     images, best = result.summary["images"], result.summary["reconstructions"][0]
-    typer.echo(
+    _row(
+        verdict(result.summary).level,
         f"{len(images['registered'])} of {images['total']} images, {best['points']} points, mean "
-        f"reprojection error {best['mean_reprojection_error_px'] or 0:.2f} px"
+        f"reprojection error {best['mean_reprojection_error_px'] or 0:.2f} px",
     )
-    typer.echo(f"  {_unit(best['metric_scale'])}")
+    _row("scale", _unit(best["metric_scale"]))
     if refined := _refined_focal_lengths(images["details"].values()):
-        typer.echo(f"  {refined}")
+        _row("cameras", refined)
+    weak = [f"{name} ({count})" for name, count in weakest(result.summary)]
+    if weak:
+        _row("weakest", f"{', '.join(weak)}; verified matches with registered photos")
+    for finding in findings(result.summary):
+        if finding.level == "warning" and not finding.title.endswith("missing"):
+            _row("warning", f"{finding.title}: {finding.text}")
     for name, reason in images["unconfirmed"].items():
-        typer.echo(f"  not confirmed: {name}: {reason}")
-    for name, reason in images["left_out"].items():
-        typer.echo(f"  left out: {name}: {reason}")
+        _row("guessed", f"not confirmed: {name}: {reason}")
     for name, reason in images["unregistered"].items():
-        typer.echo(f"  not registered: {name}: {reason}")
+        _row("missing", f"not registered: {name}: {reason}")
+    if (output / "report.html").is_file():
+        _row("open", f"{output}/report.html")
     seconds = sum(stage["seconds"] for stage in result.summary["stages"].values())
-    typer.echo(f"written to {output} in {seconds:.0f} s")
+    _row("time", f"written to {output} in {seconds:.0f} s")
+
+
+def _row(label: str, text: str) -> None:
+    colors = {"good": "green", "partial": "yellow", "warning": "yellow", "missing": "yellow"}
+    typer.echo(typer.style(f"{label:<9}", fg=colors.get(label), bold=True) + text)
 
 
 def _unit(metric: dict[str, Any] | None) -> str:

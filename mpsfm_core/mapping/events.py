@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
+
+from mpsfm_core.data import SceneState
 
 
 class MappingEvents(Protocol):
@@ -12,6 +15,8 @@ class MappingEvents(Protocol):
 
     def image_rejected(self, name: str, reason: str) -> None: ...
 
+    def scene_changed(self, scene: Callable[[], SceneState]) -> None: ...
+
 
 class Silent:
     """Nobody listens."""
@@ -20,4 +25,7 @@ class Silent:
         """Nothing."""
 
     def image_rejected(self, name: str, reason: str) -> None:
+        """Nothing."""
+
+    def scene_changed(self, scene: Callable[[], SceneState]) -> None:
         """Nothing."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpsfm_core.data import DepthPrior
+from mpsfm_core.data import DepthPrior, PosedImage, SceneState
 from mpsfm_core.scene.reconstruction import MetricScale, Reconstruction, RegisteredImage
 from mpsfm_core.scene.scene import Scene
 
@@ -48,6 +48,17 @@ def finished(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
         registered_image(scene, int(i), factor, in_metres) for i in scene.registered_images()
     )
     return Reconstruction(images, tracks.xyz * factor, mean_errors, metric)
+
+
+def current(scene: Scene) -> SceneState:
+    """The scene as it is now, in its own units."""
+    images = (registered_image(scene, int(i), 1.0, False) for i in scene.registered_images())
+    tracks = scene.tracks
+    used = np.unique(tracks.point_of[tracks.observations()])
+    return SceneState(
+        tuple(PosedImage(i.name, i.camera, i.rotation, i.translation, i.depth) for i in images),
+        tracks.xyz[used].copy(),
+    )
 
 
 def registered_image(scene: Scene, index: int, factor: float, in_metres: bool) -> RegisteredImage:

@@ -330,6 +330,7 @@ class Group:
         self.attempts.forget()
         self._last_size = self.size, len(self.scene.tracks)
         self._drop(lost_images(self.scene), "lost its points in global refinement")
+        self.journal.scene_changed(self.scene)
 
     def _undo_jump(self, before: Snapshot) -> None:
         """Return to an earlier state if cameras jumped and their depth contradicts since then.
@@ -365,6 +366,7 @@ class Group:
     def _accept(self, image: int) -> None:
         self.attempts.scene_changed()
         self.journal.registered(image, self.size)
+        self.journal.scene_changed(self.scene)
 
     def _drop(self, images: list[int], reason: str) -> None:
         """Take images out that were registered before; the run goes on."""

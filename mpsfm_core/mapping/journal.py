@@ -9,7 +9,9 @@ from contextlib import contextmanager
 
 from mpsfm_core.data import MappingProblem, VerifiedPair
 from mpsfm_core.mapping.events import MappingEvents
+from mpsfm_core.mapping.finishing import current
 from mpsfm_core.scene.reconstruction import MappingReport, Reconstruction
+from mpsfm_core.scene.scene import Scene
 
 
 class Journal:
@@ -27,6 +29,10 @@ class Journal:
         """An image was registered, as the ``count``-th of its group."""
         images = self._problem.images
         self._events.image_registered(images[image].name, count, len(images))
+
+    def scene_changed(self, scene: Scene) -> None:
+        """Images or points have moved; who wants to see them now pays for a copy."""
+        self._events.scene_changed(lambda: current(scene))
 
     def rejected(self, image: int, reason: str) -> None:
         """An image was not registered, or is no longer."""

@@ -214,6 +214,16 @@ def _weak(summary: Mapping[str, Any]) -> Iterator[Finding]:
         )
 
 
+def weakest(summary: Mapping[str, Any], most: int = 3) -> list[tuple[str, int]]:
+    """The registered photos with fewest verified matches with others of them, and how many."""
+    registered = set(summary["images"]["registered"])
+    matches = Counter(dict.fromkeys(summary["images"]["registered"], 0))
+    for pair in summary["pairs"]["all"]:
+        if "inliers" in pair and registered.issuperset(pair["images"]):
+            matches.update(dict.fromkeys(pair["images"], pair["inliers"]))
+    return sorted(matches.items(), key=lambda item: item[1])[: min(most, len(registered) // 2)]
+
+
 def partner_counts(summary: Mapping[str, Any]) -> Counter[str]:
     """For each registered image how many others of them it has verified matches with."""
     registered = set(summary["images"]["registered"])

@@ -18,6 +18,7 @@ import pycolmap
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
 from mpsfm_core.errors import InputError
 from mpsfm_core.inputs.images import SUMMARY
+from mpsfm_core.inputs.models import read_model
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.views import MATCHES
 from mpsfm_core.results.writer import DENSE, DEPTH, VIEWS
@@ -108,10 +109,7 @@ class ResultFolder:
         """Of the original photos; empty after a failed run."""
         if self.failed:
             return pycolmap.Reconstruction()
-        try:
-            return pycolmap.Reconstruction(str(self.path / "sparse"))
-        except Exception as error:  # pycolmap raises what C++ throws
-            raise InputError(f"{self.path / 'sparse'}: cannot be read: {error}") from error
+        return read_model(self.path / "sparse")
 
     def dense_cloud(self) -> tuple[Float64, UInt8]:
         """World points (n, 3) and RGB colours (n, 3) of ``dense.ply``, empty if it is not there."""

@@ -1,0 +1,77 @@
+"""``mpsfm view``: results and COLMAP models in a viewer plugin; and viewers of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from mpsfm_core.registry import Registry
+    from mpsfm_core.viewing import Pictures
+
+
+def view(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A result folder or any COLMAP model.")
+    ],
+    viewer: Annotated[
+        str, typer.Option("--viewer", metavar="NAME", help="Of a viewer plugin: viser, rerun.")
+    ] = "viser",
+) -> None:
+    """Show cameras and points; viser serves a page until Ctrl-C, rerun writes DIR/scene.rrd."""
+    from mpsfm_core.registry import Registry
+    from mpsfm_core.viewing import read_scene
+
+    scene, cloud, pictures = read_scene(folder)
+    opened = open_viewer(Registry.discover(), viewer, folder, pictures)
+    opened.show(scene, cloud)
+    typer.echo(opened.finish())
+    opened.wait()
+
+
+def open_viewer(registry: Registry, name: str, output: Path, pictures: Pictures) -> Any:
+    """A viewer by its name.
+
+    Raises :class:`~mpsfm_core.errors.InputError` when no plugin brings it, or it cannot be opened.
+    """
+    from pkgutil import resolve_name
+
+    from mpsfm_core.errors import InputError, did_you_mean
+
+    brought = registry.call_hook("mpsfm_viewers")
+    known = {key: value for answer in brought for key, value in dict(answer).items()}
+    if name not in known:
+        hint = did_you_mean(name, known) if known else "; pip install mpsfm-viser or mpsfm-rerun"
+        raise InputError(f"no viewer {name!r}{hint}")
+    try:
+        return resolve_name(known[name])(output, pictures)
+    except Exception as error:
+        raise InputError(
+            f"viewer {name!r} cannot be opened: {type(error).__name__}: {error}"
+        ) from error
+
+
+@contextmanager
+def showing_run(registry: Registry, name: str | None, photos: Path, output: Path) -> Iterator[None]:
+    """A viewer shows what the block reconstructs; without a name nothing is shown.
+
+    It stays open after a run that ended well, until Ctrl-C.
+    """
+    if name is None:
+        yield
+        return
+    from mpsfm_core.viewing import photos_in, read_scene
+
+    viewer = open_viewer(registry, name, output, photos_in(photos))
+    registry.register(viewer, name=f"viewer {name}")
+    try:
+        yield
+        scene, cloud, _ = read_scene(output)
+        viewer.show(scene, cloud)
+    finally:
+        typer.echo(viewer.finish())
+    viewer.wait()

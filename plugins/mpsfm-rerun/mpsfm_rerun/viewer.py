@@ -1,0 +1,105 @@
+"""A recording in which the reconstruction grows, image by image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import rerun
+
+from mpsfm_core import hookimpl
+from mpsfm_core.data import PosedImage, SceneState
+from mpsfm_core.viewing import Cloud, Pictures, lifted
+
+RECORDING = "scene.rrd"
+TIMELINE = "step"
+
+
+class RerunViewer:
+    """Writes ``OUTPUT/scene.rrd``; each scene is a step of the timeline ``step``."""
+
+    def __init__(self, output: Path, pictures: Pictures) -> None:
+        output.mkdir(parents=True, exist_ok=True)
+        self.path = output / RECORDING
+        self._recording = rerun.RecordingStream("mpsfm")
+        self._recording.save(self.path)
+        self._recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
+        self._pictures = pictures
+        self._step = 0
+        self._shown: set[str] = set()
+
+    @hookimpl
+    def mpsfm_scene_changed(self, scene: Callable[[], SceneState]) -> None:
+        """A step of the recording."""
+        self.show(scene())
+
+    @hookimpl
+    def mpsfm_notice(self, text: str) -> None:
+        """Into the log of the recording."""
+        self._recording.log("log", rerun.TextLog(text))
+
+    @hookimpl
+    def mpsfm_image_rejected(self, name: str, reason: str) -> None:
+        """Into the log of the recording."""
+        text = f"{name}: {reason}"
+        self._recording.log("log", rerun.TextLog(text, level=rerun.TextLogLevel.WARN))
+
+    def show(self, scene: SceneState, cloud: Cloud | None = None) -> None:
+        """The next step."""
+        self._step += 1
+        self._recording.set_time(TIMELINE, sequence=self._step)
+        names = {image.name for image in scene.images}
+        for name in self._shown - names:
+            self._recording.log(_place(name), rerun.Clear(recursive=True))
+        for image in scene.images:
+            self._log_image(image, with_depth=cloud is None)
+        self._recording.log("world/points", rerun.Points3D(scene.points))
+        if cloud is not None:
+            self._recording.log("world/dense", rerun.Points3D(cloud.xyz, colors=cloud.rgb))
+        self._shown = names
+
+    def finish(self) -> str:
+        """Close the file."""
+        self._recording.flush()
+        self._recording.disconnect()
+        return f"open it with: rerun {self.path}"
+
+    def wait(self) -> None:
+        """There is a file to open."""
+
+    def _log_image(self, image: PosedImage, *, with_depth: bool) -> None:
+        place, camera = _place(image.name), image.camera
+        world_from_camera = rerun.Transform3D(
+            translation=-image.rotation.T @ image.translation, mat3x3=image.rotation.T
+        )
+        self._recording.log(place, world_from_camera)
+        pinhole = rerun.Pinhole(
+            image_from_camera=camera.matrix,
+            resolution=camera.size,
+            camera_xyz=rerun.ViewCoordinates.RDF,
+        )
+        picture = self._pictures(image.name)
+        if image.name not in self._shown and picture is not None:
+            scale = np.diag([picture.shape[1] / camera.width, picture.shape[0] / camera.height, 1])
+            pinhole = rerun.Pinhole(
+                image_from_camera=scale @ camera.matrix,
+                resolution=(picture.shape[1], picture.shape[0]),
+                camera_xyz=rerun.ViewCoordinates.RDF,
+            )
+            self._recording.log(f"{place}/photo", rerun.Image(picture).compress(), static=True)
+        if image.name not in self._shown:
+            self._recording.log(f"{place}/photo", pinhole, static=True)
+        if with_depth:
+            points = lifted(image, picture)
+            depth_place = f"world/depth/{_key(image.name)}"
+            self._recording.log(depth_place, rerun.Points3D(points.xyz, colors=points.rgb))
+
+
+def _place(name: str) -> str:
+    return f"world/cameras/{_key(name)}"
+
+
+def _key(name: str) -> str:
+    """An image name as one part of an entity path."""
+    return str(rerun.escape_entity_path_part(name))

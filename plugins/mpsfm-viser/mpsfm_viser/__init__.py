@@ -1,0 +1,1 @@
+"""Reconstructions in the browser, by viser."""

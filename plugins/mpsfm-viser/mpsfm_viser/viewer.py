@@ -1,0 +1,159 @@
+"""A page that shows the scene as it is now, served on this machine."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+import viser
+import viser.transforms
+
+from mpsfm_core import hookimpl
+from mpsfm_core.data import PosedImage, SceneState
+from mpsfm_core.geometry import camera_center
+from mpsfm_core.viewing import Cloud, Pictures, lifted
+
+PORT_VARIABLE = "MPSFM_VIEWER_PORT"
+"""Environment variable: where the page is served; if it is taken, the next free one."""
+HOST_VARIABLE = "MPSFM_VIEWER_HOST"
+"""Environment variable: 0.0.0.0 lets other machines look; by default this one alone can."""
+_LEAST_SECONDS = 1.0
+"""Between two scenes during a run: a scene takes a moment to send (ours)."""
+_NEW, _OLD = (255, 122, 26), (31, 157, 107)
+
+
+class ViserViewer:
+    """Cameras as frustums with their photos, depth maps as points, and sparse points.
+
+    ``output``: of the run; nothing is written there.
+    """
+
+    def __init__(self, output: Path, pictures: Pictures) -> None:
+        self.server = viser.ViserServer(
+            host=os.environ.get(HOST_VARIABLE, "127.0.0.1"),
+            port=int(os.environ.get(PORT_VARIABLE, "8080")),
+            label="MP-SfM",
+            verbose=False,
+        )
+        self._pictures = pictures
+        self._thumbnails: dict[str, object] = {}
+        self._shown: set[str] = set()
+        self._last = -np.inf
+        self._lock = threading.Lock()
+        self._state = self.server.gui.add_markdown("waiting for the first images")
+        self._point_size = self.server.gui.add_slider("point size", 0.1, 5.0, 0.1, 1.0)
+        self._frustum_size = self.server.gui.add_slider("camera size", 0.1, 5.0, 0.1, 1.0)
+        self.clouds: list[viser.PointCloudHandle] = []
+        self.frustums: dict[str, viser.CameraFrustumHandle] = {}
+        self._unit = 1.0
+        self._point_size.on_update(lambda _: self._resize())
+        self._frustum_size.on_update(lambda _: self._resize())
+
+    @property
+    def address(self) -> str:
+        """Of the page."""
+        return f"http://localhost:{self.server.get_port()}"
+
+    @hookimpl
+    def mpsfm_scene_changed(self, scene: Callable[[], SceneState]) -> None:
+        """Show it, unless the last one is very recent."""
+        now = time.monotonic()
+        if now - self._last >= _LEAST_SECONDS:
+            self._last = now
+            self.show(scene())
+
+    @hookimpl
+    def mpsfm_stage_started(self, stage: str, total: int | None) -> None:
+        """Say what goes on while there is nothing to see yet."""
+        if not self._shown:
+            self._state.content = f"{stage} ..."
+
+    def show(self, scene: SceneState, cloud: Cloud | None = None) -> None:
+        """Replace what is shown; ``cloud`` is shown instead of the depth maps."""
+        with self._lock, self.server.atomic():
+            self._unit = _unit(scene)
+            self.clouds = []
+            for name in self.frustums.keys() - {image.name for image in scene.images}:
+                self.frustums.pop(name).remove()
+            for image in scene.images:
+                self.frustums[image.name] = self._frustum(image)
+                if cloud is None:
+                    self._cloud(f"/depth/{_key(image.name)}", lifted(image, self._picture(image)))
+            if cloud is not None:
+                self._cloud("/dense", cloud)
+            grey = np.full(scene.points.shape, 200, np.uint8)
+            self._cloud("/sparse", Cloud(scene.points, grey))
+            self._shown = set(self.frustums)
+            self._state.content = f"**{len(scene.images)} images**, {len(scene.points):,} points"
+            if scene.images:
+                up = -np.sum([image.rotation[1] for image in scene.images], axis=0)
+                if np.linalg.norm(up) > 0:
+                    self.server.scene.set_up_direction(tuple(up / np.linalg.norm(up)))
+            self._resize()
+
+    def finish(self) -> str:
+        """The page stays until the program ends."""
+        return f"{self.address} shows it"
+
+    def wait(self) -> None:
+        """Until Ctrl-C."""
+        threading.Event().wait()
+
+    def _frustum(self, image: PosedImage) -> viser.CameraFrustumHandle:
+        camera = image.camera
+        wxyz = viser.transforms.SO3.from_matrix(image.rotation.T).wxyz
+        handle = self.server.scene.add_camera_frustum(
+            f"/cameras/{_key(image.name)}",
+            fov=2 * float(np.arctan2(camera.height / 2, camera.fy)),
+            aspect=camera.width / camera.height,
+            scale=0.1 * self._unit,
+            color=_OLD if image.name in self._shown else _NEW,
+            image=self._picture(image),
+            wxyz=wxyz,
+            position=camera_center(image.rotation, image.translation),
+        )
+
+        @handle.on_click
+        def _(event: viser.SceneNodePointerEvent[viser.CameraFrustumHandle]) -> None:
+            """Look through it."""
+            event.client.camera.wxyz = handle.wxyz
+            event.client.camera.position = handle.position
+
+        return handle
+
+    def _cloud(self, name: str, cloud: Cloud) -> None:
+        handle = self.server.scene.add_point_cloud(
+            name, cloud.xyz.astype(np.float32), cloud.rgb, point_size=0.005 * self._unit
+        )
+        self.clouds.append(handle)
+
+    def _picture(self, image: PosedImage) -> np.ndarray | None:
+        if image.name not in self._thumbnails:
+            self._thumbnails[image.name] = self._pictures(image.name)
+        return self._thumbnails[image.name]
+
+    def _resize(self) -> None:
+        for cloud in self.clouds:
+            cloud.point_size = 0.005 * self._unit * self._point_size.value
+        for frustum in self.frustums.values():
+            frustum.scale = 0.1 * self._unit * self._frustum_size.value
+
+
+def _unit(scene: SceneState) -> float:
+    """How large the scene is: median distance of what it holds from its middle."""
+    centers = [camera_center(image.rotation, image.translation) for image in scene.images]
+    places = np.array([*scene.points[:: max(1, len(scene.points) // 2000)], *centers])
+    if not len(places):
+        return 1.0
+    distances = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    return float(np.median(distances)) or 1.0
+
+
+def _key(name: str) -> str:
+    """An image name as one level of the tree of nodes."""
+    return quote(name, safe="")

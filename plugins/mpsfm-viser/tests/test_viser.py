@@ -1,0 +1,71 @@
+"""A real server: its page answers, and its scene has what it was shown."""
+
+from __future__ import annotations
+
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="viser is not installed")
+
+from mpsfm_viser.viewer import ViserViewer
+
+from mpsfm_core.data import DepthPrior, PinholeCamera, PosedImage, SceneState
+from mpsfm_core.registry import Registry
+
+CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 32.0, 24.0)
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+
+def scene(count: int) -> SceneState:
+    depth = DepthPrior.from_arrays(np.full((12, 16), 2.0), np.full((12, 16), 1e-4))
+    images = tuple(
+        PosedImage(f"room/{i}.jpg", CAMERA, np.eye(3), np.array([-float(i), 0, 0]), depth)
+        for i in range(count)
+    )
+    return SceneState(images, np.random.default_rng(0).uniform(-1, 1, (50, 3)))
+
+
+@pytest.fixture
+def viewer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ViserViewer]:
+    monkeypatch.setenv("MPSFM_VIEWER_PORT", "18765")
+    made = ViserViewer(tmp_path, lambda name: np.zeros((12, 16, 3), np.uint8))
+    yield made
+    made.server.stop()
+
+
+def test_the_page_answers(viewer: ViserViewer) -> None:
+    with urllib.request.urlopen(viewer.address, timeout=20) as page:
+        assert page.status == 200
+        assert b"<html" in page.read()
+    assert viewer.address in viewer.finish()
+
+
+def test_the_scene_has_the_cameras_and_their_depth(viewer: ViserViewer) -> None:
+    viewer.show(scene(3))
+    assert viewer.frustums.keys() == {f"room/{i}.jpg" for i in range(3)}
+    np.testing.assert_allclose(viewer.frustums["room/2.jpg"].position, [2, 0, 0])
+    assert viewer.frustums["room/2.jpg"].aspect == pytest.approx(64 / 48)
+    names = {cloud.name for cloud in viewer.clouds}
+    assert names == {"/sparse", *(f"/depth/room%2F{i}.jpg" for i in range(3))}
+    (depth,) = (cloud for cloud in viewer.clouds if cloud.name == "/depth/room%2F0.jpg")
+    np.testing.assert_allclose(np.asarray(depth.points)[:, 2], 2, atol=1e-2)
+
+
+def test_an_image_that_is_taken_out_goes(viewer: ViserViewer) -> None:
+    viewer.show(scene(3))
+    viewer.show(scene(2))
+    assert viewer.frustums.keys() == {"room/0.jpg", "room/1.jpg"}
+    assert len(viewer.clouds) == 3
+
+
+def test_it_listens_to_a_run(viewer: ViserViewer) -> None:
+    registry = Registry()
+    registry.register(viewer, name="viewer")
+    registry.call_hook("mpsfm_scene_changed", scene=lambda: scene(2))
+    assert len(viewer.frustums) == 2
+    registry.call_hook("mpsfm_scene_changed", scene=lambda: scene(3))
+    assert len(viewer.frustums) == 2, "the last one was just now"
