@@ -18,12 +18,12 @@ else:
     tomllib = pytest.importorskip("tomli")
 
 PLUGINS = sorted(path.parent for path in Path(__file__).parent.glob("*/pyproject.toml"))
-DISTRIBUTIONS = {"cv2": "opencv-python-headless"}
+DISTRIBUTIONS = {"cv2": "opencv-python-headless", "rerun": "rerun-sdk"}
 """Of imports that are called otherwise."""
 WITH_THE_CORE = {"mpsfm_core", "pydantic"}
 """Options are pydantic models."""
 FOR_TESTS_ONLY = ("contract.py", "stand_in.py")
-HEAVY = {"torch", "transformers", "onnxruntime", "kornia", "cv2", "scipy", "onnx"}
+HEAVY = {"viser", "rerun", "torch", "transformers", "onnxruntime", "kornia", "cv2", "scipy", "onnx"}
 
 each_plugin = pytest.mark.parametrize("folder", PLUGINS, ids=lambda folder: folder.name)
 
