@@ -7,10 +7,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from mpsfm_core.errors import ConfigError, did_you_mean
@@ -36,6 +36,9 @@ class Backend(Options):
     otherwise: tuple[str, ...] = ()
     """Providers to take instead, in this order, where ``use`` cannot be had: its plugin or weights
     are missing, or it does not know the given options."""
+    environment: str | None = None
+    """The environment that ``use`` lives in (``mpsfm env create``); ``use: NAME@ENVIRONMENT``,
+    as it is written from then on, says the same."""
     options: dict[str, Any] = Field(default_factory=dict)
     """The provider's own options."""
     wrap: tuple[Backend, ...] = ()
@@ -43,6 +46,16 @@ class Backend(Options):
     calibration: dict[str, Any] | str | None = None
     """Uncertainty of a depth or normals provider: the values, a YAML or JSON file with them, or
     null for what the plugin declares."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_environment(cls, values: Any) -> Any:
+        if isinstance(values, Mapping) and values.get("environment") and "use" in values:
+            if values["use"] == AS_DEPTH or "@" in str(values["use"]):
+                raise ValueError(f"environment: {values['use']!r} says where it is")
+            values = {**values, "use": f"{values['use']}@{values['environment']}"}
+            del values["environment"]
+        return values
 
     @property
     def is_open(self) -> bool:
@@ -87,6 +100,10 @@ def parse_settings(
     """
     try:
         return model.model_validate(dict(values))
+    except SettingsError as error:  # of a model that is checked in another environment
+        raise SettingsError(
+            tuple(replace(problem, path=(*path, *problem.path)) for problem in error.problems)
+        ) from error
     except ValidationError as error:
         problems = tuple(
             SettingProblem(

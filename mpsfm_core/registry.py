@@ -25,6 +25,8 @@ from mpsfm_core.discovery import (
     new_manager,
     spec_fault,
 )
+from mpsfm_core.environments.remote import EnvironmentHooks, remote_providers
+from mpsfm_core.environments.store import all_environments
 from mpsfm_core.errors import InputError, MpsfmError, ProviderError, did_you_mean
 from mpsfm_core.first_party import requirement_for
 from mpsfm_core.options import Backend, Options, SettingPath, parse_settings
@@ -103,8 +105,9 @@ class Registry:
         self._muted: set[tuple[str, str]] = set()
 
     @classmethod
-    def discover(cls, timeout_s: float | None = None) -> Registry:
-        """Load the built-in providers and every installed plugin.
+    def discover(cls, timeout_s: float | None = None, environments: bool = True) -> Registry:
+        """Load the built-in providers and every installed plugin, and look up what
+        ``environments`` bring (:mod:`mpsfm_core.environments`), as ``NAME@ENVIRONMENT``.
 
         A plugin that fails is listed with the reason and hurts nobody else. ``timeout_s``: time
         limit for each plugin, by default ``$MPSFM_PLUGIN_TIMEOUT_S`` or 10 s.
@@ -113,6 +116,8 @@ class Registry:
         registry.register(builtin, name="builtin", distribution=CORE, version=core_version())
         for plugin in installed_plugins(_default_timeout() if timeout_s is None else timeout_s):
             registry._add(plugin)
+        if environments:
+            registry._add_environments()
         return registry
 
     def register(
@@ -293,6 +298,13 @@ class Registry:
                 answers.append(answer)
         return answers
 
+    def _add_environments(self) -> None:
+        remotes = [r for environment in all_environments() for r in remote_providers(environment)]
+        for r in remotes:
+            self._entries.append(_Entry(r.spec, r.distribution, r.version, r.fault, r.hint))
+        if remotes:
+            self._manager.register(EnvironmentHooks(remotes), "environments")
+
     def _add(self, plugin: Plugin) -> None:
         origin = (plugin.distribution, plugin.version)
         status = ProviderStatus("plugin", plugin.name, *origin, capabilities=plugin.hooks)
@@ -338,6 +350,12 @@ class Registry:
         if home := requirement_for(kind, name):
             return f"{kind} provider {name!r} comes with a plugin: pip install '{home}'"
         known = self.names(kind)
+        base, _, environment = name.partition("@")
+        if environment and not any(other.endswith(f"@{environment}") for other in known):
+            return (
+                f"no {kind} provider {base!r} in an environment {environment!r}: "
+                f"'mpsfm env list' shows what there is, 'mpsfm env create' makes one"
+            )
         text = f"no {kind} provider {name!r}{did_you_mean(name, known)}"
         others = [e.spec.kind for e in self._entries if e.spec.name == name]
         if others:

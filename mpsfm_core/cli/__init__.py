@@ -21,6 +21,7 @@ from mpsfm_core.cli import (
     config,
     demo,
     doctor,
+    env,
     evaluate,
     export,
     models,
@@ -58,6 +59,7 @@ def build_app() -> typer.Typer:
     app.command("calibrate")(calibrate.calibrate)
     app.add_typer(plugins.app, name="plugins")
     app.add_typer(config.app, name="config")
+    app.add_typer(env.app, name="env")
     app.add_typer(models.app, name="models")
     app.add_typer(cache.app, name="cache")
     app.add_typer(testsets.app, name="testsets")
