@@ -158,7 +158,10 @@ def _malformed(spec: ProviderSpec) -> str:
     """The first rule the specification breaks, or an empty text."""
     if spec.kind not in KINDS:
         return f"unknown kind {spec.kind!r}{did_you_mean(str(spec.kind), KINDS)}"
-    if not (isinstance(spec.name, str) and _NAME.fullmatch(spec.name)):
+    name = spec.name
+    if isinstance(name, str) and callable(spec.factory):
+        name = name.partition("@")[0]  # what follows is the environment that it lives in
+    if not (isinstance(name, str) and _NAME.fullmatch(name)):
         return f"name {spec.name!r} is not made of lower-case letters, digits and - . _"
     if not (callable(spec.factory) or _is_reference(spec.factory)):
         return f"factory {spec.factory!r} does not look like 'package.module:Class'"
