@@ -41,6 +41,15 @@ def benchmark(
             metavar="A,B", help="Other methods on the same matches (default: all), or none."
         ),
     ] = None,
+    results: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--result",
+            metavar="NAME=FOLDER",
+            help="Models that another program made, FOLDER/SCENE/SET each: COLMAP's or "
+            "transforms.json. May be repeated.",
+        ),
+    ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Sets mapped at the same time.")] = 1,
     overrides: Overrides = None,
     compare: Annotated[
@@ -78,6 +87,7 @@ def benchmark(
         OTHERS if peers is None else () if peers == "none" else _listed(peers),
         tuple(overrides or ()),
         workers,
+        dict(_named(text) for text in results or ()),
     )
     registry = Registry.discover()
     with showing_progress(registry, quiet):
@@ -91,6 +101,21 @@ def _tell(record: Record, known: bool) -> None:
     images = f"{len(record.estimated)}/{len(record.truth)} images"
     end = "known" if known else record.error or f"{record.cpu_seconds:.1f} s"
     typer.echo(f"{record.scene} {record.set_name} {record.label}: {images}, {end}", err=True)
+
+
+def _named(text: str) -> tuple[str, Path]:
+    """Name and folder of ``--result``."""
+    import re
+
+    from mpsfm_core.errors import InputError
+    from mpsfm_core.evaluation.methods import OTHERS, OURS
+
+    name, _, folder = text.partition("=")
+    if not (folder and re.fullmatch(r"[\w.-]+", name) and Path(folder).is_dir()):
+        raise InputError(f"--result {text}: must look like NAME=FOLDER, of a folder that is there")
+    if name.split("-")[0] == OURS or name in OTHERS:
+        raise InputError(f"--result {text}: {name!r} is the name of a method of the benchmark")
+    return name, Path(folder)
 
 
 def _listed(text: str) -> tuple[str, ...]:

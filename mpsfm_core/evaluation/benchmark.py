@@ -7,8 +7,8 @@ the sets, matches only for pairs inside a set; the cache keeps them. Each finish
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from mpsfm_core.evaluation.methods import (
 )
 from mpsfm_core.evaluation.prior_quality import QUALITIES, error_seed, prior_settings
 from mpsfm_core.evaluation.records import Record, read_record, record_file, write_record
+from mpsfm_core.evaluation.results_of_others import records_of
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
 from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.runner import extract
@@ -50,6 +51,8 @@ class Plan:
     :data:`~mpsfm_core.evaluation.prior_quality.QUALITIES` or ``degraded-N``, our mapper runs with
     each. ``peers``: of :data:`~mpsfm_core.evaluation.methods.OTHERS`. ``overrides``: settings
     ``KEY=VALUE`` of all configurations. ``workers``: sets that are mapped at the same time.
+    ``results``: label -> folder of models that another program made
+    (:mod:`~mpsfm_core.evaluation.results_of_others`).
     """
 
     scenes: tuple[Path, ...]
@@ -59,6 +62,7 @@ class Plan:
     peers: tuple[str, ...] = OTHERS
     overrides: tuple[str, ...] = ()
     workers: int = 1
+    results: Mapping[str, Path] = field(default_factory=dict)
 
 
 def run_benchmark(
@@ -89,6 +93,12 @@ def run_benchmark(
                 if done is not None:
                     done(record, known)
             records += sorted(own, key=_order(sets, plan))
+            for label, folder in plan.results.items():
+                for record in records_of(label, folder, scene, sets, Path(config).stem):
+                    write_record(output, record)
+                    records.append(record)
+                    if done is not None:
+                        done(record, True)
     return records
 
 
