@@ -15,6 +15,7 @@ import argparse
 import json
 import pickle
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,9 @@ import numpy as np
 from benchmarks._scenes import shared_folder
 from benchmarks.accuracy import FASTDEPTH, PRIORS
 from mpsfm_core.data import DepthPrior, Float64, NormalPrior
+from mpsfm_core.dense.fusion import fuse_depth_maps
+from mpsfm_core.dense.options import DenseOptions
+from mpsfm_core.dense.stage import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.benchmark import PairsOfSets, problem_of_sets
 from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy, thinned
@@ -42,7 +46,6 @@ from mpsfm_core.inputs.models import read_model
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.registry import Registry
-from mpsfm_core.results.dense_cloud import fuse_depth_maps
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.scene.reconstruction import Reconstruction
 
@@ -50,6 +53,10 @@ TOLERANCES = (0.02, 0.05)
 """Metres, of the clouds."""
 NEAR = 0.1
 """Relative error of depth that counts as near."""
+WAYS = ("mapper", "dense")
+"""Maps as the mapper refined them, and after the dense stage."""
+CERTAIN = 0.02
+"""Relative std up to which depth counts as measured in the photos."""
 POINT_NEAR = 0.01
 """The same at points of a true model."""
 
@@ -140,12 +147,17 @@ def measured(name: str, scene: SceneFolder, mapped: Sequence[MappedSet]) -> list
     """Means over the sets of a case, a row for each way to make the maps."""
     photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
     rows = []
-    for way in ("mapper",):
+    for way in WAYS:
         found = []
         for item in mapped:
-            images = {image.name: image.depth for image in item.reconstruction.images}
-            cloud, _ = fuse_depth_maps(item.reconstruction, view_of(photos), ResultOptions())
-            found.append(set_errors(scene, item.reconstruction, images, cloud))
+            model, seconds = item.reconstruction, 0.0
+            if way == "dense":
+                started = time.process_time()
+                model, _ = densify(model, view_of(photos), DenseOptions(), workers=1)
+                seconds = (time.process_time() - started) / len(model.images)
+            maps = {image.name: image.depth for image in model.images}
+            cloud, *_ = fuse_depth_maps(model, view_of(photos), ResultOptions())
+            found.append({**set_errors(scene, model, maps, cloud), "cpu_s_photo": seconds})
         rows.append({"case": name, "maps": way, **_means(found)})
     return rows
 
@@ -173,7 +185,7 @@ def set_errors(
         map_errors(depth, aligned.scale, read_depth(scene.depth / f"{Path(name).stem}.png"))
         for name, depth in maps.items()
     ]
-    result = {key: float(np.mean([each[key] for each in found])) for key in found[0]}
+    result = {key: float(np.nanmean([each[key] for each in found])) for key in found[0]}
     accuracy = cloud_accuracy(aligned.apply(cloud), scan_of(scene, tuple(maps)), TOLERANCES)
     for tolerance in map(str, TOLERANCES):
         centimetres = round(100 * float(tolerance))
@@ -195,11 +207,14 @@ def map_errors(depth: DepthPrior, scale: float, truth: Float64) -> dict[str, flo
     ok &= found > 0
     true = truth[known][ok]
     error = np.abs(scale * found[ok] - true)
+    std = np.sqrt(np.maximum(variance[ok], 0))
+    within, certain = error <= scale * std, std <= CERTAIN * found[ok]
     return {
         "abs_rel": float((error / true).mean()),
         "near": float((error <= NEAR * true).mean()),
-        "within_std": float((error <= scale * np.sqrt(variance[ok])).mean()),
-        "coverage": float(ok.mean()),
+        "certain": float(certain.mean()),
+        "within_std_certain": float(within[certain].mean()) if certain.any() else np.nan,
+        "within_std_rest": float(within[~certain].mean()) if not certain.all() else np.nan,
     }
 
 
@@ -247,8 +262,8 @@ def points_near(
 
 
 def _means(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    usable = [each for each in found if each]
-    means = {key: float(np.mean([each[key] for each in usable])) for key in usable[0]}
+    usable = [each for each in found if len(each) > 1]
+    means = {key: float(np.nanmean([each[key] for each in usable])) for key in usable[0]}
     return {"sets": len(usable), **means}
 
 

@@ -22,7 +22,7 @@ class DenseOptions(Options):
     """Depths that are tried at a pixel, at most."""
     window_radius: int = Field(3, ge=1)
     """Of the windows that are compared, pixels of the level."""
-    grey_noise: float = Field(3.0, gt=0)
+    grey_noise: float = Field(2.0, gt=0)
     """Std of grey values (of 255) that counts as no texture."""
     view_share: float = Field(0.5, gt=0, le=1)
     """Share of the views that see a point, best first, that judge a depth: others are occluded."""
@@ -30,7 +30,7 @@ class DenseOptions(Options):
     """Of the squared deviation from the refined depth, in std, beside a cost of 0 to 1."""
     small_step: float = Field(0.04, ge=0)
     """Penalty of neighbours one label apart (semi-global matching, P1)."""
-    large_step: float = Field(0.8, ge=0)
+    large_step: float = Field(1.6, ge=0)
     """Of neighbours further apart (P2); lower across edges of the photo."""
     match_std_px: float = Field(0.5, gt=0)
     """Std of a match, in pixels of the map."""

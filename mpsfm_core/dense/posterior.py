@@ -24,6 +24,10 @@ _VARIANCE_REDUCTION = 2
 _EDGE = 0.03
 """Step of log depth between neighbours of the field's grid that halves their coupling (ours)."""
 _ITERATIONS, _TOLERANCE = 30, 1e-3
+_ONE_SIGMA = 0.683
+"""Share within one std of a normal distribution."""
+_MIN_STD = 1e-4
+"""Of log depth that is known: no sensor is better."""
 
 
 class Observed(NamedTuple):
@@ -36,6 +40,26 @@ class Observed(NamedTuple):
     def known(self) -> Bool:
         """(h, w), where something was measured."""
         return np.isfinite(self.log_std)
+
+
+def with_known(measured: Observed, known: Observed) -> Observed:
+    """What was measured, joined with what was known at the same pixels.
+
+    The std of the known depth is taken as its distance to the measured one says, which may be far
+    less than it declares: depth of a sensor must not suffer.
+    """
+    which = measured.known
+    if not which.any():
+        return measured
+    distance = np.abs(measured.log_depth - known.log_depth)[which]
+    std = np.float32(max(float(np.quantile(distance, _ONE_SIGMA)), _MIN_STD))
+    ours, theirs = measured.log_std**-2.0, std**-2.0
+    total = ours + theirs
+    mean = (ours * measured.log_depth + theirs * known.log_depth) / total
+    return Observed(
+        np.where(which, mean, measured.log_depth).astype(np.float32),
+        np.where(which, total**-0.5, np.inf).astype(np.float32),
+    )
 
 
 def posterior(known: Observed, measured: Observed, correlation_px: float) -> Observed:

@@ -12,7 +12,7 @@ import numpy as np
 from mpsfm_core.data import Bool, DepthPrior, View
 from mpsfm_core.dense.consistency import Agreement, compare_depth, splat_depth
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.posterior import Observed, posterior
+from mpsfm_core.dense.posterior import Observed, posterior, with_known
 from mpsfm_core.dense.source_views import choose_sources
 from mpsfm_core.dense.stereo import StereoDepth, match_depth
 from mpsfm_core.dense.view import DenseView
@@ -20,6 +20,8 @@ from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
 
 _MAX_COST = 0.9
 """Of depth that counts as measured: black photos agree on everything (ours)."""
+_NOISE_FACTOR = 1.25
+"""Of the noise that differences between views speak for: they share errors of poses (ours)."""
 _SEEN_STDS = 1.5
 """Depth seen from elsewhere counts up to so many std of the known depth from it: what is further
 may be seen past an edge (ours)."""
@@ -67,7 +69,7 @@ def densify(
     maps = list(reconstruction.images)
     for row in found:
         known = Observed(views[row].log_depth, views[row].log_std)
-        measured = _measured(row, views, found, agreed)
+        measured = with_known(_measured(row, views, found, agreed), known)
         joined = posterior(known, measured, options.correlation_px)
         maps[posed[row]] = _with_depth(images[row], views[row], joined)
     names = [image.name for image in images]
@@ -119,7 +121,7 @@ def _measured(
     view, agreement = views[row], agreed[row]
     confirmed = agreement.confirmed & _supported(view, found[row])
     log_depth = found[row].log_depth + agreement.mean_change
-    std = np.hypot(found[row].log_std, np.float32(agreement.noise))
+    std = np.hypot(found[row].log_std, np.float32(_NOISE_FACTOR * agreement.noise))
     others = [
         (
             views[other],

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mpsfm_core.data import Float64, UInt8
+from mpsfm_core.data import Float32, Float64, UInt8
 from mpsfm_core.errors import InputError
 
 _TYPES = {
@@ -17,16 +21,32 @@ _TYPES = {
 _LONGEST_HEADER = 1 << 16
 
 
-def write_ply(path: Path, points: Float64, colors: UInt8) -> None:
-    """Write points (n, 3) with RGB colours (n, 3) as little-endian float32 and uint8."""
-    vertices = np.empty(len(points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    vertices["xyz"], vertices["rgb"] = points, colors
+def write_ply(
+    path: Path,
+    points: Float64,
+    colors: UInt8,
+    normals: Float32 | None = None,
+    further: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+) -> None:
+    """Write points (n, 3) with RGB colours (n, 3) as little-endian float32 and uint8.
+
+    ``normals``: (n, 3). ``further``: properties (n,) by name, float32 or uint8.
+    """
+    columns: dict[str, NDArray[Any]] = dict(zip("xyz", points.T.astype("<f4"), strict=True))
+    if normals is not None:
+        columns |= zip(("nx", "ny", "nz"), normals.T.astype("<f4"), strict=True)
+    columns |= zip(("red", "green", "blue"), colors.T, strict=True)
+    columns |= further
+    kinds = {name: "uchar" if x.dtype == np.uint8 else "float" for name, x in columns.items()}
+    layout = [(name, _TYPES[kind]) for name, kind in kinds.items()]
+    vertices = np.empty(len(points), dtype=layout)
+    for name, values in columns.items():
+        vertices[name] = values
     header = [
         "ply",
         "format binary_little_endian 1.0",
         f"element vertex {len(points)}",
-        *(f"property float {axis}" for axis in "xyz"),
-        *(f"property uchar {color}" for color in ("red", "green", "blue")),
+        *(f"property {kind} {name}" for name, kind in kinds.items()),
         "end_header",
     ]
     path.write_bytes("\n".join([*header, ""]).encode("ascii") + vertices.tobytes())

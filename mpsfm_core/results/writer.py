@@ -25,13 +25,14 @@ from pathlib import Path
 from typing import Any
 
 import pycolmap
+from numpy.typing import NDArray
 
 from mpsfm_core.data import UInt8
+from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.files import replacing
 from mpsfm_core.inputs.images import SUMMARY
 from mpsfm_core.inputs.nerfstudio import can_hold, write_transforms
 from mpsfm_core.results.colmap_model import build_model, pinhole, point_colors, write_model
-from mpsfm_core.results.dense_cloud import fuse_depth_maps
 from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos, portable_name
@@ -112,7 +113,8 @@ def write_results(
         write_ply(folder / "points.ply", best.reconstruction.points, best.colors)
         if options.dense_cloud:
             dense = fuse_depth_maps(best.reconstruction, photos.view, options, seed)
-            write_ply(folder / DENSE, *dense)
+            further: dict[str, NDArray[Any]] = {"std": dense.std, "views": dense.views}
+            write_ply(folder / DENSE, dense.points, dense.colors, dense.normals, further)
         if options.depth_maps:
             write_depth_maps(folder / DEPTH, best.reconstruction)
         if photos.any_distorted(best.reconstruction):

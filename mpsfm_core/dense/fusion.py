@@ -1,0 +1,185 @@
+"""One point cloud from the depth maps of all images, every surface once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
+from mpsfm_core.dense.source_views import choose_sources
+from mpsfm_core.geometry import (
+    camera_center,
+    inside,
+    pixel_centers,
+    project,
+    resize_map,
+    sample_nearest,
+    transform,
+    unproject,
+)
+from mpsfm_core.results.options import ResultOptions
+from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
+
+_NEIGHBORS = 8
+"""Images that vote on the points of one image: those that see most of it."""
+_WORSE = 1.5
+"""Pixels of so many times the median std stay in any case: a network that promises little still
+gives a cloud (ours)."""
+
+
+_SAME = 0.02
+"""Relative distance up to which points that agree are one, whatever their std (ours)."""
+_MUCH_SURER = 0.5
+"""Std of an image, in that of another that agrees, with which its surface stands for the other's at
+any distance (ours)."""
+
+
+class Cloud(NamedTuple):
+    """Points of a surface, (n, ...).
+
+    ``points``: (n, 3) float64, world. ``colors``: (n, 3) uint8, RGB. ``normals``: (n, 3) float32,
+    unit, towards the camera that saw the point; zero where the depth map says none. ``std``: (n,)
+    float32, of the depth, world units. ``views``: (n,) uint8, images whose depth agrees, its own
+    counted: 1 for what one image alone says.
+    """
+
+    points: Float64
+    colors: UInt8
+    normals: Float32
+    std: Float32
+    views: UInt8
+
+
+def fuse_depth_maps(
+    reconstruction: Reconstruction,
+    view_of: Callable[[str], View],
+    options: ResultOptions,
+    seed: int = 0,
+) -> Cloud:
+    """Where images agree on a surface it is taken from the one that is most certain.
+
+    Left out are uncertain pixels, those that more images see through than confirm, and images
+    without a confirmed pose. Above ``options.dense_max_points`` a random share of each map's pixels
+    is taken.
+    """
+    reconstruction = replace(reconstruction, images=reconstruction.confirmed_images)
+    images = reconstruction.images
+    limit = max(options.dense_max_relative_std, _WORSE * _median_relative_std(images))
+    usable = [_certain(image, limit) for image in images]
+    neighbors = choose_sources(images, _NEIGHBORS)
+    found = []
+    for row, (image, near) in enumerate(zip(images, neighbors, strict=True)):
+        pixels = np.flatnonzero(usable[row])
+        points, variance = _lift(image, pixels)
+        others = [(images[j], usable[j], j < row) for j in near]
+        kept, views = _votes(points, variance, others, options.dense_consistency_sigmas)
+        found.append((pixels[kept], views[kept]))
+    total = sum(len(pixels) for pixels, _ in found)
+    share = min(1.0, options.dense_max_points / max(1, total))
+    rng = np.random.default_rng(seed)
+    parts = [_EMPTY]
+    for image, (pixels, views) in zip(images, found, strict=True):
+        chosen = np.sort(rng.choice(len(pixels), int(share * len(pixels)), replace=False))
+        points, variance = _lift(image, pixels[chosen])
+        colors = _colors(view_of(image.name), image, pixels[chosen])
+        normals = _normals(image).reshape(-1, 3)[pixels[chosen]]
+        std = np.sqrt(variance).astype(np.float32)
+        parts.append(Cloud(points, colors, normals, std, views[chosen]))
+    return Cloud(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+_EMPTY = Cloud(
+    np.zeros((0, 3)),
+    np.zeros((0, 3), np.uint8),
+    np.zeros((0, 3), np.float32),
+    np.zeros(0, np.float32),
+    np.zeros(0, np.uint8),
+)
+
+
+def _median_relative_std(images: Sequence[RegisteredImage]) -> float:
+    """Over the images, of the median over the pixels."""
+    spreads = [
+        np.median(np.sqrt(_variance(image)[valid]) / image.depth.depth[valid])
+        for image in images
+        if (valid := image.depth.valid).any()
+    ]
+    return float(np.median(spreads)) if spreads else 0.0
+
+
+def _certain(image: RegisteredImage, max_relative_std: float) -> Bool:
+    certain: Bool = _variance(image) <= (max_relative_std * image.depth.depth) ** 2
+    return certain & image.depth.valid
+
+
+def _variance(image: RegisteredImage) -> Float32:
+    assert image.depth.variance is not None  # a refined map always has one
+    return image.depth.variance
+
+
+def _lift(image: RegisteredImage, pixels: Int64) -> tuple[Float64, Float64]:
+    """World points (n, 3) of flat pixel indices of the map, and their depth variance (n,)."""
+    height, width = image.depth.shape
+    camera = image.camera.resized(width, height)
+    xy = pixel_centers(width, height).reshape(-1, 2)[pixels]
+    local = unproject(camera, xy, image.depth.depth.ravel()[pixels])
+    world = local @ image.rotation + camera_center(image.rotation, image.translation)
+    return world, _variance(image).ravel()[pixels].astype(np.float64)
+
+
+def _votes(
+    points: Float64,
+    variance: Float64,
+    others: Sequence[tuple[RegisteredImage, Bool, bool]],
+    sigmas: float,
+) -> tuple[Bool, UInt8]:
+    """Which points stay, and how many images agree on each.
+
+    ``others``: images, which of their pixels may become points, and whether they come first among
+    equally certain ones.
+    """
+    votes = np.zeros(len(points), dtype=np.int64)
+    views = np.ones(len(points), np.uint8)
+    theirs = np.zeros(len(points), np.bool_)
+    for other, usable, first in others:
+        height, width = other.depth.shape
+        local = transform(other.rotation, other.translation, points)
+        xy = project(other.camera.resized(width, height), local)
+        seen = np.flatnonzero(inside(xy, (width, height)))
+        seen = seen[sample_nearest(other.depth.valid, xy[seen])]
+        ahead = sample_nearest(other.depth.depth, xy[seen]) - local[seen, 2]
+        other_variance = sample_nearest(_variance(other), xy[seen])
+        std = np.sqrt(variance[seen] + other_variance)
+        agrees = np.abs(ahead) <= sigmas * std
+        votes[seen] += agrees.astype(np.int64) - (ahead > sigmas * std)
+        views[seen[agrees]] += 1
+        surer = other_variance <= variance[seen] if first else other_variance < variance[seen]
+        same = np.abs(ahead) <= _SAME * local[seen, 2]
+        same |= other_variance <= _MUCH_SURER**2 * variance[seen]
+        theirs[seen[agrees & surer & same & sample_nearest(usable, xy[seen])]] = True
+    return (votes >= 0) & ~theirs, views
+
+
+def _normals(image: RegisteredImage) -> Float32:
+    """World normals (h, w, 3) float32 of a map; zero at holes and borders."""
+    height, width = image.depth.shape
+    camera = image.camera.resized(width, height)
+    local = unproject(camera, pixel_centers(width, height), image.depth.depth)
+    normals = np.zeros((height, width, 3), np.float32)
+    across, down = local[1:-1, 2:] - local[1:-1, :-2], local[2:, 1:-1] - local[:-2, 1:-1]
+    normal = np.cross(down, across)  # towards the camera: x right, y down, z forward
+    valid = image.depth.valid
+    usable = valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1] & valid[:-2, 1:-1]
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    unit = normal / np.where(length > 0, length, 1)
+    normals[1:-1, 1:-1] = np.where(usable[..., None], unit @ image.rotation, 0)
+    return normals
+
+
+def _colors(view: View, image: RegisteredImage, pixels: Int64) -> UInt8:
+    height, width = image.depth.shape
+    small = resize_map(view.image, width, height).reshape(-1, 3)[pixels]
+    return np.round(small).astype(np.uint8)
