@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import sys
+from types import ModuleType
+
 import cv2
-import hubconf
 import torch
 from common import export, photos, save, seeded
-from mono.model.decode_heads.RAFTDepthNormalDPTDecoder5 import RAFTDepthNormalDPT5
+
+for name in ("mmcv", "mmcv.utils", "torchvision", "torchvision.ops", "torchvision.ops.misc"):
+    sys.modules[name] = ModuleType(name)  # imported, and not used here
+sys.modules["mmcv.utils"].collect_env = dict
+sys.modules["torchvision.ops.misc"].FrozenBatchNorm2d = torch.nn.Identity
+
+import hubconf  # noqa: E402
+from mono.model.decode_heads.RAFTDepthNormalDPTDecoder5 import RAFTDepthNormalDPT5  # noqa: E402
 
 _SIZE = 616, 1064
 _MEAN, _STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
