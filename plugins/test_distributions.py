@@ -88,3 +88,15 @@ def test_readme(folder: Path) -> None:
     assert "```yaml" in text or "export " in text
     overview = folder.parents[1] / "README.md"
     assert f"| [{folder.name}](plugins/{folder.name}) |" in overview.read_text(encoding="utf-8")
+
+
+def test_the_meta_distribution_names_every_plugin() -> None:
+    meta = project_of(PLUGINS[0].parents[1] / "meta")
+    extras = meta["optional-dependencies"]
+    names = {re.split(r"[<>=]", requirement)[0] for requirement in extras["all"]}
+    assert names == {folder.name for folder in PLUGINS}
+    for requirement in (*meta["dependencies"], *extras["torch"], *extras["viewers"]):
+        assert re.split(r"[<>=]", requirement)[0] in names | {"mpsfm-core"}
+    versions = {project_of(folder)["version"] for folder in PLUGINS}
+    core = project_of(PLUGINS[0].parents[1])["version"]
+    assert versions | {meta["version"]} == {core}, "one version"

@@ -146,3 +146,10 @@ def test_a_model_is_shown_by_the_command(
     assert ended.exit_code == 0, ended.output
     assert "seen.txt" in ended.output
     assert (tmp_path / "seen.txt").read_text() == "5 20"
+
+
+def test_a_run_opens_the_viewer_before_anything_else(tmp_path: Path) -> None:
+    arguments = ["reconstruct", str(tmp_path), "-o", str(tmp_path / "out"), "--viewer", "nothing"]
+    ended = CliRunner().invoke(build_app(), arguments)
+    assert ended.exit_code == 2
+    assert "no viewer 'nothing'" in ended.stderr

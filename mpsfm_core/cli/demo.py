@@ -44,6 +44,7 @@ def demo(
     metric = result.summary["reconstructions"][0]["metric_scale"] is not None
     _compare(reconstruction_poses(result.model), read_poses(folder / "gt"), metric)
     typer.echo("open next:")
+    typer.echo(f"  {output}/report.html   in a browser: cameras, points, photos, depth, matches")
     typer.echo(f"  {output}/dense.ply     in MeshLab, CloudCompare or Blender")
     typer.echo(f"  {output}/sparse        in COLMAP (File > Import model) or pycolmap")
     typer.echo(f"  {output}/summary.json  what was used and what came out")

@@ -63,6 +63,7 @@ def reconstruct(
         poses=poses,
         overrides=settings(overrides, offline),
         fresh=fresh,
+        viewer=viewer,
     )
 
 
