@@ -78,7 +78,7 @@ def _print_plugins(registry: Registry) -> bool:
         count = usable[name]
         own = [line for line in faults if line.distribution == name]
         missing = f", {len(own)} cannot be used" if own else ""
-        _line(name, f"{version}, {count} provider{'' if count == 1 else 's'} or hooks{missing}")
+        _line(name, f"{version}, {count} providers and hooks usable{missing}")
     for line in faults:
         _line("", f"{line.kind} {line.name} {line.reason}; {line.install_hint}".rstrip("; "))
     return any(line.kind == "plugin" for line in faults)

@@ -77,17 +77,19 @@ class ViserViewer:
         """Replace what is shown; ``cloud`` is shown instead of the depth maps."""
         with self._lock, self.server.atomic():
             self._unit = _unit(scene)
-            self.clouds = []
+            while self.clouds:
+                self.clouds.pop().remove()
             for name in self.frustums.keys() - {image.name for image in scene.images}:
                 self.frustums.pop(name).remove()
             for image in scene.images:
                 self.frustums[image.name] = self._frustum(image)
                 if cloud is None:
                     self._cloud(f"/depth/{_key(image.name)}", lifted(image, self._picture(image)))
-            if cloud is not None:
+            if cloud is None:
+                grey = np.full(scene.points.shape, 200, np.uint8)
+                self._cloud("/sparse", Cloud(scene.points, grey))
+            else:
                 self._cloud("/dense", cloud)
-            grey = np.full(scene.points.shape, 200, np.uint8)
-            self._cloud("/sparse", Cloud(scene.points, grey))
             self._shown = set(self.frustums)
             self._state.content = f"**{len(scene.images)} images**, {len(scene.points):,} points"
             if scene.images:

@@ -15,6 +15,7 @@ from mpsfm_viser.viewer import ViserViewer
 
 from mpsfm_core.data import DepthPrior, PinholeCamera, PosedImage, SceneState
 from mpsfm_core.registry import Registry
+from mpsfm_core.viewing import Cloud
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 32.0, 24.0)
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -60,6 +61,16 @@ def test_an_image_that_is_taken_out_goes(viewer: ViserViewer) -> None:
     viewer.show(scene(2))
     assert viewer.frustums.keys() == {"room/0.jpg", "room/1.jpg"}
     assert len(viewer.clouds) == 3
+
+
+def test_the_final_cloud_takes_the_place_of_the_depth_maps(viewer: ViserViewer) -> None:
+    viewer.show(scene(2))
+    before = list(viewer.clouds)
+    viewer.show(scene(2), Cloud(np.zeros((4, 3)), np.zeros((4, 3), np.uint8)))
+    assert [cloud.name for cloud in viewer.clouds] == ["/dense"]
+    for cloud in before:
+        with pytest.warns(UserWarning, match="removed"):
+            cloud.remove()
 
 
 def test_it_listens_to_a_run(viewer: ViserViewer) -> None:
