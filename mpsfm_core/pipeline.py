@@ -11,27 +11,35 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pycolmap
 from threadpoolctl import threadpool_limits
 
 from mpsfm_core.checkpoints import DiskCheckpoints
 from mpsfm_core.config import Config, load_config
-from mpsfm_core.data import MappingProblem, Pose
-from mpsfm_core.dense.stage import densify
+from mpsfm_core.data import Float64, MappingProblem, Pose, View
+from mpsfm_core.dense.fusion import fuse_depth_maps
+from mpsfm_core.dense.options import DenseOptions
+from mpsfm_core.dense.sparse_depth import depth_of_points
+from mpsfm_core.dense.stage import DenseReport, densify
 from mpsfm_core.errors import InputError, ReconstructionError
 from mpsfm_core.extraction.focal import estimate_focals
 from mpsfm_core.extraction.runner import Extraction, extract
-from mpsfm_core.files import claimed
+from mpsfm_core.files import claimed, replacing
+from mpsfm_core.geometry import transform
 from mpsfm_core.inputs.images import SUMMARY, ImageSet, check_apart, find_images, load_images
-from mpsfm_core.inputs.models import match_names, read_poses
+from mpsfm_core.inputs.models import match_names, read_model, read_poses
 from mpsfm_core.mapping import mapper
 from mpsfm_core.provision import Provision, provide
 from mpsfm_core.registry import Registry, core_version
 from mpsfm_core.report.page import write_report
+from mpsfm_core.results.depth_maps import read_depth_map, write_depth_maps
+from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos
+from mpsfm_core.results.ply import write_cloud
 from mpsfm_core.results.summary import describe_images, describe_pairs, describe_reconstructions
-from mpsfm_core.results.writer import Component, write_failure, write_results
-from mpsfm_core.scene.reconstruction import MappingResult
+from mpsfm_core.results.writer import DENSE, DEPTH, Component, write_failure, write_results
+from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
 from mpsfm_core.stages import Stages
 
 PathLike = str | Path
@@ -313,3 +321,66 @@ def _with_poses(problem: MappingProblem, poses: Mapping[str, Pose]) -> MappingPr
 
 def _path(value: PathLike | None) -> Path | None:
     return None if value is None else Path(value)
+
+
+def densify_model(
+    model: PathLike,
+    images: PathLike,
+    output: PathLike,
+    options: DenseOptions | None = None,
+    workers: int | None = None,
+) -> DenseReport:
+    """Measure depth in the photos of a model and write ``depth/`` and ``dense.ply``.
+
+    The search starts from the maps in ``model/depth`` if the model is an output folder of ours,
+    else from the range of the points that an image sees; images without either are left out.
+
+    Raises:
+        InputError: model or photos cannot be read, names do not match, the model has no points, or
+            ``output`` cannot be written.
+    """
+    with claimed(Path(output)):
+        return _densify_model(Path(model), Path(images), Path(output), options, workers)
+
+
+def _densify_model(
+    model: Path, images: Path, output: Path, options: DenseOptions | None, workers: int | None
+) -> DenseReport:
+    colmap, poses = read_model(model), read_poses(model)
+    matched = match_names(find_images(images), poses)
+    if len(matched) < 2:
+        raise InputError(f"{images}: has {len(matched)} of the photos of {model}, two are needed")
+    photos = load_images(images, model=model, names=list(matched))
+    points = {str(image.name): _depths_of_points(colmap, image) for image in colmap.images.values()}
+    registered = []
+    for index, source in enumerate(photos):
+        found = matched[source.name]
+        file = model / DEPTH / f"{found}.npz"
+        depth = read_depth_map(file) if file.is_file() else depth_of_points(points[found])
+        if depth is not None:
+            pose, ids = poses[found], np.zeros(0, np.int64)
+            registered.append(
+                RegisteredImage(index, source.name, source.pinhole, *pose, ids, depth, 1.0)
+            )
+    if not registered:
+        raise InputError(f"{model}: has no points, so nothing says how far the surfaces are")
+    known = Reconstruction(tuple(registered), np.zeros((0, 3)), np.zeros(0))
+    rows = {name: row for row, name in enumerate(photos.names)}
+
+    def view_of(name: str) -> View:
+        return photos.view(rows[name])
+
+    dense, report = densify(known, view_of, options or DenseOptions(), workers)
+    with replacing(output, (DENSE, DEPTH)) as folder:
+        write_depth_maps(folder / DEPTH, dense)
+        write_cloud(folder / DENSE, fuse_depth_maps(dense, view_of, ResultOptions()))
+    return report
+
+
+def _depths_of_points(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Float64:
+    seen = [point.point3D_id for point in image.points2D if point.has_point3D()]
+    if not seen or not image.has_pose:
+        return np.zeros(0)
+    xyz = np.array([model.points3D[number].xyz for number in seen])
+    matrix = np.asarray(image.cam_from_world().matrix())
+    return transform(matrix[:, :3], matrix[:, 3], xyz)[:, 2]

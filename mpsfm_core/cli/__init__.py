@@ -20,6 +20,7 @@ from mpsfm_core.cli import (
     calibrate,
     config,
     demo,
+    dense,
     doctor,
     env,
     evaluate,
@@ -50,6 +51,7 @@ def build_app() -> typer.Typer:
     )
     app.command("reconstruct")(reconstruct.reconstruct)
     app.command("demo")(demo.demo)
+    app.command("dense")(dense.dense)
     app.command("export")(export.export)
     app.command("report")(report.report)
     app.command("view")(view.view)

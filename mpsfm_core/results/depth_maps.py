@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mpsfm_core.data import DepthPrior
+from mpsfm_core.errors import InputError
 from mpsfm_core.scene.reconstruction import Reconstruction
 
 
@@ -29,3 +31,15 @@ def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
             camera=image.camera.resized(width, height).params,
             cam_from_world=np.column_stack([image.rotation, image.translation]),
         )
+
+
+def read_depth_map(path: Path) -> DepthPrior:
+    """Depth with variance of a file that :func:`write_depth_maps` wrote.
+
+    Raises :class:`InputError` when it is damaged or something else.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return DepthPrior.from_arrays(file["depth"], file["variance"], file["valid"])
+    except Exception as error:  # numpy has no base class for what damaged archives raise
+        raise InputError(f"{path}: is no depth map of a run, or damaged: {error}") from error

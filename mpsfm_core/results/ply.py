@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Float32, Float64, UInt8
+from mpsfm_core.dense.fusion import Cloud
 from mpsfm_core.errors import InputError
 
 _TYPES = {
@@ -50,6 +51,12 @@ def write_ply(
         "end_header",
     ]
     path.write_bytes("\n".join([*header, ""]).encode("ascii") + vertices.tobytes())
+
+
+def write_cloud(path: Path, cloud: Cloud) -> None:
+    """Write a fused cloud, with ``std`` and ``views`` as properties of that name."""
+    further: dict[str, NDArray[Any]] = {"std": cloud.std, "views": cloud.views}
+    write_ply(path, cloud.points, cloud.colors, cloud.normals, further)
 
 
 def read_ply(path: Path) -> tuple[Float64, UInt8]:

@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import pycolmap
-from numpy.typing import NDArray
 
 from mpsfm_core.data import UInt8
 from mpsfm_core.dense.fusion import fuse_depth_maps
@@ -36,7 +35,7 @@ from mpsfm_core.results.colmap_model import build_model, pinhole, point_colors, 
 from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos, portable_name
-from mpsfm_core.results.ply import write_ply
+from mpsfm_core.results.ply import write_cloud, write_ply
 from mpsfm_core.results.views import write_views
 from mpsfm_core.scene.reconstruction import Reconstruction
 
@@ -113,8 +112,7 @@ def write_results(
         write_ply(folder / "points.ply", best.reconstruction.points, best.colors)
         if options.dense_cloud:
             dense = fuse_depth_maps(best.reconstruction, photos.view, options, seed)
-            further: dict[str, NDArray[Any]] = {"std": dense.std, "views": dense.views}
-            write_ply(folder / DENSE, dense.points, dense.colors, dense.normals, further)
+            write_cloud(folder / DENSE, dense)
         if options.depth_maps:
             write_depth_maps(folder / DEPTH, best.reconstruction)
         if photos.any_distorted(best.reconstruction):
