@@ -101,3 +101,89 @@ def test_from_drawing_to_onnx(tmp_path: Path) -> None:
     train(tmp_path / "data", tmp_path / "onward", onward, ["drawn-0-0000"], start=start)
     differences = export(run / "last.pt", tmp_path / "network.onnx")
     assert max(differences.values()) < 0.03  # of weights stored as float16, hardly trained
+
+
+def test_views_of_a_panorama_have_the_scale_of_its_tripod() -> None:
+    """In a round room of 3 m, a guess of half the depth is set right, from the floor alone."""
+    from training.panoramas import VIEWS, views
+    from training.samples import HEIGHT, ROUGH, WIDTH
+
+    def depth_of(toward: np.ndarray, axis: np.ndarray) -> np.ndarray:
+        floor = 1.45 / np.maximum(-toward[..., 2], 1e-6)
+        wall = 3.0 / np.hypot(toward[..., 0], toward[..., 1])
+        return np.minimum(floor, wall) * (toward @ axis)
+
+    def guess(image: np.ndarray, focal: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        toward, rays = toward_of(image), rays_of(focal)
+        turn = np.linalg.lstsq(rays.reshape(-1, 3), toward.reshape(-1, 3), rcond=None)[0].T
+        up = np.where(toward[..., 2:] < -1.45 / np.hypot(1.45, 3), turn[2], -rays)
+        return depth_of(toward, turn[:, 2]) / 2, up, np.ones((HEIGHT, WIDTH))
+
+    def toward_of(image: np.ndarray) -> np.ndarray:
+        toward = image / 127.5 - 1
+        return toward / np.linalg.norm(toward, axis=-1, keepdims=True)
+
+    def rays_of(focal: float) -> np.ndarray:
+        x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+        rays = np.stack([x / focal, y / focal, np.ones_like(x)], -1)
+        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+    turn, height = np.meshgrid(np.arange(1024) + 0.5, np.arange(512) + 0.5)
+    turn, height = -2 * np.pi * turn / 1024, np.pi * (0.5 - height / 512)
+    level = np.cos(height)
+    toward = np.stack([level * np.cos(turn), level * np.sin(turn), np.sin(height)], -1)
+    coded = np.rint((toward + 1) * 127.5).astype(np.uint8)
+    samples = list(views(coded, guess, np.random.default_rng(0)))
+    assert len(samples) == VIEWS
+    for sample in samples:
+        toward, rays = toward_of(sample.image), rays_of(float(sample.camera[0]))
+        turned = np.linalg.lstsq(rays.reshape(-1, 3), toward.reshape(-1, 3), rcond=None)[0].T
+        known = sample.kind == ROUGH
+        assert known.mean() > 0.8
+        assert sample.metric
+        ratio = sample.depth[known] / depth_of(toward, turned[:, 2])[known]
+        np.testing.assert_allclose(np.percentile(ratio, [5, 50, 95]), 1, atol=0.04)
+        flat = np.linalg.norm(sample.normals, axis=-1) > 0.5
+        assert (sample.normals[flat] @ turned[2] > 0.99).all()
+
+
+def test_triangulated_points_are_the_depth_of_a_photo() -> None:
+    """Drawn as blocks where they are seen, the nearest in front, nothing elsewhere."""
+    from training.make_data import _sparse
+    from training.samples import HEIGHT, SURFACE, UNKNOWN, WIDTH
+
+    camera = np.array([500.0, 500.0, 320.0, 240.0], np.float32)
+    points = np.array([[0.1, 0.2, 2.0], [0.3, 0.6, 6.0], [0.0, 0.0, -1.0], [9.0, 0.0, 2.0]])
+    sample = _sparse(np.zeros((480, 640, 3), np.uint8), points, camera)
+    assert not sample.metric
+    assert (sample.kind == SURFACE).sum() == 9
+    assert (sample.kind == UNKNOWN).sum() == WIDTH * HEIGHT - 9
+    assert (sample.depth[sample.kind == SURFACE] == 2).all()
+    assert sample.depth[145, 172] == 2
+
+
+def test_guessed_depth_teaches_no_std() -> None:
+    """How far two networks agree is not how good one of them is."""
+    import torch
+    from training.batches import augmented
+    from training.losses import losses
+    from training.samples import ROUGH
+
+    sample = slanted_plane()
+    guessed = {**sample, "kind": np.full_like(sample["kind"], ROUGH)}
+    shape = (1, 1, 96, 128)
+    for stored, taught in ((sample, True), (guessed, False)):
+        batch = augmented([stored], (256, 192))
+        log_std = torch.full(shape, -1.0, requires_grad=True)
+        out = {
+            "log_depth": batch.log_depth + torch.linspace(0, 1, 128),
+            "log_std": log_std,
+            "normals": torch.nn.functional.normalize(torch.ones(1, 3, 96, 128), dim=1),
+            "log_angle": torch.zeros(shape),
+            "validity": torch.zeros(shape),
+            "log_focal": torch.zeros(1, 1),
+        }
+        parts = losses(out, batch)
+        assert parts["shape"] > 0
+        torch.stack(list(parts.values())).sum().backward()
+        assert bool(log_std.grad.abs().sum() > 0) == taught

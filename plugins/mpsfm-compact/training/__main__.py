@@ -49,6 +49,22 @@ def sky(data: Data, photos: Path, teacher: Path, names: list[str]) -> None:
     make_sky(data, photos, teacher, names)
 
 
+@app.command("triangulated")
+def triangulated(data: Data, images: Path, model: Path, name: str) -> None:
+    """Photos with the points of their COLMAP reconstruction, to hold out."""
+    from training.make_data import make_triangulated
+
+    make_triangulated(data, images, model, name)
+
+
+@app.command("views")
+def views(data: Data, panoramas: Path, teacher: Path) -> None:
+    """Cut views from panoramas on tripods, whose height gives the scale."""
+    from training.make_data import make_views
+
+    make_views(data, panoramas, teacher)
+
+
 @app.command("train")
 def train(
     data: Data,
@@ -59,13 +75,13 @@ def train(
     start: Annotated[Path | None, typer.Option(help="weights to begin with")] = None,
     minutes: Annotated[float | None, typer.Option(help="stop then, to go on later")] = None,
     seed: int = 0,
-    real_share: float = 0.35,
+    rate: float = 1e-3,
 ) -> None:
     """Train, or go on with a run."""
     from training.train import Schedule
     from training.train import train as run_training
 
-    schedule = Schedule(steps, cooldown, real_share=real_share)
+    schedule = Schedule(steps, cooldown, rate=rate)
     run_training(data, run, schedule, held_out or ["drawn-1-0000"], seed, start, minutes)
 
 

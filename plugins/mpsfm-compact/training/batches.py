@@ -199,10 +199,10 @@ def _spoiled(image: Tensor, rng: np.random.Generator) -> Tensor:
     for picture in image:
         kind = rng.random()
         array = picture.permute(1, 2, 0).numpy()
-        if kind < 0.2:
-            array = cv2.GaussianBlur(array, (0, 0), rng.uniform(0.4, 1.6))
-        elif kind < 0.35:
-            length = int(rng.integers(3, 12))
+        if kind < 0.22:
+            array = cv2.GaussianBlur(array, (0, 0), rng.uniform(0.4, 2.2))
+        elif kind < 0.4:
+            length = int(rng.integers(3, 15))
             kernel = np.zeros((length, length), np.float32)
             kernel[length // 2] = 1 / length
             turn = cv2.getRotationMatrix2D(
@@ -210,7 +210,7 @@ def _spoiled(image: Tensor, rng: np.random.Generator) -> Tensor:
             )
             kernel = cv2.warpAffine(kernel, turn, (length, length))
             array = cv2.filter2D(array, -1, kernel / max(kernel.sum(), 1e-6))
-        elif kind < 0.45:
+        elif kind < 0.5:
             share = rng.uniform(0.35, 0.8)
             little = cv2.resize(array, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
             array = cv2.resize(little, array.shape[1::-1], interpolation=cv2.INTER_LINEAR)

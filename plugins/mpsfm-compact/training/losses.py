@@ -13,7 +13,7 @@ from training.samples import EMPTY, SURFACE, UNKNOWN
 
 _WEIGHTS = {
     "shape": 1.0,
-    "scale": 0.5,
+    "scale": 0.8,
     "edges": 0.6,
     "std": 0.3,
     "normals": 0.7,
@@ -31,10 +31,11 @@ def losses(out: Mapping[str, Tensor], batch: Batch) -> dict[str, Tensor]:
 
     Depth is judged by the absolute difference of logs: its shape after each image is given its
     own scale, for metric samples that scale, and where it is measured the steps between pixels at
-    four distances. A std is that of a Laplace distribution of what remains, and moves nothing
-    but itself.
+    four distances. A std is that of a Laplace distribution of what remains where it is measured
+    (of another network's guess it would say how far the two agree), and moves nothing but itself.
     """
     known = batch.known
+    measured = known & (batch.kind == SURFACE)
     residual = torch.where(known, out["log_depth"] - batch.log_depth, 0.0)
     count = known.sum((1, 2, 3)).clamp(min=1)
     offset = residual.sum((1, 2, 3)) / count
@@ -45,8 +46,8 @@ def losses(out: Mapping[str, Tensor], batch: Batch) -> dict[str, Tensor]:
     parts = {
         "shape": _mean(error, known),
         "scale": (offset.abs() * metric).sum() / metric.sum().clamp(min=1),
-        "edges": _edges(residual, known & (batch.kind == SURFACE)),
-        "std": _mean(error.detach() * torch.exp(-log_std) + log_std, known),
+        "edges": _edges(residual, measured),
+        "std": _mean(error.detach() * torch.exp(-log_std) + log_std, measured),
     }
     seen = batch.normals.square().sum(1, keepdim=True) > 0.5
     truth = functional.normalize(batch.normals, dim=1)

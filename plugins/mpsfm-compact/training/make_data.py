@@ -8,6 +8,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from training.normals import normals_of_depth
+from training.panoramas import compact_guess, views
 from training.samples import EMPTY, HEIGHT, ROUGH, SURFACE, UNKNOWN, WIDTH, Sample, write_shard
 from training.synthetic.make import draw_samples
 
@@ -22,6 +24,8 @@ PER_SHARD = 240
 _TEACHER_FOCAL = 0.888
 """Over the width, of the photos that FastDepth was trained on: 518.9 px of 640, cut to 304 of 333
 (Wofk et al., 2019)."""
+_EXACT = 1.0
+"""Largest error, in pixels, of triangulated points that are taken for true."""
 _FIELD_DEG = 60.0
 """Horizontal field of view of photos that do not tell theirs."""
 
@@ -52,6 +56,46 @@ def make_real(output: Path, source: Path) -> None:
         if not (output / name).exists():
             count = write_shard(output / name, _frames(description))
             print(f"{name}: {count} frames")  # noqa: T201
+
+
+def make_triangulated(output: Path, images: Path, model: Path, name: str) -> None:
+    """Photos with the depth of points that COLMAP triangulated, in its unit, as shard ``name``.
+
+    ``images``: the photos; ``model``: COLMAP's reconstruction of them.
+    """
+    import pycolmap
+
+    def samples(folder: Path) -> Iterator[Sample]:
+        pycolmap.undistort_images(folder, model, images)
+        found = pycolmap.Reconstruction(folder / "sparse")
+        for image in sorted(found.images.values(), key=lambda i: str(i.name)):
+            picture = cv2.imread(str(folder / "images" / image.name))[..., ::-1]
+            camera = np.array(image.camera.params, np.float32)
+            seen = [found.points3D[p.point3D_id] for p in image.points2D if p.has_point3D()]
+            exact = [p.xyz for p in seen if p.error < _EXACT and p.track.length() > 2]
+            points = image.cam_from_world() * np.array(exact).reshape(-1, 3)
+            yield _sparse(picture, points, camera)
+
+    if not (output / name).exists():
+        with TemporaryDirectory() as folder:
+            print(f"{name}: {write_shard(output / name, samples(Path(folder)))} photos")  # noqa: T201
+
+
+def _sparse(
+    image: NDArray[np.uint8], points: NDArray[np.float64], camera: NDArray[np.float32]
+) -> Sample:
+    """A photo with points (n, 3) of its frame, each drawn as 3 x 3 pixels of the sample."""
+    blank = np.zeros(image.shape[:2], np.float32)
+    sample = _fitted(image, blank, camera, metric=False)
+    fx, fy, cx, cy = sample.camera
+    points = points[points[:, 2] > 0]
+    column = (fx * points[:, 0] / points[:, 2] + cx).astype(int)
+    row = (fy * points[:, 1] / points[:, 2] + cy).astype(int)
+    inside = (column > 0) & (column < WIDTH - 1) & (row > 0) & (row < HEIGHT - 1)
+    for k in np.flatnonzero(inside)[np.argsort(-points[inside, 2])]:
+        block = slice(row[k] - 1, row[k] + 2), slice(column[k] - 1, column[k] + 2)
+        sample.depth[block] = points[k, 2]
+    return replace(sample, kind=np.where(sample.depth > 0, SURFACE, UNKNOWN).astype(np.uint8))
 
 
 def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str]) -> None:
@@ -92,6 +136,21 @@ def make_sky(output: Path, photos: Path, teacher: Path, names: Sequence[str]) ->
         return replace(sample, depth=nothing, normals=np.zeros_like(sample.normals), kind=kind)
 
     _label(output, "sky", photos, names, label)
+
+
+def make_views(output: Path, panoramas: Path, teacher: Path) -> None:
+    """Cut views from upright panoramas, one shard each, with the scale of their tripods.
+
+    ``panoramas``: folder of equirectangular JPEGs. ``teacher``: an ONNX file of this plugin.
+    """
+    guess = compact_guess(teacher)
+    for path in sorted(panoramas.rglob("*.jpg")):
+        name = f"view-{path.stem}"
+        if not (output / name).exists():
+            picture = np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])
+            rng = np.random.default_rng([ord(letter) for letter in path.stem])
+            count = write_shard(output / name, views(picture, guess, rng))
+            print(f"{name}: {count} views")  # noqa: T201
 
 
 def _teacher(path: Path, side: int) -> Callable[[NDArray[np.uint8]], NDArray[np.float32]]:

@@ -27,15 +27,18 @@ class Schedule:
     cooldown: int = 1000
     batch: int = 16
     rate: float = 1e-3
-    encoder_rate: float = 4e-4
+    encoder_rate: float = 0.4
+    """As a share of ``rate``."""
     warmup: int = 200
     decay: float = 1e-2
     average: float = 0.998
     """Of the running mean of the weights, which is what is exported."""
-    real_share: float = 0.35
-    """Of real frames, beside drawn samples."""
+    real_share: float = 0.15
+    """Of real frames, beside drawn samples and views."""
+    view_share: float = 0.25
+    """Of views of panoramas."""
     sky_share: float = 0.06
-    """Of photos that only tell where there is sky, beside both."""
+    """Of photos that only tell where there is sky, beside all others."""
 
 
 def train(
@@ -58,12 +61,14 @@ def train(
     shards = list(find_shards(data))
     kept = [s for s in shards if not any(name in s.name for name in held_out)]
     judged = [s for s in shards if s not in kept]
-    real = [s for s in kept if s.name.startswith("real")]
-    sky = [s for s in kept if s.name.startswith("sky")]
-    drawn = [s for s in kept if s.name.startswith("drawn")]
-    shares = (1 - schedule.real_share, schedule.real_share, schedule.sky_share)
-    sources = list(zip((drawn, real, sky), shares, strict=True))
-    sampler = Sampler([source for source in sources if source[0]])
+    shares = {
+        "drawn": 1 - schedule.real_share - schedule.view_share,
+        "real": schedule.real_share,
+        "view": schedule.view_share,
+        "sky": schedule.sky_share,
+    }
+    sources = {kind: [s for s in kept if s.name.startswith(kind)] for kind in shares}
+    sampler = Sampler([(found, shares[kind]) for kind, found in sources.items() if found])
     network = CompactNetwork()
     _begin(network, start)
     network.to(device, memory_format=torch.channels_last)
@@ -82,7 +87,8 @@ def train(
         mean.load_state_dict(state["mean"])
         optimizer.load_state_dict(state["optimizer"])
         step = int(state["step"])
-    print(f"{len(drawn)} drawn and {len(real)} real shards, from step {step}", flush=True)  # noqa: T201
+    counts = ", ".join(f"{len(found)} {kind}" for kind, found in sources.items())
+    print(f"shards: {counts}; from step {step}", flush=True)  # noqa: T201
     network.train()
     recent: dict[str, float] = {}
     for batch in batches(sampler, schedule.batch, seed, step):
@@ -185,7 +191,7 @@ def _optimizer(network: CompactNetwork, schedule: Schedule) -> torch.optim.Optim
         [
             {
                 "params": parameters,
-                "top": schedule.encoder_rate if encoder else schedule.rate,
+                "top": schedule.rate * (schedule.encoder_rate if encoder else 1.0),
                 "weight_decay": schedule.decay if matrix else 0.0,
             }
             for (encoder, matrix), parameters in groups.items()

@@ -29,9 +29,7 @@ World = Callable[[Builder], Callable[[], Shot]]
 def room(b: Builder) -> Callable[[], Shot]:
     """A furnished room with windows, doors and pictures."""
     rng = b.rng
-    large = rng.random() < 0.15
-    length, width = rng.uniform(2.2, 7, 2) * (2 if large else 1)
-    height = rng.uniform(2.3, 3.2) * (rng.uniform(1, 1.8) if large else 1)
+    (length, width), height = _floor_plan(rng)
     _sky(b)
     walls = b.look((1, 5))
     ceiling = Look(b.look().texture, 5, tuple(rng.uniform(0.7, 1.1) * np.ones(3)), (0, 0))
@@ -85,13 +83,32 @@ def room(b: Builder) -> Callable[[], Shot]:
 
     def shoot() -> Shot:
         at = rng.uniform(-0.46, 0.46, 2) * (length, width)
-        eye = np.array([*at, min(rng.uniform(0.6, 1.9), height - 0.3)])
-        goal = np.array([*rng.uniform(-0.5, 0.5, 2) * (length, width), rng.uniform(0, 1.8)])
+        to = rng.uniform(-0.5, 0.5, 2) * (length, width)
+        if rng.random() < 0.5:  # who photographs a room steps back to see it
+            longer = int(width > length)
+            end = rng.choice([-1.0, 1.0]) * (length, width)[longer]
+            at[longer], to[longer] = rng.uniform(0.2, 0.46) * end, -rng.uniform(0, 0.5) * end
+        high = rng.uniform(1.2, 1.75) if rng.random() < 0.65 else rng.uniform(0.6, 2.0)
+        eye = np.array([*at, min(high, height - 0.3)])
+        goal = np.array([*to, rng.uniform(0, 1.8)])
         if np.linalg.norm(goal - eye) < 0.5:
             goal[:2] = -at
         return _aimed(rng, eye, goal)
 
     return shoot
+
+
+def _floor_plan(rng: np.random.Generator) -> tuple[tuple[float, float], float]:
+    """Length, width and height in metres: closets and baths, ordinary rooms, large ones, halls and
+    corridors."""
+    kind = rng.choice(5, p=(0.12, 0.46, 0.22, 0.1, 0.1))
+    low, high = ((1.8, 3.5), (3.0, 6.5), (4.5, 10.0), (8.0, 18.0), (5.0, 20.0))[kind]
+    length, width = rng.uniform(low, high, 2)
+    if kind == 4:
+        width = rng.uniform(1.2, 2.6)
+    height = rng.uniform(2.7, 6.0) if kind == 3 else rng.uniform(2.3, 3.3)
+    sides = (length, width) if rng.random() < 0.5 else (width, length)
+    return sides, height
 
 
 def street(b: Builder) -> Callable[[], Shot]:
