@@ -22,18 +22,26 @@ from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.sparse_depth import depth_of_points
 from mpsfm_core.dense.stage import DenseReport, densify
-from mpsfm_core.errors import InputError, ReconstructionError
+from mpsfm_core.errors import ConfigError, InputError, ReconstructionError
 from mpsfm_core.extraction.focal import estimate_focals
+from mpsfm_core.extraction.predictions import FROM_MATCHER
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.files import claimed, replacing
 from mpsfm_core.geometry import transform
 from mpsfm_core.inputs.images import SUMMARY, ImageSet, check_apart, find_images, load_images
+from mpsfm_core.inputs.matches import (
+    ImportedMatches,
+    matches_from_database,
+    matches_from_hloc,
+)
 from mpsfm_core.inputs.models import match_names, read_model, read_poses
+from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
 from mpsfm_core.provision import Provision, provide
 from mpsfm_core.registry import Registry, core_version
 from mpsfm_core.report.page import write_report
 from mpsfm_core.results.depth_maps import read_depth_map, write_depth_maps
+from mpsfm_core.results.georeference import georeference
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos
 from mpsfm_core.results.ply import write_cloud
@@ -75,11 +83,14 @@ def reconstruct(
     overrides: Sequence[str] = (),
     registry: Registry | None = None,
     fresh: bool = False,
+    database: PathLike | None = None,
+    hloc: tuple[PathLike, PathLike] | None = None,
 ) -> ReconstructionResult:
-    """Reconstruct a folder of photos.
+    """Reconstruct a folder of photos, or a video.
 
     Args:
-        images: folder of photos, subfolders included.
+        images: folder of photos, subfolders included; or a video, whose frames are chosen as
+            ``config.inputs.video`` says and go into ``frames/`` of the output.
         output: folder to write (see :mod:`mpsfm_core.results.writer`), nothing is written if None.
             A run has it to itself.
         config: name of a shipped configuration, a YAML file, or a loaded one.
@@ -90,6 +101,9 @@ def reconstruct(
             ``mapping.known_poses`` says whether they are a start or stay.
         overrides: settings such as ``"runtime.workers=2"``; not with a loaded configuration.
         registry: the providers to choose from, by default those of all installed plugins.
+        database: COLMAP database whose keypoints and matches are taken instead of our own; they are
+            verified again. Its cameras are not: give it as ``intrinsics`` too if they are good.
+        hloc: features and matches file of hloc, instead of ``database``.
         fresh: do not go on from the checkpoint that a run left which was killed while mapping.
 
     Raises:
@@ -103,6 +117,10 @@ def reconstruct(
         config = load_config(config, overrides, registry)
     elif overrides:
         raise TypeError("overrides go into load_config(), this configuration is loaded already")
+    if database is not None and hloc is not None:
+        raise TypeError("matches are of a database or of hloc, not of both")
+    if database is not None or hloc is not None:
+        config = _without_matching(config)
     folder, target = Path(images), _path(output)
     run = _Run(config, registry, target, fresh)
     with ExitStack() as stack:
@@ -110,7 +128,16 @@ def reconstruct(
         if target is not None:
             check_apart(target, folder)
             stack.enter_context(claimed(target))
-        return run(folder, _path(intrinsics), _path(image_list), _path(poses))
+        elif is_video(folder):
+            raise InputError(f"{folder}: a video needs an output folder, for its frames")
+        matches = (database,) if database is not None else hloc or ()
+        return run(
+            folder,
+            _path(intrinsics),
+            _path(image_list),
+            _path(poses),
+            tuple(Path(file) for file in matches),
+        )
 
 
 class _Run:
@@ -127,6 +154,8 @@ class _Run:
         self._provision = Provision(config, ())
         self._folder = Path()
         self._dense: list[dict[str, Any]] | None = None
+        self._imported: ImportedMatches | None = None
+        self._place: dict[str, object] | None = None
 
     def __call__(
         self,
@@ -134,12 +163,17 @@ class _Run:
         intrinsics: Path | None,
         image_list: Path | None,
         poses: Path | None,
+        matches: tuple[Path, ...],
     ) -> ReconstructionResult:
         stage = self._stages.stage
-        find_images(folder)  # no folder, no downloads
+        if not is_video(folder):
+            find_images(folder)  # no folder, no downloads
         with stage("providers"):
             self._provision = provide(self._config, self._registry, self._stages)
         config = self._provision.config
+        if is_video(folder):
+            with stage("video"):
+                folder = self._frames(folder)
         self._folder = folder
         with stage("inputs"):
             images = load_images(
@@ -151,9 +185,10 @@ class _Run:
                 without=self._output,
             )
             known = {} if poses is None else _known_poses(poses, images)
+            self._imported = _import_matches(matches, images)
         with stage("extraction"):
             images = estimate_focals(images, config, self._registry, self._stages)
-            extraction = extract(images, config, self._registry, self._stages)
+            extraction = extract(images, config, self._registry, self._stages, self._imported)
         problem = _with_poses(extraction.problem, known)
         with stage("mapping"):
             options, checkpoints = config.mapper_options(), self._checkpoints(problem)
@@ -163,6 +198,8 @@ class _Run:
             if checkpoints is not None:
                 checkpoints.forget()
             self._give_up(images, extraction, mapping, photos)
+        if config.results.georeference and not known:
+            mapping = self._georeference(images, mapping)
         mapping, self._dense = self._densified(mapping, photos)
         summary: dict[str, Any] = {}
         with stage("results"):
@@ -219,6 +256,33 @@ class _Run:
                 reports.append(asdict(report))
         return replace(mapping, reconstructions=tuple(parts)), reports
 
+    def _georeference(self, images: ImageSet, mapping: MappingResult) -> MappingResult:
+        """Lay reconstructions over the GPS positions of their photos, where these suffice."""
+        positions = {image.name: image.gps for image in images if image.gps is not None}
+        if not positions:
+            return mapping
+        laid = []
+        for number, reconstruction in enumerate(mapping.reconstructions):
+            found = georeference(reconstruction, positions)
+            if isinstance(found, str):
+                laid.append(reconstruction)
+                described: dict[str, object] = {"why_not": found}
+            else:
+                laid.append(found[0])
+                described = found[1].describe()
+            if number == 0:
+                self._place = described
+        return replace(mapping, reconstructions=tuple(laid))
+
+    def _frames(self, video: Path) -> Path:
+        """The folder of the frames that are taken from a video."""
+        assert self._output is not None
+
+        def progress(done: int, total: int) -> None:
+            self._stages.stage_progress("video", done, total)
+
+        return extract_frames(video, self._output, self._provision.config.inputs.video, progress)
+
     def _give_up(
         self, images: ImageSet, extraction: Extraction, mapping: MappingResult, photos: Photos
     ) -> None:
@@ -258,9 +322,11 @@ class _Run:
         return {
             "status": status,
             "photos": str(self._folder.resolve()),
+            "matches_from": None if self._imported is None else self._imported.source,
             "images": describe_images(images, extraction.report, mapping),
             "pairs": describe_pairs(extraction.report, mapping),
             "reconstructions": describe_reconstructions(mapping, models),
+            "georeference": self._place,
             "stages": {name: asdict(record) for name, record in self._stages.report().items()},
             "dense": self._dense,
             "mapping_runs": mapping.report.runs,
@@ -298,6 +364,23 @@ class _Run:
                 }
             )
         return described
+
+
+def _without_matching(config: Config) -> Config:
+    """No providers for what is brought."""
+    if config.depth.use == FROM_MATCHER:
+        raise ConfigError("depth: the matcher gives it, which does not run for matches of others")
+    nothing = dict.fromkeys(("features", "matcher", "dense_matcher", "retrieval"))
+    return config.model_copy(update=nothing)
+
+
+def _import_matches(files: tuple[Path, ...], images: ImageSet) -> ImportedMatches | None:
+    """From a COLMAP database, or from the two files of hloc."""
+    if not files:
+        return None
+    if len(files) == 1:
+        return matches_from_database(files[0], images)
+    return matches_from_hloc(files[0], files[1], images)
 
 
 def _known_poses(model: Path, images: ImageSet) -> dict[str, Pose]:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def reconstruct(
-    images: Annotated[Path, typer.Argument(help="Folder of photos.")],
+    images: Annotated[Path, typer.Argument(help="Folder of photos, or a video.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Is written.")],
     config: ConfigName = "default",
     intrinsics: Annotated[
@@ -37,6 +37,14 @@ def reconstruct(
         ),
     ] = None,
     overrides: Overrides = None,
+    database: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Keypoints and matches of a COLMAP database, not ours."),
+    ] = None,
+    hloc: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(metavar="FEATURES MATCHES", help="... of hloc's two files (.h5)."),
+    ] = None,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Do not go on from where a killed run was.")
     ] = False,
@@ -44,7 +52,7 @@ def reconstruct(
     viewer: ViewerName = None,
     quiet: Quiet = False,
 ) -> None:
-    """Reconstruct a folder of photos.
+    """Reconstruct a folder of photos, or a video.
 
     Without --config it takes the best features, depth and normals that it can get, and says which.
 
@@ -53,6 +61,8 @@ def reconstruct(
     reconstruction was possible; the summary then has the reasons. After a run that was killed the
     same command goes on where it was.
     """
+    if database is not None and hloc is not None:
+        raise typer.BadParameter("matches are of --database or of --hloc, not of both")
     run(
         images,
         output,
@@ -61,6 +71,8 @@ def reconstruct(
         intrinsics=intrinsics,
         image_list=image_list,
         poses=poses,
+        database=database,
+        hloc=hloc,
         overrides=settings(overrides, offline),
         fresh=fresh,
         viewer=viewer,
@@ -123,6 +135,8 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
         f"reprojection error {best['mean_reprojection_error_px'] or 0:.2f} px",
     )
     _row("scale", _unit(best["metric_scale"]))
+    if place := result.summary["georeference"]:
+        _row("place", _place(place))
     if refined := _refined_focal_lengths(images["details"].values()):
         _row("cameras", refined)
     weak = [f"{name} ({count})" for name, count in weakest(result.summary)]
@@ -150,10 +164,22 @@ def _unit(metric: dict[str, Any] | None) -> str:
     """What one unit of the reconstruction is; ``metric``: the summary's ``metric_scale``."""
     if metric is None:
         return "unit unknown: no depth is metric"
-    by = f"by {metric['num_images']} depth maps, spread {metric['spread']:.0%}"
+    by = f"by {metric['num_images']} {metric['by']}, spread {metric['spread']:.0%}"
     if metric["trusted"]:
         return f"in metres, {by}"
     return f"not in metres: one unit is about {metric['metres_per_unit']:.3g} m {by}"
+
+
+def _place(georeference: Mapping[str, Any]) -> str:
+    """Where on Earth, or why not; ``georeference``: of the summary."""
+    if "why_not" in georeference:
+        return f"not georeferenced: {georeference['why_not']}"
+    origin = georeference["origin"]
+    return (
+        f"east, north, up of {origin['latitude']:.6f}, {origin['longitude']:.6f}; "
+        f"{georeference['inliers']} of {georeference['images']} GPS positions fit, "
+        f"{georeference['rms_m']:.1f} m off; up by {georeference['up']}"
+    )
 
 
 def _refined_focal_lengths(details: Collection[Mapping[str, Any]]) -> str:

@@ -20,6 +20,9 @@ class PointMatches:
     scores: Float32
 
 
+NO_POINTS = PointMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, dtype=np.float32))
+
+
 def snap(
     dense: DenseMatches, keypoints_a: Float64, keypoints_b: Float64, radius_px: float
 ) -> SparseMatches:

@@ -20,7 +20,7 @@ from mpsfm_core.data import (
 )
 from mpsfm_core.extraction.backends import ActiveProvider, worker_count
 from mpsfm_core.extraction.cache import content_key, digest
-from mpsfm_core.extraction.dense import PointMatches, sample, snap
+from mpsfm_core.extraction.dense import NO_POINTS, PointMatches, sample, snap
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.pairs import Pair
 from mpsfm_core.extraction.verification import CALIBRATED, TwoView, verify
@@ -79,7 +79,7 @@ class PairMatcher:
         results = [self._run(provider, pair) for provider in self._providers]
         no_scores = np.empty(0, dtype=np.float32)
         sparse = SparseMatches(np.empty((0, 2), dtype=np.int64), no_scores)
-        points, std_px = PointMatches(np.empty((0, 2)), np.empty((0, 2)), no_scores), 1.0
+        points, std_px = NO_POINTS, 1.0
         for result in results:
             if result.sparse is not None:
                 sparse = result.sparse

@@ -22,7 +22,7 @@ class Predictions:
     """Runs the depth and normals providers; calibrates, resizes and masks what they say."""
 
     def __init__(
-        self, bench: Workbench, matcher: PairMatcher, candidates: list[Candidates]
+        self, bench: Workbench, matcher: PairMatcher | None, candidates: list[Candidates]
     ) -> None:
         self._bench = bench
         self._matcher = matcher
@@ -63,7 +63,7 @@ class Predictions:
 
     def _from_matcher(self, index: int) -> DepthPrior:
         """Depth of the pair whose prediction is most certain; none at all without a pair."""
-        assert self._best is not None
+        assert self._best is not None and self._matcher is not None
         if index not in self._best:
             empty = np.zeros((1, 1), dtype=np.float32)
             return DepthPrior(empty, empty, np.zeros((1, 1), dtype=np.bool_))

@@ -14,16 +14,20 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mpsfm_core.config import Config
-from mpsfm_core.data import Features, MappingImage, MappingProblem
+from mpsfm_core.data import Features, MappingImage, MappingProblem, SparseMatches
 from mpsfm_core.extraction.backends import thread_count
+from mpsfm_core.extraction.dense import NO_POINTS
 from mpsfm_core.extraction.events import ExtractionEvents, Silent
 from mpsfm_core.extraction.features import FeatureTable
-from mpsfm_core.extraction.matching import PairMatcher, PairVerifier, assemble
+from mpsfm_core.extraction.matching import Candidates, PairMatcher, PairVerifier, assemble
 from mpsfm_core.extraction.predictions import Predictions, check_depth_source
 from mpsfm_core.extraction.report import describe
 from mpsfm_core.extraction.selection import PairSelection
+from mpsfm_core.extraction.verification import TwoView
 from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.inputs.images import ImageSet
+from mpsfm_core.inputs.matches import ImportedMatches
 from mpsfm_core.registry import Registry
 
 
@@ -44,10 +48,13 @@ def extract(
     config: Config,
     registry: Registry,
     events: ExtractionEvents | None = None,
+    imported: ImportedMatches | None = None,
 ) -> Extraction:
     """Run all providers of a configuration.
 
     What the cache has is not computed again, so that an interrupted run goes on where it was.
+    ``imported``: keypoints and matches that stand instead of features, pairs and matchers; they are
+    verified as ours are.
 
     Raises:
         InputError: a provider, its weights or its files are missing, or the configuration does
@@ -56,25 +63,16 @@ def extract(
         OutputError: the cache cannot be written.
     """
     with threadpool_limits(thread_count(config.runtime), user_api="blas"):
-        return _extract(Workbench(images, config, registry, events or Silent()))
+        return _extract(Workbench(images, config, registry, events or Silent()), imported)
 
 
-def _extract(bench: Workbench) -> Extraction:
+def _extract(bench: Workbench, imported: ImportedMatches | None) -> Extraction:
     check_depth_source(bench.config, bench.registry)
     bench.run_masks()
-    backend = bench.config.features
-    table = None if backend is None else FeatureTable(bench, backend)
-    located = [_NO_FEATURES] * len(bench.images) if table is None else table.extract()
-    selection = PairSelection(bench, table)
-    matcher, verifier = PairMatcher(bench, table), PairVerifier(bench, located)
-    candidates = matcher.match(selection.choose(), located)
-    outcomes = verifier.verify(candidates)
-    kept = zip(candidates, outcomes, strict=True)
-    if more := selection.choose_again([c.pair for c, outcome in kept if not outcome.reason]):
-        candidates += matcher.match(more, located)
-        outcomes += verifier.verify(candidates[len(outcomes) :])
+    found = _match(bench) if imported is None else _verify(bench, imported)
+    candidates, outcomes, located = found.candidates, found.outcomes, found.located
     assembled = assemble(candidates, outcomes, located)
-    priors = Predictions(bench, matcher, candidates).run()
+    priors = Predictions(bench, found.matcher, candidates).run()
     problem = MappingProblem(
         tuple(
             MappingImage(
@@ -89,7 +87,51 @@ def _extract(bench: Workbench) -> Extraction:
         ),
         assembled.pairs,
     )
-    return Extraction(problem, describe(bench, problem, selection.proposed, candidates, outcomes))
+    return Extraction(problem, describe(bench, problem, found.proposed, candidates, outcomes))
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """``located``: features of the images, without descriptors. ``proposed``: number of pairs
+    before the filters of plugins. ``outcomes``: of each of the ``candidates``."""
+
+    located: list[Features]
+    proposed: int
+    candidates: list[Candidates]
+    outcomes: list[TwoView]
+    matcher: PairMatcher | None = None
+
+
+def _match(bench: Workbench) -> _Found:
+    """By the providers of the configuration."""
+    backend = bench.config.features
+    table = None if backend is None else FeatureTable(bench, backend)
+    located = [_NO_FEATURES] * len(bench.images) if table is None else table.extract()
+    selection = PairSelection(bench, table)
+    matcher, verifier = PairMatcher(bench, table), PairVerifier(bench, located)
+    candidates = matcher.match(selection.choose(), located)
+    outcomes = verifier.verify(candidates)
+    kept = zip(candidates, outcomes, strict=True)
+    if more := selection.choose_again([c.pair for c, outcome in kept if not outcome.reason]):
+        candidates += matcher.match(more, located)
+        outcomes += verifier.verify(candidates[len(outcomes) :])
+    return _Found(located, selection.proposed, candidates, outcomes, matcher)
+
+
+def _verify(bench: Workbench, imported: ImportedMatches) -> _Found:
+    """As they come, without those in masked areas."""
+    located, allowed = [], []
+    for index, (xy, std_px) in enumerate(zip(imported.keypoints, imported.std_px, strict=True)):
+        mask = bench.mask(index)
+        allowed.append(np.ones(len(xy), np.bool_) if mask is None else sample_nearest(mask, xy))
+        located.append(Features(xy, np.empty((len(xy), 0), dtype=np.float32), std_px=std_px))
+    candidates = []
+    for pair, matches in sorted(imported.matches.items()):
+        keep = allowed[pair[0]][matches.indices[:, 0]] & allowed[pair[1]][matches.indices[:, 1]]
+        sparse = SparseMatches(matches.indices[keep], matches.scores[keep])
+        candidates.append(Candidates(pair, sparse, NO_POINTS, 1.0))
+    outcomes = PairVerifier(bench, located).verify(candidates)
+    return _Found(located, len(candidates), candidates, outcomes)
 
 
 _NO_FEATURES = Features(np.empty((0, 2)), np.empty((0, 0), dtype=np.float32))

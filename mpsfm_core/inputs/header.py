@@ -6,12 +6,17 @@ import math
 import re
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
+from mpsfm_core.inputs.codecs import heif_exif, is_heif
+
 _EXIF_SIGNATURE = b"Exif\x00\x00"
+_XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\x00"
 _JPEG_SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD9)))
 _TYPE_FORMATS = {1: "B", 3: "H", 4: "I", 5: "II", 9: "i", 10: "ii"}
+_TYPE_SIZES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MAX_ASPECT_DIFFERENCE = 0.02
@@ -30,11 +35,13 @@ class Header:
 
     ``size``: stored (width, height) before rotation, None where only decoding tells.
     ``orientation``: EXIF's 1 to 8. ``tags``: numeric EXIF tags by number.
+    ``projection``: of a panorama, as ``equirectangular``.
     """
 
     size: tuple[int, int] | None
     orientation: int
     tags: dict[int, float]
+    projection: str | None = None
 
     def focal_px(self, width: int, height: int) -> float | None:
         """Focal length in pixels of the image at this (stored) size, None when EXIF has none.
@@ -122,26 +129,48 @@ def _jp2_size(data: bytes) -> tuple[int, int] | None:
 def read_header(data: bytes) -> Header:
     """Header of an encoded image; what is damaged or unknown is left out."""
     size: tuple[int, int] | None = None
-    block: bytes | None = None
     if data[:2] == b"\xff\xd8":
         for marker, payload in _jpeg_segments(data):
             if marker in _JPEG_SOF and len(payload) >= 5:
                 rows, columns = struct.unpack(">HH", payload[1:5])
                 size = (columns, rows)
-            elif marker == 0xE1 and payload.startswith(_EXIF_SIGNATURE):
-                block = block or payload[len(_EXIF_SIGNATURE) :]
     elif data[:8] == b"\x89PNG\r\n\x1a\n":
         size = struct.unpack(">II", data[16:24]) if len(data) >= 24 else None
-        block = next((c for name, c in _chunks(data, 8, ">") if name == b"eXIf"), None)
-    elif data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-        block = next((c for name, c in _chunks(data, 12, "<") if name == b"EXIF"), None)
-        block = block.removeprefix(_EXIF_SIGNATURE) if block else None
-    elif data[:4] in (b"II*\x00", b"MM\x00*"):
-        # The decoder turns TIFFs upright itself, so that their stored size says nothing.
-        return Header(None, 1, _read_tags(data))
+    block = exif_block(data)
     tags = _read_tags(block) if block else {}
     orientation = int(tags.get(_ORIENTATION, 1))
-    return Header(size, orientation if 1 <= orientation <= 8 else 1, tags)
+    if block is data or is_heif(data) or not 1 <= orientation <= 8:
+        # Decoders turn TIFF and HEIF upright themselves; a TIFF's stored size then says nothing.
+        orientation = 1
+    return Header(size, orientation, tags, _projection(data))
+
+
+def exif_block(data: bytes) -> bytes | None:
+    """The TIFF structure with the EXIF data of an encoded image; a TIFF is one itself."""
+    if data[:2] == b"\xff\xd8":
+        found = (p for m, p in _jpeg_segments(data) if m == 0xE1 and p.startswith(_EXIF_SIGNATURE))
+        block = next(found, None)
+        return None if block is None else block[len(_EXIF_SIGNATURE) :]
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return next((c for name, c in _chunks(data, 8, ">") if name == b"eXIf"), None)
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        block = next((c for name, c in _chunks(data, 12, "<") if name == b"EXIF"), None)
+        return block.removeprefix(_EXIF_SIGNATURE) if block else None
+    if data[:4] in (b"II*\x00", b"MM\x00*"):
+        return data
+    return heif_exif(data) if is_heif(data) else None
+
+
+def _projection(data: bytes) -> str | None:
+    """What a panorama's XMP data call its projection, None of other photos."""
+    if data[:2] != b"\xff\xd8":
+        return None
+    for marker, payload in _jpeg_segments(data):
+        if marker == 0xE1 and payload.startswith(_XMP_SIGNATURE):
+            found = re.search(rb"GPano:ProjectionType\W{1,4}(\w{1,40})", payload)
+            if found is not None:
+                return found[1].decode("ascii", "replace")
+    return None
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -181,20 +210,33 @@ def _read_tags(block: bytes) -> dict[int, float]:
     return tags
 
 
-def _read_directory(block: bytes, order: str, offset: int) -> dict[int, float]:
-    tags = {}
-    try:
+def tiff_entries(block: bytes, offset: int | None = None) -> Iterator[tuple[int, int, int, int]]:
+    """Tag, type, number of values and the place of the first one, of each entry of a directory.
+
+    ``offset``: of the directory, by default the first one. Ends where the block is cut off.
+    """
+    order = {b"II": "<", b"MM": ">"}.get(block[:2])
+    if order is None or len(block) < 8:
+        return
+    with suppress(struct.error):
+        if offset is None:
+            (offset,) = struct.unpack_from(order + "I", block, 4)
         (count,) = struct.unpack_from(order + "H", block, offset)
         for entry in range(offset + 2, offset + 2 + 12 * count, 12):
             tag, kind, number = struct.unpack_from(order + "HHI", block, entry)
+            place = entry + 8
+            if number * _TYPE_SIZES.get(kind, 1) > 4:
+                (place,) = struct.unpack_from(order + "I", block, place)
+            yield tag, kind, number, place
+
+
+def _read_directory(block: bytes, order: str, offset: int) -> dict[int, float]:
+    tags = {}
+    with suppress(struct.error):  # the directory is cut off: what was read so far stands
+        for tag, kind, number, place in tiff_entries(block, offset):
             layout = _TYPE_FORMATS.get(kind)
             if layout is None or number != 1:
                 continue
-            place = entry + 8
-            if struct.calcsize(order + layout) > 4:
-                (place,) = struct.unpack_from(order + "I", block, place)
             values = struct.unpack_from(order + layout, block, place)
             tags[tag] = values[0] / values[1] if len(values) == 2 and values[1] else values[0]
-    except struct.error:
-        pass  # the directory is cut off: what was read so far stands
     return tags

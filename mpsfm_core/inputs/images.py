@@ -17,6 +17,7 @@ import pycolmap
 
 from mpsfm_core.data import Bool, Float64, PinholeCamera, UInt8, View
 from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.inputs.gps import GpsPosition, read_gps
 from mpsfm_core.inputs.header import Header, read_header
 from mpsfm_core.inputs.intrinsics import Intrinsics, read_intrinsics
 from mpsfm_core.inputs.options import InputOptions
@@ -63,7 +64,8 @@ class SourceImage:
     the upright image; ``camera_id`` is the number in the intrinsics file, or counts distinct
     cameras. ``pinhole``: the camera of the undistorted (maybe reduced) view. ``focal_known``:
     False when the focal length is a guess: EXIF's, a provider's or the default. ``digest``: SHA-256
-    of the file.
+    of the file. ``orientation``: EXIF's, of the stored pixels. ``gps``: where it was
+    taken, if EXIF says it.
     """
 
     name: str
@@ -72,6 +74,8 @@ class SourceImage:
     pinhole: PinholeCamera
     focal_source: FocalSource
     digest: str
+    orientation: int = 1
+    gps: GpsPosition | None = None
 
     def original_pixels(self, xy: Float64) -> Float64:
         """Pixels (n, 2) of the undistorted view as pixels of the upright original image."""
@@ -297,6 +301,7 @@ class _File:
     header: Header
     digest: str
     fault: str = ""
+    gps: GpsPosition | None = None
 
 
 class _CameraGuesses:
@@ -325,7 +330,9 @@ def _source_image(
     focal: FocalSource,
     options: InputOptions,
 ) -> SourceImage:
-    return SourceImage(name, path, camera, _view_camera(camera, options), focal, file.digest)
+    pinhole = _view_camera(camera, options)
+    orientation = file.header.orientation
+    return SourceImage(name, path, camera, pinhole, focal, file.digest, orientation, file.gps)
 
 
 def _simple_camera(size: tuple[int, int], focal: float, number: int) -> pycolmap.Camera:
@@ -430,10 +437,15 @@ def _probe(path: Path, options: InputOptions) -> _File:
     try:
         check_whole(data, path)
         header = read_header(data)
+        if header.projection is not None:
+            raise InputError(
+                f"image {path} is a panorama ({header.projection}): cut it into perspective views "
+                f"first, for example with ffmpeg's v360 filter"
+            )
         size = upright_size(data, header, path)
     except InputError as error:
         return _File((0, 0), Header(None, 1, {}), "", str(error))
-    return _File(size, header, hashlib.sha256(data).hexdigest())
+    return _File(size, header, hashlib.sha256(data).hexdigest(), gps=read_gps(data))
 
 
 def _judge(left_out: Mapping[str, str], total: int, options: InputOptions) -> None:

@@ -21,6 +21,7 @@ import pycolmap
 import yaml
 
 from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.inputs.colmap_database import read_database
 from mpsfm_core.inputs.models import match_names, read_model
 
 _DEFAULT_MODELS = {3: "SIMPLE_PINHOLE", 4: "PINHOLE"}
@@ -127,7 +128,8 @@ class Intrinsics:
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
-    """Read ``intrinsics.yaml``, a COLMAP model, its ``cameras.txt``, or ``transforms.json``.
+    """Read ``intrinsics.yaml``, a COLMAP model, its ``cameras.txt``, a COLMAP database
+    (``.db``), or ``transforms.json``.
 
     Raises :class:`InputError` that names the file, the camera and what is wrong.
     """
@@ -137,6 +139,8 @@ def read_intrinsics(path: Path) -> Intrinsics:
             entries = _from_text(text) if text.is_file() else _from_model(path)
         elif path.suffix == ".json":
             entries = _from_model(path)
+        elif path.suffix == ".db":
+            entries = _from_database(path)
         elif path.suffix == ".txt":
             entries = _from_text(path)
         else:
@@ -210,11 +214,25 @@ def _lines(path: Path) -> list[str]:
     return [line for line in lines if not line.startswith("#")]
 
 
+def _from_database(path: Path) -> tuple[CameraEntry, ...]:
+    database = read_database(path)
+    names: dict[int, list[str]] = {}
+    for name, number in database.images.items():
+        names.setdefault(database.camera_of[number], []).append(name)
+    return _from_cameras(path, database.cameras, names)
+
+
 def _from_model(path: Path) -> tuple[CameraEntry, ...]:
     model = read_model(path)
     names: dict[int, list[str]] = {}
     for image in model.images.values():
         names.setdefault(image.camera_id, []).append(image.name)
+    return _from_cameras(path, model.cameras, names)
+
+
+def _from_cameras(
+    path: Path, cameras: Mapping[int, pycolmap.Camera], names: Mapping[int, list[str]]
+) -> tuple[CameraEntry, ...]:
     return tuple(
         _entry(
             f"{path}, camera {number}",
@@ -224,7 +242,7 @@ def _from_model(path: Path) -> tuple[CameraEntry, ...]:
             (camera.width, camera.height),
             names.get(number, []),
         )
-        for number, camera in model.cameras.items()
+        for number, camera in cameras.items()
     )
 
 

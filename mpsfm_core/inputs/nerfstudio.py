@@ -39,6 +39,8 @@ _CAMERA_KEYS = (
 )
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """Between the axes of OpenGL's cameras and ours."""
+_LARGEST = 1 << 20
+"""Pixels of a side, and more than any photo has."""
 _ROTATION_TOLERANCE = 1e-3
 """Of an entry of R^T R: files are written with few digits."""
 
@@ -91,7 +93,7 @@ def read_transforms(path: Path) -> pycolmap.Reconstruction:
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} cannot be read: {error}") from error
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
@@ -131,8 +133,9 @@ def _world_from_camera(where: str, value: object) -> Float64:
     pose = np.eye(4)
     pose[:3] = matrix[:3]
     rotation = pose[:3, :3]
-    off = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not off <= _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         raise InputError(f"{where}: the left 3x3 block of 'transform_matrix' is no rotation")
     left, _, right = np.linalg.svd(rotation)
     pose[:3, :3] = left @ right
@@ -143,6 +146,8 @@ def _camera(where: str, values: Mapping[str, Any], picture: Path) -> pycolmap.Ca
     numbers = _numbers(where, values)
     if "w" not in numbers or "h" not in numbers:
         numbers.update(_picture_size(where, picture))
+    if not 1 <= min(numbers["w"], numbers["h"]) <= max(numbers["w"], numbers["h"]) < _LARGEST:
+        raise InputError(f"{where}: no picture has 'w' {numbers['w']:g} and 'h' {numbers['h']:g}")
     width, height = int(numbers["w"]), int(numbers["h"])
     focal = numbers.get("fl_x")
     if focal is None and 0 < numbers.get("camera_angle_x", 0) < math.pi:

@@ -9,6 +9,18 @@ from pydantic import Field
 from mpsfm_core.options import Options
 
 
+class VideoOptions(Options):
+    """Which frames of a video become photos."""
+
+    motion: float = Field(0.08, gt=0, lt=1)
+    """The next frame is taken when points have moved by this share of the diagonal (ours: about
+    what 3 to 5 degrees of a phone's turn move them)."""
+    overlap: float = Field(0.7, gt=0, lt=1)
+    """... or when only this share of them is still seen."""
+    max_frames: int = Field(300, ge=2)
+    """Of more frames evenly spread ones are taken."""
+
+
 class InputOptions(Options):
     """How photos become views."""
 
@@ -30,3 +42,5 @@ class InputOptions(Options):
     blank_pixels: float = Field(0.0, ge=0, le=1)
     """Undistortion: 0 keeps only the area that is seen everywhere, 1 keeps every original pixel
     with empty (masked) corners (COLMAP's option and default)."""
+    video: VideoOptions = Field(default_factory=VideoOptions)
+    """Of a video instead of photos."""

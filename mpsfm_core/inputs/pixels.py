@@ -9,12 +9,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core.data import Bool, UInt8
+from mpsfm_core.data import Bool, Float64, UInt8
 from mpsfm_core.errors import InputError
+from mpsfm_core.inputs.codecs import HEIF, RAW, decoder_of
 from mpsfm_core.inputs.header import Header, declared_pixels, is_cut_jpeg, read_header
 
-EXTENSIONS = frozenset(
-    (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".webp", ".bmp", ".jp2", ".ppm", ".pgm")
+EXTENSIONS = (
+    HEIF
+    | RAW
+    | frozenset(
+        (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".webp", ".bmp", ".jp2", ".ppm", ".pgm")
+    )
 )
 """File names that count as images; the content may be any of these formats."""
 
@@ -31,7 +36,8 @@ def check_whole(data: bytes, path: Path) -> None:
     """Decode an image once, coarsely; raises :class:`InputError` when it is damaged or none."""
     if is_cut_jpeg(data):
         raise InputError(f"image {path} is cut off: its end is missing; copy it again")
-    _decode(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    if decoder_of(data, path) is None:  # others are decoded whole, for their size
+        _decode(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
 
 def check_size(data: bytes, path: Path, max_pixels: int) -> None:
@@ -62,6 +68,9 @@ def decode_rgb(data: bytes, header: Header, path: Path) -> UInt8:
     16-bit values are scaled by 1/257, floats in [0, 1] by 255; grayscale is repeated, alpha
     dropped. Raises :class:`InputError` when the file is no image or damaged.
     """
+    decode = decoder_of(data, path)
+    if decode is not None:
+        return decode(data, path)
     pixels = _decode(data, path)
     if pixels.ndim == 2:
         rgb = cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB)
@@ -93,6 +102,19 @@ def orient(image: UInt8, orientation: int) -> UInt8:
     if orientation in (2, 3, 6, 7):
         image = image[:, ::-1]
     return np.ascontiguousarray(image)
+
+
+def orient_pixels(xy: Float64, size: tuple[int, int], orientation: int) -> Float64:
+    """Pixels (n, 2) of a stored image of (width, height) as those of :func:`orient`'s."""
+    x, y = xy[:, 0], xy[:, 1]
+    width, height = size
+    if orientation >= 5:
+        x, y, width, height = y, x, height, width
+    if orientation in (3, 4, 7, 8):
+        y = height - y
+    if orientation in (2, 3, 6, 7):
+        x = width - x
+    return np.stack([x, y], axis=1)
 
 
 def _decode(data: bytes, path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:

@@ -29,3 +29,5 @@ class ResultOptions(Options):
     dense_consistency_sigmas: float = Field(3.0, gt=0)
     """A pixel that another image sees through, by more than this many standard deviations, is left
     out of ``dense.ply`` unless more images confirm than contradict it."""
+    georeference: bool = True
+    """Where the photos have GPS positions that spread enough: metres east, north and up."""

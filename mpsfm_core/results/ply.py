@@ -82,10 +82,10 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
                 break  # vertices come first
             case ["property", kind, name] if kind in _TYPES:
                 layout.append((name, _TYPES[kind]))
+    names = [name for name, _ in layout]
+    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+        raise InputError(f"{path}: its points have no x, y and z, or have them twice")
     vertex = np.dtype(layout)
-    names = vertex.names or ()
-    if not {"x", "y", "z"} <= set(names):
-        raise InputError(f"{path}: its points have no x, y and z")
     body = memoryview(data)[end + len(b"end_header\n") :]
     if len(body) < count * vertex.itemsize:
         raise InputError(f"{path}: is cut off, {count} points are announced")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from mpsfm_core.data import DepthPrior, Float64, Int64, PinholeCamera, Pose
 
@@ -34,16 +36,17 @@ class RegisteredImage:
 
 @dataclass(frozen=True)
 class MetricScale:
-    """World units to metres, from the per-image scales of metric priors.
+    """World units to metres, from the per-image scales of metric priors, or from GPS.
 
     ``metres_per_unit``: the factor already applied when ``trusted``. ``spread``: robust relative
-    standard deviation (1.4826 MAD) of the per-image estimates.
+    standard deviation (1.4826 MAD) of the per-image estimates. ``by``: what told it, for people.
     """
 
     metres_per_unit: float
     spread: float
     num_images: int
     trusted: bool
+    by: str = "depth maps"
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,3 +95,30 @@ class MappingResult:
 
     reconstructions: tuple[Reconstruction, ...]
     report: MappingReport
+
+
+def transformed(
+    reconstruction: Reconstruction,
+    scale: float,
+    rotation: Float64,
+    translation: Float64,
+    metric: MetricScale | None,
+) -> Reconstruction:
+    """The reconstruction in another world, ``x' = scale * rotation x + translation``, whose unit
+    ``metric`` describes."""
+    images = []
+    for image in reconstruction.images:
+        turned = image.rotation @ rotation.T
+        depth = image.depth
+        variance = None if depth.variance is None else depth.variance * np.float32(scale**2)
+        images.append(
+            replace(
+                image,
+                rotation=turned,
+                translation=scale * image.translation - turned @ translation,
+                depth=replace(depth, depth=depth.depth * np.float32(scale), variance=variance),
+                scale=image.scale * scale,
+            )
+        )
+    points = scale * reconstruction.points @ rotation.T + translation
+    return replace(reconstruction, images=tuple(images), points=points, metric=metric)

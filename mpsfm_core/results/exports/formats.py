@@ -85,7 +85,9 @@ def export(
         raise InputError(f"no format {format_name!r}{did_you_mean(format_name, FORMATS)}")
     chosen = FORMATS[format_name]
     source = Source.read(folder, photos)
-    if chosen.turned if turn is None else turn:
+    if turn is None:
+        turn = chosen.turned and not source.is_georeferenced
+    if turn:
         source = source.turned()
     output = output or folder / "exports" / format_name
     described = _describe(source, format_name)
@@ -97,13 +99,15 @@ def export(
 
 
 def _describe(source: Source, format_name: str) -> dict[str, Any]:
-    gravity = source.gravity
+    orientation = "east, north, up" if source.is_georeferenced else "as in the model"
+    if source.gravity is not None:
+        orientation = f"z is up: {source.gravity}"
     return {
         "format": format_name,
         "images": len(source.names),
         "points": source.model.num_points3D(),
         "left_out": list(source.left_out),
         "metres_per_unit": source.metres_per_unit,
-        "orientation": "as in the model" if gravity is None else f"z is up: {gravity}",
+        "orientation": orientation,
         "world_from_model": source.world_from_model.matrix().tolist(),
     }

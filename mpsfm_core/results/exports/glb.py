@@ -29,7 +29,7 @@ _EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 
 def write(source: Source, folder: Path) -> None:
     """Write ``scene.glb``."""
-    scene, y_up = _Scene(), _FLIP if source.gravity is None else _Y_UP_FROM_Z
+    scene, y_up = _Scene(), _Y_UP_FROM_Z if source.z_is_up else _FLIP
     points, colors = source.dense_points()
     if len(points):
         mesh = scene.mesh("points", _POINTS, points @ y_up.T, np.asarray(colors))

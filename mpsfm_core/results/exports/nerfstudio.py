@@ -42,7 +42,7 @@ def write(source: Source, folder: Path) -> None:
         if depths:  # all frames must have one, or none
             frame["depth_file_path"] = depths[frame["file_path"]]
     transforms |= {"camera_model": "OPENCV", "ply_file_path": "sparse_pc.ply"}
-    if source.gravity is not None:
+    if source.z_is_up:
         transforms["orientation_override"] = "none"
     path.write_text(json.dumps(transforms, indent=2), encoding="utf-8")
 

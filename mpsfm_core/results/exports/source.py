@@ -123,6 +123,16 @@ class Source:
         names = [found[name] for name in self.names]
         return load_images(self.photos, model_folder(self.folder), options=options, names=names)
 
+    @property
+    def is_georeferenced(self) -> bool:
+        """Whether the world is east, north, up in metres."""
+        return "origin" in (self.summary.get("georeference") or {})
+
+    @property
+    def z_is_up(self) -> bool:
+        """Whether gravity is along -z in the exported world."""
+        return self.gravity is not None or self.is_georeferenced
+
     def turned(self) -> Source:
         """With gravity along -z, and the middle of the points, else of the cameras, as origin."""
         gravity = estimate_gravity(self._rotations(), self._world_normals())
@@ -238,7 +248,7 @@ def _read_summary(path: Path) -> dict[str, Any]:
         return {}
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} cannot be read: {error}") from error
     if not isinstance(summary, dict):
         raise InputError(f"{path}: is no summary of a run")
@@ -250,7 +260,7 @@ def _read_summary(path: Path) -> dict[str, Any]:
 def _read_depth(path: Path, scale: float) -> tuple[PinholeCamera, DepthPrior]:
     """A file of :func:`mpsfm_core.results.depth_maps.write_depth_maps`, depth times ``scale``."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             depth, variance = file["depth"], file["variance"]
             valid, camera = file["valid"], file["camera"]
         rows, columns = depth.shape

@@ -1,0 +1,100 @@
+"""Frames of rendered videos, chosen by what is in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mpsfm_core.data import PinholeCamera
+from mpsfm_core.errors import InputError
+from mpsfm_core.inputs.images import find_images
+from mpsfm_core.inputs.options import VideoOptions
+from mpsfm_core.inputs.video import choose_frames, extract_frames, is_video
+from mpsfm_core.testing.scenes import arc_poses, room_scene
+
+SIZE = (160, 120)
+CAMERA = PinholeCamera(*SIZE, 130.0, 130.0, 80.0, 60.0)
+
+
+@pytest.fixture(scope="module")
+def turn() -> list[np.ndarray]:
+    """A camera that turns around the middle of a room by 2 degrees a frame."""
+    scene = room_scene()
+    return [
+        cv2.cvtColor(scene.render(CAMERA, pose).rgb, cv2.COLOR_RGB2BGR)
+        for pose in arc_poses(40, 2.0)
+    ]
+
+
+def write(path: Path, frames: list[np.ndarray]) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, SIZE)
+    for frame in frames:
+        writer.write(frame)
+    writer.release()
+    return path
+
+
+def test_frames_are_chosen_by_motion_and_not_by_time(turn, tmp_path: Path) -> None:
+    slow = [frame for frame in turn[:20] for _ in range(3)] + turn[20:]
+    steady = choose_frames(write(tmp_path / "a.avi", turn), VideoOptions())
+    waiting = choose_frames(write(tmp_path / "b.avi", slow), VideoOptions())
+    assert 5 <= len(steady) <= 15
+    assert abs(len(waiting) - len(steady)) <= 1
+    gaps = np.diff([number // 3 if number < 60 else number - 40 for number in waiting])
+    assert gaps.max() <= 2.5 * np.median(gaps)
+
+
+def test_a_camera_that_waits_gives_no_frames(turn, tmp_path: Path) -> None:
+    frames = [*turn[:20], *[turn[20]] * 40, *turn[20:]]
+    chosen = choose_frames(write(tmp_path / "v.avi", frames), VideoOptions())
+    assert sum(20 < number < 60 for number in chosen) <= 1
+
+
+def test_blurred_frames_are_passed_over(turn, tmp_path: Path) -> None:
+    blurred = {n for n in range(len(turn)) if n % 3}
+    frames = [cv2.blur(f, (13, 1)) if n in blurred else f for n, f in enumerate(turn)]
+    chosen = choose_frames(write(tmp_path / "v.avi", frames), VideoOptions())
+    assert len(chosen) >= 5
+    assert len(blurred & set(chosen)) <= 1  # two thirds of all frames
+
+
+def test_more_frames_than_asked_for_are_thinned_evenly(turn, tmp_path: Path, caplog) -> None:
+    options = VideoOptions(motion=0.02, max_frames=6)
+    chosen = choose_frames(write(tmp_path / "v.avi", turn), options)
+    assert len(chosen) == 6
+    assert max(np.diff(chosen)) <= 2.5 * min(np.diff(chosen))
+    assert "max_frames" in caplog.text
+
+
+def test_frames_are_written_once(turn, tmp_path: Path) -> None:
+    video = write(tmp_path / "v.avi", turn)
+    assert is_video(video)
+    folder = extract_frames(video, tmp_path / "out", VideoOptions())
+    names = find_images(folder)
+    assert names == [f"frame_{n:06d}.jpg" for n in choose_frames(video, VideoOptions())]
+    picture = cv2.imread(str(folder / names[2])).astype(float)
+    difference = [np.abs(picture - frame).mean() for frame in turn]
+    assert np.argmin(difference) == int(names[2][6:12])
+    written = (folder / names[0]).stat().st_mtime_ns
+    assert extract_frames(video, tmp_path / "out", VideoOptions()) == folder
+    assert (folder / names[0]).stat().st_mtime_ns == written
+    extract_frames(video, tmp_path / "out", VideoOptions(motion=0.3))
+    assert len(find_images(folder)) < len(names)
+
+
+def test_a_camera_that_stands_still_is_refused(turn, tmp_path: Path) -> None:
+    video = write(tmp_path / "v.avi", [turn[0]] * 30)
+    with pytest.raises(InputError, match="camera hardly moves"):
+        extract_frames(video, tmp_path / "out", VideoOptions())
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_video_that_is_cut_off_is_used_as_far_as_it_goes(turn, tmp_path: Path) -> None:
+    video = write(tmp_path / "v.avi", turn)
+    data = video.read_bytes()
+    video.write_bytes(data[: len(data) // 2])
+    chosen = choose_frames(video, VideoOptions())
+    assert 3 <= len(chosen) <= 8
