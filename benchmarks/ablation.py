@@ -23,6 +23,8 @@ from mpsfm_core.yaml_text import write_yaml
 
 VARIANTS: Mapping[str, Mapping[str, object]] = {
     "default": {},
+    "start from a pair": {"initialization": {"all_at_once": False}},
+    "reprojection loss not measured": {"refinement": {"measure_keypoint_noise": False}},
     "no lifting": {"registration": {"lifting": False}},
     "bundle adjustment beside refined depth": {"refinement": {"bundle_depth": "refined"}},
     "no depth refinement": {"refinement": {"integrate": False}},

@@ -32,6 +32,8 @@ from mpsfm_core.testing.halls import QUALITIES, Hall, hall_problem
 PEER = "colmap"
 VARIANTS: Mapping[str, Mapping[str, object]] = {
     "default": {},
+    "start from a pair": {"initialization": {"all_at_once": False}},
+    "reprojection loss not measured": {"refinement": {"measure_keypoint_noise": False}},
     "evidence not weighed": {"consistency": {"weigh_evidence": False}},
     "no depth check": {"consistency": {"enabled": False}},
 }

@@ -32,13 +32,14 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numba import njit
 
-from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera
+from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera
 from mpsfm_core.geometry import pixel_centers, unproject
 from mpsfm_core.mapping.depth_noise import local_noise, witnesses
 from mpsfm_core.mapping.options import ConsistencyOptions
@@ -50,6 +51,9 @@ MAX_GRIDS = 64
 """Thinned maps that are kept: views that overlap come one after the other."""
 STEPS = 4
 """Errors tried to either side along a pixel's ray, evenly spaced up to the limit (ours)."""
+SAMPLING = 2
+"""Every so many columns and rows a pixel of a thinned map is carried over: thousands are left, and
+a share of 5 % of independent ones is known within 0.4 % (ours)."""
 OVERLAP_GRID = 16
 """Columns and rows of the pixels by which overlap is judged (ours)."""
 MIN_OVERLAP = 0.05
@@ -86,16 +90,18 @@ class DepthCheck:
         ]
         return max(found, default=Inconsistency(0.0, -1))
 
-    def conflicting_images(self, limit: float, std_factor: float = 1.0) -> list[tuple[int, float]]:
-        """Registered images to leave out so that no two contradict each other, and how much each
-        did.
+    def conflicting_images(
+        self, images: Sequence[int] | Int64, limit: float, std_factor: float = 1.0
+    ) -> list[tuple[int, float]]:
+        """Registered images to leave out so that none of ``images`` and another contradict each
+        other, and how much each did.
 
         ``limit``: share of contradicting pixels above which two do. The image with most conflicts
         goes first.
         """
         scene = self._scene
         shares = np.zeros((scene.num_images, scene.num_images))
-        for image in map(int, scene.registered_images()):
+        for image in map(int, images):
             for other in overlapping_views(scene, image, self._options.num_views):
                 if not shares[image, other]:
                     share = self.between(image, other, std_factor)
@@ -115,10 +121,9 @@ class DepthCheck:
             rotation = scene.rotations[target] @ scene.rotations[source].T
             translation = scene.translations[target] - rotation @ scene.translations[source]
             one, two = self._grid(source, std_factor), self._grid(target, std_factor)
-            count = count_unexplained(
+            total += unexplained_share(
                 one, two, rotation, translation, options.max_deviation, options.min_gap
             )
-            total += count / one.depth.size
         return total
 
     def _grid(self, image: int, std_factor: float) -> _Grid:
@@ -194,15 +199,16 @@ class _MapState(NamedTuple):
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
-def count_unexplained(
+def unexplained_share(
     source: _Grid,
     target: _Grid,
     rotation: Float64,
     translation: Float64,
     limit: float,
     min_gap: float,
-) -> int:
-    """Pixels of one view that lie before what another sees, whatever errors of depth are likely.
+) -> float:
+    """Share of the pixels of one view that lie before what another sees, whatever errors of depth
+    are likely.
 
     Args:
         source, target: maps of the two. rotation, translation: ``target_from_source``. limit:
@@ -210,10 +216,11 @@ def count_unexplained(
         min_gap: share of the seen depth up to which before it is not in front of it.
     """
     rows, columns = target.depth.shape
-    r, t, count = rotation, translation, 0
-    for row in range(source.depth.shape[0]):
+    r, t, count, visited = rotation, translation, 0, 0
+    for row in range(SAMPLING // 2, source.depth.shape[0], SAMPLING):
         y = (row + 0.5 - source.params[3]) / source.params[1]
-        for column in range(source.depth.shape[1]):
+        for column in range(SAMPLING // 2, source.depth.shape[1], SAMPLING):
+            visited += 1
             if not source.valid[row, column]:
                 continue
             x = (column + 0.5 - source.params[2]) / source.params[0]
@@ -244,4 +251,4 @@ def count_unexplained(
                 if explained:
                     break
             count += not explained
-    return count
+    return count / max(visited, 1)

@@ -7,13 +7,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
+from mpsfm_core.data import Bool, Int64, MappingProblem, VerifiedPair
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.attempts import Attempts
 from mpsfm_core.mapping.correspondences import Correspondences, correspondences
 from mpsfm_core.mapping.depth_consistency import DepthCheck
 from mpsfm_core.mapping.failure_ladder import FailureLadder
 from mpsfm_core.mapping.filtering import disconnected_images, filter_points, lost_images
+from mpsfm_core.mapping.global_start import Placement, place_all
 from mpsfm_core.mapping.initialization import Start, Starts, place_first
 from mpsfm_core.mapping.journal import Journal
 from mpsfm_core.mapping.options import MapperOptions
@@ -57,6 +58,7 @@ class Group:
         self._check = DepthCheck(self.scene, options.consistency)
         self._ladder = FailureLadder(options.registration)
         self._last_size = (0, 0)
+        self._checked: Bool = np.zeros(self.scene.num_images, dtype=np.bool_)
 
     @property
     def size(self) -> int:
@@ -85,6 +87,54 @@ class Group:
         for image in map(int, scene.registered_images()):
             self._accept(image)
         return True
+
+    def start_from_all(self, left: Bool) -> bool:
+        """Place all well connected images at once; False, and nothing done, unless that holds.
+
+        It does where, without views that contradict others, the points explain as many of the
+        matches of all as make other runs needless.
+        """
+        before = self.scene.snapshot()
+        with self.journal.timed("global start"):
+            placed = place_all(self.scene, left, self._options.seed)
+            if placed is None:
+                return False
+            self._build(placed)
+        self._refine_globally()
+        self._check_all(self._options.consistency.max_violations, "with all images placed at once")
+        if self._explained_share(placed.images) < self._options.enough_explained:
+            self.scene.restore(before)
+            self.refiner.forget_all()
+            self._checked[:] = False
+            self._last_size = (0, 0)
+            return False
+        for image in map(int, self.scene.registered_images()):
+            self._accept(image)
+        return True
+
+    def _build(self, placed: Placement) -> None:
+        """Points and a first refinement of images that were placed at once."""
+        scene, options = self.scene, self._options
+        images = [int(image) for image in placed.images]
+        for image, rotation, translation, scale in zip(
+            images, placed.rotations, placed.translations, placed.scales, strict=True
+        ):
+            scene.register(image, rotation, translation)
+            scene.maps[image].set_scale(float(scale))
+        for image in images:
+            triangulate_image(scene, image, options.triangulation)
+        wide = options.refinement.first_reprojection_scale
+        self.refiner.adjust(images, reprojection_scale=wide)
+        filter_points(scene, options.triangulation)
+
+    def _explained_share(self, images: Int64) -> float:
+        """Of the matches between some images, by score, whose keypoints see the same point."""
+        graph, point_of = self.scene.graph, self.scene.tracks.point_of
+        chosen = self.scene.mask(images)[graph.image_of]
+        between = chosen[graph.source] & chosen[graph.target]
+        points = point_of[graph.source]
+        same = between & (points >= 0) & (points == point_of[graph.target])
+        return float(graph.score[same].sum() / max(graph.score[between].sum(), 1e-12))
 
     def start_from_pair(self, left: Bool) -> bool:
         """Find the first pair among the images that are left and refine it."""
@@ -115,10 +165,12 @@ class Group:
 
     def finish(self) -> None:
         """Last refinements, and the depth check once more for every image."""
+        if self._checked[self.scene.registered].all():
+            return
         self._refine_globally()
         consistency = self._options.consistency
         if consistency.enabled and consistency.check_at_end:
-            self._check_all()
+            self._check_all(consistency.max_violations_final, "at the end")
         if self._options.refinement.final_robust:
             self._refine_globally(final=True)
 
@@ -342,26 +394,31 @@ class Group:
         if not len(images) or rotation_angle_deg(turns).max() < JUMP_DEG:
             return
         limit = self._options.consistency.max_violations
-        after, worse = self.scene.snapshot(), len(self._conflicts(limit))
+        after, worse = self.scene.snapshot(), len(self._conflicts(images, limit))
         self.scene.restore(before)
-        if not worse > len(self._conflicts(limit)):
+        if not worse > len(self._conflicts(images, limit)):
             self.scene.restore(after)
 
-    def _conflicts(self, limit: float) -> list[tuple[int, float]]:
-        """Images to leave out so that no two views contradict each other, and how much each did."""
+    def _conflicts(self, images: Int64, limit: float) -> list[tuple[int, float]]:
+        """Views to leave out so that none contradicts one of the images, and how much each did."""
         if not self._options.consistency.enabled:
             return []
         with self.journal.timed("depth check"):
-            return self._check.conflicting_images(limit, self.refiner.std_factor)
+            return self._check.conflicting_images(images, limit, self.refiner.std_factor)
 
-    def _check_all(self) -> None:
-        """Deregister images until no two views contradict each other."""
-        conflicting = self._conflicts(self._options.consistency.max_violations_final)
+    def _check_all(self, limit: float, when: str) -> None:
+        """Deregister images until no two views contradict each other.
+
+        Those that held before are not compared with each other again.
+        """
+        images = self.scene.registered & ~self._checked
+        self._checked |= images
+        conflicting = self._conflicts(np.flatnonzero(images), limit)
         for image, share in conflicting:
-            self._drop([image], f"at the end {share:.0%} of the pixels contradict another view's")
+            self._drop([image], f"{when} {share:.0%} of the pixels contradict another view's")
         if conflicting:
             apart = disconnected_images(self.scene)
-            self._drop(apart, "held to the rest only by an image that was dropped at the end")
+            self._drop(apart, f"held to the rest only by an image that was dropped {when}")
 
     def _accept(self, image: int) -> None:
         self.attempts.scene_changed()
@@ -373,6 +430,7 @@ class Group:
         for image in images:
             if self.refiner.fixed[image]:
                 continue
+            self._checked[image] = False
             self.scene.deregister(image)
             self.refiner.forget(image)
             self.attempts.scene_changed()

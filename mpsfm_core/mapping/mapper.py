@@ -102,8 +102,10 @@ class Mapper:
         """Reconstruct a group among the images that are left, or go on with the one that grows;
         False when there is none."""
         if not self._growing:
+            if np.count_nonzero(self.left) < 2:
+                return False
             self.group = self._new_group()
-            if not self._start_from_known_poses() and not self.group.start_from_pair(self.left):
+            if not self._start_from_known_poses() and not self._start():
                 return False
             self._growing = True
         paused()
@@ -121,6 +123,13 @@ class Mapper:
 
     def _new_group(self) -> Group:
         return self.group_type(self.problem, self.options, self._starts, self.journal)
+
+    def _start(self) -> bool:
+        """Start from all images at once, or else from a pair."""
+        at_once = self.options.initialization.all_at_once
+        if at_once and self.group.start_from_all(self.left):
+            return True
+        return self.group.start_from_pair(self.left)
 
     def _start_from_known_poses(self) -> bool:
         if self._poses_hold and not self.group.start_from_known_poses(self.left):

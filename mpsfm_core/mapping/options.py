@@ -21,8 +21,11 @@ THREADS = 2
 
 
 class InitializationOptions(Options):
-    """Choice of the first pair."""
+    """How a group of images starts."""
 
+    all_at_once: bool = True
+    """Place all well connected images at once (:mod:`mpsfm_core.mapping.global_start`), and go on
+    from a first pair only where that does not hold."""
     max_pairs: int = Field(50, ge=1)
     """How many pairs are tried, best first."""
     num_compared: int = Field(5, ge=1)
@@ -118,6 +121,9 @@ class RefinementOptions(Options):
     measure_depth_noise: bool = True
     """Weigh depth by how well views agree (:mod:`mpsfm_core.mapping.depth_noise`); off: by the
     declared variance alone."""
+    measure_keypoint_noise: bool = True
+    """Widen the reprojection loss where keypoints are clean
+    (:mod:`mpsfm_core.mapping.keypoint_noise`); off: as ``bundle`` says."""
     rescale: bool = True
     """Estimate the scales of all priors anew in global refinement (reference: regular_resc)."""
     max_scale_deviations: float = Field(2.0, gt=0)

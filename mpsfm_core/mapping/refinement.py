@@ -15,12 +15,14 @@ import numpy as np
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.mapping.depth_noise import DepthNoise, measure_depth_noise
 from mpsfm_core.mapping.filtering import filter_points
+from mpsfm_core.mapping.keypoint_noise import measure_loss_scale
 from mpsfm_core.mapping.options import THREADS, MapperOptions
 from mpsfm_core.mapping.triangulation import complete_and_merge, lift_low_parallax
 from mpsfm_core.mapping.view_selection import local_bundle
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
 from mpsfm_core.optimize.covariance import depth_variance_of_points, point_covariances
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
+from mpsfm_core.optimize.losses import Loss
 from mpsfm_core.optimize.thinning import (
     thinned_camera,
     thinned_pixels,
@@ -40,7 +42,8 @@ MIN_SCALE_POINTS = 20
 class Refiner:
     """Refines a scene; remembers the integrators and how well depth and points agree.
 
-    ``noise``: how good the priors are in this scene; refreshed by global refinement.
+    ``noise``: how good the priors are in this scene; ``loss_scale``: of the reprojection loss, in
+    stds of a keypoint. Both are refreshed by global refinement.
     ``fixed``: (n,) bool, images whose pose never changes.
     """
 
@@ -51,6 +54,7 @@ class Refiner:
         self.scores = scores
         self.fixed: Bool = np.zeros(scene.num_images, dtype=np.bool_)
         self.noise = DepthNoise()
+        self.loss_scale = options.refinement.bundle.reprojection_scale
         self._assumed = DepthNoise()
         self._integrators: dict[int, DepthIntegrator] = {}
 
@@ -208,7 +212,7 @@ class Refiner:
             ),
             options.model_copy(
                 update={
-                    "reprojection_scale": options.reprojection_scale * reprojection_scale,
+                    "reprojection_scale": self.loss_scale * reprojection_scale,
                     "depth_scale": depth_scale,
                     "max_iterations": max_iterations or options.max_iterations,
                 }
@@ -249,6 +253,7 @@ class Refiner:
         for _ in range(options.global_iterations):
             if options.rescale:
                 self.rescale(images)
+            self._measure_keypoint_noise()
             self._measure_noise()
             if self._alternates:
                 self.integrate(images)
@@ -262,6 +267,12 @@ class Refiner:
     def forget(self, image: int) -> None:
         """Drop what is remembered of an image that left the scene."""
         self._integrators.pop(image, None)
+
+    def forget_all(self) -> None:
+        """Drop what is remembered of the scene, which starts anew."""
+        self._integrators.clear()
+        self.noise = self._assumed = DepthNoise()
+        self.loss_scale = self.options.bundle.reprojection_scale
 
     def _integrate(self, image: int, covariances: Float64, angles: Float64) -> None:
         scene, tracks = self.scene, self.scene.tracks
@@ -307,6 +318,12 @@ class Refiner:
         for row in rows:
             scene.set_shared_focal(int(images[row]), *map(float, intrinsics[row, :2]))
         return True
+
+    def _measure_keypoint_noise(self) -> None:
+        """Let the reprojection loss suit the keypoints, whose tails Cauchy's loss knows."""
+        bundle = self.options.bundle
+        if self.options.measure_keypoint_noise and bundle.reprojection_loss == Loss.CAUCHY:
+            self.loss_scale = measure_loss_scale(self.scene, bundle.reprojection_scale)
 
     def _measure_noise(self) -> None:
         """Measure how good the priors are; integrators that assumed much else are made anew."""

@@ -112,7 +112,7 @@ def hypothesize(
     image_of = scene.graph.image_of
     centers = scene.centers()
     center_a, center_b = centers[image_of[source]], centers[image_of[target]]
-    points = midpoints(center_a, _world_rays(scene, source), center_b, _world_rays(scene, target))
+    points = midpoints(center_a, scene.world_rays(source), center_b, scene.world_rays(target))
     low = ~(triangulation_angle_deg(center_a, center_b, points) >= options.min_angle_deg)
     low |= ~_fits(scene, source, target, points, max_error_px)
     from_source, source_valid = scene.lift(source[low])
@@ -194,12 +194,6 @@ def _registered_edges(scene: Scene, image: int) -> tuple[Int64, Int64]:
 
 def _angle_error_px(scene: Scene, image: int, options: TriangulationOptions) -> float:
     return float(scene.intrinsics[image, 0] * np.tan(np.radians(options.max_angle_error_deg)))
-
-
-def _world_rays(scene: Scene, keypoints: Int64) -> Float64:
-    rotations = scene.rotations[scene.graph.image_of[keypoints]]
-    rays: Float64 = np.einsum("nji,nj->ni", rotations, scene.rays(keypoints))
-    return rays
 
 
 def midpoints(center_a: Float64, ray_a: Float64, center_b: Float64, ray_b: Float64) -> Float64:

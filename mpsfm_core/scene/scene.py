@@ -124,6 +124,12 @@ class Scene:
         xy = self.keypoints[keypoints]
         return np.stack([(xy[:, 0] - cx) / fx, (xy[:, 1] - cy) / fy, np.ones(len(xy))], axis=1)
 
+    def world_rays(self, keypoints: Int64) -> Float64:
+        """The same rays in the world's frame, (m, 3)."""
+        rotations = self.rotations[self.graph.image_of[keypoints]]
+        rays: Float64 = np.einsum("nji,nj->ni", rotations, self.rays(keypoints))
+        return rays
+
     def depth_at(self, keypoints: Int64) -> tuple[Float64, Bool]:
         """Best depth (m,) of keypoints in their images, world units, 0 where not valid; and where
         it is."""

@@ -74,7 +74,7 @@ def test_a_surface_in_seen_empty_space_is_a_violation_and_one_behind_is_not() ->
     near = wall(4.0)
     near[10:20, 10:25] = 2.0
     scene = posed_scene([near, wall(4.0)], [HERE, HERE], SMALL)
-    box = 150 / near.size
+    box = 5 * 7 / (15 * 20)  # of every second pixel either way
     assert between(scene, 0, 1) == pytest.approx(box)
     assert between(scene, 1, 0) == pytest.approx(box)
     check = DepthCheck(scene, OPTIONS).of_image(0)
@@ -201,6 +201,7 @@ def test_a_view_in_the_twin_room_is_told_by_what_differs() -> None:
 
 def test_the_image_with_most_conflicts_goes() -> None:
     scene = posed_scene([wall(4.0), wall(4.0), wall(2.0), wall(4.0)], [HERE] * 4, SMALL)
-    removed = DepthCheck(scene, OPTIONS).conflicting_images(OPTIONS.max_violations)
+    images = scene.registered_images()
+    removed = DepthCheck(scene, OPTIONS).conflicting_images(images, OPTIONS.max_violations)
     assert [image for image, _ in removed] == [2]
     assert removed[0][1] == pytest.approx(1.0)

@@ -1,0 +1,56 @@
+"""What matches say of how keypoints err."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mpsfm_core.mapping.keypoint_noise import (
+    EFFICIENT,
+    MAX_RESIDUAL,
+    epipolar_residuals,
+    measure_loss_scale,
+)
+from mpsfm_core.scene.scene import Scene
+from mpsfm_core.testing.halls import hall_problem
+
+SCALE = 0.65
+
+
+def scene_of(noise_px: float, *, tails: bool = False, wrong: float = 0.0) -> Scene:
+    """Nine views of a hall at their true poses; with tails, every fourth keypoint errs 8 times as
+    much."""
+    hall = hall_problem(9, keypoint_noise_px=noise_px, wrong_matches=wrong, seed=1)
+    scene = Scene(hall.problem)
+    for number, image in enumerate(hall.problem.images):
+        scene.register(number, *hall.truth[image.name])
+    if tails:
+        rng = np.random.default_rng(0)
+        far = rng.uniform(size=len(scene.keypoints)) < 0.25
+        scene.keypoints[far] += 8 * noise_px * rng.normal(size=(far.sum(), 2))
+    return scene
+
+
+def test_distances_of_matches_have_the_std_of_the_keypoints() -> None:
+    residuals = epipolar_residuals(scene_of(0.7))
+    assert np.sqrt((residuals**2).mean()) == pytest.approx(1.0, rel=0.05)
+    assert (residuals < MAX_RESIDUAL).all()
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.05])
+def test_clean_keypoints_get_a_loss_near_least_squares(wrong: float) -> None:
+    scale = measure_loss_scale(scene_of(0.7, wrong=wrong), SCALE)
+    assert scale == pytest.approx(EFFICIENT, rel=0.1)
+
+
+def test_keypoints_with_tails_keep_their_loss() -> None:
+    scene = scene_of(0.7, tails=True)
+    # most keypoints are better than they declare, as learned ones are
+    scene.keypoint_std_px *= 2
+    assert measure_loss_scale(scene, SCALE) == SCALE
+
+
+def test_few_matches_tell_nothing() -> None:
+    scene = scene_of(0.7)
+    scene.registered[1:] = False
+    assert measure_loss_scale(scene, SCALE) == SCALE
