@@ -101,6 +101,8 @@ class Group:
                 return False
             self._build(placed)
         self._refine_globally()
+        if self.refiner.focal_is_stable():
+            self._refine_globally()  # the first time around poses that a wrong focal length bent
         self._check_all(self._options.consistency.max_violations, "with all images placed at once")
         if self._explained_share(placed.images) < self._options.enough_explained:
             self.scene.restore(before)

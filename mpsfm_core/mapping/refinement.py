@@ -248,7 +248,7 @@ class Refiner:
         images = [int(i) for i in self.scene.registered_images()]
         complete_and_merge(self.scene, self.triangulation, create=True)
         lift_low_parallax(self.scene, self.triangulation)
-        if self._focal_is_stable():
+        if self.focal_is_stable():
             self.adjust(images, focal=True)
         for _ in range(options.global_iterations):
             if options.rescale:
@@ -298,7 +298,7 @@ class Refiner:
         known = [self.scene.problem.images[i].focal_known for i in images]
         return ~np.array(known, dtype=np.bool_)
 
-    def _focal_is_stable(self) -> bool:
+    def focal_is_stable(self) -> bool:
         """Whether guessed focal lengths can be told from the images registered so far."""
         images, options = self.scene.registered_images(), self.options
         if not options.refine_focal or len(images) < options.focal_min_images:
