@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks._scenes import percent
-from mpsfm_core.data import MappingProblem, VerifiedPair
+from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.mapping.depth_consistency import DepthCheck
@@ -73,6 +73,11 @@ class Observed(Group):
     case: SymmetricProblem
     verdicts: list[tuple[bool, bool]]
     first: int
+
+    def start_from_all(self, left: Bool) -> bool:
+        started = super().start_from_all(left)
+        self.first = int(self.scene.registered.argmax())
+        return started
 
     def _try_pair(self, pair: VerifiedPair) -> str | None:
         self.first = pair.image_a

@@ -158,7 +158,7 @@ class Limited(Group):
         self.limit -= 1
         return self.limit >= 0 and super()._register_next(available)
 
-    def _check_all(self) -> None:
+    def _check_all(self, limit: float, when: str) -> None:
         images = self.scene.registered_images()
         if len(images) > 4:
             self._drop(images[self.kept :].tolist(), "contradicted at the end")
@@ -171,7 +171,8 @@ def test_the_group_that_ends_larger_gets_the_images(
     second_limit: int, kept: int, sizes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem = mapping_problem(room_scene(), CAMERA, arc_poses(6, 14.0))
-    mapper = Mapper(problem, MapperOptions(), Silent())
+    options = MapperOptions.model_validate({"initialization": {"all_at_once": False}})
+    mapper = Mapper(problem, options, Silent())
     mapper.group_type = Limited
     monkeypatch.setattr(Limited, "kept", kept)
     monkeypatch.setattr(Limited, "limit", 2)
