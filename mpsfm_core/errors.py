@@ -12,6 +12,10 @@ class MpsfmError(Exception):
 
     exit_code = 1
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # as it is, whatever its constructor asks for: it may come from another process
+        return _restored, (type(self), self.args, self.__dict__)
+
 
 class InputError(MpsfmError):
     """The user's input is wrong: images, intrinsics, configuration, weights, options."""
@@ -76,6 +80,12 @@ class ReconstructionError(MpsfmError):
     def __init__(self, message: str, summary: Mapping[str, Any] | None = None) -> None:
         super().__init__(message)
         self.summary = dict(summary or {})
+
+
+def _restored(kind: type[MpsfmError], args: tuple[Any, ...], state: dict[str, Any]) -> MpsfmError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(state)
+    return error
 
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str:

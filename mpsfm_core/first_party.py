@@ -53,6 +53,9 @@ FIRST_PARTY: Mapping[str, tuple[str, ...]] = MappingProxyType(
 )
 """Requirement for pip -> the providers that it brings, as ``kind/name``."""
 
+EXECUTORS: Mapping[str, str] = MappingProxyType({"dask": "mpsfm-dask", "ray": "mpsfm-ray"})
+"""Executor -> what to install for it."""
+
 
 def requirement_for(kind: str, name: str) -> str:
     """What to install for a provider, empty if it is none of ours."""

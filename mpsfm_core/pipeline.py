@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 from threadpoolctl import threadpool_limits
 
+from mpsfm_core import precompile
 from mpsfm_core.checkpoints import DiskCheckpoints
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import Float64, MappingProblem, Pose, View
@@ -175,6 +176,7 @@ class _Run:
             with stage("video"):
                 folder = self._frames(folder)
         self._folder = folder
+        compilation = precompile.begin()
         with stage("inputs"):
             images = load_images(
                 folder,
@@ -190,6 +192,9 @@ class _Run:
             images = estimate_focals(images, config, self._registry, self._stages)
             extraction = extract(images, config, self._registry, self._stages, self._imported)
         problem = _with_poses(extraction.problem, known)
+        if compilation is not None:
+            with stage("compilation"):
+                compilation.wait()
         with stage("mapping"):
             options, checkpoints = config.mapper_options(), self._checkpoints(problem)
             mapping = mapper.reconstruct(problem, options, self._stages, checkpoints)

@@ -17,7 +17,7 @@ the method of its kind's protocol below.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, get_args, runtime_checkable
@@ -156,6 +156,23 @@ class MaskProvider(Protocol):
     def mask(self, view: View) -> Bool: ...
 
 
+class Executor(Protocol):
+    """Runs steps of the extraction on workers elsewhere."""
+
+    def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
+        """Run ``step(item)`` for all items; yields once for each that is done, in any order.
+
+        Step and items can be pickled; what a step finds out it leaves in the cache. A step whose
+        worker was lost runs again on another. Raises what a step raised. Closing the iterator drops
+        what has not begun.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the workers."""
+        ...
+
+
 PROTOCOLS: dict[Kind, type] = {
     "depth": DepthProvider,
     "normals": NormalsProvider,
@@ -271,6 +288,14 @@ class Hooks:
         """Calibration of a prior for these options; None leaves it to the spec's default.
 
         ``kind`` is depth or normals, or ``wrapper`` for a wrapper around such a provider.
+        """
+
+    @hookspec(firstresult=True)
+    def mpsfm_executor(self, name: str, options: Mapping[str, Any]) -> Executor | None:
+        """The executor that ``runtime.executor`` names, connected to its workers; None if it is
+        not of this plugin. ``options``: ``runtime.executor_options``.
+
+        Raises :class:`~mpsfm_core.errors.ConfigError` when it cannot be had.
         """
 
     @hookspec

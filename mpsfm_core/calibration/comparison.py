@@ -98,7 +98,7 @@ class Comparison:
     def _compare(
         self, images: Sequence[int], compare: Callable[[int], Samples | None]
     ) -> tuple[Samples, ...]:
-        compared = self._bench.each("comparison", images, compare, self.provider.workers)
+        compared = self._bench.each("comparison", images, compare, self.provider)
         samples = tuple(image for image in compared if image is not None)
         if not samples:
             raise InputError(

@@ -29,7 +29,7 @@ class FeatureTable:
     def extract(self) -> list[Features]:
         """Run the stage; returns features without descriptors, to keep memory small."""
         images = range(len(self._bench.images))
-        return self._bench.each("features", images, self._located, self._provider.workers)
+        return self._bench.each("features", images, self._located, self._provider)
 
     def __getitem__(self, index: int) -> Features:
         return self._recent.get(index, lambda: self._load(index))

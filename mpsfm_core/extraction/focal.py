@@ -53,7 +53,7 @@ def estimate_focals(
         return float(focal * images[index].camera.width / view.camera.width)
 
     with threadpool_limits(thread_count(config.runtime), user_api="blas"):
-        estimates = bench.each("focal", guessed, estimate, provider.workers)
+        estimates = bench.each("focal", guessed, estimate, provider, here=True)
     by_camera: dict[int, list[float]] = defaultdict(list)
     for index, focal in zip(guessed, estimates, strict=True):
         if np.isfinite(focal):

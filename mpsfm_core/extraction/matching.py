@@ -18,7 +18,7 @@ from mpsfm_core.data import (
     SparseMatches,
     VerifiedPair,
 )
-from mpsfm_core.extraction.backends import ActiveProvider, worker_count
+from mpsfm_core.extraction.backends import ActiveProvider
 from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.dense import NO_POINTS, PointMatches, sample, snap
 from mpsfm_core.extraction.features import FeatureTable
@@ -59,12 +59,15 @@ class PairMatcher:
 
     def match(self, pairs: list[Pair], located: list[Features]) -> list[Candidates]:
         """Run the stage. ``located``: features of all images, descriptors not needed."""
-        workers = min(provider.workers for provider in self._providers)
 
         def work(pair: Pair) -> Candidates:
             return self._candidates(pair, located[pair[0]], located[pair[1]])
 
-        return self._bench.each("matching", pairs, work, workers)
+        return self._bench.each("matching", pairs, work, *self._providers)
+
+    def results(self, pair: Pair) -> list[PairMatches]:
+        """What each matcher returns for a pair, cached."""
+        return [self._run(provider, pair) for provider in self._providers]
 
     def pair_depth(self, pair: Pair, side: int) -> DepthPrior:
         """Depth of one image of a pair (0 or 1) as the matcher saw it."""
@@ -76,7 +79,7 @@ class PairMatcher:
 
     def _candidates(self, pair: Pair, a: Features, b: Features) -> Candidates:
         options = self._bench.config.extraction
-        results = [self._run(provider, pair) for provider in self._providers]
+        results = self.results(pair)
         no_scores = np.empty(0, dtype=np.float32)
         sparse = SparseMatches(np.empty((0, 2), dtype=np.int64), no_scores)
         points, std_px = NO_POINTS, 1.0
@@ -126,8 +129,7 @@ class PairVerifier:
 
     def verify(self, candidates: list[Candidates]) -> list[TwoView]:
         """Run the stage."""
-        workers = worker_count(self._bench.config.runtime)
-        return self._bench.each("verification", candidates, self._verify, workers)
+        return self._bench.each("verification", candidates, self._verify)
 
     def _verify(self, matches: Candidates) -> TwoView:
         options, seed = self._bench.config.verification, self._bench.config.runtime.seed

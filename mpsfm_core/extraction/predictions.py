@@ -41,22 +41,27 @@ class Predictions:
         images = range(len(self._bench.images))
         depth = self._raw.depth
         if not depth.can("uncached") and self._best is None:
-            self._bench.each("depth", images, self._predict_only, depth.workers)
+            self._bench.each("depth", images, self._predict_only, depth)
         slowest = self._raw.normals or depth
-        return self._bench.each("normals", images, self._both, slowest.workers)
+        here = self._best is not None
+        return self._bench.each("normals", images, self._both, slowest, here=here)
 
     def _predict_only(self, index: int) -> None:
         """Leaves the result in the cache: full-size maps of all images need not fit in memory."""
-        self._predicted(index)
+        self.predicted(index)
 
     def _both(self, index: int) -> tuple[DepthPrior, NormalPrior]:
-        raw_depth, raw_normals = self._predicted(index)
-        depth = self._depth_calibration.apply(raw_depth)
-        if raw_normals is None:
-            raw_normals = self._raw.predict_normals(index, depth)
-        return self._on_grid(index, depth, self._normal_calibration.apply(raw_normals))
+        depth, normals = self.full_size(index)
+        return self._on_grid(index, depth, self._normal_calibration.apply(normals))
 
-    def _predicted(self, index: int) -> tuple[DepthPrior, NormalPrior | None]:
+    def full_size(self, index: int) -> tuple[DepthPrior, NormalPrior]:
+        """Calibrated depth of an image, and its normals as they are predicted; cached."""
+        raw_depth, normals = self.predicted(index)
+        depth = self._depth_calibration.apply(raw_depth)
+        return depth, self._raw.predict_normals(index, depth) if normals is None else normals
+
+    def predicted(self, index: int) -> tuple[DepthPrior, NormalPrior | None]:
+        """Depth of an image as it is predicted, and its normals if they come along; cached."""
         if self._best is not None:
             return self._from_matcher(index), None
         return self._raw.predict(index)

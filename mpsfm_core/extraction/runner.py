@@ -18,6 +18,7 @@ from mpsfm_core.data import Features, MappingImage, MappingProblem, SparseMatche
 from mpsfm_core.extraction.backends import thread_count
 from mpsfm_core.extraction.dense import NO_POINTS
 from mpsfm_core.extraction.events import ExtractionEvents, Silent
+from mpsfm_core.extraction.execution import workers_elsewhere
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.matching import Candidates, PairMatcher, PairVerifier, assemble
 from mpsfm_core.extraction.predictions import Predictions, check_depth_source
@@ -60,10 +61,15 @@ def extract(
         InputError: a provider, its weights or its files are missing, or the configuration does
             not fit together.
         ProviderRunError, ProviderOutputError: a provider failed or broke its contract.
+        ConfigError: the executor cannot be had, or its workers do not share the cache.
         OutputError: the cache cannot be written.
     """
-    with threadpool_limits(thread_count(config.runtime), user_api="blas"):
-        return _extract(Workbench(images, config, registry, events or Silent()), imported)
+    bench = Workbench(images, config, registry, events or Silent())
+    with (
+        threadpool_limits(thread_count(config.runtime), user_api="blas"),
+        workers_elsewhere(bench),
+    ):
+        return _extract(bench, imported)
 
 
 def _extract(bench: Workbench, imported: ImportedMatches | None) -> Extraction:

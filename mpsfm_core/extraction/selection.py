@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,11 @@ from mpsfm_core import validation
 from mpsfm_core.data import Float64
 from mpsfm_core.errors import ConfigError
 from mpsfm_core.extraction import first_look, pairs
-from mpsfm_core.extraction.backends import worker_count
+from mpsfm_core.extraction.backends import ActiveProvider
 from mpsfm_core.extraction.cache import content_key
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.pairs import Pair
 from mpsfm_core.extraction.workbench import Workbench
-from mpsfm_core.options import Backend
 
 
 class PairSelection:
@@ -110,25 +110,31 @@ class PairSelection:
             for other in range(first + 1, count):
                 found[first, other] = first_look.evidence(strongest[first], strongest[other])
 
-        bench.each("first look", range(count), compare, worker_count(bench.config.runtime))
+        bench.each("first look", range(count), compare)
         found += found.T
         bench.cache.store("first-look", key, found)
         return found
 
+    def describe(self, index: int) -> Any:
+        """The global descriptor (d,) of an image, cached.
+
+        Raises :class:`ConfigError` without a retrieval provider.
+        """
+        bench, provider = self._bench, self._retrieval
+        return bench.result(
+            provider,
+            np.ndarray,
+            bench.view_inputs(index, provider),
+            lambda instance: validation.run_retrieval(provider.spec, instance, bench.view(index)),
+        )
+
     def _descriptors(self) -> list[Any]:
-        backend: Backend | None = self._bench.config.retrieval
+        images = range(len(self._bench.images))
+        return self._bench.each("retrieval", images, self.describe, self._retrieval)
+
+    @cached_property
+    def _retrieval(self) -> ActiveProvider:
+        backend = self._bench.config.retrieval
         if backend is None:
             raise ConfigError("pairs.mode: 'retrieval' needs a provider: set retrieval.use")
-        bench, provider = self._bench, self._bench.provider("retrieval", backend)
-
-        def describe(index: int) -> Any:
-            return bench.result(
-                provider,
-                np.ndarray,
-                bench.view_inputs(index, provider),
-                lambda instance: validation.run_retrieval(
-                    provider.spec, instance, bench.view(index)
-                ),
-            )
-
-        return bench.each("retrieval", range(len(bench.images)), describe, provider.workers)
+        return self._bench.provider("retrieval", backend)

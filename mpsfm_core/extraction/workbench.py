@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -11,7 +11,7 @@ import numpy as np
 from mpsfm_core import validation
 from mpsfm_core.config import Config
 from mpsfm_core.data import Bool, UInt8, View
-from mpsfm_core.extraction.backends import ActiveProvider
+from mpsfm_core.extraction.backends import ActiveProvider, worker_count
 from mpsfm_core.extraction.cache import Cache, content_key, digest
 from mpsfm_core.extraction.events import ExtractionEvents
 from mpsfm_core.extraction.parallel import run_stage
@@ -36,7 +36,10 @@ class Workbench:
         self.cache = Cache(config.runtime.cache_dir)
         self.providers: list[ActiveProvider] = []
         self._events = events
-        self._masks: list[tuple[UInt8, str]] = []
+        self.elsewhere: Callable[[str, Sequence[Any]], Generator[None, None, None]] | None = None
+        """Runs a stage on the workers of an executor, where there is one."""
+        self._mask_providers: list[ActiveProvider] = []
+        self._masks: dict[int, tuple[UInt8, str]] = {}
 
     def provider(self, kind: Kind, backend: Backend) -> ActiveProvider:
         """Take a provider into use."""
@@ -45,10 +48,22 @@ class Workbench:
         return provider
 
     def each(
-        self, stage: str, items: Sequence[Item], work: Callable[[Item], Result], workers: int
+        self,
+        stage: str,
+        items: Sequence[Item],
+        work: Callable[[Item], Result],
+        *providers: ActiveProvider,
+        here: bool = False,
     ) -> list[Result]:
-        """One stage: work on all items in parallel, in their order."""
-        return run_stage(self._events, stage, items, work, workers)
+        """One stage: work on all items in parallel, in their order.
+
+        ``providers``: what it asks, if anything. ``here``: not on an executor's workers, even if
+        the cache would keep what they find.
+        """
+        workers = min((p.workers for p in providers), default=worker_count(self.config.runtime))
+        kept = providers and not any(provider.can("uncached") for provider in providers)
+        ahead = self.elsewhere(stage, items) if self.elsewhere and kept and not here else None
+        return run_stage(self._events, stage, items, work, workers, ahead)
 
     def result(
         self,
@@ -76,46 +91,53 @@ class Workbench:
     def view(self, index: int) -> View:
         """The view of an image, its mask restricted by the mask providers."""
         view = self.images.view(index)
-        return replace(view, mask=self.mask(index)) if self._masks else view
+        return replace(view, mask=self.mask(index)) if self._mask_providers else view
 
     def mask(self, index: int) -> Bool | None:
         """Which pixels of a view may be used, None for all."""
         mask = self.images.mask(index)
-        if not self._masks:
+        if not self._mask_providers:
             return mask
         width, height = self.images[index].pinhole.size
-        bits = np.unpackbits(self._masks[index][0], count=height * width)
+        bits = np.unpackbits(self._allowed(index)[0], count=height * width)
         allowed = bits.reshape(height, width).astype(np.bool_)
         return allowed if mask is None else allowed & mask
 
     def view_inputs(self, index: int, provider: ActiveProvider) -> list[object]:
         """What identifies a view for a provider: pixels, masks, and intrinsics if it uses them."""
+        pixels, *intrinsics = self._unmasked_inputs(index, provider)
+        masks = [self._allowed(index)[1]] if self._mask_providers else []
+        return [pixels, *masks, *intrinsics]
+
+    def _unmasked_inputs(self, index: int, provider: ActiveProvider) -> list[object]:
         inputs: list[object] = [self.images.pixel_key(index)]
-        if self._masks:
-            inputs.append(self._masks[index][1])
         if provider.can("intrinsics-aware"):
             inputs.append(self.images[index].pinhole.params.tolist())
         return inputs
 
+    def take_masks(self) -> None:
+        """Take the mask providers into use; views have their masks from then on."""
+        self._mask_providers = [self.provider("mask", backend) for backend in self.config.masks]
+
     def run_masks(self) -> None:
-        """Run all mask providers; views have their masks from then on."""
-        active = [self.provider("mask", backend) for backend in self.config.masks]
-        if not active:
-            return
+        """Take the mask providers into use, and run them all."""
+        self.take_masks()
+        if self._mask_providers:
+            self.each("masks", range(len(self.images)), self._allowed, *self._mask_providers)
 
-        def allowed(index: int) -> tuple[UInt8, str]:
+    def _allowed(self, index: int) -> tuple[UInt8, str]:
+        """Where all mask providers allow it, packed, and its digest."""
+        if index not in self._masks:
             together = np.array(True)
-            for provider in active:
+            for provider in self._mask_providers:
                 together = together & self._mask(provider, index)
-            return np.packbits(together), digest(together)
-
-        workers = min(provider.workers for provider in active)
-        self._masks = self.each("masks", range(len(self.images)), allowed, workers)
+            self._masks[index] = np.packbits(together), digest(together)
+        return self._masks[index]
 
     def _mask(self, provider: ActiveProvider, index: int) -> Bool:
         return self.result(
             provider,
             np.ndarray,
-            self.view_inputs(index, provider),
+            self._unmasked_inputs(index, provider),
             lambda instance: validation.run_mask(provider.spec, instance, self.images.view(index)),
         )

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -126,6 +126,9 @@ class ImageSet:
         self._options = options
         self._views: Recent[int, View] = Recent(_CACHED_BYTES, _bytes)
         self._warps: Recent[str, Warp] = Recent(_CACHED_WARPS, lambda _: 1)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.images, self._options)  # decoded views stay where they are
 
     def __len__(self) -> int:
         return len(self.images)

@@ -37,8 +37,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 
+from mpsfm_core import jit
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera
 from mpsfm_core.geometry import pixel_centers, unproject
 from mpsfm_core.mapping.depth_noise import local_noise, witnesses
@@ -198,7 +198,7 @@ class _MapState(NamedTuple):
     std_factor: float
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@jit.kernel()
 def unexplained_share(
     source: _Grid,
     target: _Grid,

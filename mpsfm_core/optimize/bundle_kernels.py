@@ -10,16 +10,15 @@ slot each; camera-side vectors hold 6 numbers for each pose slot (rotation, tran
 one for each focal slot. A pose moves as ``R <- exp(w) R, t <- t + dt``, a focal length as
 ``f <- f exp(a)``.
 """
-# mypy: allow-untyped-decorators
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from mpsfm_core import jit
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.optimize.losses import evaluate
 
@@ -40,7 +39,10 @@ MAX_OWN_STEPS = 10
 losses make points with outliers converge slowly; this takes a third of the iterations and half of
 the time, to a lower cost at the same tolerance (our measurement)."""
 OWN_STEP_DAMPING = 1e-6
-POSE = 6
+POSE, FOCAL = np.int64(6), np.int64(1)
+"""Numbers of a pose and of a focal length."""
+_ONLY = np.int64(0)
+"""Row of a block that has one row."""
 
 
 class Observations(NamedTuple):
@@ -170,14 +172,8 @@ def make_scratch(longest: int) -> Scratch:
     )
 
 
-_kernel = njit(
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-    fastmath={"contract"},
-    forceinline=True,
-    _nrt=False,
-)
+_OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "forceinline": True, "_nrt": False}
+_kernel, _helper = jit.kernel(**_OPTIONS), jit.helper(**_OPTIONS)
 
 
 @_kernel
@@ -220,7 +216,7 @@ def number_pairs(obs: Observations, pose_slot: Int32, variable: Bool, pair: Int3
     return count
 
 
-@_kernel
+@_helper
 def observe(k: int, p: int, bundle: Bundle, state: State) -> Sight:
     """See observation ``k`` of point ``p``; cost and derivatives are 0 where it is not visible."""
     obs, robust = bundle.obs, bundle.robust
@@ -261,7 +257,7 @@ def observe(k: int, p: int, bundle: Bundle, state: State) -> Sight:
     )
 
 
-@_kernel
+@_helper
 def _fill_pose_columns(s: Sight, columns: Float64) -> None:
     """columns (3, 6) <- h [dx/dw | dx/dt]."""
     columns[0, 0] = s.hxz * s.qy
@@ -281,7 +277,7 @@ def _fill_pose_columns(s: Sight, columns: Float64) -> None:
     columns[2, 5] = s.hzz
 
 
-@_kernel
+@_helper
 def _add_pose(s: Sight, columns: Float64, slot: int, row: int, system: System) -> None:
     """Add the pose's gradient, diagonal and the upper triangle of its own block."""
     blocks, gradient, diagonal = system.blocks, system.gradient, system.diagonal
@@ -312,7 +308,7 @@ def _add_pose(s: Sight, columns: Float64, slot: int, row: int, system: System) -
     blocks[row, 5, 5] += s.hzz
 
 
-@_kernel
+@_helper
 def _add_focal(
     s: Sight, columns: Float64, focal: int, slot: int, poses: int, system: System
 ) -> None:
@@ -326,7 +322,7 @@ def _add_focal(
             system.border[focal, POSE * slot + a] += s.x * columns[0, a] + s.y * columns[1, a]
 
 
-@_kernel
+@_helper
 def _add_point(s: Sight, rotation: Float64, image: int, block: Float64, p: int) -> None:
     """block[p] (10,) += packed lower triangle of R^T h R at 0..5 and R^T g at 6..8."""
     r = rotation
@@ -342,7 +338,7 @@ def _add_point(s: Sight, rotation: Float64, image: int, block: Float64, p: int) 
             )
 
 
-@_kernel
+@_helper
 def _add_coupling(
     columns: Float64, width: int, rotation: Float64, image: int, y: Float64, n: int, fresh: bool
 ) -> None:
@@ -354,7 +350,7 @@ def _add_coupling(
             y[n, c, a] = value if fresh else y[n, c, a] + value
 
 
-@_kernel
+@_helper
 def _invert_factor(block: Float64, p: int, damping: float) -> bool:
     """Replace the packed V in block[p, :6] by L^-1, where V + damping m I = L L^T; m, the mean
     of V's diagonal, goes to block[p, 9]. False (nothing replaced) if it is not positive definite.
@@ -385,7 +381,7 @@ def _invert_factor(block: Float64, p: int, damping: float) -> bool:
     return True
 
 
-@_kernel
+@_helper
 def _whiten(block: Float64, p: int, y: Float64, n: int, width: int) -> None:
     """y[n] (3, width) <- L^-1 y[n]."""
     i00, i10, i11 = block[p, 0], block[p, 1], block[p, 2]
@@ -397,7 +393,7 @@ def _whiten(block: Float64, p: int, y: Float64, n: int, width: int) -> None:
         y[n, 2, a] = i20 * y0 + i21 * y1 + i22 * y2
 
 
-@_kernel
+@_helper
 def _point_step(block: Float64, p: int, g0: float, g1: float, g2: float, step: Float64) -> float:
     """step (3,) <- -V^-1 g; returns the decrease of cost that the linear model promises."""
     i00, i10, i11 = block[p, 0], block[p, 1], block[p, 2]
@@ -412,7 +408,7 @@ def _point_step(block: Float64, p: int, g0: float, g1: float, g2: float, step: F
     return promised
 
 
-@_kernel
+@_helper
 def _eliminate_from_poses(
     count: int, z0: float, z1: float, z2: float, pair: Int32, system: System, scratch: Scratch
 ) -> None:
@@ -433,7 +429,7 @@ def _eliminate_from_poses(
                     blocks[row, i, j] -= y0 * y[b, 0, j] + y1 * y[b, 1, j] + y2 * y[b, 2, j]
 
 
-@_kernel
+@_helper
 def _eliminate_from_focals(
     count: int,
     num_focals: int,
@@ -460,7 +456,7 @@ def _eliminate_from_focals(
             )
 
 
-@_kernel
+@_helper
 def _find_or_add(values: Int64, count: int, value: int) -> int:
     for index in range(count):
         if values[index] == value:
@@ -491,7 +487,7 @@ def reduce_points(
     poses = len(layout.pair)
     cost = 0.0
     for p in range(first, last):
-        count = num_focals = 0
+        count = num_focals = np.int64(0)
         for a in range(10):
             eliminated[p, a] = 0.0
         for k in range(obs.start[p], obs.start[p + 1]):
@@ -523,7 +519,7 @@ def reduce_points(
                 columns[1, 0] = s.y * s.hyy
                 columns[2, 0] = s.x * s.hxz + s.y * s.hyz
                 fresh = n == num_focals
-                _add_coupling(columns, 1, state.rotations, image, scratch.yf, n, fresh)
+                _add_coupling(columns, FOCAL, state.rotations, image, scratch.yf, n, fresh)
                 num_focals = max(num_focals, n + 1)
         if not _invert_factor(eliminated, p, damping):
             for a in range(10):
@@ -536,13 +532,13 @@ def reduce_points(
         for a in range(count):
             _whiten(eliminated, p, scratch.y, a, POSE)
         for f in range(num_focals):
-            _whiten(eliminated, p, scratch.yf, f, 1)
+            _whiten(eliminated, p, scratch.yf, f, FOCAL)
         _eliminate_from_poses(count, z0, z1, z2, layout.pair, system, scratch)
         _eliminate_from_focals(count, num_focals, z0, z1, z2, poses, system, scratch)
     return cost
 
 
-@_kernel
+@_helper
 def _joint_step(
     p: int,
     damping: float,
@@ -588,7 +584,7 @@ def _joint_step(
     return 0.5 * promised
 
 
-@_kernel
+@_helper
 def _look(p: int, bundle: Bundle, trial: State, scratch: Scratch) -> tuple[float, float, bool]:
     """Cost of a point after a step, cost before it of what it lost from view, and whether its
     depths are safe. Fills ``scratch.block`` with the point's own normal equations."""
@@ -600,7 +596,7 @@ def _look(p: int, bundle: Bundle, trial: State, scratch: Scratch) -> tuple[float
     for k in range(obs.start[p], obs.start[p + 1]):
         s = observe(k, p, bundle, trial)
         cost += s.cost
-        _add_point(s, trial.rotations, obs.image[k], block, 0)
+        _add_point(s, trial.rotations, obs.image[k], block, _ONLY)
         n = k - obs.start[p]
         if before[n, 0] >= 0.0:
             safe = safe and s.z > MIN_DEPTH_RATIO * before[n, 1]
@@ -644,9 +640,9 @@ def step_points(
             cost, lost, safe = _look(p, bundle, trial, scratch)
         for _ in range(MAX_OWN_STEPS if bundle.layout.variable_point[p] else 0):
             block = scratch.block
-            if not _invert_factor(block, 0, OWN_STEP_DAMPING):
+            if not _invert_factor(block, _ONLY, OWN_STEP_DAMPING):
                 break
-            gain = _point_step(block, 0, block[0, 6], block[0, 7], block[0, 8], step)
+            gain = _point_step(block, _ONLY, block[0, 6], block[0, 7], block[0, 8], step)
             if not gain > tolerance * cost:
                 break
             x, y, z = points[p, 0], points[p, 1], points[p, 2]
@@ -765,10 +761,10 @@ def point_covariances(
         block[0, 0] = block[0, 2] = block[0, 5] = damping
         for k in range(bundle.obs.start[p], bundle.obs.start[p + 1]):
             s = observe(k, p, bundle, state)
-            _add_point(s, state.rotations, bundle.obs.image[k], block, 0)
-        if not _invert_factor(block, 0, 0.0):
+            _add_point(s, state.rotations, bundle.obs.image[k], block, _ONLY)
+        if not _invert_factor(block, _ONLY, 0.0):
             # an unobserved direction beside strong ones: the damping drowned in rounding
-            _invert_factor(block, 0, 1e-12)
+            _invert_factor(block, _ONLY, 1e-12)
         i00, i10, i11 = block[0, 0], block[0, 1], block[0, 2]
         i20, i21, i22 = block[0, 3], block[0, 4], block[0, 5]
         out[p, 0, 0] = i00 * i00 + i10 * i10 + i20 * i20

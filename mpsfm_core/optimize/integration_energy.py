@@ -22,18 +22,17 @@ edges to the vague normals there. All three losses are concave in the squared re
 re-weighted least squares majorises this energy: a step that lowers the quadratic, however inexact,
 cannot raise the energy.
 """
-# mypy: allow-untyped-decorators
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from mpsfm_core import jit
 from mpsfm_core.data import Bool, Float32, Float64, Int64, NormalPrior, PinholeCamera
 
-_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+_kernel, _helper = jit.kernel(fastmath=True), jit.helper(fastmath=True)
 
 _MISSING = 1e30  # squared residual of a side that does not exist
 _SQRT_3 = 1.7320508075688772
@@ -117,6 +116,7 @@ def normal_terms(
     link[1, 1:-2, 1:-1] = active[:-1] & active[1:]
     terms = NormalTerms._make([*np.zeros((3, *shape), np.float32), link])
     usable = normals.valid & active
+    assert normals.variance is not None
     _fill_normal_terms(normals.normals, normals.variance, usable, camera.params, weight, terms)
     return terms
 
@@ -225,7 +225,7 @@ def _add_normals(
     return energy
 
 
-@_kernel
+@_helper
 def _link_row(
     z_behind: Float64,
     z: Float64,
@@ -271,7 +271,7 @@ def _link_row(
     return energy
 
 
-@_kernel
+@_helper
 def _exp(x: float) -> float:
     """exp(x) for x <= 0 to 1e-14, and exp(-60) below; unlike a library call, it vectorises."""
     scaled = max(x, -60.0) * 1.4426950408889634
@@ -292,7 +292,7 @@ def _exp(x: float) -> float:
     return value
 
 
-@_kernel
+@_helper
 def _log(x: float) -> float:
     """log(x) for x in [1, 3] to 1e-11, by the series of the area hyperbolic tangent at sqrt(3)."""
     u = (x - _SQRT_3) / (x + _SQRT_3)

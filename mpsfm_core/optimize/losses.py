@@ -16,9 +16,10 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
+
+from mpsfm_core import jit
 
 
 class Loss(IntEnum):
@@ -68,7 +69,7 @@ LOSSES: Mapping[Loss, Callable[[NDArray[Any], float], tuple[Any, Any]]] = Mappin
 """The functions by name, for numpy arrays; kernels use :func:`evaluate`."""
 
 
-@njit(cache=True, error_model="numpy")
+@jit.helper()
 def evaluate(loss: int, s: float, scale: float) -> Any:
     """``(rho, rho')`` of one squared residual; ``loss`` is a :class:`Loss` as an int."""
     if loss == 1:

@@ -20,23 +20,28 @@ This costs 1.7 times a point smoother and leaves 40 times less error after eight
 
 Arrays of a level carry a frame of one zero pixel, so that no kernel branches at borders.
 """
-# mypy: allow-untyped-decorators
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from mpsfm_core import jit
 from mpsfm_core.data import Float32, Float64
 
-_kernel = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+_kernel, _helper = (
+    jit.kernel(fastmath={"contract", "reassoc"}),
+    jit.helper(fastmath={"contract", "reassoc"}),
+)
 
 SOLVED = 1e-10
 """Relative error that only rounding is left below."""
 _TINY = 1e-30  # less is nothing
-_NO_SQUARES = (0.0,) * 10
+_Squares = tuple[float, ...]
+"""Six couplings, then four masses, of a cell."""
+_Corners = tuple[float, float, float, float]
+_NO_SQUARES: _Squares = (0.0,) * 10
 
 
 class Solution(NamedTuple):
@@ -171,7 +176,7 @@ def _prepare_smoother(level: _Level) -> None:
                 level.row_pivot[i, j] = _inverse(left + max(east[i, j], 0.0))
 
 
-@_kernel
+@_helper
 def _chain(hold: float, coupling: float, rest: float) -> float:
     """What holds the next pixel of a line: the rest of its diagonal, and the line up to it."""
     coupling = max(coupling, 0.0)
@@ -179,7 +184,7 @@ def _chain(hold: float, coupling: float, rest: float) -> float:
     return total
 
 
-@_kernel
+@_helper
 def _inverse(value: float) -> float:
     return 1.0 / value if value > _TINY else 0.0
 
@@ -197,7 +202,7 @@ def _smooth(level: _Level, nine_point: bool, backward: bool) -> None:
         _relax_columns(level, nine_point)
 
 
-@_kernel
+@_helper
 def _relax_points(level: _Level, nine_point: bool) -> None:
     """Solve the pixels that the coarser grid keeps, one by one."""
     x, row = level.x, level.work[0]
@@ -207,7 +212,7 @@ def _relax_points(level: _Level, nine_point: bool) -> None:
             x[i, j] += row[j] / level.diagonal[i, j]
 
 
-@_kernel
+@_helper
 def _relax_rows(level: _Level, nine_point: bool) -> None:
     """Solve each row that the coarser grid leaves out."""
     east, pivot, x, row = level.east, level.row_pivot, level.x, level.work[0]
@@ -226,7 +231,7 @@ def _relax_rows(level: _Level, nine_point: bool) -> None:
             x[i, j] += change
 
 
-@_kernel
+@_helper
 def _relax_columns(level: _Level, nine_point: bool) -> None:
     """Solve each column that the coarser grid leaves out (all are prepared: it vectorises)."""
     south, pivot, x, change = level.south, level.column_pivot, level.x, level.work
@@ -244,7 +249,7 @@ def _relax_columns(level: _Level, nine_point: bool) -> None:
             x[i, j] += change[i, j]
 
 
-@_kernel
+@_helper
 def _residual_row(level: _Level, i: int, nine_point: bool, row: Float64) -> None:
     """rhs - A x of one row."""
     east, south, southeast, southwest = level.east, level.south, level.southeast, level.southwest
@@ -348,7 +353,7 @@ def _derive_interpolation(fine: _Level, coarse: _Level) -> None:
                 )
 
 
-@_kernel
+@_helper
 def _shares(first: float, second: float, mass: float) -> tuple[float, float]:
     """Interpolation weights of two neighbours.
 
@@ -414,8 +419,8 @@ def _coarsen(fine: _Level, coarse: _Level, nine_point: bool) -> None:
             coarse.mass[i + 1, j + 1] += q[9]
 
 
-@_kernel
-def _add_mass(q, mass, a):  # type: ignore[no-untyped-def]
+@_helper
+def _add_mass(q: _Squares, mass: float, a: _Corners) -> _Squares:
     """Add mass * (a . corners)^2 to the couplings (6) and masses (4) `q` of a cell.
 
     Positive masses are lumped, which keeps couplings from getting negative at isolated heavy
@@ -440,8 +445,8 @@ def _add_mass(q, mass, a):  # type: ignore[no-untyped-def]
     )
 
 
-@_kernel
-def _add_coupling(q, coupling, a, b):  # type: ignore[no-untyped-def]
+@_helper
+def _add_coupling(q: _Squares, coupling: float, a: _Corners, b: _Corners) -> _Squares:
     """Add coupling * ((a - b) . corners)^2 to a cell."""
     v0, v1, v2, v3 = a[0] - b[0], a[1] - b[1], a[2] - b[2], a[3] - b[3]
     total = v0 + v1 + v2 + v3

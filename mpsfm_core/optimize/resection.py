@@ -5,15 +5,14 @@ known the two are the same. The objective is the sum of Tukey's biweight of each
 to the projected segment: quadratic for small distances, no influence from a limit on. Its
 Gauss-Newton steps move the pose as bundle adjustment does, ``R <- exp(w) R, t <- t + dt``.
 """
-# mypy: allow-untyped-decorators
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from mpsfm_core import jit
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.optimize.bundle_kernels import MIN_DEPTH, POSE, rotation_of
 
@@ -57,7 +56,7 @@ class _Foot(NamedTuple):
     av: float
 
 
-_kernel = njit(cache=True, nogil=True, error_model="numpy")
+_kernel, _helper = jit.kernel(), jit.helper()
 
 
 def distances_and_depths(
@@ -68,7 +67,8 @@ def distances_and_depths(
     Both are NaN where an end is not in front of the camera. ``intrinsics``: fx, fy, cx, cy.
     """
     distances, depths = np.empty((2, len(segments.xy)))
-    _measure(*pose, intrinsics, segments, distances, depths)
+    rotation, translation = map(np.ascontiguousarray, pose)
+    _measure(rotation, translation, intrinsics, segments, distances, depths)
     return distances, depths
 
 
@@ -80,7 +80,7 @@ def refine_pose(
     Large scales first let matches pull that are far off yet. Matches that determine no pose leave
     it where it was.
     """
-    rotation, translation = pose[0].copy(), pose[1].copy()
+    rotation, translation = map(np.ascontiguousarray, pose)
     matrix, vector = np.empty((POSE, POSE)), np.empty(POSE)
     for scale in scales:
         linearize(rotation, translation, intrinsics, segments, scale, matrix, vector)
@@ -162,7 +162,7 @@ def _measure(
             depths[i] = 1.0 / ((1.0 - foot.share) / foot.near[2] + foot.share / foot.far[2])
 
 
-@_kernel
+@_helper
 def _nearest(
     i: int, rotation: Float64, translation: Float64, intrinsics: Float64, segments: Segments
 ) -> _Foot:
@@ -188,7 +188,7 @@ def _nearest(
     return _Foot(True, near, near_q, far, far_q, share, du, dv, au, av)
 
 
-@_kernel
+@_helper
 def _rotated(rotation: Float64, x: float, y: float, z: float) -> tuple[float, float, float]:
     return (
         rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
@@ -197,7 +197,7 @@ def _rotated(rotation: Float64, x: float, y: float, z: float) -> tuple[float, fl
     )
 
 
-@_kernel
+@_helper
 def _differentiate(
     point: tuple[float, float, float],
     rotated: tuple[float, float, float],

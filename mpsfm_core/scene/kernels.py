@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from mpsfm_core import jit
 from mpsfm_core.data import Float64, Int64
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@jit.kernel()
 def sorted_by_point(point_of: Int64, num_points: int) -> Int64:
     """Keypoints that observe a point, sorted by point, then keypoint (counting sort).
 
@@ -30,7 +30,7 @@ def sorted_by_point(point_of: Int64, num_points: int) -> Int64:
     return keypoints
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@jit.kernel()
 def max_triangulation_angles(
     points: Float64, observation_points: Int64, centers: Float64
 ) -> Float64:

@@ -1,0 +1,140 @@
+"""Steps of the extraction on workers elsewhere: they leave what they find in the shared cache.
+
+A worker makes its own providers from the configuration and the plugins that are installed there,
+and does to an item what a thread of this process would do; this process then finds the result in
+the cache.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+import uuid
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from mpsfm_core.config import Config
+from mpsfm_core.errors import ConfigError, InputError, did_you_mean
+from mpsfm_core.extraction.backends import thread_count
+from mpsfm_core.extraction.cache import content_key
+from mpsfm_core.extraction.events import Silent
+from mpsfm_core.extraction.features import FeatureTable
+from mpsfm_core.extraction.matching import PairMatcher
+from mpsfm_core.extraction.predictions import Predictions
+from mpsfm_core.extraction.selection import PairSelection
+from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.first_party import EXECUTORS
+from mpsfm_core.inputs.images import ImageSet
+from mpsfm_core.providers import Executor
+from mpsfm_core.registry import Registry
+
+THREADS = "threads"
+
+
+@contextmanager
+def workers_elsewhere(bench: Workbench) -> Iterator[None]:
+    """While this lasts, the stages that the executor's workers can do are done there first.
+
+    Raises :class:`ConfigError` when no plugin brings the executor, or its workers cannot be had.
+    """
+    executor = _executor(bench)
+    if executor is None:
+        yield
+        return
+    bench.elsewhere = _Elsewhere(bench, executor)
+    try:
+        yield
+    finally:
+        executor.close()
+
+
+def _executor(bench: Workbench) -> Executor | None:
+    runtime = bench.config.runtime
+    name, options = runtime.executor, runtime.executor_options
+    if name == THREADS:
+        return None
+    found: Executor | None = bench.registry.hook.mpsfm_executor(name=name, options=options)
+    if found is None:
+        known = (THREADS, *EXECUTORS)
+        hint = (
+            f": pip install {EXECUTORS[name]}" if name in EXECUTORS else did_you_mean(name, known)
+        )
+        raise ConfigError(f"runtime.executor: no plugin brings {name!r}{hint}")
+    return found
+
+
+class _Elsewhere:
+    """The stages of a run that its executor's workers do."""
+
+    def __init__(self, bench: Workbench, executor: Executor) -> None:
+        runtime = bench.config.runtime.model_copy(update={"executor": THREADS})
+        config = bench.config.model_copy(update={"runtime": runtime})
+        self._step = Step(uuid.uuid4().hex, "", bench.images, config)
+        self._executor = executor
+        bench.cache.store(_MARK, content_key(self._step.run), np.array(True))
+
+    def __call__(self, stage: str, items: Sequence[Any]) -> Generator[None, None, None]:
+        """Run a stage; yields after each item."""
+        return self._executor.run(replace(self._step, stage=stage), items)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A stage, to be called with an item on any machine.
+
+    ``run``: names the run; a worker keeps its providers from step to step.
+    """
+
+    run: str
+    stage: str
+    images: ImageSet
+    config: Config
+
+    def __call__(self, item: Any) -> None:
+        with threadpool_limits(thread_count(self.config.runtime), user_api="blas"):
+            _station(self).work[self.stage](item)
+
+
+class _Station:
+    """What a worker has of a run: how each stage works on an item."""
+
+    def __init__(self, step: Step) -> None:
+        config = step.config
+        bench = Workbench(step.images, config, Registry.discover(), Silent())
+        if bench.cache.load(_MARK, content_key(step.run), np.ndarray) is None:
+            raise InputError(
+                f"the worker on {socket.gethostname()} does not see the cache {bench.cache.folder} "
+                f"of this run: set runtime.cache_dir to a folder that all machines share"
+            )
+        bench.take_masks()
+        table = None if config.features is None else FeatureTable(bench, config.features)
+        matcher = PairMatcher(bench, table)
+        priors = Predictions(bench, matcher, [])
+        self.work: dict[str, Callable[[Any], object]] = {
+            "masks": bench.mask,
+            "retrieval": PairSelection(bench, table).describe,
+            "matching": matcher.results,
+            "depth": priors.predicted,
+            "normals": priors.full_size,
+        }
+        if table is not None:
+            self.work["features"] = table.__getitem__
+
+
+_MARK = "run"
+_LOCK = threading.Lock()
+_STATIONS: dict[str, _Station] = {}
+
+
+def _station(step: Step) -> _Station:
+    """This process's own, of the latest run alone."""
+    with _LOCK:
+        if step.run not in _STATIONS:
+            _STATIONS.clear()
+            _STATIONS[step.run] = _Station(step)
+        return _STATIONS[step.run]

@@ -1,0 +1,19 @@
+"""Announces the executor ``dask``; imports Dask when it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from mpsfm_core import hookimpl
+from mpsfm_core.providers import Executor
+
+
+@hookimpl
+def mpsfm_executor(name: str, options: Mapping[str, Any]) -> Executor | None:
+    """The executor, connected to its workers."""
+    if name != "dask":
+        return None
+    from mpsfm_dask.executor import DaskExecutor
+
+    return DaskExecutor(options)

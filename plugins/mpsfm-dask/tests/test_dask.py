@@ -1,0 +1,46 @@
+"""The executor on a real cluster of several processes on this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from mpsfm_dask.executor import DaskExecutor
+
+from mpsfm_core.errors import ConfigError
+from mpsfm_core.testing import executors
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # of the cluster's own threads at its end
+
+
+@pytest.fixture(scope="module")
+def executor() -> Iterator[DaskExecutor]:
+    executor = DaskExecutor({"workers": 2})
+    yield executor
+    executor.close()
+
+
+def test_items(executor: DaskExecutor, tmp_path: Path) -> None:
+    executors.check_items(executor, tmp_path / "items")
+
+
+def test_errors(executor: DaskExecutor) -> None:
+    executors.check_errors(executor)
+
+
+def test_a_lost_worker_loses_nothing(executor: DaskExecutor, tmp_path: Path) -> None:
+    executors.check_lost_worker(executor, tmp_path / "items")
+
+
+def test_extraction(tmp_path: Path) -> None:
+    executors.check_extraction("dask", {"workers": 2}, tmp_path)
+
+
+def test_options() -> None:
+    executors.check_options(DaskExecutor)
+
+
+def test_no_cluster() -> None:
+    with pytest.raises(ConfigError, match="no Dask workers at"):
+        DaskExecutor({"address": "tcp://127.0.0.1:9", "timeout_s": 1})

@@ -1,0 +1,1 @@
+"""Runs the extraction on workers of Ray."""

@@ -1,0 +1,79 @@
+"""An executor on the workers of a Ray cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from typing import Any
+
+import ray
+from pydantic import Field
+
+from mpsfm_core.errors import ConfigError
+from mpsfm_core.options import Options, SettingsError, parse_settings
+
+MAX_TASKS = 50_000
+"""Beyond, a task has several items (our choice)."""
+
+
+class RayOptions(Options):
+    """Where the workers are."""
+
+    address: str | None = None
+    """Of the cluster, ``auto`` or ``ray://HOST:10001``; null starts workers on this machine."""
+    workers: int | None = Field(None, ge=1)
+    """On this machine: processes, null for one a core."""
+
+
+class RayExecutor:
+    """Puts a stage's step into the object store once, and runs the items as tasks."""
+
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        """Raises ConfigError when options are wrong or the cluster does not answer."""
+        try:
+            checked = parse_settings(RayOptions, options, ("runtime", "executor_options"))
+        except SettingsError as error:
+            raise ConfigError(str(error)) from error
+        self._own = not ray.is_initialized()
+        if not self._own:
+            return
+        local = {"num_cpus": checked.workers, "include_dashboard": False}
+        try:
+            ray.init(
+                address=checked.address or "local",
+                log_to_driver=False,
+                **(local if checked.address is None else {}),
+            )
+        except (OSError, RuntimeError, ValueError) as error:
+            where = checked.address or "this machine"
+            raise ConfigError(f"no Ray workers at {where}: {error}") from error
+
+    def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
+        """As :meth:`mpsfm_core.providers.Executor.run`."""
+        size = 1 + len(items) // MAX_TASKS
+        parts = [list(items[n : n + size]) for n in range(0, len(items), size)]
+        shared = ray.put(step)
+        waiting = {_work.remote(shared, part): len(part) for part in parts}
+        try:
+            while waiting:
+                done, _ = ray.wait(list(waiting))
+                for reference in done:
+                    try:
+                        ray.get(reference)
+                    except ray.exceptions.RayTaskError as error:
+                        raise error.cause from None
+                    for _ in range(waiting.pop(reference)):
+                        yield
+        finally:
+            for reference in waiting:
+                ray.cancel(reference)
+
+    def close(self) -> None:
+        """End the connection, and the workers that were started for it."""
+        if self._own:
+            ray.shutdown()
+
+
+@ray.remote(max_retries=3)
+def _work(step: Callable[[Any], None], items: list[Any]) -> None:
+    for item in items:
+        step(item)

@@ -1,0 +1,42 @@
+"""The executor on a real cluster of several processes on this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mpsfm_core.testing import executors
+
+pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
+from mpsfm_ray.executor import RayExecutor
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # of the cluster's own threads at its end
+
+
+@pytest.fixture(scope="module")
+def executor() -> Iterator[RayExecutor]:
+    executor = RayExecutor({"workers": 2})
+    yield executor
+    executor.close()
+
+
+def test_items(executor: RayExecutor, tmp_path: Path) -> None:
+    executors.check_items(executor, tmp_path / "items")
+
+
+def test_errors(executor: RayExecutor) -> None:
+    executors.check_errors(executor)
+
+
+def test_a_lost_worker_loses_nothing(executor: RayExecutor, tmp_path: Path) -> None:
+    executors.check_lost_worker(executor, tmp_path / "items")
+
+
+def test_extraction(tmp_path: Path) -> None:
+    executors.check_extraction("ray", {"workers": 2}, tmp_path)
+
+
+def test_options() -> None:
+    executors.check_options(RayExecutor)

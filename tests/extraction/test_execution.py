@@ -1,0 +1,150 @@
+"""Stages of the extraction on workers elsewhere, here of an executor in this process.
+
+Real clusters are in the tests of mpsfm-dask and mpsfm-ray.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Generator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+
+from mpsfm_core import hookimpl
+from mpsfm_core.config import Config, RuntimeOptions
+from mpsfm_core.data import DataError, PinholeCamera
+from mpsfm_core.errors import ConfigError, InputError, ProviderOutputError, ReconstructionError
+from mpsfm_core.extraction.execution import Step
+from mpsfm_core.extraction.runner import Extraction, extract
+from mpsfm_core.inputs.images import load_images
+from mpsfm_core.options import Backend
+from mpsfm_core.registry import Registry
+from mpsfm_core.testing.case import difference
+from mpsfm_core.testing.scenes import arc_poses, room_scene
+
+CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
+
+
+class Pickled:
+    """Does a step as another process would: from its pickle."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, int] = {}
+        self.closed = False
+        self.another_cache: Path | None = None
+
+    def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
+        arrived = pickle.loads(pickle.dumps(step))
+        assert isinstance(arrived, Step)
+        self.stages[arrived.stage] = len(items)
+        if self.another_cache is not None:
+            runtime = arrived.config.runtime.model_copy(update={"cache_dir": self.another_cache})
+            config = arrived.config.model_copy(update={"runtime": runtime})
+            arrived = Step(arrived.run, arrived.stage, arrived.images, config)
+        for item in items:
+            arrived(item)
+            yield
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Plugin:
+    def __init__(self) -> None:
+        self.executor = Pickled()
+
+    @hookimpl
+    def mpsfm_executor(self, name: str, options: Mapping[str, Any]) -> Pickled | None:
+        return self.executor if name == "pickled" else None
+
+
+@pytest.fixture
+def plugin() -> Plugin:
+    return Plugin()
+
+
+@pytest.fixture
+def run(tmp_path: Path, plugin: Plugin) -> Callable[..., Extraction]:
+    (tmp_path / "photos").mkdir()
+    for number, pose in enumerate(arc_poses(3, 10.0)):
+        rgb = room_scene().render(CAMERA, pose).rgb
+        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), rgb[..., ::-1])
+    registry = Registry.discover()
+    registry.register(plugin, name="pickled")
+
+    def run(executor: str, **changes: Any) -> Extraction:
+        runtime = RuntimeOptions(cache_dir=tmp_path / executor, workers=2, executor=executor)
+        values: dict[str, Any] = {
+            "features": Backend(use="sift"),
+            "matcher": Backend(use="mutual-nearest"),
+            "depth": Backend(use="flat"),
+            "normals": Backend(use="from-depth"),
+            "runtime": runtime,
+        }
+        images = load_images(tmp_path / "photos")
+        return extract(images, Config(**values | changes), registry)
+
+    return run
+
+
+def test_results_are_those_of_threads(run: Callable[..., Extraction], plugin: Plugin) -> None:
+    here, there = run("threads"), run("pickled")
+    assert not difference(here.problem, there.problem)
+    executor = plugin.executor
+    assert executor.stages["features"] == 3 and executor.stages["matching"] == 3
+    assert executor.closed
+    assert all(line["computed"] == 0 for line in there.report["providers"] if line["from_cache"])
+
+
+def test_masks_and_retrieval(run: Callable[..., Extraction], plugin: Plugin) -> None:
+    changes = {
+        "masks": (Backend(use="sky-simple"),),
+        "retrieval": Backend(use="appearance"),
+        "pairs": {"mode": "retrieval", "top_k": 1},
+    }
+    here, there = run("threads", **changes), run("pickled", **changes)
+    assert not difference(here.problem, there.problem)
+    assert plugin.executor.stages["masks"] == plugin.executor.stages["retrieval"] == 3
+
+
+def test_a_cache_that_is_not_shared(
+    run: Callable[..., Extraction], plugin: Plugin, tmp_path: Path
+) -> None:
+    plugin.executor.another_cache = tmp_path / "elsewhere"
+    with pytest.raises(InputError, match=r"does not see the cache .*runtime\.cache_dir"):
+        run("pickled")
+    assert plugin.executor.closed
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"), [("dask", "pip install mpsfm-dask"), ("thread", "did you mean 'threads'")]
+)
+def test_no_such_executor(
+    run: Callable[..., Extraction], monkeypatch: pytest.MonkeyPatch, name: str, hint: str
+) -> None:
+    monkeypatch.setattr(Registry, "hook", _NoHook())
+    with pytest.raises(ConfigError, match=hint):
+        run(name)
+
+
+class _NoHook:
+    @staticmethod
+    def mpsfm_executor(name: str, options: Mapping[str, Any]) -> None:
+        return None
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        DataError("depth", "is NaN"),
+        ProviderOutputError("name", "photo.jpg", "depth", "is NaN"),
+        ReconstructionError("none", {"status": "failed"}),
+    ],
+)
+def test_errors_come_from_other_processes_as_they_were(error: Exception) -> None:
+    arrived = pickle.loads(pickle.dumps(error))
+    assert type(arrived) is type(error) and str(arrived) == str(error)
+    assert vars(arrived) == vars(error)

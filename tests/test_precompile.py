@@ -1,0 +1,58 @@
+"""Kernels are compiled once, in the background, and work where nothing can be kept on disk."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba.core.caching
+import pytest
+
+from mpsfm_core import jit
+from mpsfm_core.precompile import Compilation
+
+MAPS_WITHOUT_COMPILING = """
+from numba.core import event
+from mpsfm_core.precompile import begin, compile_kernels
+assert begin() is None
+with event.install_recorder("numba:compile") as compiled:
+    compile_kernels("bundles")
+assert not compiled.buffer, compiled.buffer
+"""
+
+
+def finished(code: int) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", f"raise SystemExit({code})"])
+
+
+def test_what_failed_is_tried_again(tmp_path: Path) -> None:
+    stamp = tmp_path / "stamp"
+    Compilation((finished(0), finished(1)), stamp).wait()
+    assert not stamp.exists()
+    Compilation((finished(0), finished(0)), stamp).wait()
+    assert stamp.exists()
+
+
+def test_a_kernel_works_where_nothing_can_be_kept(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
+    jit._warn.cache_clear()
+
+    @jit.kernel()
+    def double(x: float) -> float:
+        return 2.0 * x
+
+    with caplog.at_level(logging.WARNING):
+        assert double(21.0) == 42.0
+    assert "NUMBA_CACHE_DIR" in caplog.text
+
+
+@pytest.mark.slow
+def test_all_that_mapping_needs_is_compiled_before(tmp_path: Path) -> None:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    subprocess.run([sys.executable, "-m", "mpsfm_core.precompile"], env=environment, check=True)
+    subprocess.run([sys.executable, "-c", MAPS_WITHOUT_COMPILING], env=environment, check=True)
