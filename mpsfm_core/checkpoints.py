@@ -24,7 +24,7 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.extraction.cache import cache_folder, content_key
 from mpsfm_core.files import remove_unfinished, write_file
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.state import Frozen, freeze
+from mpsfm_core.mapping.state import Frozen, fingerprint
 from mpsfm_core.registry import core_version
 from mpsfm_core.stages import Stages
 
@@ -57,7 +57,7 @@ class DiskCheckpoints:
         every_s: float,
     ) -> None:
         self._folder = cache_folder(cache_dir) / "mapping"
-        self._path = self._folder / f"{_problem_key(problem, options)}.npz"
+        self._path = self._folder / f"{fingerprint((problem, options))}.npz"
         self._stages = stages
         self._every_s = self._wait_s = every_s
         self._total = len(problem.images)
@@ -141,12 +141,3 @@ def code_key() -> str:
             found.update(f"{file.relative_to(package)}\n".encode() + file.read_bytes())
     versions = [metadata.version(name) for name in _LIBRARIES]
     return content_key(FORMAT, found.hexdigest(), versions, platform.machine())
-
-
-def _problem_key(problem: MappingProblem, options: MapperOptions) -> str:
-    """SHA-256 of all that the mapper is given."""
-    found = hashlib.sha256()
-    for name, array in freeze((problem, options)).items():
-        found.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        found.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
-    return found.hexdigest()

@@ -18,6 +18,7 @@ from mpsfm_core.mapping.initialization import Starts
 from mpsfm_core.mapping.journal import Journal
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.runs import Run, explained_shares, settled, with_all_times
+from mpsfm_core.mapping.state import canonical
 from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction
 
 CONTENDER_SHARE = 0.25
@@ -39,6 +40,7 @@ def reconstruct(
     ``checkpoints``.
     """
     options, events = options or MapperOptions(), events or Silent()
+    problem = canonical(problem)
     keeper = Keeper(checkpoints, problem, events)
     runs, unfinished = keeper.load()
     for number in range(len(runs), options.max_runs):

@@ -8,12 +8,13 @@ only data of the classes of the numerics comes back.
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import json
 from collections import Counter, OrderedDict, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sized
 from enum import Enum
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ from mpsfm_core.errors import DataError
 
 Frozen: TypeAlias = Mapping[str, NDArray[Any]]
 """The arrays of a state by name; ``tree`` says how they belong together."""
+
+T = TypeVar("T")
 
 FORMAT = 1
 """Raised when the meaning of frozen states changes."""
@@ -70,7 +73,9 @@ class _Writer:
 
     def __init__(self, shared: object) -> None:
         self.arrays: dict[str, NDArray[Any]] = {}
-        self._shared = {id(found): number for number, found in enumerate(_parts(shared))}
+        self._shared: dict[int, int] = {}
+        for number, found in enumerate(_parts(shared)):
+            self._shared.setdefault(id(found), number)
         self._met: dict[int, int] = {}
         self._alive: list[object] = [shared]  # so that no number is given to two objects
 
@@ -78,7 +83,7 @@ class _Writer:
         """The description of a value, as JSON has it."""
         if value is None or type(value) in _PLAIN:
             return value
-        if id(value) in self._shared:
+        if id(value) in self._shared:  # after plain values, which are one by chance
             return {"shared": self._shared[id(value)]}
         if id(value) in self._met:
             return {"met": self._met[id(value)]}
@@ -257,24 +262,60 @@ class _Reader:
         return made
 
 
-def _parts(value: object, met: set[int] | None = None) -> Iterator[object]:
-    """All objects of a tree of data classes, sequences and arrays, in a fixed order."""
-    met = set() if met is None else met
-    if value is None or type(value) in _PLAIN or id(value) in met:
-        return
-    met.add(id(value))
-    yield value
+def fingerprint(value: object) -> str:
+    """SHA-256 of the values in a tree of data classes, options, sequences and arrays.
+
+    How arrays lie in memory, and which are one, does not count.
+    """
+    found = hashlib.sha256()
+    for part in _parts(value):
+        if isinstance(part, np.ndarray):
+            found.update(f"{part.dtype.str}{part.shape}".encode())
+            found.update(np.ascontiguousarray(part).reshape(-1).view(np.uint8).data)
+        else:
+            plain = part is None or isinstance(part, (*_PLAIN, Enum))
+            size = len(part) if isinstance(part, Sized) else ""
+            found.update(f"{_path(type(part))}{part if plain else size};".encode())
+    return found.hexdigest()
+
+
+def canonical(value: T) -> T:
+    """The same data with every array in C order and in memory of its own.
+
+    Results of sums and products depend, in the last bit, on how their arrays lie in memory, and a
+    problem whose parts come from the cache may differ there from one that was just computed.
+    """
+    made: Any = value
     if isinstance(value, np.ndarray):
-        yield from _parts(value.base, met) if isinstance(value.base, np.ndarray) else ()
-    elif isinstance(value, (tuple, list)):
+        if value.base is not None or not value.flags.c_contiguous:
+            made = np.array(value, order="C")
+            made.flags.writeable = value.flags.writeable
+    elif isinstance(value, tuple):
+        items = [canonical(item) for item in value]
+        if any(new is not old for new, old in zip(items, value, strict=True)):
+            made = type(value)._make(items) if hasattr(value, "_make") else tuple(items)
+    elif _is_ours(type(value)) and not isinstance(value, (BaseModel, Enum)):
+        attributes = {name: canonical(item) for name, item in _attributes(value)}
+        if any(item is not getattr(value, name) for name, item in attributes.items()):
+            made = object.__new__(type(value))
+            for name, item in attributes.items():
+                object.__setattr__(made, name, item)
+    return cast(T, made)
+
+
+def _parts(value: object) -> Iterator[object]:
+    """All there is in a tree, in a fixed order; twice what stands in two places."""
+    yield value
+    if isinstance(value, (tuple, list)):
         for item in value:
-            yield from _parts(item, met)
+            yield from _parts(item)
     elif isinstance(value, Mapping):
-        for item in value.values():
-            yield from _parts(item, met)
-    elif _is_ours(type(value)):
+        for key, item in value.items():
+            yield key
+            yield from _parts(item)
+    elif _is_ours(type(value)) and not isinstance(value, Enum):
         for _, item in _attributes(value):
-            yield from _parts(item, met)
+            yield from _parts(item)
 
 
 def _attributes(value: Any) -> Iterator[tuple[str, Any]]:

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.data import DepthPrior, MappingProblem, PinholeCamera
 from mpsfm_core.errors import DataError
 from mpsfm_core.mapping.events import Silent
 from mpsfm_core.mapping.mapper import Mapper, reconstruct
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.state import Frozen, freeze, thaw
+from mpsfm_core.mapping.state import Frozen, canonical, fingerprint, freeze, thaw
 from mpsfm_core.scene.reconstruction import MappingResult
 from mpsfm_core.testing.problems import Noise, mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
@@ -72,7 +72,7 @@ def problem() -> MappingProblem:
         room_scene(), CAMERA, arc_poses(6, 14.0), noise=noise, points_per_view=80, map_width=48
     )
     apart = tuple(p for p in whole.pairs if (p.image_a < 3) == (p.image_b < 3))
-    return MappingProblem(whole.images, apart)
+    return canonical(MappingProblem(whole.images, apart))
 
 
 OPTIONS = MapperOptions(max_runs=2, enough_explained=1.0)
@@ -151,6 +151,36 @@ def test_what_cannot_be_kept_is_named_with_its_place(problem: MappingProblem) ->
     mapper.journal._seconds["lock"] = threading.Lock()
     with pytest.raises(TypeError, match=r"state\.journal\._seconds\['lock'\]: a _thread\.lock"):
         freeze(mapper, (problem, mapper.journal._events))
+
+
+def moved(array: np.ndarray) -> np.ndarray:
+    """The same values elsewhere: a view, in Fortran's order."""
+    return np.asfortranarray(np.stack([array, array]))[0]
+
+
+def test_how_a_problem_lies_in_memory_does_not_count(problem: MappingProblem, undisturbed) -> None:
+    result, states = undisturbed
+    images = tuple(
+        replace(
+            image,
+            keypoints=moved(image.keypoints),
+            depth=DepthPrior(
+                *map(moved, (image.depth.depth, image.depth.variance, image.depth.valid)),
+                metric=image.depth.metric,
+            ),
+        )
+        for image in problem.images
+    )
+    other = MappingProblem(images, problem.pairs)
+    assert not same(freeze(other), freeze(problem))
+    assert fingerprint(other) == fingerprint(problem) == fingerprint(canonical(other))
+    assert same(freeze(canonical(other)), freeze(canonical(problem)))
+    assert canonical(canonical(other).images[0]) is not images[0]
+    memory = Memory(states[: len(states) // 2], -1)
+    again = reconstruct(other, OPTIONS, checkpoints=memory)
+    assert same(content(again, other), content(result, problem))
+    fewer = MappingProblem(problem.images, problem.pairs[1:])
+    assert fingerprint(fewer) != fingerprint(problem)
 
 
 def test_options_come_back(problem: MappingProblem) -> None:

@@ -1,0 +1,69 @@
+"""Runs a small reconstruction again and again, disturbed in another place each time.
+
+A process of its own, with ``failing_calls`` loaded: everything is imported and compiled once, and
+each run is a fork of it. Reads a line of JSON for each run from stdin and answers with one.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import sys
+import traceback
+from pathlib import Path
+from typing import Any
+
+_LIMIT_S = 120
+
+
+def disturbed(request: dict[str, Any]) -> dict[str, Any]:
+    """Run once in a fork; says how it ended: signal, or the error's class and message."""
+    report = Path(request["report"])
+    report.unlink(missing_ok=True)
+    child = os.fork()
+    if child == 0:
+        signal.alarm(_LIMIT_S)
+        _reconstruct(request, report)
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    if os.WIFSIGNALED(status):
+        return {"signal": os.WTERMSIG(status)}
+    return dict(json.loads(report.read_text()))
+
+
+def _reconstruct(request: dict[str, Any], report: Path) -> None:
+    from mpsfm_core import errors, pipeline
+
+    shim = ctypes.CDLL(None)
+    shim.counted.restype = ctypes.c_long
+    number = ctypes.c_long(request.get("number", -1))
+    folder = request["folder"].encode()
+    ended: dict[str, Any] = {"error": None, "expected": True}
+    try:
+        shim.arm(folder, number, request.get("errno", 0), request.get("lasting", 0))
+        pipeline.reconstruct(
+            request["images"], request["output"], request["config"],
+            intrinsics=request["intrinsics"],
+        )  # fmt: skip
+    except BaseException as error:
+        ended = {"error": f"{type(error).__name__}: {error}", "trace": traceback.format_exc()}
+        ended["expected"] = isinstance(error, (errors.MpsfmError, KeyboardInterrupt))
+    calls = shim.counted()
+    shim.arm(b"", ctypes.c_long(-1), 0, 0)
+    report.write_text(json.dumps({**ended, "calls": calls}))
+
+
+def main() -> None:
+    """Answer requests until there are no more; the first warms everything up in this process."""
+    _reconstruct(json.loads(sys.stdin.readline()), Path(os.devnull))
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    for line in sys.stdin:
+        sys.stdout.write(json.dumps(disturbed(json.loads(line))) + "\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

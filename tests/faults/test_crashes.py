@@ -1,0 +1,84 @@
+"""Nothing is lost, whatever ends a run: killed, or failed by the disk, at any call that writes."""
+
+from __future__ import annotations
+
+import errno
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from .conftest import Scene, content
+
+KILLS, FAULTS = 120, 120
+QUICK = 6
+ERRORS = (errno.ENOSPC, errno.EIO, errno.EACCES, errno.EROFS, errno.EMFILE)
+
+
+def points(scene: Scene, count: int, seed: int) -> list[int]:
+    """Calls to strike, spread over all of a run, the same each time."""
+    rng = np.random.default_rng(seed)
+    edges = np.linspace(0, scene.calls, count + 1).astype(int)
+    return [int(rng.integers(first, max(first + 1, end))) for first, end in pairwise(edges)]
+
+
+def check_intact(scene: Scene, what: object) -> None:
+    """Earlier results or new ones, never a mixture; what is only half exchanged says so."""
+    found = content(scene.output)
+    scratch = {name for name in found if name.startswith(".mpsfm-")}
+    visible = {name: value for name, value in found.items() if name not in scratch}
+    assert "notes.txt" in visible
+    if any(name.endswith("ready.json") for name in scratch):
+        return  # amid the exchange: the next run finishes it
+    assert visible in (scene.earlier, {**scene.whole}), what
+
+
+def check_next_run(scene: Scene, what: object) -> None:
+    scene.age()
+    ended = scene.run()
+    assert ended.get("error", "killed") is None, (what, ended)
+    assert content(scene.output) == scene.whole, what
+    assert scene.leftovers() == [], what
+
+
+def killed(scene: Scene, number: int) -> None:
+    scene.reset()
+    ended = scene.run(number=number)
+    assert ended.get("signal") == 9 or ended["calls"] <= number, ended
+    check_intact(scene, number)
+    check_next_run(scene, number)
+
+
+def failed(scene: Scene, number: int, error: int, lasting: bool) -> None:
+    what = number, errno.errorcode[error], lasting
+    scene.reset()
+    ended = scene.run(number=number, errno=error, lasting=int(lasting))
+    assert ended.get("expected"), (what, ended)
+    check_intact(scene, what)
+    if ended["error"] is None:
+        visible = {k: v for k, v in content(scene.output).items() if not k.startswith(".mpsfm")}
+        assert visible == scene.whole, what
+    check_next_run(scene, what)
+
+
+def test_killed_at_a_few_calls(scene: Scene) -> None:
+    for number in points(scene, QUICK, 0):
+        killed(scene, number)
+
+
+@pytest.mark.slow
+def test_killed_at_many_calls(scene: Scene) -> None:
+    for number in points(scene, KILLS, 1):
+        killed(scene, number)
+
+
+def test_a_few_failing_calls(scene: Scene) -> None:
+    for number, error in zip(points(scene, QUICK, 2), ERRORS * 2, strict=False):
+        failed(scene, number, error, error == errno.ENOSPC)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", ERRORS, ids=errno.errorcode.get)
+def test_many_failing_calls(scene: Scene, error: int) -> None:
+    for turn, number in enumerate(points(scene, FAULTS // len(ERRORS), 3 + error)):
+        failed(scene, number, error, turn % 2 == 0)
