@@ -13,7 +13,7 @@ import json
 import logging
 import platform
 import time
-import zipfile
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any, cast
@@ -21,6 +21,7 @@ from typing import Any, cast
 import numpy as np
 
 from mpsfm_core.data import MappingProblem
+from mpsfm_core.errors import DataError
 from mpsfm_core.extraction.cache import cache_folder, content_key
 from mpsfm_core.files import remove_unfinished, write_file
 from mpsfm_core.mapping.options import MapperOptions
@@ -74,11 +75,9 @@ class DiskCheckpoints:
         if not self._path.is_file():
             return None
         try:
-            with self._path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-            header = json.loads(arrays.pop(_HEADER).tobytes())
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            self.unreadable(f"it is damaged ({error})")
+            header, arrays = read_checkpoint(self._path)
+        except DataError as error:
+            self.unreadable(str(error))
             return None
         if header.get("code") != code_key():
             self.unreadable(f"it is of other code ({header.get('version')}, format or libraries)")
@@ -128,6 +127,20 @@ class DiskCheckpoints:
         for path in self._folder.glob("*.npz"):
             if time.time() - path.stat().st_mtime > _KEPT_S:
                 path.unlink(missing_ok=True)
+
+
+def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], Frozen]:
+    """Header and state of a file; raises :class:`DataError` when it is damaged."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        header = json.loads(arrays.pop(_HEADER).tobytes())
+        missing = {"code", "version", "registered", "time"} - header.keys()
+        if missing:
+            raise ValueError(f"no {', '.join(missing)}")
+    except Exception as error:  # zip, numpy and json readers share no base class
+        raise DataError("checkpoint", f"it is damaged ({error})") from error
+    return header, arrays
 
 
 @functools.cache

@@ -62,6 +62,12 @@ class RuntimeOptions(Options):
     a plugin reaches (``dask``, ``ray``) and that share ``cache_dir`` and the photos."""
     executor_options: dict[str, Any] = Field(default_factory=dict)
     """Of the executor, as ``address``."""
+    on_error: Literal["fail", "skip"] = "fail"
+    """A provider that fails on a photo (raises, breaks its contract, does not answer) ends the run,
+    or the run goes on without that photo, or without that pair, and says so. More than half of the
+    photos end it in any case."""
+    timeout_s: float | None = Field(1800.0, gt=0)
+    """Seconds that a provider may take for one photo or pair, null for any time."""
     checkpoint_s: float | None = Field(60.0, ge=0)
     """Seconds between checkpoints of the mapping, more where writing one takes long; a run that
     was killed goes on from the last. Null writes none."""

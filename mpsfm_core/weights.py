@@ -33,7 +33,7 @@ import urllib.parse
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import platformdirs
 from filelock import FileLock
@@ -217,8 +217,16 @@ class WeightStore:
         record = self._record_path
         if not record.is_file():
             return {}
-        entries: dict[str, dict[str, Any]] = json.loads(record.read_text(encoding="utf-8"))
-        return entries
+        try:
+            entries = json.loads(record.read_text(encoding="utf-8"))
+            if not all(isinstance(entry, dict) for entry in entries.values()):
+                raise ValueError("not a record for each file")
+        except (ValueError, AttributeError, RecursionError) as error:
+            raise WeightsError(
+                f"{record} is damaged ({error}): remove it; what was downloaded is then compared "
+                f"with the hash of its plugin, or fetched again"
+            ) from error
+        return cast(dict[str, dict[str, Any]], entries)
 
     def _record(self, uri: str, path: Path, sha256: str) -> None:
         record = self._record_path

@@ -60,6 +60,8 @@ def parse_yaml(text: str, source: str) -> Any:
         raise ConfigError(f"{source}{line}: not valid YAML: {error.problem}") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{source}: not valid YAML: {error}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{source}: is nested too deeply") from error
 
 
 def write_yaml(value: Any) -> str:

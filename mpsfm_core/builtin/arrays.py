@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import io
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +48,10 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
             arrays = {main: _read_exr(path)}
         else:
             arrays = {main: _read_image(path)}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} cannot be read: {error}") from error
+    except InputError:
+        raise
+    except Exception as error:  # readers of damaged files raise what their parsers raise
+        raise InputError(f"{path} cannot be read: {type(error).__name__}: {error}") from error
     if main not in arrays:
         raise InputError(f"{path} has no array {main!r}, it has {', '.join(arrays) or 'none'}")
     return arrays

@@ -147,6 +147,10 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
             _row("warning", f"{finding.title}: {finding.text}")
     for name, reason in images["unconfirmed"].items():
         _row("guessed", f"not confirmed: {name}: {reason}")
+    for name, reason in images["left_out"].items():
+        _row("missing", f"left out: {name}: {reason}")
+    for name, reason in images["failed"].items():
+        _row("missing", f"a provider failed: {name}: {reason}")
     for name, reason in images["unregistered"].items():
         _row("missing", f"not registered: {name}: {reason}")
     if (output / "report.html").is_file():

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
-import pycolmap
-
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.overlap import Overlap, overlap_from_depth, overlap_from_model
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.sampling import SamplingOptions, sample_buckets
 from mpsfm_core.evaluation.scene_folder import TESTSETS, SceneFolder, read_scene, write_sets
 from mpsfm_core.inputs.images import load_images
+from mpsfm_core.inputs.models import read_model
 from mpsfm_core.inputs.options import InputOptions
 
 SOURCES = ("auto", "depth", "model")
@@ -63,7 +62,7 @@ def _from_depth(scene: SceneFolder) -> Overlap:
 
 
 def _from_model(scene: SceneFolder) -> Overlap:
-    model = pycolmap.Reconstruction(str(scene.path / "gt"))
+    model = read_model(scene.path / "gt")
     if not model.num_points3D():
         raise InputError(f"{scene.path / 'gt'}: the model has no points to measure overlap with")
     return overlap_from_model(model, sorted(scene.truth))

@@ -82,7 +82,7 @@ def read_ply(path: Path) -> Float64:
         end = data.index(b"end_header")
         start = data.index(b"\n", end) + 1
         return _vertices(data[:end].decode("ascii").splitlines(), data[start:])
-    except (OSError, ValueError, KeyError, UnicodeDecodeError) as error:
+    except (OSError, ValueError, LookupError, StopIteration) as error:
         raise InputError(f"{path}: not a readable PLY file: {error}") from error
 
 

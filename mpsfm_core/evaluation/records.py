@@ -87,7 +87,7 @@ def read_record(path: Path) -> Record:
         content["others"] = [_unpacked(model) for model in content["others"]]
         content["truth"] = _unpacked(content["truth"])
         return Record(**content)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{path}: no record of a benchmark: {error}") from error
 
 

@@ -129,7 +129,7 @@ def _read_sets(file: Path) -> Iterator[tuple[str, int, list[str]]]:
     try:
         # The base loader leaves all scalars texts: a stem such as 0008 is no number.
         content = yaml.load(file.read_text(encoding="utf-8"), Loader=yaml.BaseLoader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{file} cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise InputError(f"{file}: must map buckets to sets of images")

@@ -10,9 +10,10 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from mpsfm_core.config import RuntimeOptions
+from mpsfm_core.errors import ProviderRunError
 from mpsfm_core.options import Backend
 from mpsfm_core.providers import API_VERSION, Capability, Kind, ProviderContext, ProviderSpec
 from mpsfm_core.registry import Registry
@@ -81,11 +82,22 @@ class ActiveProvider:
         """How many threads may use it: one with a GPU."""
         return 1 if _device(self._runtime, self.spec) == "cuda" else worker_count(self._runtime)
 
-    def timed(self, key: str, compute: Callable[[Any], T]) -> T:
-        """Compute the result named ``key`` with this thread's instance, on the provider's clock."""
+    def timed(self, key: str, compute: Callable[[Any], T], timeout_s: float | None = None) -> T:
+        """Compute the result named ``key`` with this thread's instance, on the provider's clock.
+
+        Raises :class:`ProviderRunError` when it takes longer than ``timeout_s``. A thread cannot be
+        killed: it stays behind, and another instance answers from then on.
+        """
         provider = self.instance
         started = time.perf_counter()
-        result = compute(provider)
+        try:
+            result = within(timeout_s, lambda: compute(provider))
+        except TimeoutError as error:
+            del self._local.provider
+            raise ProviderRunError(
+                f"provider {self.spec.name!r}: no answer within {timeout_s:g} s; raise "
+                f"runtime.timeout_s if it is that slow"
+            ) from error
         seconds = time.perf_counter() - started
         with self._lock:
             self._known.add(key)
@@ -138,6 +150,29 @@ class ActiveProvider:
             self._local.provider = self._create()
         found = {uri: self._store.locate(uri) for uri in uris}
         return {uri: file_sha256(path) for uri, path in found.items() if path is not None}
+
+
+def within(seconds: float | None, compute: Callable[[], T]) -> T:
+    """The result of a computation; :class:`TimeoutError` when it is not there in time."""
+    if seconds is None:
+        return compute()
+    outcome: list[Any] = []
+
+    def work() -> None:
+        try:
+            outcome.append((compute(), None))
+        except BaseException as error:
+            outcome.append((None, error))
+
+    thread = threading.Thread(target=work, name="mpsfm provider", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if not outcome:
+        raise TimeoutError
+    result, error = outcome[0]
+    if error is not None:
+        raise error
+    return cast(T, result)
 
 
 def worker_count(runtime: RuntimeOptions) -> int:

@@ -13,7 +13,6 @@ import io
 import json
 import logging
 import os
-import zipfile
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ import numpy as np
 import platformdirs
 from numpy.typing import NDArray
 
-from mpsfm_core.errors import DataError, OutputError
+from mpsfm_core.errors import OutputError
 from mpsfm_core.files import remove_unfinished, write_file
 from mpsfm_core.weights import CACHE_VARIABLE
 
@@ -34,8 +33,6 @@ Arrays = Mapping[str, NDArray[Any]]
 
 FORMAT = 1
 """Raised when the meaning of entries changes, which makes all old ones unreachable."""
-
-_DAMAGED = (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, DataError)
 
 
 class Cache:
@@ -64,7 +61,7 @@ class Cache:
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as archive:
                 return unpack(cls, {name: archive[name] for name in archive.files})
-        except _DAMAGED as error:
+        except Exception as error:  # readers of damaged files raise what their parsers raise
             _log.warning("cache entry %s is damaged (%s): computing it again", path, error)
             return None
 

@@ -53,7 +53,7 @@ class FeatureTable:
             return validation.run_features(self._provider.spec, instance, self._bench.view(index))
 
         inputs = self._bench.view_inputs(index, self._provider)
-        features = self._bench.result(self._provider, Features, inputs, compute)
+        features = self._bench.result(self._provider, Features, inputs, compute, [index])
         mask = self._bench.mask(index)
         if mask is None:
             return features

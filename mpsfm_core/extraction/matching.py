@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pycolmap
@@ -22,6 +22,7 @@ from mpsfm_core.extraction.backends import ActiveProvider
 from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.dense import NO_POINTS, PointMatches, sample, snap
 from mpsfm_core.extraction.features import FeatureTable
+from mpsfm_core.extraction.nothing import NOTHING
 from mpsfm_core.extraction.pairs import Pair
 from mpsfm_core.extraction.verification import CALIBRATED, TwoView, verify
 from mpsfm_core.extraction.workbench import Workbench
@@ -97,6 +98,8 @@ class PairMatcher:
 
     def _run(self, provider: ActiveProvider, pair: Pair) -> PairMatches:
         bench, table = self._bench, self._table
+        if bench.failed(pair):
+            return cast(PairMatches, NOTHING[PairMatches]())
 
         def compute(instance: Any) -> PairMatches:
             views = bench.view(pair[0]), bench.view(pair[1])
@@ -106,7 +109,7 @@ class PairMatcher:
         inputs: list[object] = [bench.view_inputs(index, provider) for index in pair]
         if table is not None and provider.can("sparse"):
             inputs += [table.key(index) for index in pair]
-        return bench.result(provider, PairMatches, inputs, compute)
+        return bench.result(provider, PairMatches, inputs, compute, pair)
 
     def _allowed(self, pair: Pair, dense: DenseMatches) -> DenseMatches:
         """The matches that no mask forbids."""

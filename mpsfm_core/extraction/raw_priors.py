@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 from mpsfm_core import validation
 from mpsfm_core.data import DepthPrior, NormalPrior
 from mpsfm_core.extraction.backends import ActiveProvider
 from mpsfm_core.extraction.cache import digest
+from mpsfm_core.extraction.nothing import JointPrior
 from mpsfm_core.extraction.workbench import Workbench
-
-
-@dataclass(frozen=True, eq=False)
-class JointPrior:
-    """Both priors of one pass of a network."""
-
-    depth: DepthPrior
-    normals: NormalPrior
 
 
 class RawPriors:
@@ -42,13 +34,13 @@ class RawPriors:
             def compute_both(instance: Any) -> JointPrior:
                 return JointPrior(*validation.run_joint(provider.spec, instance, bench.view(index)))
 
-            both = bench.result(provider, JointPrior, ["joint", *inputs], compute_both)
+            both = bench.result(provider, JointPrior, ["joint", *inputs], compute_both, [index])
             return both.depth, both.normals
 
         def compute(instance: Any) -> DepthPrior:
             return validation.run_depth(provider.spec, instance, bench.view(index))
 
-        return bench.result(provider, DepthPrior, inputs, compute), None
+        return bench.result(provider, DepthPrior, inputs, compute, [index]), None
 
     def predict_normals(self, index: int, depth: DepthPrior | None) -> NormalPrior:
         """Normals of an image by the normals provider; ``depth``: its calibrated depth, which a
@@ -62,7 +54,7 @@ class RawPriors:
         def compute(instance: Any) -> NormalPrior:
             return validation.run_normals(provider.spec, instance, bench.view(index), depth)
 
-        return bench.result(provider, NormalPrior, inputs, compute)
+        return bench.result(provider, NormalPrior, inputs, compute, [index])
 
 
 def _is_joint(bench: Workbench, depth: ActiveProvider) -> bool:

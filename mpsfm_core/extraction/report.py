@@ -34,6 +34,7 @@ def describe(
         "pairs_matched": len(candidates),
         "pairs_verified": len(problem.pairs),
         "pairs": pairs,
+        "failed": {names[index]: reason for index, reason in sorted(bench.failures.items())},
         "images": {image.name: _image(image) for image in problem.images},
         "providers": [_provider(provider) for provider in bench.providers],
     }

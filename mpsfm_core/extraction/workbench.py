@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from mpsfm_core import validation
 from mpsfm_core.config import Config
 from mpsfm_core.data import Bool, UInt8, View
+from mpsfm_core.errors import MpsfmError, ProviderOutputError, ProviderRunError
 from mpsfm_core.extraction.backends import ActiveProvider, worker_count
 from mpsfm_core.extraction.cache import Cache, content_key, digest
 from mpsfm_core.extraction.events import ExtractionEvents
+from mpsfm_core.extraction.nothing import NOTHING
 from mpsfm_core.extraction.parallel import run_stage
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.options import Backend
 from mpsfm_core.providers import Kind
 from mpsfm_core.registry import Registry
 
+_log = logging.getLogger(__name__)
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 class Workbench:
-    """Runs providers on views and keeps what they return."""
+    """Runs providers on views and keeps what they return.
+
+    ``failures``: images that the run goes on without -> what a provider failed with.
+    """
 
     def __init__(
         self, images: ImageSet, config: Config, registry: Registry, events: ExtractionEvents
@@ -35,6 +43,7 @@ class Workbench:
         self.registry = registry
         self.cache = Cache(config.runtime.cache_dir)
         self.providers: list[ActiveProvider] = []
+        self.failures: dict[int, str] = {}
         self._events = events
         self.elsewhere: Callable[[str, Sequence[Any]], Generator[None, None, None]] | None = None
         """Runs a stage on the workers of an executor, where there is one."""
@@ -71,18 +80,43 @@ class Workbench:
         cls: type[Result],
         inputs: Sequence[object],
         compute: Callable[[Any], Result],
+        images: Sequence[int] = (),
     ) -> Result:
-        """What a provider returns for inputs that plain data identifies: cached, or computed."""
+        """What a provider returns for inputs that plain data identifies: cached, or computed.
+
+        ``images``: those that it is about. Where ``runtime.on_error`` says so, a provider that
+        fails on one gives nothing for it, which is not cached.
+        """
         key = self.key(provider, inputs)
-        if provider.can("uncached"):
-            return provider.timed(key, compute)
-        found = self.cache.load(provider.kind, key, cls)
+        uncached = provider.can("uncached")
+        found = None if uncached else self.cache.load(provider.kind, key, cls)
         if found is not None:
             provider.count_cached(key)
             return found
-        value = provider.timed(key, compute)
-        self.cache.store(provider.kind, key, value)
+        try:
+            value = provider.timed(key, compute, self.config.runtime.timeout_s)
+        except (ProviderRunError, ProviderOutputError) as error:
+            if self.config.runtime.on_error == "fail" or cls not in NOTHING or not images:
+                raise
+            self._note_failure(images, error)
+            return cast(Result, NOTHING[cls]())
+        if not uncached:
+            self.cache.store(provider.kind, key, value)
         return value
+
+    def failed(self, images: Sequence[int]) -> bool:
+        """Whether a provider failed on one of the images: nothing more is asked about it."""
+        return any(index in self.failures for index in images)
+
+    def _note_failure(self, images: Sequence[int], error: MpsfmError) -> None:
+        """Remember it; raises the error once more than half of the images have failed."""
+        names = " and ".join(self.images[index].name for index in images)
+        _log.warning("%s goes on without it: %s", names, error)
+        if len(images) == 1:
+            self.failures[images[0]] = str(error)
+        if len(self.failures) > len(self.images) / 2:
+            count = f"{len(self.failures)} of {len(self.images)} photos failed"
+            raise ProviderRunError(f"{count}, the last so: {error}") from error
 
     def key(self, provider: ActiveProvider, inputs: Sequence[object]) -> str:
         """Names a result of a provider by all it depends on."""

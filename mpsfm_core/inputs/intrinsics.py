@@ -154,7 +154,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
 def _from_yaml(path: Path) -> tuple[CameraEntry, ...]:
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise InputError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, Mapping) or not data:
         raise InputError(f"{path}: expected numbered cameras, see the format in the documentation")

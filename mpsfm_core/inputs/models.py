@@ -10,6 +10,7 @@ import pycolmap
 
 from mpsfm_core.data import Pose
 from mpsfm_core.errors import InputError
+from mpsfm_core.inputs.colmap_files import check_binary_model
 from mpsfm_core.inputs.nerfstudio import read_transforms
 
 
@@ -30,8 +31,9 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         return read_transforms(path)
     folder = model_folder(path)
     try:
+        check_binary_model(folder)
         return pycolmap.Reconstruction(str(folder))
-    except (RuntimeError, ValueError, IndexError) as error:
+    except (OSError, RuntimeError, ValueError, IndexError) as error:
         raise InputError(f"{folder}: not a readable COLMAP model: {error}") from error
 
 

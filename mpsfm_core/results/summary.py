@@ -42,6 +42,7 @@ def describe_images(
         "unconfirmed": {name: reason for name, reason in reasons.items() if name in placed},
         "unregistered": {name: reason for name, reason in reasons.items() if name not in placed},
         "left_out": images.left_out,
+        "failed": extraction.get("failed", {}),
         "details": {
             image.name: {
                 **_focal_length(image, cameras.get(image.name)),

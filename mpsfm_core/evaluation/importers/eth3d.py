@@ -18,6 +18,7 @@ from mpsfm_core.data import Float32
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.importers.colmap_model import model_frames
 from mpsfm_core.evaluation.importers.frames import Frame, carried_depth, need
+from mpsfm_core.inputs.models import read_model
 
 
 def read_frames(source: Path) -> list[Frame]:
@@ -27,7 +28,7 @@ def read_frames(source: Path) -> list[Frame]:
     depth, original = source / "ground_truth_depth" / "dslr_images", source / "dslr_calibration_jpg"
     if not depth.is_dir():
         return frames
-    model = pycolmap.Reconstruction(str(need(original, "calibration of the depth maps")))
+    model = read_model(need(original, "calibration of the depth maps"))
     distorted = {Path(str(image.name)).name: image.camera for image in model.images.values()}
     return [_with_depth(frame, depth / frame.name, distorted.get(frame.name)) for frame in frames]
 

@@ -1,0 +1,52 @@
+"""What stands for the result of a provider that failed on a photo: it says nothing anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from mpsfm_core.data import (
+    DepthPrior,
+    Features,
+    NormalPrior,
+    PairMatches,
+    SparseMatches,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class JointPrior:
+    """Both priors of one pass of a network."""
+
+    depth: DepthPrior
+    normals: NormalPrior
+
+
+def _depth() -> DepthPrior:
+    zero = np.zeros((1, 1), dtype=np.float32)
+    return DepthPrior(zero, zero, np.zeros((1, 1), dtype=np.bool_))
+
+
+def _normals() -> NormalPrior:
+    zero = np.zeros((1, 1), dtype=np.float32)
+    return NormalPrior(np.zeros((1, 1, 3), np.float32), zero, np.zeros((1, 1), dtype=np.bool_))
+
+
+def _matches() -> PairMatches:
+    none = np.zeros(0, dtype=np.float32)
+    return PairMatches(SparseMatches(np.zeros((0, 2), dtype=np.int64), none))
+
+
+NOTHING: Mapping[type, Callable[[], object]] = MappingProxyType(
+    {
+        Features: lambda: Features(np.zeros((0, 2)), np.zeros((0, 0), dtype=np.float32)),
+        DepthPrior: _depth,
+        NormalPrior: _normals,
+        JointPrior: lambda: JointPrior(_depth(), _normals()),
+        PairMatches: _matches,
+    }
+)
+"""By the class of the result; masks and descriptions of whole images have no such value."""

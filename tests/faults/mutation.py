@@ -1,0 +1,127 @@
+"""Hostile copies of well-formed files, and processes in which they are read."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import signal
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from mpsfm_core.errors import MpsfmError
+
+LIMIT_S = 10
+"""A file that keeps a reader busy for longer hangs it."""
+MEMORY = 1 << 30
+"""Bytes that a reader may take for a file of some kilobytes, beside what the process had."""
+
+_TOKENS = (
+    *(b"0", b"-1", b"1e309", b"nan", b"99999999999999999999", b"18446744073709551615", b"1_0"),
+    *(
+        b"\x00",
+        b"\xff\xfe",
+        b"\xc3",
+        b"[" * 500,
+        b"{" * 500,
+        b"'",
+        b'"',
+        b"\n",
+        b"- ",
+        b"? ",
+        b"!!x",
+    ),
+    *(b"&a [*a]", b"../../../etc/passwd", b"*b", b"null", b"true", b"1:", b"%", b"\t"),
+    *(b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\xff" * 8),
+)
+
+Reader = Callable[[Path], object]
+
+
+def mutated(data: bytes, rng: random.Random) -> bytes:
+    """A file that differs in a few places: cut, overwritten, repeated, or with foreign tokens."""
+    kind = rng.randrange(6)
+    if kind == 0:
+        return data[: rng.randrange(len(data) + 1)]
+    made = bytearray(data)
+    for _ in range(rng.choice((1, 1, 2, 4, 16))):
+        place = rng.randrange(len(made) + 1)
+        if kind == 1 and place < len(made):
+            made[place] ^= 1 << rng.randrange(8)
+        elif kind == 2:
+            made[place : place + rng.randrange(1, 9)] = rng.randbytes(rng.randrange(9))
+        elif kind == 3:
+            start = rng.randrange(len(made) + 1)
+            made[place:place] = made[start : start + rng.randrange(1, 65)]
+        elif kind == 4:
+            token = rng.choice(_TOKENS)
+            made[place : place + rng.choice((0, len(token)))] = token
+        else:
+            del made[place : place + rng.randrange(1, 33)]
+    return bytes(made)
+
+
+def failures(reader: Reader, name: str, seed: bytes, numbers: range) -> Iterator[str]:
+    """Read mutated copies in a process of its own; a line for each that it does not refuse or
+    read as it should: another exception than ours, its death, a hang, too much memory."""
+    start = numbers.start
+    while start < numbers.stop:
+        died, end = yield from _in_process(reader, name, seed, range(start, numbers.stop))
+        if died:
+            yield f"{name} case {end}: {died}"
+        start = end + 1
+
+
+def case(name: str, seed: bytes, number: int) -> bytes:
+    """The bytes of a numbered case, the same each time."""
+    return mutated(seed, random.Random(f"{name} {number}"))
+
+
+def _in_process(reader: Reader, name: str, seed: bytes, numbers: range):
+    receiver, sender = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(receiver)
+        try:
+            _read_all(reader, name, seed, numbers, sender)
+        finally:
+            os._exit(0)
+    os.close(sender)
+    last = numbers.start
+    with os.fdopen(receiver, "r") as lines:
+        for line in lines:
+            number, _, fault = line.rstrip("\n").partition(" ")
+            last = int(number)
+            if fault:
+                yield f"{name} case {last}: {fault}"
+    _, status = os.waitpid(child, 0)
+    if os.WIFSIGNALED(status):
+        what = os.WTERMSIG(status)
+        return ("it hangs" if what == signal.SIGALRM else f"killed by signal {what}"), last
+    return "", numbers.stop
+
+
+def _read_all(reader: Reader, name: str, seed: bytes, numbers: range, sender: int) -> None:
+    with Path("/proc/self/statm").open() as file:
+        used = int(file.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 1)
+    os.dup2(null, 2)
+    with tempfile.TemporaryDirectory() as folder:
+        for number in numbers:
+            os.write(sender, f"{number} \n".encode())
+            path = Path(folder) / name
+            path.write_bytes(case(name, seed, number))
+            signal.alarm(LIMIT_S)
+            try:
+                reader(path)
+            except MpsfmError:
+                pass
+            except BaseException as error:
+                place = traceback.extract_tb(error.__traceback__)[-1]
+                text = f"{type(error).__name__}: {error} ({place.filename}:{place.lineno})"
+                os.write(sender, f"{number} {' '.join(text.split())[:300]}\n".encode())
+            signal.alarm(0)

@@ -1,0 +1,303 @@
+"""No file can crash, hang or fill the memory of a reader: it is read or refused in our words."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import struct
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mpsfm_core import checkpoints
+from mpsfm_core.builtin.arrays import read_arrays
+from mpsfm_core.config import load_config
+from mpsfm_core.data import DepthPrior, Features
+from mpsfm_core.errors import MpsfmError
+from mpsfm_core.evaluation.cloud_accuracy import read_ply
+from mpsfm_core.evaluation.prior_quality import read_depth
+from mpsfm_core.evaluation.records import read_record
+from mpsfm_core.evaluation.scene_folder import _read_sets
+from mpsfm_core.extraction.cache import Cache, content_key
+from mpsfm_core.inputs.header import declared_pixels, is_cut_jpeg, read_header
+from mpsfm_core.inputs.images import load_images, read_image_list
+from mpsfm_core.inputs.intrinsics import read_intrinsics
+from mpsfm_core.inputs.models import read_poses
+from mpsfm_core.mapping.state import freeze, thaw
+from mpsfm_core.registry import Registry
+from mpsfm_core.uncertainty.file import read_values
+from mpsfm_core.weights import WeightStore
+from mpsfm_core.yaml_text import parse_yaml
+
+from .mutation import failures
+
+QUICK, SLOW = 12, 110
+
+_IMAGE = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
+_TAGS = [(0x0112, 3, 1, 6), (0xA405, 3, 1, 28)]
+_EXIF = b"Exif\0\0II*\0" + struct.pack("<IH", 8, len(_TAGS))
+_EXIF += b"".join(struct.pack("<HHII", *tag) for tag in _TAGS) + bytes(4)
+
+
+def encoded(suffix: str) -> bytes:
+    image = np.tile(_IMAGE, (4, 4, 1)) if suffix == ".jp2" else _IMAGE
+    return cv2.imencode(suffix, image)[1].tobytes()
+
+
+def with_exif() -> bytes:
+    data = encoded(".jpg")
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(_EXIF) + 2) + _EXIF + data[2:]
+
+
+def archive(**arrays: Any) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+def synthetic() -> pycolmap.Reconstruction:
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig = 1, 1
+    options.num_frames_per_rig, options.num_points3D = 3, 8
+    return pycolmap.synthesize_dataset(options)
+
+
+def as_photo(path: Path) -> None:
+    """As one photo of three."""
+    for name in ("a.png", "b.png"):
+        (path.parent / name).write_bytes(encoded(".png"))
+    found = load_images(path.parent)
+    for index in range(len(found)):
+        found.view(index)
+
+
+def in_model(name: str, text: bool) -> Callable[[Path], None]:
+    """As one file of a model whose others are as they should be."""
+
+    def read(path: Path) -> None:
+        data = path.read_bytes()
+        (synthetic().write_text if text else synthetic().write_binary)(str(path.parent))
+        path.write_bytes(data)
+        read_poses(path.parent)
+        read_intrinsics(path.parent)
+
+    return read
+
+
+def model_file(name: str, folder: Path) -> bytes:
+    (synthetic().write_text if name.endswith("txt") else synthetic().write_binary)(str(folder))
+    return (folder / name).read_bytes()
+
+
+def as_config(registry: Registry) -> Callable[[Path], object]:
+    return lambda path: load_config(path, registry=registry)
+
+
+def as_cache_entry(path: Path) -> None:
+    cache, key = Cache(path.parent), content_key(1)
+    place = cache.folder / "depth" / key[:2] / f"{key}.npz"
+    place.parent.mkdir(parents=True, exist_ok=True)
+    path.replace(place)
+    cache.load("depth", key, DepthPrior)
+
+
+def as_state(path: Path) -> None:
+    """As a checkpoint that has been found to be of this problem."""
+    thaw(checkpoints.read_checkpoint(path)[1])
+
+
+def as_hashes(path: Path) -> None:
+    store = WeightStore(path.parent, offline=True)
+    store.cache_dir.mkdir(exist_ok=True)
+    path.replace(store.cache_dir / "hashes.json")
+    store.resolve("https://example.org/a.onnx")
+
+
+def as_onnx(path: Path) -> None:
+    from mpsfm_onnx.model import _open
+
+    from mpsfm_core.providers import ProviderContext
+
+    _open(path, ProviderContext(lambda uri, sha256=None: Path(uri), "cpu", 1, 0))
+
+
+_TRANSFORMS = json.dumps(
+    {
+        "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0, "w": 32, "h": 24,
+        "camera_model": "OPENCV", "k1": 0.1,
+        "frames": [
+            {"file_path": f"{n}.png", "transform_matrix": np.eye(4).tolist()} for n in range(3)
+        ],
+    }
+).encode()  # fmt: skip
+_CONFIG = b"extends: default\nfeatures: {use: sift}\nmatcher: {use: mutual-nearest}\n\
+depth:\n  use: files\n  options: {directory: /tmp, relative_std: 0.02}\n\
+normals: {use: from-depth}\nruntime: {workers: 1, seed: 3}\nmapping:\n  max_runs: 2\n"
+_PLY = b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n\
+property float z\nend_header\n0 0 1\n1 2 3\n"
+_PLY_BINARY = _PLY[: _PLY.index(b"0 0 1")].replace(b"ascii", b"binary_little_endian") + bytes(24)
+_RECORD = json.dumps({
+    "scene": "a", "bucket": "b", "index": 0, "method": "m", "estimated": {"a": list(range(12))},
+    "others": [], "truth": {"a": list(range(12))},
+}).encode()  # fmt: skip
+
+
+def readers(folder: Path, registry: Registry) -> dict[str, tuple[bytes, Callable[[Path], object]]]:
+    """File name -> a well-formed one, and what reads it."""
+    depth = np.ones((4, 5), np.float32)
+    state = freeze(
+        {"a": np.arange(20.0), "b": [1, (2, "x")], "f": Features(np.ones((4, 2)), depth)}
+    )
+    header = np.frombuffer(b'{"code": "", "version": "", "registered": 1, "time": ""}', np.uint8)
+    entry = archive(depth=depth, valid=depth > 0, variance=depth, metric=np.array(True))
+    images = {
+        f"c{s}": encoded(s) for s in (".jpg", ".png", ".tif", ".webp", ".bmp", ".jp2", ".ppm")
+    }
+    models = [f"{n}.{s}" for s in ("bin", "txt") for n in
+              ("cameras", "images", "points3D", "frames", "rigs")]  # fmt: skip
+    return {
+        **{name: (data, as_photo) for name, data in images.items()},
+        "exif.jpg": (with_exif(), as_photo),
+        "config.yaml": (_CONFIG, as_config(registry)),
+        "intrinsics.yaml": (b"1: {model: OPENCV, params: [30, 30, 16, 12, 0, 0, 0, 0], "
+                            b"width: 32, height: 24, images: [a.png, b.png]}\n", read_intrinsics),
+        "transforms.json": (_TRANSFORMS, lambda path: (read_poses(path), read_intrinsics(path))),
+        **{name: (model_file(name, folder), in_model(name, name.endswith("txt")))
+           for name in models},
+        "cloud.ply": (_PLY, read_ply),
+        "binary.ply": (_PLY_BINARY, read_ply),
+        "depth.npz": (entry, lambda path: read_arrays(path, "depth")),
+        "depth.npy": (io_npy(depth), lambda path: read_arrays(path, "depth")),
+        "depth.png": (cv2.imencode(".png", depth.astype(np.uint16))[1].tobytes(), read_depth),
+        "entry.npz": (entry, as_cache_entry),
+        "state.npz": (archive(header=header, **state), as_state),
+        "calibration.yaml": (b"kind: depth\ncalibration: {scale: 1.5}\nprovenance: {a: b}\n",
+                             lambda path: read_values(path, "depth")),
+        "testsets.yaml": (b"minimal:\n- images: [a, b]\ntriplets:\n  x:\n  - [a, b, c]\n",
+                          lambda path: list(_read_sets(path))),
+        "record.json": (_RECORD, read_record),
+        "hashes.json": (b'{"https://example.org/a.onnx": {"sha256": "00", "stamp": [1, 2]}}',
+                        as_hashes),
+        "list.txt": (b"# photos\na.png\nb.png\n", read_image_list),
+    }  # fmt: skip
+
+
+def io_npy(array: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+@pytest.fixture(scope="module")
+def registry() -> Registry:
+    return Registry.discover()
+
+
+@pytest.fixture(autouse=True)
+def quiet() -> Any:
+    logging.disable(logging.CRITICAL)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+    logging.disable(logging.NOTSET)
+
+
+def check(tmp_path: Path, registry: Registry, numbers: range) -> None:
+    table = readers(tmp_path, registry)
+    found = [
+        fault
+        for name, (seed, reader) in table.items()
+        for fault in failures(reader, name, seed, numbers)
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_well_formed_files_are_read(tmp_path: Path, registry: Registry) -> None:
+    for name, (data, reader) in readers(tmp_path, registry).items():
+        path = tmp_path / name.replace(".", "_") / name
+        path.parent.mkdir()
+        path.write_bytes(data)
+        if name not in ("hashes.json", "record.json"):  # no such download, no such run
+            reader(path)
+
+
+def test_some_mutations(tmp_path: Path, registry: Registry) -> None:
+    check(tmp_path, registry, range(QUICK))
+
+
+@pytest.mark.slow
+def test_many_mutations(tmp_path: Path, registry: Registry) -> None:
+    check(tmp_path, registry, range(QUICK, SLOW))
+
+
+def test_mutated_networks(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("mpsfm_onnx.stand_in", reason="needs mpsfm-onnx and onnxruntime")
+    assert onnx is not None
+    import onnx as format
+
+    tensor = format.helper.make_tensor_value_info
+    node = format.helper.make_node("Add", ["x", "x"], ["y"])
+    inputs, outputs = [tensor("x", 1, [1, 3])], [tensor("y", 1, [1, 3])]
+    graph = format.helper.make_graph([node], "g", inputs, outputs)
+    opset = [format.helper.make_opsetid("", 17)]
+    seed = format.helper.make_model(graph, opset_imports=opset, ir_version=8).SerializeToString()
+    assert not list(failures(as_onnx, "net.onnx", seed, range(60)))
+
+
+@given(st.binary(max_size=200) | st.binary(max_size=60).map(lambda b: b"\xff\xd8\xff\xe1" + b))
+def test_any_bytes_have_a_header(data: bytes) -> None:
+    header = read_header(data)
+    assert 1 <= header.orientation <= 8
+    header.focal_px(32, 24)
+    declared_pixels(data)
+    is_cut_jpeg(data)
+
+
+@given(st.text(max_size=60))
+def test_any_text_is_yaml_or_refused(text: str) -> None:
+    try:
+        parse_yaml(text, "x.yaml")
+    except MpsfmError as error:
+        assert "x.yaml" in str(error)
+
+
+FOUND = {
+    "cloud.ply": [b"ply\nelement vertex 1\nproperty float x\nend_header\n0\n",
+                  b"ply\nformat ascii 1.0\nelement vertex\nend_header\n"],
+    "depth.npz": [b"PK\x03\x04" + b"\xff" * 40],
+    "depth.npy": [b"\x93NUMPY\x01\x00\x0a\x00{'descr': [\n", b"\x93NUMPY\x01\x00\x02\x00{("],
+    "entry.npz": [b"\x93NUMPY\x01\x00\x02\x00{("],
+    "config.yaml": [b"[" * 3000], "intrinsics.yaml": [b"[" * 3000, b"1: 2001-99-99\n"],
+    "testsets.yaml": [b"[" * 3000], "calibration.yaml": [b"{" * 3000],
+    "transforms.json": [b"[" * 100_000], "record.json": [b"[" * 100_000, b"[]", b"1"],
+    "hashes.json": [b"", b"{", b"[1]", b'{"a": 1}', b"\xff", b"[" * 100_000],
+    # counts that kept COLMAP busy without end
+    "points3D.bin": [b"\xff" * 8, b"\x01" + bytes(50) + b"\xff" * 8],
+    "frames.bin": [b"\x01" + bytes(71) + b"\xff" * 4], "images.bin": [b"\x01" + bytes(7)],
+    "state.npz": [b"", b"PK\x05\x06" + bytes(18)],
+}  # fmt: skip
+"""What mutation found, or what it led to."""
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_what_was_found_before_is_refused(name: str, tmp_path: Path, registry: Registry) -> None:
+    _, reader = readers(tmp_path, registry)[name]
+    for number, data in enumerate(FOUND[name]):
+        path = tmp_path / str(number) / name
+        path.parent.mkdir()
+        path.write_bytes(data)
+        if name == "entry.npz":
+            reader(path)  # is computed again
+            continue
+        with pytest.raises(MpsfmError):
+            reader(path)
