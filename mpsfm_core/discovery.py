@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import json
 import logging
+import os
 import re
+import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib import metadata
@@ -59,12 +62,56 @@ def new_manager() -> pluggy.PluginManager:
     return manager
 
 
-def installed_plugins(timeout_s: float) -> Iterator[Plugin]:
-    """Load every entry point of the group ``mpsfm.plugins``, in the order of their names."""
+def installed_plugins(
+    timeout_s: float, crashing: Collection[tuple[str, str]] = ()
+) -> Iterator[Plugin]:
+    """Load every entry point of the group ``mpsfm.plugins``, in the order of their names.
+
+    ``crashing``: (name, module) of those that are not loaded: see :func:`crashing_plugins`.
+    """
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
     for entry in sorted(entries, key=lambda e: (_distribution(e)[0], e.name)):
         name, version = _distribution(entry)
-        yield _load(entry, name, version, timeout_s)
+        if (entry.name, entry.value) in crashing:
+            hint = f"reinstall or uninstall {name}"
+            fault = "ends the whole process when it is loaded"
+            yield Plugin(entry.name, name, version, fault=fault, hint=hint)
+        else:
+            yield _load(entry, name, version, timeout_s)
+
+
+def crashing_plugins(timeout_s: float) -> set[tuple[str, str]]:
+    """(name, module) of the plugins that end the process in which they are loaded.
+
+    All are loaded in another process first, and one by one only if that does not survive.
+    """
+    entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
+    named = {(entry.name, entry.value) for entry in entries}
+    if _survives(sorted(named), timeout_s):
+        return set()
+    return {pair for pair in named if not _survives([pair], timeout_s)}
+
+
+def _survives(pairs: Sequence[tuple[str, str]], timeout_s: float) -> bool:
+    """Whether a process lives on that loads some plugins; what they raise does not count."""
+    script = (
+        "import json, os, sys\n"
+        "from mpsfm_core import discovery\n"
+        "wanted = [tuple(pair) for pair in json.loads(sys.argv[1])]\n"
+        "entries = discovery.metadata.entry_points(group=discovery.ENTRY_POINT_GROUP)\n"
+        "for entry in entries:\n"
+        "    if (entry.name, entry.value) in wanted:\n"
+        "        discovery._load(entry, entry.name, '', float(sys.argv[2]))\n"
+        "os._exit(0)\n"
+    )
+    command = [sys.executable, "-c", script, json.dumps(list(pairs)), str(timeout_s)]
+    ended = subprocess.run(command, env=same_path(), capture_output=True, check=False)
+    return ended.returncode == 0
+
+
+def same_path() -> dict[str, str]:
+    """An environment in which another interpreter finds the modules that this one finds."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
 def inspect_plugin(module: object, name: str, distribution: str, version: str) -> Plugin:

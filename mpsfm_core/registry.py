@@ -20,6 +20,7 @@ import pluggy
 from mpsfm_core.builtin import plugin as builtin
 from mpsfm_core.discovery import (
     Plugin,
+    crashing_plugins,
     inspect_plugin,
     installed_plugins,
     new_manager,
@@ -105,16 +106,20 @@ class Registry:
         self._muted: set[tuple[str, str]] = set()
 
     @classmethod
-    def discover(cls, timeout_s: float | None = None, environments: bool = True) -> Registry:
+    def discover(
+        cls, timeout_s: float | None = None, environments: bool = True, *, probe: bool = False
+    ) -> Registry:
         """Load the built-in providers and every installed plugin, and look up what
         ``environments`` bring (:mod:`mpsfm_core.environments`), as ``NAME@ENVIRONMENT``.
 
         A plugin that fails is listed with the reason and hurts nobody else. ``timeout_s``: time
-        limit for each plugin, by default ``$MPSFM_PLUGIN_TIMEOUT_S`` or 10 s.
+        limit for each plugin, by default ``$MPSFM_PLUGIN_TIMEOUT_S`` or 10 s. ``probe``: load
+        them in another process first, so that one which crashes is listed as well.
         """
         registry = cls()
         registry.register(builtin, name="builtin", distribution=CORE, version=core_version())
-        for plugin in installed_plugins(_default_timeout() if timeout_s is None else timeout_s):
+        limit = _default_timeout() if timeout_s is None else timeout_s
+        for plugin in installed_plugins(limit, crashing_plugins(limit) if probe else ()):
             registry._add(plugin)
         if environments:
             registry._add_environments()

@@ -23,9 +23,11 @@ import hashlib
 import http.client
 import importlib
 import importlib.util
+import ipaddress
 import json
 import os
 import re
+import socket
 import threading
 import time
 import urllib.error
@@ -369,7 +371,7 @@ def _download(uri: str, part: Path, expected: str | None, progress: Progress | N
     while True:
         before = _size(part)
         try:
-            response = _open(_request(uri, expected), part, expected is not None)
+            response = _open(_request(uri, expected), part, uri, expected is not None)
             reached = True
             if response is not None:
                 _receive(response, part, progress)
@@ -393,7 +395,7 @@ def _download(uri: str, part: Path, expected: str | None, progress: Progress | N
 
 
 def _open(
-    request: urllib.request.Request, part: Path, hash_is_known: bool
+    request: urllib.request.Request, part: Path, uri: str, hash_is_known: bool
 ) -> http.client.HTTPResponse | None:
     """The server's answer; goes on from ``part`` if the rest certainly belongs to the same file.
 
@@ -407,7 +409,7 @@ def _open(
         if etag:
             request.add_header("If-Range", etag)
     try:
-        return _answer(request)
+        return _answer(request, _Redirects(request, hash_is_known or uri.startswith("hf://")))
     except urllib.error.HTTPError as error:
         with error:
             if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
@@ -418,13 +420,14 @@ def _open(
             return None
 
 
-def _answer(request: urllib.request.Request) -> http.client.HTTPResponse:
+def _answer(request: urllib.request.Request, redirects: _Redirects) -> http.client.HTTPResponse:
     """Open the connection, in a thread: no other limit covers the look-up of the server's name."""
     outcome: list[Any] = []
 
     def work() -> None:
         try:
-            outcome.append(urllib.request.urlopen(request, timeout=_TIMEOUT_S))
+            opener = urllib.request.build_opener(redirects)
+            outcome.append(opener.open(request, timeout=_TIMEOUT_S))
         except Exception as error:
             outcome.append(error)
 
@@ -437,6 +440,49 @@ def _answer(request: urllib.request.Request) -> http.client.HTTPResponse:
         raise outcome[0]
     response: http.client.HTTPResponse = outcome[0]
     return response
+
+
+class _Redirects(urllib.request.HTTPRedirectHandler):
+    """Follows a server elsewhere only where that cannot do harm.
+
+    Never from the network to this machine or its local network, never from encryption to none. To
+    another host only for a file of a hub, which keeps its files elsewhere, and for one whose hash
+    is known.
+    """
+
+    def __init__(self, asked: urllib.request.Request, host_may_change: bool) -> None:
+        self._from_here = is_local(asked.host)
+        self._host = urllib.parse.urlsplit(asked.full_url).hostname
+        self._host_may_change = host_may_change
+
+    def redirect_request(
+        self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str
+    ) -> Any:
+        """The request for the new place; raises :class:`WeightsError` when it is not to be made."""
+        new = urllib.parse.urlsplit(newurl)
+        why = ""
+        if not self._from_here and is_local(new.netloc):
+            why = "an address of the local network"
+        elif req.type == "https" and new.scheme != "https":
+            why = "a place without encryption"
+        elif new.hostname != self._host and not self._host_may_change:
+            why = "another host, and no sha256 is given to check what comes from there"
+        if why:
+            raise WeightsError(f"{req.full_url}: the server redirects to {newurl}: {why}")
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+def is_local(netloc: str) -> bool:
+    """Whether a host (with or without port) is, by name or look-up, of this or the local network.
+
+    One that cannot be looked up is not.
+    """
+    host = urllib.parse.urlsplit(f"//{netloc}").hostname or ""
+    try:
+        found = {str(entry[4][0]).partition("%")[0] for entry in socket.getaddrinfo(host, None)}
+        return any(not ipaddress.ip_address(address).is_global for address in found)
+    except (OSError, ValueError):
+        return False
 
 
 def _receive(response: http.client.HTTPResponse, part: Path, progress: Progress | None) -> None:

@@ -160,6 +160,39 @@ def test_a_broken_plugin_is_checked_with_a_reason(environment: dict[str, str]) -
     assert "pip install no-such-library" in ended.stderr
 
 
+CRASH = "import ctypes; ctypes.string_at(0)"
+
+
+def test_a_plugin_that_crashes_the_process(install_plugin: InstallPlugin) -> None:
+    install_plugin("mpsfm-crashes", CRASH)
+    install_plugin(
+        "mpsfm-late",
+        f"""
+        from mpsfm_core import ProviderSpec, hookimpl
+
+        class Late:
+            def __init__(self, options, context):
+                pass
+
+            def predict(self, view):
+                {CRASH}
+
+        @hookimpl
+        def mpsfm_providers():
+            return [ProviderSpec("depth", "late", Late)]
+        """,
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    ended = mpsfm(environment, "plugins", "list", "--json")
+    assert ended.returncode == 0, ended.stderr
+    lines = {line["distribution"]: line for line in json.loads(ended.stdout)}
+    assert "ends the whole process" in lines["mpsfm-crashes"]["reason"]
+    assert lines["mpsfm-late"]["available"] and lines["mpsfm-core"]["available"]
+    ended = mpsfm(environment, "plugins", "check", "late")
+    assert ended.returncode == 2
+    assert "late: a check ended the whole process (SIGSEGV)" in ended.stderr
+
+
 def test_metadata_without_a_name(install_plugin: InstallPlugin) -> None:
     module = install_plugin("mpsfm-nameless", HEALTHY)
     (info,) = Path(sys.path[0]).glob("mpsfm_nameless-*.dist-info")

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import threading
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -347,3 +348,49 @@ def test_safetensors_and_files_without_tensors(tmp_path: Path) -> None:
     torch.save(torch.ones(2), tmp_path / "t.pt")
     with pytest.raises(WeightsError, match="holds a Tensor"):
         load_torch_state(tmp_path / "t.pt")
+
+
+class Answer:
+    """What a redirect handler needs of an answer."""
+
+    def read(self) -> bytes:
+        return b""
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("asked", "target", "host_may_change", "why"),
+    [
+        ("https://8.8.8.8/a", "https://127.0.0.1/b", True, "local network"),
+        ("https://8.8.8.8/a", "https://localhost:99/b", True, "local network"),
+        ("https://8.8.8.8/a", "https://10.1.2.3/b", True, "local network"),
+        ("https://8.8.8.8/a", "https://[::1]/b", True, "local network"),
+        ("https://8.8.8.8/a", "https://169.254.169.254/latest", True, "local network"),
+        ("https://8.8.8.8/a", "http://8.8.8.8/b", True, "without encryption"),
+        ("https://8.8.8.8/a", "https://9.9.9.9/b", False, "another host"),
+        ("https://8.8.8.8/a", "https://9.9.9.9/b", True, ""),
+        ("https://8.8.8.8/a", "https://8.8.8.8/b", False, ""),
+        ("http://127.0.0.1:1/a", "http://127.0.0.1:2/b", False, ""),
+    ],
+)
+def test_where_a_server_may_redirect_to(
+    asked: str, target: str, host_may_change: bool, why: str
+) -> None:
+    request = urllib.request.Request(asked)
+    redirects = weights._Redirects(request, host_may_change)
+    if why:
+        with pytest.raises(WeightsError, match=why):
+            redirects.redirect_request(request, Answer(), 302, "Found", {}, target)
+    else:
+        followed = redirects.redirect_request(request, Answer(), 302, "Found", {}, target)
+        assert followed is not None and followed.full_url == target
+
+
+def test_a_damaged_record_of_hashes(tmp_path: Path) -> None:
+    store = WeightStore(tmp_path)
+    store.cache_dir.mkdir()
+    (store.cache_dir / "hashes.json").write_text("{")
+    with pytest.raises(WeightsError, match=r"hashes\.json is damaged"):
+        store.resolve("https://example.org/a.onnx")

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
@@ -10,11 +15,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mpsfm_core.discovery import same_path
+from mpsfm_core.errors import ProviderError
 from mpsfm_core.providers import Kind
 
 if TYPE_CHECKING:
     from mpsfm_core.registry import ProviderStatus
     from mpsfm_core.testing import CheckResult
+
+_CHECKING = "MPSFM_CHECKING"
+"""Set in the process that runs the checks."""
 
 app = typer.Typer(no_args_is_help=True, help="Installed plugins and their providers.")
 
@@ -26,7 +36,7 @@ def list_plugins(
     """List all providers: where they come from, licences, and whether they can be used."""
     from mpsfm_core.registry import Registry
 
-    status = Registry.discover().status()
+    status = Registry.discover(probe=True).status()
     if as_json:
         typer.echo(json.dumps([asdict(line) for line in status], indent=2, default=str))
     else:
@@ -49,6 +59,11 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
 ) -> None:
     """Check whether providers keep the contract; exit code 1 if one does not."""
+    if _CHECKING not in os.environ:
+        arguments = [name, "--device", device, *(["--json"] if as_json else [])]
+        arguments += [part for value in options or () for part in ("--set", value)]
+        arguments += [part for value in only or () for part in ("--only", value)]
+        raise typer.Exit(_elsewhere(name, arguments))
     from mpsfm_core.registry import Registry
     from mpsfm_core.testing.contract import (
         find_plugin,
@@ -58,7 +73,7 @@ def check(
         setup_from,
     )
 
-    registry = Registry.discover()
+    registry = Registry.discover(probe=True)
     plugin = find_plugin(registry, name)
     if plugin is not None and plugin.available and not as_json:
         hooks = ", ".join(plugin.capabilities)
@@ -102,6 +117,32 @@ def new(
     for path in write_plugin(name, kind, output):
         typer.echo(path)
     typer.echo(f"next: pip install -e {output / name} && mpsfm plugins check {name}")
+
+
+def _elsewhere(name: str, arguments: list[str]) -> int:
+    """Check in another process, which a crashing provider may end; returns the exit code."""
+    command = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+    environment = {**same_path(), _CHECKING: "1"}
+    with tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen(
+            [*command, "plugins", "check", *arguments],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+        )
+        assert process.stdout is not None
+        with process:
+            for line in process.stdout:
+                typer.echo(line, nl=False)
+        errors.seek(0)
+        typer.echo(errors.read(), nl=False, err=True)
+    if process.returncode >= 0:
+        return process.returncode
+    ended = signal.Signals(-process.returncode).name
+    raise ProviderError(
+        f"{name}: a check ended the whole process ({ended}): the one after the last that is listed"
+    )
 
 
 def _print_result(result: CheckResult) -> None:

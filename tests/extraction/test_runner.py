@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import cv2
 import numpy as np
 import pytest
@@ -327,3 +329,44 @@ def test_the_seed_reaches_the_providers(world) -> None:
         runtime=runtime, pairs=PairOptions(mode="retrieval"), retrieval=Backend(use="seeded")
     )
     assert seeds == [(7, 3, "cpu")]
+
+
+@pytest.mark.parametrize("kind", ["features", "depth", "normals"])
+def test_a_photo_on_which_a_provider_fails_may_be_left_out(world, kind: str) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError("in the network")
+
+    world.break_on[kind, "view2.png"] = fail
+    runtime = RuntimeOptions(cache_dir=world.cache, workers=2, on_error="skip")
+    found = world.extract(runtime=runtime)
+    assert list(found.report["failed"]) == ["view2.png"]
+    assert "'truth', image 'view2.png': ZeroDivisionError" in found.report["failed"]["view2.png"]
+    image = found.problem.images[world.names.index("view2.png")]
+    assert not (image.depth.valid.any() and image.normals.valid.any() and len(image.keypoints))
+    # What could not be had is not in the cache: the next run asks again, and has everything.
+    world.break_on.clear()
+    whole = world.extract(runtime=runtime)
+    assert whole.report["failed"] == {}
+    assert pairs_of(whole.problem) == ALL_PAIRS
+
+
+def test_more_than_half_of_the_photos_failing_ends_the_run(world) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError("in the network")
+
+    for name in world.names[1:]:
+        world.break_on["depth", name] = fail
+    runtime = RuntimeOptions(cache_dir=world.cache, workers=1, on_error="skip")
+    with pytest.raises(ProviderRunError, match=r"3 of 4 photos failed, the last so: provider"):
+        world.extract(runtime=runtime)
+
+
+def test_a_provider_that_hangs_has_a_time_limit(world) -> None:
+    released = threading.Event()
+    world.break_on["depth", "view2.png"] = lambda: released.wait(60) and None
+    try:
+        runtime = RuntimeOptions(cache_dir=world.cache, workers=2, timeout_s=1.0)
+        with pytest.raises(ProviderRunError, match=r"'truth': no answer within 1 s"):
+            world.extract(runtime=runtime)
+    finally:
+        released.set()
