@@ -16,7 +16,7 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib import metadata
@@ -83,30 +83,35 @@ def installed_plugins(
 def crashing_plugins(timeout_s: float) -> set[tuple[str, str]]:
     """(name, module) of the plugins that end the process in which they are loaded.
 
-    All are loaded in another process first, and one by one only if that does not survive.
+    Another process says of each which it is about to load: the last is the one that ended it.
     """
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
-    named = {(entry.name, entry.value) for entry in entries}
-    if _survives(sorted(named), timeout_s):
-        return set()
-    return {pair for pair in named if not _survives([pair], timeout_s)}
+    left = {(entry.name, entry.value) for entry in entries}
+    crashing: set[tuple[str, str]] = set()
+    while left:
+        command = [sys.executable, "-c", _TRIAL, json.dumps(sorted(left)), str(timeout_s)]
+        ended = subprocess.run(
+            command, env=same_path(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=False
+        )
+        named = [line for line in ended.stdout.decode().splitlines() if line.startswith("[")]
+        if ended.returncode >= 0 or not named:
+            break
+        name, module = json.loads(named[-1])
+        left.discard((name, module))
+        crashing.add((name, module))
+    return crashing
 
 
-def _survives(pairs: Sequence[tuple[str, str]], timeout_s: float) -> bool:
-    """Whether a process lives on that loads some plugins; what they raise does not count."""
-    script = (
-        "import json, os, sys\n"
-        "from mpsfm_core import discovery\n"
-        "wanted = [tuple(pair) for pair in json.loads(sys.argv[1])]\n"
-        "entries = discovery.metadata.entry_points(group=discovery.ENTRY_POINT_GROUP)\n"
-        "for entry in entries:\n"
-        "    if (entry.name, entry.value) in wanted:\n"
-        "        discovery._load(entry, entry.name, '', float(sys.argv[2]))\n"
-        "os._exit(0)\n"
-    )
-    command = [sys.executable, "-c", script, json.dumps(list(pairs)), str(timeout_s)]
-    ended = subprocess.run(command, env=same_path(), capture_output=True, check=False)
-    return ended.returncode == 0
+_TRIAL = """
+import json, os, sys
+from mpsfm_core import discovery
+wanted = [tuple(pair) for pair in json.loads(sys.argv[1])]
+for entry in discovery.metadata.entry_points(group=discovery.ENTRY_POINT_GROUP):
+    if (entry.name, entry.value) in wanted:
+        os.write(1, (json.dumps([entry.name, entry.value]) + chr(10)).encode())
+        discovery._load(entry, entry.name, "", float(sys.argv[2]))
+os._exit(0)
+"""
 
 
 def same_path() -> dict[str, str]:

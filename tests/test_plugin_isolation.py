@@ -108,7 +108,7 @@ def environment(
 
 def mpsfm(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", "from mpsfm_core.cli import main; main()", *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180)
 
 
 def test_the_list_says_what_is_wrong_and_what_to_do(environment: dict[str, str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pycolmap
 
 from mpsfm_core.data import Float64, PinholeCamera, UInt8, View
 from mpsfm_core.geometry import sample_nearest
+from mpsfm_core.inputs.colmap_files import check_binary_model
 from mpsfm_core.inputs.undistortion import camera_key
 from mpsfm_core.scene.reconstruction import Reconstruction
 
@@ -59,8 +61,8 @@ def build_model(
 def write_model(folder: Path, model: pycolmap.Reconstruction, *, text: bool = False) -> None:
     """Write a model, binary or text.
 
-    Raises ``OSError`` when the disk has no room. COLMAP's writer does not notice, and its reader
-    takes gigabytes for a truncated file, so the room is tried before rather than the result after.
+    Raises ``OSError`` when the disk has no room or fails. COLMAP's writer does not notice either,
+    so the room is tried before and the files are measured after.
     """
     folder.mkdir(parents=True, exist_ok=True)
     keypoints = sum(image.num_points2D() for image in model.images.values())
@@ -69,7 +71,12 @@ def write_model(folder: Path, model: pycolmap.Reconstruction, *, text: bool = Fa
     _try_room(
         folder / "room", 512 * records + (32 if not text else 96) * (keypoints + observations)
     )
-    (model.write_text if text else model.write_binary)(str(folder))
+    try:
+        (model.write_text if text else model.write_binary)(str(folder))
+    except (RuntimeError, ValueError) as error:
+        raise OSError(errno.EIO, f"COLMAP cannot write {folder.name}/: {error}") from error
+    if not (_whole_text if text else _whole_binary)(folder, model):
+        raise OSError(errno.EIO, f"the disk did not take all of {folder.name}/")
 
 
 def point_colors(
@@ -94,6 +101,32 @@ def pinhole(camera: PinholeCamera) -> pycolmap.Camera:
     return pycolmap.Camera(
         model="PINHOLE", width=camera.width, height=camera.height, params=camera.params
     )
+
+
+def _whole_binary(folder: Path, model: pycolmap.Reconstruction) -> bool:
+    try:
+        check_binary_model(folder)
+    except (OSError, ValueError):
+        return False
+    params = sum(len(camera.params) for camera in model.cameras.values())
+    size = (folder / "cameras.bin").stat().st_size
+    return size == 8 + 24 * model.num_cameras() + 8 * params
+
+
+def _whole_text(folder: Path, model: pycolmap.Reconstruction) -> bool:
+    wanted = {
+        "cameras.txt": model.num_cameras(),
+        "images.txt": 2 * model.num_images(),
+        "points3D.txt": model.num_points3D(),
+        "frames.txt": model.num_frames(),
+        "rigs.txt": model.num_rigs(),
+    }
+    for name, count in wanted.items():
+        data = (folder / name).read_bytes()
+        lines = [line for line in data.split(b"\n")[:-1] if not line.startswith(b"#")]
+        if not data.endswith(b"\n") or len(lines) != count:
+            return False
+    return True
 
 
 def _try_room(path: Path, size: int) -> None:

@@ -105,3 +105,24 @@ def test_a_disk_without_room_is_noticed_and_left_clean(model, tmp_path: Path) ->
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("part", ["cameras", "images", "points3D", "frames", "rigs"])
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.98])
+def test_a_model_that_the_disk_did_not_take_is_no_result(
+    model: pycolmap.Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    text: bool, part: str, kept: float,
+) -> None:  # fmt: skip
+    write_model(tmp_path, model, text=text)
+    name = "write_text" if text else "write_binary"
+    write = getattr(pycolmap.Reconstruction, name)
+
+    def cut(self: pycolmap.Reconstruction, folder: str) -> None:
+        write(self, folder)
+        path = Path(folder) / f"{part}.{'txt' if text else 'bin'}"
+        path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
+
+    monkeypatch.setattr(pycolmap.Reconstruction, name, cut)
+    with pytest.raises(OSError, match="did not take all"):
+        write_model(tmp_path, model, text=text)
