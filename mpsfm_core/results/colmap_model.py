@@ -110,7 +110,7 @@ def _whole_binary(folder: Path, model: pycolmap.Reconstruction) -> bool:
         return False
     params = sum(len(camera.params) for camera in model.cameras.values())
     size = (folder / "cameras.bin").stat().st_size
-    return size == 8 + 24 * model.num_cameras() + 8 * params
+    return bool(size == 8 + 24 * model.num_cameras() + 8 * params)
 
 
 def _whole_text(folder: Path, model: pycolmap.Reconstruction) -> bool:
