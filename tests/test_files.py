@@ -224,7 +224,7 @@ PLAIN_WRITERS = {
     "importers",
 }
 """Besides the one place: downloads that go on where they were cut, the kernel's counter of memory,
-what writes into a scratch folder, and what tests and examples write."""
+what writes into a scratch folder, logs and pipes of other processes, and what tests and examples write."""
 
 
 def test_every_write_goes_through_one_place() -> None:

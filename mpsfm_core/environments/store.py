@@ -18,6 +18,7 @@ import platformdirs
 
 from mpsfm_core.environments.process import Worker
 from mpsfm_core.errors import InputError, ProviderError, did_you_mean
+from mpsfm_core.files import write_file
 
 FOLDER_VARIABLE = "MPSFM_ENVIRONMENTS"
 """Environment variable that names the folder with all environments."""
@@ -81,7 +82,7 @@ class Environment:
         """Ask it what it brings, and keep the answer."""
         found: list[dict[str, Any]] = self.ask(do="describe")
         text = json.dumps(found, indent=1, sort_keys=True)
-        (self.folder / _DESCRIPTION).write_text(text, encoding="utf-8")
+        write_file(self.folder / _DESCRIPTION, text)
         return found
 
 
