@@ -214,17 +214,10 @@ def test_unfinished_files_of_the_dead_are_taken_away(tmp_path: Path) -> None:
     assert {*tmp_path.iterdir()} == {young, alive}
 
 
-PLAIN_WRITERS = {
-    "files.py",
-    "weights.py",
-    "stages.py",
-    "results",
-    "testing",
-    "builtin",
-    "importers",
-}
+PLAIN_WRITERS = {"files.py", "weights.py", "stages.py", "results", "testing", "builtin"}
+PLAIN_WRITERS |= {"importers", "channel.py", "process.py"}
 """Besides the one place: downloads that go on where they were cut, the kernel's counter of memory,
-what writes into a scratch folder, logs and pipes of other processes, and what tests and examples write."""
+what writes into a scratch folder, logs and pipes of other processes, and what tests write."""
 
 
 def test_every_write_goes_through_one_place() -> None:
