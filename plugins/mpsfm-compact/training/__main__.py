@@ -85,6 +85,14 @@ def train(
     run_training(data, run, schedule, held_out or ["drawn-1-0000"], seed, start, minutes)
 
 
+@app.command("average")
+def average(checkpoints: list[Path], output: Path) -> None:
+    """Write the mean of the weights of checkpoints as one that ``export`` takes."""
+    from training.export import average as run_average
+
+    run_average(checkpoints, output)
+
+
 @app.command("export")
 def export(
     checkpoint: Path,

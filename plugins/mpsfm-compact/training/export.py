@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,22 @@ def keep(checkpoint: Path, output: Path) -> None:
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     weights = averaged(state)
     torch.save({k: v.half() if v.is_floating_point() else v for k, v in weights.items()}, output)
+
+
+def average(checkpoints: Sequence[Path], output: Path) -> None:
+    """Write the mean of the weights of checkpoints, and the most samples that one has seen.
+
+    Stages of one run lie in one basin, and their mean is often better than each (Wortsman et al.,
+    Model soups, 2022); what is held out must say so.
+    """
+    states = [torch.load(path, map_location="cpu", weights_only=True) for path in checkpoints]
+    stages = [averaged(state) for state in states]
+    mean = dict(stages[-1])
+    for name, value in mean.items():
+        if value.is_floating_point():
+            mean[name] = torch.stack([stage[name] for stage in stages]).mean(dim=0)
+    samples = max(int(state["samples"]) for state in states)
+    torch.save({"mean": {f"module.{k}": v for k, v in mean.items()}, "samples": samples}, output)
 
 
 def averaged(state: dict) -> dict[str, Tensor]:
