@@ -15,6 +15,7 @@ from mpsfm_core.cli.view import open_viewer
 from mpsfm_core.data import DepthPrior, PinholeCamera, PosedImage, SceneState
 from mpsfm_core.errors import InputError
 from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.providers import hookimpl
 from mpsfm_core.registry import Registry
 from mpsfm_core.stages import Stages
@@ -35,7 +36,8 @@ def test_a_run_shows_how_it_grows() -> None:
     registry.register(Watcher())
     camera = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
     problem = mapping_problem(room_scene(), camera, arc_poses(4, 12.0), map_width=80)
-    result = mapper.reconstruct(problem, events=Stages(registry))
+    one_by_one = MapperOptions.model_validate({"initialization": {"all_at_once": False}})
+    result = mapper.reconstruct(problem, one_by_one, Stages(registry))
     sizes = [len(scene.images) for scene in seen]
     assert sizes[0] < sizes[-1] == len(result.reconstructions[0].images)
     last = seen[-1]

@@ -100,6 +100,7 @@ class Group:
             if placed is None:
                 return False
             self._build(placed)
+        self.refiner.clean_matches = True
         self._refine_globally()
         if self.refiner.focal_is_stable():
             self._refine_globally()  # the first time around poses that a wrong focal length bent

@@ -44,6 +44,8 @@ class Refiner:
 
     ``noise``: how good the priors are in this scene; ``loss_scale``: of the reprojection loss, in
     stds of a keypoint. Both are refreshed by global refinement.
+    ``clean_matches``: whether all pairs were heard before an image was placed, so that the loss may
+    be as wide as keypoints are clean; while images join one by one it holds wrong ones off.
     ``fixed``: (n,) bool, images whose pose never changes.
     """
 
@@ -55,6 +57,7 @@ class Refiner:
         self.fixed: Bool = np.zeros(scene.num_images, dtype=np.bool_)
         self.noise = DepthNoise()
         self.loss_scale = options.refinement.bundle.reprojection_scale
+        self.clean_matches = False
         self._assumed = DepthNoise()
         self._integrators: dict[int, DepthIntegrator] = {}
 
@@ -273,6 +276,7 @@ class Refiner:
         self._integrators.clear()
         self.noise = self._assumed = DepthNoise()
         self.loss_scale = self.options.bundle.reprojection_scale
+        self.clean_matches = False
 
     def _integrate(self, image: int, covariances: Float64, angles: Float64) -> None:
         scene, tracks = self.scene, self.scene.tracks
@@ -322,7 +326,8 @@ class Refiner:
     def _measure_keypoint_noise(self) -> None:
         """Let the reprojection loss suit the keypoints, whose tails Cauchy's loss knows."""
         bundle = self.options.bundle
-        if self.options.measure_keypoint_noise and bundle.reprojection_loss == Loss.CAUCHY:
+        measure = self.options.measure_keypoint_noise and self.clean_matches
+        if measure and bundle.reprojection_loss == Loss.CAUCHY:
             self.loss_scale = measure_loss_scale(self.scene, bundle.reprojection_scale)
 
     def _measure_noise(self) -> None:

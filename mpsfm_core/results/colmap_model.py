@@ -116,9 +116,9 @@ def _whole_binary(folder: Path, model: pycolmap.Reconstruction) -> bool:
 def _whole_text(folder: Path, model: pycolmap.Reconstruction) -> bool:
     wanted = {
         "cameras.txt": model.num_cameras(),
-        "images.txt": 2 * model.num_images(),
+        "images.txt": 2 * model.num_reg_images(),
         "points3D.txt": model.num_points3D(),
-        "frames.txt": model.num_frames(),
+        "frames.txt": model.num_reg_frames(),
         "rigs.txt": model.num_rigs(),
     }
     for name, count in wanted.items():

@@ -286,7 +286,8 @@ def setup_of(spec: ProviderSpec, folder: Path) -> Setup:
     except Exception as error:
         text = f"{spec.kind} provider {spec.name!r}: its contract {spec.contract!r} fails"
         raise ProviderError(f"{text}: {type(error).__name__}: {error}") from error
-    if isinstance(setup, Mapping):  # from another environment
+    if isinstance(setup, Mapping) and {part.name for part in fields(Setup)}.issuperset(setup):
+        # from another environment
         setup = Setup(**setup)
     if not isinstance(setup, Setup):
         raise ProviderError(f"{spec.contract!r} returns a {type(setup).__name__}, not a Setup")

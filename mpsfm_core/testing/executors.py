@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -103,7 +104,8 @@ def check_extraction(name: str, options: dict[str, Any], folder: Path) -> None:
         cache_dir=folder / "there", workers=2, executor=name, executor_options=options
     )
     try:
-        _extract(folder, runtime, _CtrlC())
+        with _hearing_ctrl_c():
+            _extract(folder, runtime, _CtrlC())
     except KeyboardInterrupt:
         pass
     else:
@@ -125,6 +127,16 @@ class _Watch(Silent):
     def stage_progress(self, stage: str, done: int, total: int) -> None:
         assert done == self.done.get(stage, 0) + 1 and done <= total
         self.done[stage] = done
+
+
+@contextmanager
+def _hearing_ctrl_c() -> Iterator[None]:
+    """Where tests run side by side their processes are told to ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class _CtrlC(Silent):

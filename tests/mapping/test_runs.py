@@ -78,7 +78,7 @@ class Scripted:
     def __init__(self, problem: MappingProblem, options: MapperOptions, events: object) -> None:
         self.explained = self.script[options.seed]
 
-    def run(self) -> Run:
+    def run(self, paused: object = None) -> Run:
         # a group's only mark is here how much it explains
         models = [Reconstruction((), np.full((1, 3), e), np.zeros(1)) for e in self.explained]
         return Run(models, self.explained, MappingReport(seconds={"all": 2.0}, counts={"all": 1}))
