@@ -1,4 +1,5 @@
-"""Settings of the dense stage. What is "ours" was measured with ``python -m benchmarks.dense``."""
+"""Settings of the dense stage. Those without a source are ours: first choices, and
+what a few photos of one scene say; ``python -m benchmarks.dense`` measures them."""
 
 from __future__ import annotations
 
