@@ -444,7 +444,7 @@ def _densify_model(
     for index, source in enumerate(photos):
         found = matched[source.name]
         file = model / DEPTH / f"{found}.npz"
-        depth = read_depth_map(file) if file.is_file() else depth_of_points(points[found])
+        depth = read_depth_map(file)[1] if file.is_file() else depth_of_points(points[found])
         if depth is not None:
             pose, ids = poses[found], np.zeros(0, np.int64)
             registered.append(

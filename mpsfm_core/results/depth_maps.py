@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mpsfm_core.data import DepthPrior
+from mpsfm_core.data import DepthPrior, PinholeCamera
 from mpsfm_core.errors import InputError
 from mpsfm_core.scene.reconstruction import Reconstruction
 
@@ -33,13 +33,17 @@ def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
         )
 
 
-def read_depth_map(path: Path) -> DepthPrior:
-    """Depth with variance of a file that :func:`write_depth_maps` wrote.
+def read_depth_map(path: Path, scale: float = 1.0) -> tuple[PinholeCamera, DepthPrior]:
+    """The grid and the depth, times ``scale``, of a file that :func:`write_depth_maps` wrote.
 
     Raises :class:`InputError` when it is damaged or something else.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return DepthPrior.from_arrays(file["depth"], file["variance"], file["valid"])
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            depth, variance = file["depth"], file["variance"]
+            valid, camera = file["valid"], file["camera"]
+        rows, columns = depth.shape
+        grid = PinholeCamera(columns, rows, *map(float, camera))
+        return grid, DepthPrior(depth * np.float32(scale), variance * np.float32(scale**2), valid)
     except Exception as error:  # numpy has no base class for what damaged archives raise
         raise InputError(f"{path}: is no depth map of a run, or damaged: {error}") from error

@@ -20,6 +20,7 @@ from mpsfm_core.inputs.images import SUMMARY, ImageSet, find_images, load_images
 from mpsfm_core.inputs.models import match_names, model_folder, read_model
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.results.colmap_model import pinhole
+from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.orientation import Gravity, estimate_gravity, rotation_to_z
 from mpsfm_core.results.photos import copy_view, portable_name
 from mpsfm_core.results.ply import read_ply
@@ -174,7 +175,7 @@ class Source:
         path = self.folder / DEPTH / f"{name}.npz"
         if not path.is_file():
             return None
-        camera, depth = _read_depth(path, float(self.world_from_model.scale))
+        camera, depth = read_depth_map(path, float(self.world_from_model.scale))
         return Maps(camera, depth, fit_normals(camera, depth, FromDepthOptions()))
 
     def undistorted(self) -> pycolmap.Reconstruction:
@@ -255,16 +256,3 @@ def _read_summary(path: Path) -> dict[str, Any]:
     if summary.get("status") == "failed":
         raise InputError(f"{path.parent}: the run made no reconstruction; {SUMMARY} says why")
     return summary
-
-
-def _read_depth(path: Path, scale: float) -> tuple[PinholeCamera, DepthPrior]:
-    """A file of :func:`mpsfm_core.results.depth_maps.write_depth_maps`, depth times ``scale``."""
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            depth, variance = file["depth"], file["variance"]
-            valid, camera = file["valid"], file["camera"]
-        rows, columns = depth.shape
-        grid = PinholeCamera(columns, rows, *map(float, camera))
-        return grid, DepthPrior(depth * np.float32(scale), variance * np.float32(scale**2), valid)
-    except Exception as error:  # numpy has no base class for what damaged archives raise
-        raise InputError(f"{path}: is no depth map of a run, or damaged: {error}") from error
