@@ -22,6 +22,7 @@ from pydantic import Field
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.errors import ConfigError, ProviderError, did_you_mean
 from mpsfm_core.extraction.options import ExtractionOptions, PairOptions, VerificationOptions
+from mpsfm_core.formats import VERSION, check_version
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.options import MapperOptions, MappingOptions
 from mpsfm_core.options import (
@@ -38,6 +39,9 @@ from mpsfm_core.registry import Registry
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.uncertainty.file import CALIBRATIONS, read_values
 from mpsfm_core.yaml_text import line_of, parse_yaml, write_yaml
+
+FORMAT = 1
+"""Of configuration files."""
 
 
 class RuntimeOptions(Options):
@@ -123,7 +127,7 @@ class Config(Options):
 
     def to_yaml(self) -> str:
         """The configuration with all defaults; loading it gives the same configuration."""
-        return write_yaml(self.model_dump(mode="json"))
+        return write_yaml({VERSION: FORMAT, **self.model_dump(mode="json")})
 
 
 _BLOCKS: dict[str, Kind] = {
@@ -236,6 +240,8 @@ def _read_chain(path: Path, children: tuple[Path, ...] = ()) -> list[_Layer]:
     data = parse_yaml(text, str(path)) or {}
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: must be a mapping, is a {type(data).__name__}")
+    check_version(data, FORMAT, path, ConfigError)
+    data.pop(VERSION, None)
     parent = data.pop("extends", None)
     if children:
         data.pop("description", None)

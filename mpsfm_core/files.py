@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mpsfm_core.errors import InputError, OutputError
+from mpsfm_core.formats import VERSION, check_version
 
 fcntl: Any = None
 with suppress(ImportError):  # not on Windows
@@ -33,6 +34,8 @@ _TEMPORARY = ".tmp"
 _GRACE_S = 60.0
 """A younger file may be one that its writer has not locked yet."""
 _READY = "ready.json"
+FORMAT = 1
+"""Of what a scratch folder says of the exchange that it was made for."""
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EINVAL, errno.ENOLCK}
 
@@ -119,7 +122,8 @@ def replacing(output: Path, entries: tuple[str, ...]) -> Iterator[Path]:
             yield fresh
             _sync(fresh)
             new = sorted(entry.name for entry in fresh.iterdir())
-            write_file(own / _READY, json.dumps({"entries": entries, "new": new}))
+            plan = {VERSION: FORMAT, "entries": entries, "new": new}
+            write_file(own / _READY, json.dumps(plan))
             _swap(output, own)
     except BaseException:
         _remove_empty(created)
@@ -128,12 +132,12 @@ def replacing(output: Path, entries: tuple[str, ...]) -> Iterator[Path]:
 
 def _swap(output: Path, own: Path) -> None:
     """Renames only, undone in reverse when one fails; goes on where an earlier one was killed."""
-    plan = json.loads((own / _READY).read_text(encoding="utf-8"))
+    entries, new = _plan(own)
     fresh, old = own / "new", own / "old"
     remaining = sorted(entry.name for entry in fresh.iterdir())
     moves = []
-    if remaining == plan["new"]:  # else all old entries have gone, as they go first
-        moves = [(output / name, old / name) for name in plan["entries"]]
+    if remaining == new:  # else all old entries have gone, as they go first
+        moves = [(output / name, old / name) for name in entries]
         moves = [(source, target) for source, target in moves if source.exists()]
     moves += [(fresh / name, output / name) for name in remaining]
     done: list[tuple[Path, Path]] = []
@@ -148,9 +152,33 @@ def _swap(output: Path, own: Path) -> None:
     (own / _READY).unlink()
 
 
+def _plan(own: Path) -> tuple[list[str], list[str]]:
+    """Names that are to go from the output folder, and those that are to come.
+
+    Raises :class:`InputError` unless we wrote it: a folder that came from elsewhere may name files
+    anywhere.
+    """
+    path = own / _READY
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        check_version(content, FORMAT, path)
+        entries, new = list(content["entries"]), list(content["new"])
+        if any(Path(name).name != name or name in ("", "..") for name in (*entries, *new)):
+            raise ValueError("names what is not in the folder")
+        if any((own / part).is_symlink() for part in ("new", "old")):
+            raise ValueError("leads elsewhere")
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise InputError(
+            f"{path}: no run of ours left this ({error}); remove {own} if you know where it is from"
+        ) from error
+    return entries, new
+
+
 def _clear_up(output: Path) -> None:
     """Finish or take away what killed runs left; the caller is alone in the folder."""
     for own in output.glob(f"{_SCRATCH}*"):
+        if own.is_symlink() or not own.is_dir():
+            continue  # not ours
         if (own / _READY).is_file() and (own / "new").is_dir():
             _log.warning("%s: finishing what a killed run was about to put in place", output)
             _swap(output, own)

@@ -28,6 +28,7 @@ from mpsfm_core.extraction.focal import estimate_focals
 from mpsfm_core.extraction.predictions import FROM_MATCHER
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.files import claimed, replacing
+from mpsfm_core.formats import VERSION
 from mpsfm_core.geometry import transform
 from mpsfm_core.inputs.images import SUMMARY, ImageSet, check_apart, find_images, load_images
 from mpsfm_core.inputs.matches import (
@@ -46,6 +47,7 @@ from mpsfm_core.results.georeference import georeference
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos
 from mpsfm_core.results.ply import write_cloud
+from mpsfm_core.results.summary import FORMAT as SUMMARY_FORMAT
 from mpsfm_core.results.summary import describe_images, describe_pairs, describe_reconstructions
 from mpsfm_core.results.writer import DENSE, DEPTH, Component, write_failure, write_results
 from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
@@ -325,6 +327,7 @@ class _Run:
         models: Sequence[pycolmap.Reconstruction],
     ) -> dict[str, Any]:
         return {
+            VERSION: SUMMARY_FORMAT,
             "status": status,
             "photos": str(self._folder.resolve()),
             "matches_from": None if self._imported is None else self._imported.source,

@@ -42,7 +42,10 @@ from filelock import FileLock
 
 from mpsfm_core.errors import WeightsError
 from mpsfm_core.files import write_file
+from mpsfm_core.formats import VERSION, check_version
 
+FORMAT = 1
+"""Of ``hashes.json``."""
 CACHE_VARIABLE = "MPSFM_CACHE"
 """Environment variable that names the cache directory."""
 OFFLINE_VARIABLES = ("MPSFM_OFFLINE", "HF_HUB_OFFLINE")
@@ -221,6 +224,8 @@ class WeightStore:
             return {}
         try:
             entries = json.loads(record.read_text(encoding="utf-8"))
+            check_version(entries, FORMAT, record, WeightsError)
+            entries.pop(VERSION, None)
             if not all(isinstance(entry, dict) for entry in entries.values()):
                 raise ValueError("not a record for each file")
         except (ValueError, AttributeError, RecursionError) as error:
@@ -234,7 +239,8 @@ class WeightStore:
         record = self._record_path
         with FileLock(record.with_suffix(".lock")):
             entries = self._entries() | {uri: {"sha256": sha256, "stamp": _stamp(path)}}
-            write_file(record, json.dumps(entries, indent=1, sort_keys=True))
+            content = {VERSION: FORMAT, **entries}
+            write_file(record, json.dumps(content, indent=1, sort_keys=True))
 
     @property
     def _record_path(self) -> Path:

@@ -11,6 +11,7 @@ from typing import Any
 
 from mpsfm_core.calibration.metrics import NORMAL_COVERAGE
 from mpsfm_core.files import write_file
+from mpsfm_core.formats import VERSION
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
@@ -32,6 +33,8 @@ _METRICS = {
     "ause": "AUSE",
     "rmse": "RMSE",
 }
+FORMAT = 1
+"""Of ``NAME.report.json``."""
 _IDEAL = {
     "coverage": NORMAL_COVERAGE,
     "coverage_of_folds": NORMAL_COVERAGE[:1],
@@ -50,7 +53,7 @@ def write_report(calibration_file: Path, report: Mapping[str, Any]) -> tuple[Pat
     numbers = calibration_file.with_suffix(".report.json")
     svg, png = _plots(report)
     write_file(page, _page(report, svg))
-    write_file(numbers, json.dumps(report, indent=2) + "\n")
+    write_file(numbers, json.dumps({VERSION: FORMAT, **report}, indent=2) + "\n")
     if png is not None:
         write_file(calibration_file.with_suffix(".report.png"), png)
     return page, numbers

@@ -8,10 +8,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from mpsfm_core.errors import InputError
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.files import write_file
+from mpsfm_core.formats import VERSION, check_version
 
 TIMINGS = "timings.json"
+FORMAT = 1
+"""Of ``timings.json``."""
 _FIRST_GUESS = {
     "features": 0.3,
     "matching": 0.5,
@@ -79,7 +83,7 @@ class TimeLeft:
         """For the next run; a cache that cannot be written is none of the user's worries here."""
         known = {**_read(self._file), **{k: round(v, 6) for k, v in self._ended.items()}}
         with suppress(OSError):
-            write_file(self._file, json.dumps(known))
+            write_file(self._file, json.dumps({VERSION: FORMAT, **known}))
 
     def _left_of(self, step: str) -> float:
         start, done, total = self._running[step]
@@ -109,6 +113,7 @@ def in_words(seconds: float | None) -> str:
 def _read(file: Path) -> dict[str, float]:
     try:
         known = json.loads(file.read_text(encoding="utf-8"))
+        check_version(known, FORMAT, file)
         return {step: float(known[step]) for step in _FIRST_GUESS if step in known}
-    except (OSError, ValueError, TypeError, AttributeError):
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError, InputError):
         return {}

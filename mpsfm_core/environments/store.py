@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import shutil
@@ -19,7 +20,12 @@ import platformdirs
 from mpsfm_core.environments.process import Worker
 from mpsfm_core.errors import InputError, ProviderError, did_you_mean
 from mpsfm_core.files import write_file
+from mpsfm_core.formats import VERSION, check_version
 
+_log = logging.getLogger(__name__)
+
+FORMAT = 1
+"""Of the description of an environment."""
 FOLDER_VARIABLE = "MPSFM_ENVIRONMENTS"
 """Environment variable that names the folder with all environments."""
 
@@ -71,17 +77,25 @@ class Environment:
 
     def describe(self) -> list[dict[str, Any]]:
         """What its providers are, without starting it: as of when it was made."""
+        path = self.folder / _DESCRIPTION
         try:
-            text = (self.folder / _DESCRIPTION).read_text(encoding="utf-8")
-            found: list[dict[str, Any]] = json.loads(text)
-        except (OSError, ValueError):
+            content = json.loads(path.read_text(encoding="utf-8"))
+            if isinstance(content, list):  # as it was before it had a version
+                content = {"providers": content}
+            check_version(content, FORMAT, path)
+            found: list[dict[str, Any]] = content["providers"]
+        except InputError as error:
+            _log.warning("%s is left out: %s", self.label, error)
+            return []
+        except (OSError, ValueError, KeyError, AttributeError, RecursionError):
             return []
         return found
 
     def refresh(self) -> list[dict[str, Any]]:
         """Ask it what it brings, and keep the answer."""
         found: list[dict[str, Any]] = self.ask(do="describe")
-        text = json.dumps(found, indent=1, sort_keys=True)
+        content = {VERSION: FORMAT, "providers": found}
+        text = json.dumps(content, indent=1, sort_keys=True)
         write_file(self.folder / _DESCRIPTION, text)
         return found
 

@@ -17,7 +17,10 @@ from mpsfm_core.data import Float64, Pose
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.pose_auc import PoseConvention, pose_errors_deg
 from mpsfm_core.files import write_file
+from mpsfm_core.formats import VERSION, check_version
 
+FORMAT = 1
+"""Of the records."""
 RUNS = "runs"
 """Folder of the records below a benchmark's output folder."""
 
@@ -72,7 +75,7 @@ def record_file(scene: str, config: str, set_name: str, label: str) -> Path:
 def write_record(output: Path, record: Record) -> None:
     """Write a record; a reader sees the whole of it or nothing."""
     path = output / record.file
-    content = asdict(record)
+    content = {VERSION: FORMAT, **asdict(record)}
     content["estimated"] = _packed(record.estimated)
     content["others"] = [_packed(model) for model in record.others]
     content["truth"] = _packed(record.truth)
@@ -80,9 +83,11 @@ def write_record(output: Path, record: Record) -> None:
 
 
 def read_record(path: Path) -> Record:
-    """Read a record; raises :class:`InputError` when it is damaged."""
+    """Read a record; raises :class:`InputError` when it is damaged or of a newer version."""
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        check_version(content, FORMAT, path)
+        content.pop(VERSION, None)
         content["estimated"] = _unpacked(content["estimated"])
         content["others"] = [_unpacked(model) for model in content["others"]]
         content["truth"] = _unpacked(content["truth"])

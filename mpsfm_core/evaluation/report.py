@@ -19,7 +19,10 @@ from mpsfm_core.evaluation.pose_auc import (
 )
 from mpsfm_core.evaluation.records import Record
 from mpsfm_core.files import write_file
+from mpsfm_core.formats import VERSION
 
+FORMAT = 1
+"""Of ``report.json``."""
 ALL_SCENES = "all scenes"
 _COLORS = ("#1b6ca8", "#d1495b", "#2e8b57", "#e08e0b", "#7b4fa3", "#5c5c5c", "#17a2b8", "#a0522d")
 _PLOT = (440, 260)
@@ -131,7 +134,7 @@ def write_report(output: Path, records: Sequence[Record]) -> None:
         for name, other in CONVENTIONS.items()
     }
     errors = [[*record.name, record.error] for record in records if record.error]
-    text = json.dumps({"conventions": content, "errors": errors}, indent=1)
+    text = json.dumps({VERSION: FORMAT, "conventions": content, "errors": errors}, indent=1)
     write_file(output / "report.json", text + "\n")
     write_file(output / "report.html", _page(rows, records, convention))
 

@@ -6,7 +6,8 @@ The layout::
     intrinsics.yaml   optional: see mpsfm_core.inputs.intrinsics; else the cameras of gt/
     gt/               COLMAP model with true poses
     gt_depth/         optional: 16-bit PNG, millimetres along z, 0 where unknown
-    testsets.yaml     optional: bucket -> sets of images; else one set of all images
+    testsets.yaml     optional: bucket -> sets of images; else one set of all images; beside the
+                      buckets maybe ``format_version``
 
 A bucket is a list of sets, or a mapping of names to lists of sets (then its buckets are called
 ``triplets/0-5`` and so on). A set is a list of image names, extensions optional, or a mapping with
@@ -25,11 +26,14 @@ import yaml
 from mpsfm_core.data import Pose
 from mpsfm_core.errors import InputError
 from mpsfm_core.files import write_file
+from mpsfm_core.formats import VERSION, check_version
 from mpsfm_core.inputs.images import find_images
 from mpsfm_core.inputs.models import match_names, read_poses
 from mpsfm_core.yaml_text import write_yaml
 
 TESTSETS = "testsets.yaml"
+FORMAT = 1
+"""Of ``testsets.yaml``."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,7 @@ def read_scene(path: Path, *, with_sets: bool = True) -> SceneFolder:
 
 def write_sets(path: Path, buckets: Mapping[str, Sequence[Mapping[str, Any]]], note: str) -> None:
     """Write ``testsets.yaml`` of a scene folder; ``note`` becomes its first line, a comment."""
-    write_file(path / TESTSETS, f"# {note}\n{write_yaml(dict(buckets))}")
+    write_file(path / TESTSETS, f"# {note}\n{write_yaml({VERSION: FORMAT, **buckets})}")
 
 
 def _answers(bucket: str, wanted: str) -> bool:
@@ -133,6 +137,8 @@ def _read_sets(file: Path) -> Iterator[tuple[str, int, list[str]]]:
         raise InputError(f"{file} cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise InputError(f"{file}: must map buckets to sets of images")
+    check_version(content, FORMAT, file)
+    content.pop(VERSION, None)
     for bucket, entries in content.items():
         groups = entries if isinstance(entries, dict) else {"": entries}
         for group, sets in groups.items():

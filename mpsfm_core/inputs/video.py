@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from mpsfm_core.data import Float32, UInt8
 from mpsfm_core.errors import InputError
 from mpsfm_core.files import replacing
+from mpsfm_core.formats import VERSION, check_version
 from mpsfm_core.inputs.options import VideoOptions
 from mpsfm_core.weights import file_sha256
 
@@ -30,6 +32,8 @@ Progress = Callable[[int, int], None]
 _log = logging.getLogger(__name__)
 
 _LIST = "frames.json"
+FORMAT = 1
+"""Of the list of frames."""
 _TRACKED_SIDE = 480
 """Longer side in pixels of the frames that are tracked."""
 _POINTS = 300
@@ -64,9 +68,10 @@ def extract_frames(
     Raises :class:`InputError` when the file is no video, is damaged, or shows no motion.
     """
     folder = output / FRAMES
-    origin = {"sha256": _digest(video), "options": options.model_dump(mode="json")}
+    origin: dict[str, Any] = {"sha256": _digest(video), "options": options.model_dump(mode="json")}
     if _read_list(folder / _LIST) == origin:
         return folder
+    origin[VERSION] = FORMAT
     chosen = choose_frames(video, options, progress)
     with replacing(output, (FRAMES,)) as fresh:
         (fresh / FRAMES).mkdir()
@@ -254,7 +259,11 @@ def _digest(video: Path) -> str:
 
 
 def _read_list(path: Path) -> object:
+    """What a folder of frames was made from; None if nobody can tell."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        check_version(found, FORMAT, path)
+        found.pop(VERSION, None)
+    except (OSError, ValueError, AttributeError, RecursionError, InputError):
         return None
+    return found

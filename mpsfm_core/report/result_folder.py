@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,7 +18,9 @@ from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
 from mpsfm_core.errors import InputError
 from mpsfm_core.inputs.images import SUMMARY
 from mpsfm_core.inputs.models import read_model
+from mpsfm_core.results.depth_maps import load_depth_map
 from mpsfm_core.results.ply import read_ply
+from mpsfm_core.results.summary import read_summary
 from mpsfm_core.results.views import MATCHES
 from mpsfm_core.results.writer import DENSE, DEPTH, VIEWS
 
@@ -80,18 +81,10 @@ class ResultFolder:
     @classmethod
     def open(cls, path: Path) -> ResultFolder:
         """Raises :class:`InputError` when there is no summary that can be read."""
-        file = path / SUMMARY
-        try:
-            summary = json.loads(file.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(
-                f"{file}: {error.strerror}; a folder that 'mpsfm reconstruct' wrote is needed"
-            ) from error
-        except ValueError as error:
-            raise InputError(f"{file}: is damaged: {error}") from error
-        wanted = {"status", "images", "pairs", "reconstructions", "stages", "providers"}
-        if not isinstance(summary, dict) or not wanted <= summary.keys():
-            raise InputError(f"{file}: is not the summary of a run")
+        summary = read_summary(path / SUMMARY)
+        wanted = {"images", "pairs", "reconstructions", "stages", "providers"}
+        if not wanted <= summary.keys():
+            raise InputError(f"{path / SUMMARY}: is not the summary of a run")
         return cls(path, summary)
 
     @property
@@ -123,7 +116,7 @@ class ResultFolder:
         file = self.path / DEPTH / f"{name}.npz"
         if self.failed or not file.is_file():
             return None
-        data = _load(file)
+        data = load_depth_map(file)
         try:
             depth, valid = data["depth"], data["valid"]
             height, width = depth.shape

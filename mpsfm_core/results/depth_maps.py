@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpsfm_core.data import DepthPrior, PinholeCamera
 from mpsfm_core.errors import InputError
+from mpsfm_core.formats import VERSION, check_version
 from mpsfm_core.scene.reconstruction import Reconstruction
+
+FORMAT = 1
+"""Of the files."""
 
 
 def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
@@ -16,34 +22,49 @@ def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
 
     Arrays: ``depth`` (h, w) float32, z in the units of the model; ``variance`` (h, w) float32,
     those units squared; ``valid`` (h, w) bool; ``camera`` (4,) float64, fx, fy, cx, cy on this
-    grid (COLMAP pixels, undistorted); ``cam_from_world`` (3, 4) float64.
+    grid (COLMAP pixels, undistorted); ``cam_from_world`` (3, 4) float64; ``format_version``.
     """
     for image in reconstruction.images:
         height, width = image.depth.shape
         path = folder / f"{image.name}.npz"
         path.parent.mkdir(parents=True, exist_ok=True)
         assert image.depth.variance is not None  # of a refined map always
-        np.savez_compressed(
-            path,
-            depth=image.depth.depth,
-            variance=image.depth.variance,
-            valid=image.depth.valid,
-            camera=image.camera.resized(width, height).params,
-            cam_from_world=np.column_stack([image.rotation, image.translation]),
-        )
+        arrays: dict[str, Any] = {
+            VERSION: np.array(FORMAT),
+            "depth": image.depth.depth,
+            "variance": image.depth.variance,
+            "valid": image.depth.valid,
+            "camera": image.camera.resized(width, height).params,
+            "cam_from_world": np.column_stack([image.rotation, image.translation]),
+        }
+        np.savez_compressed(path, **arrays)
 
 
 def read_depth_map(path: Path, scale: float = 1.0) -> tuple[PinholeCamera, DepthPrior]:
     """The grid and the depth, times ``scale``, of a file that :func:`write_depth_maps` wrote.
 
-    Raises :class:`InputError` when it is damaged or something else.
+    Raises :class:`InputError` when it is damaged, of a newer version or something else.
+    """
+    arrays = load_depth_map(path)
+    try:
+        depth, variance = arrays["depth"], arrays["variance"]
+        rows, columns = depth.shape
+        grid = PinholeCamera(columns, rows, *map(float, arrays["camera"]))
+        scaled = depth * np.float32(scale), variance * np.float32(scale**2)
+        return grid, DepthPrior(*scaled, arrays["valid"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: is no depth map of a run: {error}") from error
+
+
+def load_depth_map(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a file that :func:`write_depth_maps` wrote, unchecked but for their version.
+
+    Raises :class:`InputError` when it is damaged or of a newer version.
     """
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            depth, variance = file["depth"], file["variance"]
-            valid, camera = file["valid"], file["camera"]
-        rows, columns = depth.shape
-        grid = PinholeCamera(columns, rows, *map(float, camera))
-        return grid, DepthPrior(depth * np.float32(scale), variance * np.float32(scale**2), valid)
+            arrays = {name: file[name] for name in file.files}
     except Exception as error:  # numpy has no base class for what damaged archives raise
         raise InputError(f"{path}: is no depth map of a run, or damaged: {error}") from error
+    check_version(arrays, FORMAT, path)
+    return arrays

@@ -2,16 +2,42 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
 from mpsfm_core.data import PinholeCamera
+from mpsfm_core.errors import InputError
+from mpsfm_core.formats import check_version
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.scene.reconstruction import MappingResult, MetricScale, Reconstruction
+
+FORMAT = 1
+"""Of ``summary.json`` and of ``views/`` beside it."""
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """The content of a ``summary.json``.
+
+    Raises :class:`InputError` when it is missing, damaged, of a newer version or something else.
+    """
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"{path}: {error.strerror}; a folder that 'mpsfm reconstruct' wrote is needed"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is damaged: {error}") from error
+    if not isinstance(summary, dict) or summary.get("status") not in ("success", "failed"):
+        raise InputError(f"{path}: is not the summary of a run")
+    check_version(summary, FORMAT, path)
+    return summary
 
 
 def describe_images(

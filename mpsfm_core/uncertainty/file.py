@@ -7,6 +7,7 @@ ships it and announces ``ProviderSpec(calibration=load_calibration(path))``.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -15,9 +16,13 @@ from pydantic import Field, model_validator
 
 from mpsfm_core.errors import ConfigError
 from mpsfm_core.files import write_file
+from mpsfm_core.formats import VERSION, check_version
 from mpsfm_core.options import Options, SettingsError, parse_settings
 from mpsfm_core.uncertainty.model import Calibration, DepthCalibration, NormalCalibration
 from mpsfm_core.yaml_text import parse_yaml, write_yaml
+
+FORMAT = 1
+"""Of calibration files."""
 
 CalibratedKind = Literal["depth", "normals"]
 CALIBRATIONS: Mapping[str, type[DepthCalibration] | type[NormalCalibration]] = {
@@ -73,10 +78,9 @@ class CalibrationFile(Options):
 
     def write(self, path: Path) -> None:
         """Write the file: JSON if it is named so, else YAML."""
-        if path.suffix == ".json":
-            text = self.model_dump_json(indent=2) + "\n"
-        else:
-            text = write_yaml(self.model_dump(mode="json"))
+        content = {VERSION: FORMAT, **self.model_dump(mode="json")}
+        is_json = path.suffix == ".json"
+        text = json.dumps(content, indent=2) + "\n" if is_json else write_yaml(content)
         write_file(path, text)
 
 
@@ -84,7 +88,8 @@ def read_values(path: Path, kind: str) -> Mapping[str, Any]:
     """The unchecked values in a calibration file for a kind of provider.
 
     Raises:
-        ConfigError: the file cannot be read, holds no mapping, or is for another kind.
+        ConfigError: the file cannot be read, holds no mapping, is of a newer version, or is for
+            another kind.
     """
     try:
         content = parse_yaml(path.read_text(encoding="utf-8"), str(path))
@@ -92,8 +97,9 @@ def read_values(path: Path, kind: str) -> Mapping[str, Any]:
         raise ConfigError(f"calibration file {str(path)!r} cannot be read: {error}") from error
     if not isinstance(content, Mapping):
         raise ConfigError(f"{path} does not hold a mapping")
+    check_version(content, FORMAT, path, ConfigError)
     if "provenance" not in content:
-        return content
+        return {key: value for key, value in content.items() if key != VERSION}
     if content.get("kind") != kind:
         raise ConfigError(f"{path} is a calibration of {content.get('kind')}, not of {kind}")
     values = content.get("calibration")

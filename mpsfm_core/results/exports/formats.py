@@ -10,6 +10,7 @@ from typing import Any
 
 from mpsfm_core.errors import InputError, did_you_mean
 from mpsfm_core.files import replacing
+from mpsfm_core.formats import VERSION
 from mpsfm_core.results.exports import (
     bundler,
     colmap_database,
@@ -23,6 +24,9 @@ from mpsfm_core.results.exports.source import Source
 
 DESCRIPTION = "export.json"
 """Beside every export: what it holds, its unit, which way is up, and how it came from the run."""
+
+DESCRIPTION_FORMAT = 1
+"""Of :data:`DESCRIPTION`."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,7 @@ def _describe(source: Source, format_name: str) -> dict[str, Any]:
     if source.gravity is not None:
         orientation = f"z is up: {source.gravity}"
     return {
+        VERSION: DESCRIPTION_FORMAT,
         "format": format_name,
         "images": len(source.names),
         "points": source.model.num_points3D(),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -24,6 +23,7 @@ from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.orientation import Gravity, estimate_gravity, rotation_to_z
 from mpsfm_core.results.photos import copy_view, portable_name
 from mpsfm_core.results.ply import read_ply
+from mpsfm_core.results.summary import read_summary
 from mpsfm_core.results.writer import DENSE, DEPTH
 
 _NORMALS_AN_IMAGE = 2000
@@ -247,12 +247,7 @@ class Source:
 def _read_summary(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from error
-    if not isinstance(summary, dict):
-        raise InputError(f"{path}: is no summary of a run")
-    if summary.get("status") == "failed":
+    summary = read_summary(path)
+    if summary["status"] == "failed":
         raise InputError(f"{path.parent}: the run made no reconstruction; {SUMMARY} says why")
     return summary
