@@ -1,0 +1,215 @@
+"""Writes a file of each of our formats, as this version writes it: ``python tests/golden/make.py``.
+
+They go into a folder named after the version, where the tests find them from then on: what was
+written once is read for ever, or refused in words. What is there is not touched; a new folder is
+made when a format has changed or a version is released.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import tempfile
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mpsfm_core import checkpoints, reconstruct
+from mpsfm_core.cli.time_left import TimeLeft
+from mpsfm_core.config import load_config
+from mpsfm_core.data import (
+    DenseMatches,
+    DepthPrior,
+    Features,
+    NormalPrior,
+    PairDepth,
+    PairMatches,
+    PinholeCamera,
+    SparseMatches,
+)
+from mpsfm_core.environments import store
+from mpsfm_core.evaluation.records import Record, write_record
+from mpsfm_core.evaluation.scene_folder import write_sets
+from mpsfm_core.extraction.cache import Cache, digest
+from mpsfm_core.extraction.nothing import JointPrior
+from mpsfm_core.extraction.verification import TwoView
+from mpsfm_core.files import replacing
+from mpsfm_core.inputs import video
+from mpsfm_core.inputs.options import VideoOptions
+from mpsfm_core.mapping.state import freeze
+from mpsfm_core.registry import Registry, core_version
+from mpsfm_core.testing.file_server import serving
+from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.uncertainty.file import CalibrationFile, Provenance
+from mpsfm_core.uncertainty.model import DepthCalibration
+from mpsfm_core.weights import WeightStore
+from mpsfm_core.worker import _description
+
+HERE = Path(__file__).parent
+CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
+CONFIG = """
+description: a run of priors in files
+features: {{use: sift, options: {{max_keypoints: 300}}}}
+matcher: {{use: mutual-nearest}}
+depth:
+  use: files
+  options: {{directory: {folder}/depth, relative_std: 0.02}}
+  calibration: {{std_scale: 1.5, relative_std: 0.03}}
+normals: {{use: from-depth}}
+extraction: {{integration_size: 32}}
+dense: {{enabled: false}}
+results: {{nerfstudio: true}}
+runtime: {{workers: 1, cache_dir: {folder}/cache}}
+"""
+KEY = "0" * 64
+STATE = {
+    "poses": [np.eye(3), (np.zeros(3), 0.5)],
+    "seen": OrderedDict(a={1, 2}, b=None),
+    "random": np.random.default_rng(4),
+}
+"""As the state of a mapper, whose own classes change with every version."""
+
+
+def entries() -> dict[str, Any]:
+    """An object of each class that the cache keeps, by kind."""
+    rng = np.random.default_rng(0)
+    maps = rng.uniform(1, 2, (3, 4)).astype(np.float32)
+    depth = DepthPrior(maps, maps**2, maps > 1.2, metric=False)
+    normals = np.zeros((3, 4, 3), np.float32)
+    normals[..., 2] = -1
+    faces = NormalPrior(normals, maps, maps > 1.2)
+    xy, scores = rng.uniform(0, 9, (5, 2)), rng.uniform(0, 1, 5).astype(np.float32)
+    rows = np.stack([np.arange(5), np.arange(5)[::-1]], axis=1)
+    matches = SparseMatches(rows, scores)
+    return {
+        "features": Features(xy, maps[[0, 1, 2, 0, 1]], scores, scores + 1, 0.7),
+        "matcher": PairMatches(matches, DenseMatches(xy, xy + 1, scores), PairDepth(depth, depth)),
+        "depth": depth,
+        "normals": faces,
+        "joint": JointPrior(depth, faces),
+        "two-view": TwoView("", "calibrated", np.arange(4), np.eye(3), np.array([0.6, 0, 0.8])),
+        "mask": np.array([[0, 255]], np.uint8),
+    }
+
+
+def write_run(folder: Path, output: Path) -> None:
+    """A result folder, and the configuration of its run."""
+    for name in ("photos", "depth"):
+        (folder / name).mkdir()
+    for number, pose in enumerate(arc_poses(3, 12.0)):
+        rendering = room_scene().render(CAMERA, pose)
+        cv2.imwrite(str(folder / "photos" / f"{number}.png"), rendering.rgb[..., ::-1])
+        np.savez(folder / "depth" / f"{number}.npz", depth=rendering.depth)
+    (folder / "intrinsics.yaml").write_text("1: {params: [140, 140, 80, 60], images: all}\n")
+    (folder / "run.yaml").write_text(CONFIG.format(folder=folder))
+    intrinsics = folder / "intrinsics.yaml"
+    reconstruct(folder / "photos", output / "out", folder / "run.yaml", intrinsics=intrinsics)
+    config = load_config(folder / "run.yaml")
+    (output / "config.yaml").write_text(config.to_yaml())
+    (output / "out" / "report.html").unlink()  # is made of the rest
+
+
+def write_cache(output: Path) -> None:
+    """Entries of each kind, a checkpoint, hashes of weights, speeds."""
+    cache, found = Cache(output / "cache"), {}
+    for kind, value in entries().items():
+        cache.store(kind, KEY, value)
+        found[kind] = digest(value)
+    (output / "digests.json").write_text(json.dumps(found, indent=1) + "\n")
+    header = {"code": checkpoints.code_key(), "version": core_version(), "registered": 2}
+    text = json.dumps({**header, "time": "2026-01-01 00:00:00"}).encode()
+    (output / "cache" / "mapping").mkdir()
+    with (output / "cache" / "mapping" / "checkpoint.npz").open("wb") as file:
+        state: Any = freeze(STATE)
+        np.savez(file, header=np.frombuffer(text, np.uint8), **state)
+    with serving() as server:
+        server.files["/v1/model.onnx"] = b"weights"
+        uri = f"{server.url}/v1/model.onnx"
+        WeightStore(output / "cache").resolve(uri)
+    record = output / "cache" / "weights" / "hashes.json"
+    record.write_text(record.read_text().replace(server.url, "https://example.org"))
+    clock = iter(range(9))
+    speeds = TimeLeft(output / "cache", lambda: float(next(clock)))
+    speeds.started("features", 4)
+    speeds.finished("features")
+    speeds.keep()
+    for path in (*output.rglob("*.lock"), *(output / "cache" / "weights").rglob("*.onnx")):
+        path.unlink()
+
+
+def write_calibrations(output: Path) -> None:
+    """As YAML and JSON."""
+    provenance = Provenance(
+        provider="a", distribution="mpsfm-a 1.0", truth="maps", data="b", date="2026-01-01",
+        core=core_version(), images=3, pixels=1000, weights={"a.onnx": "00"},
+        intervals_95={"std_scale": (1.1, 1.9)}, metrics={"before": {"nll": 1.5}},
+    )  # fmt: skip
+    values = DepthCalibration(std_scale=1.5, relative_std=0.03)
+    made = CalibrationFile(kind="depth", calibration=values, provenance=provenance)
+    for name in ("calibration.yaml", "calibration.json"):
+        made.write(output / name)
+
+
+def write_evaluation(output: Path) -> None:
+    """Sets of images and a record."""
+    sets = {"minimal": [{"images": ["0.png", "1.png"]}], "triplets": {"0-5": [["0", "1", "2"]]}}
+    write_sets(output, sets, "overlap from depth")  # type: ignore[arg-type]
+    poses = {f"{k}.png": (np.eye(3), np.array([k, 0.0, 0.5])) for k in range(3)}
+    record = Record(
+        "room", "benchmark", "minimal", "minimal-00", "ours-config", KEY, poses, poses, 3, 1.0, 1.5,
+        others=(poses,),
+    )  # fmt: skip
+    write_record(output, record)
+
+
+def write_others(output: Path) -> None:
+    """Frames of a video, an environment, and what a run that was killed left of an exchange."""
+    clip = output / "clip.avi"
+    clip.write_bytes(b"not looked into")
+    options = VideoOptions()
+    folder = output / video.FRAMES
+    folder.mkdir()
+    origin = {"sha256": video._digest(clip), "options": options.model_dump(mode="json")}
+    origin = {video.VERSION: video.FORMAT, **origin}
+    (folder / video._LIST).write_text(json.dumps(origin))
+    environment = store.Environment(output / "environment")
+    environment.ask = lambda **_: _description(Registry.discover(environments=False))  # type: ignore[method-assign,assignment]
+    environment.refresh()
+    exchange = output / "exchange"
+    child = os.fork()
+    if child == 0:
+        Path.rename = lambda *_: os.kill(os.getpid(), signal.SIGKILL)  # type: ignore[method-assign]
+        with replacing(exchange, ("old.txt",)) as fresh:
+            (exchange / "old.txt").write_text("old")
+            (fresh / "new.txt").write_text("new")
+    os.waitpid(child, 0)
+    (scratch,) = exchange.glob(".mpsfm-*")
+    (scratch / "old" / "nothing").touch()  # git keeps no empty folder
+    scratch.rename(exchange / ".mpsfm-killed")
+
+
+def main() -> None:
+    """Write them all, with nothing of this machine in them."""
+    output = HERE / core_version()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        made = folder / "made"
+        made.mkdir()
+        write_run(folder, made)
+        write_cache(made)
+        write_calibrations(made)
+        write_evaluation(made)
+        write_others(made)
+        for path in made.rglob("*"):
+            if path.suffix in (".json", ".yaml"):
+                path.write_text(path.read_text().replace(temporary, "/home/user"))
+        shutil.copytree(made, output)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,303 @@
+"""Files that an earlier version wrote are read; those of a later one are refused, or made anew.
+
+``tests/golden/VERSION`` has a file of each format as that version wrote it
+(``python tests/golden/make.py``).
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import yaml
+
+from mpsfm_core.checkpoints import read_checkpoint
+from mpsfm_core.cli.time_left import TimeLeft
+from mpsfm_core.config import load_config
+from mpsfm_core.data import DepthPrior, Features, NormalPrior, PairMatches
+from mpsfm_core.environments.store import Environment
+from mpsfm_core.errors import InputError
+from mpsfm_core.evaluation.records import read_records
+from mpsfm_core.evaluation.scene_folder import _read_sets
+from mpsfm_core.extraction.cache import Cache, digest
+from mpsfm_core.extraction.nothing import JointPrior
+from mpsfm_core.extraction.verification import TwoView
+from mpsfm_core.files import claimed
+from mpsfm_core.formats import VERSION, check_version
+from mpsfm_core.inputs import video
+from mpsfm_core.mapping.state import thaw
+from mpsfm_core.registry import core_version
+from mpsfm_core.report.page import render
+from mpsfm_core.report.result_folder import ResultFolder
+from mpsfm_core.results.depth_maps import read_depth_map
+from mpsfm_core.results.exports.source import Source
+from mpsfm_core.uncertainty.file import load_calibration
+from mpsfm_core.weights import WeightStore
+
+ROOT = Path(__file__).resolve().parents[1]
+GOLDEN = ROOT / "tests" / "golden"
+VERSIONS = sorted(path.name for path in GOLDEN.iterdir() if (path / "digests.json").is_file())
+KEY = "0" * 64
+
+
+def results(folder: Path) -> Any:
+    """All that is read of a result folder."""
+    found = ResultFolder.open(folder / "out")
+    assert found.names == ["0.png", "1.png", "2.png"] == Source.read(folder / "out").names
+    assert found.model.num_reg_images() == 3 and len(found.dense_cloud()[0]) > 100
+    maps = [(found.refined(n), found.prior(n), found.picture(n)) for n in found.names]
+    assert all(part is not None for parts in maps for part in parts)
+    assert "dense: {enabled" not in render(found)
+    lines = [(line.image_a, line.image_b, len(line.points_a)) for line in found.lines()]
+    return found.summary["reconstructions"], lines
+
+
+def depth(folder: Path) -> Any:
+    grid, prior = read_depth_map(folder / "out" / "depth" / "0.png.npz")
+    return grid, digest(prior)
+
+
+def configuration(folder: Path) -> Any:
+    """The settings that the file has; later versions may have more."""
+    (folder / "set.yaml").write_text("extends: config.yaml\n")
+    config = load_config(folder / "set.yaml").model_dump(mode="json")
+    said = yaml.safe_load((folder / "config.yaml").read_text())
+    said.pop(VERSION, None)
+    said.pop("description")
+    return contained(said, config)
+
+
+def contained(said: Any, found: Any) -> Any:
+    if not isinstance(said, dict):
+        return found
+    return {key: contained(value, found[key]) for key, value in said.items()}
+
+
+def calibrated(path: Path) -> Any:
+    """The values that the maker set."""
+    values = load_calibration(path).model_dump()
+    return {name: values[name] for name in ("std_scale", "relative_std")}
+
+
+def speeds(folder: Path) -> Any:
+    left = TimeLeft(folder / "cache")
+    left.started("features", 100)
+    return left._usual["features"]
+
+
+def frames(folder: Path) -> Any:
+    """Whether the frames would be taken as they are."""
+    options = video.VideoOptions.model_validate(
+        json.loads((folder / "frames" / "frames.json").read_text())["options"]
+    )
+    try:
+        return video.extract_frames(folder / "clip.avi", folder, options).name
+    except InputError:
+        return "looked into"
+
+
+def exchange(folder: Path) -> Any:
+    exchange_in(folder / "exchange")
+    return {path.name: path.read_text() for path in (folder / "exchange").iterdir()}
+
+
+class File(NamedTuple):
+    """``path``: that says its version. ``read``: gives what is in it. ``anew``: what it gives for a
+    file that may be newer, because it can be had again; such a file is refused where it is None.
+    """
+
+    path: str
+    read: Callable[[Path], Any]
+    anew: Any = None
+
+
+FILES: dict[str, File] = {
+    "summary": File("out/summary.json", results),
+    "depth": File("out/depth/0.png.npz", depth),
+    "calibration.yaml": File(
+        "calibration.yaml", lambda folder: calibrated(folder / "calibration.yaml")
+    ),
+    "calibration.json": File(
+        "calibration.json", lambda folder: calibrated(folder / "calibration.json")
+    ),
+    "config": File("config.yaml", configuration),
+    "testsets": File("testsets.yaml", lambda folder: list(_read_sets(folder / "testsets.yaml"))),
+    "record": File(
+        "runs/room/benchmark/minimal-00/ours-config.json",
+        lambda folder: [(r.name, len(r.estimated), len(r.others)) for r in read_records(folder)],
+    ),
+    "hashes": File(
+        "cache/weights/hashes.json",
+        lambda folder: WeightStore(folder / "cache")._recorded("https://example.org/v1/model.onnx"),
+    ),
+    "timings": File("cache/timings.json", speeds, anew=0.3),
+    "environment": File(
+        "environment/providers.json",
+        lambda folder: {p["kind"] for p in Environment(folder / "environment").describe()},
+        anew=set(),
+    ),
+    "frames": File("frames/frames.json", frames, anew="looked into"),
+    "exchange": File("exchange/.mpsfm-killed/ready.json", exchange),
+}
+EXPECTED = {
+    "calibration.yaml": {"std_scale": 1.5, "relative_std": 0.03},
+    "calibration.json": {"std_scale": 1.5, "relative_std": 0.03},
+    "testsets": [("minimal", 0, ["0.png", "1.png"]), ("triplets/0-5", 0, ["0", "1", "2"])],
+    "record": [(("room", "benchmark", "minimal-00", "ours-config"), 3, 1)],
+    "hashes": "9a129038d9a00aed0cf6a7ea059ca50a813449061ab87848cf1a13eafdf33b2c",
+    "timings": 0.25,
+    "frames": "frames",
+    "exchange": {"new.txt": "new"},
+}
+
+
+@pytest.fixture(params=VERSIONS)
+def golden(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A copy of the files of a version."""
+    return Path(shutil.copytree(GOLDEN / request.param, tmp_path / "golden"))
+
+
+def change_version(path: Path, version: int | None) -> None:
+    """Let a file say another version, or none."""
+    if path.suffix == ".npz":
+        with np.load(path) as archive:
+            arrays = {name: archive[name] for name in archive.files if name != VERSION}
+        arrays |= {} if version is None else {VERSION: np.array(version)}
+        np.savez(path, **arrays)
+        return
+    is_json = path.suffix == ".json"
+    load, dump = (json.loads, json.dumps) if is_json else (yaml.safe_load, yaml.safe_dump)
+    content = load(path.read_text())
+    assert content.pop(VERSION) >= 1
+    path.write_text(dump({**content, **({} if version is None else {VERSION: version})}))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_of_an_earlier_version_is_read(name: str, golden: Path) -> None:
+    found = FILES[name].read(golden)
+    assert found == EXPECTED.get(name, found)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_without_a_version_is_of_the_first(name: str, golden: Path, tmp_path: Path) -> None:
+    older = Path(shutil.copytree(golden, tmp_path / "older"))
+    path = older / FILES[name].path
+    change_version(path, None)
+    if name == "environment":
+        path.write_text(json.dumps(json.loads(path.read_text())["providers"]))
+    assert FILES[name].read(older) == FILES[name].read(golden)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_of_a_later_version_is_refused_or_made_anew(name: str, golden: Path) -> None:
+    change_version(golden / FILES[name].path, 999)
+    if FILES[name].anew is not None:
+        assert FILES[name].read(golden) == FILES[name].anew
+        return
+    with pytest.raises(InputError, match=r"is of format 999, of a newer mpsfm-core") as caught:
+        FILES[name].read(golden)
+    assert Path(FILES[name].path).name in str(caught.value)
+
+
+def test_the_configuration_comes_back_as_it_was_written(golden: Path) -> None:
+    said = yaml.safe_load((golden / "config.yaml").read_text())
+    assert said.pop(VERSION) == 1
+    said.pop("description")
+    assert configuration(golden) == said
+
+
+CLASSES = {
+    **{"features": Features, "matcher": PairMatches, "depth": DepthPrior, "normals": NormalPrior},
+    **{"joint": JointPrior, "two-view": TwoView, "mask": np.ndarray},
+}
+
+
+def test_entries_of_the_cache_are_read_as_they_were_written(golden: Path) -> None:
+    """Else :data:`mpsfm_core.extraction.cache.FORMAT` has to be raised."""
+    written = json.loads((golden / "digests.json").read_text())
+    cache = Cache(golden / "cache")
+    assert {kind: digest(cache.load(kind, KEY, cls)) for kind, cls in CLASSES.items()} == written
+
+
+def test_a_checkpoint_is_read_as_it_was_written(golden: Path) -> None:
+    """Else :data:`mpsfm_core.mapping.state.FORMAT` has to be raised."""
+    header, frozen = read_checkpoint(golden / "cache" / "mapping" / "checkpoint.npz")
+    assert header["version"] in VERSIONS and header["registered"] == 2
+    state = thaw(frozen)
+    assert np.array_equal(state["poses"][0], np.eye(3)) and state["poses"][1][1] == 0.5
+    assert list(state["seen"].items()) == [("a", {1, 2}), ("b", None)]
+    assert state["random"].random() == np.random.default_rng(4).random()
+
+
+def test_files_of_this_version_are_kept() -> None:
+    assert core_version() in VERSIONS, "python tests/golden/make.py writes them"
+
+
+def declared() -> dict[str, int]:
+    """Module -> the number that it gives its format."""
+    found = {}
+    for path in sorted((ROOT / "mpsfm_core").rglob("*.py")):
+        if "templates" in path.parts:
+            continue
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                name = node.targets[0].id
+                if re.fullmatch(r"(DESCRIPTION_)?FORMAT|PROTOCOL|API_VERSION", name):
+                    assert isinstance(node.value, ast.Constant)
+                    found[path.relative_to(ROOT / "mpsfm_core").as_posix()] = node.value.value
+    return found
+
+
+def test_the_documentation_lists_every_format() -> None:
+    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\|[^|]*\| (\d+) \| `([\w/.]+)` \|", text, re.MULTILINE)
+    assert {module: int(number) for number, module in rows} == declared()
+
+
+@pytest.mark.parametrize("version", [0, -3, "two", None, [1], float("nan"), float("inf")])
+def test_what_is_no_version_is_refused(version: object) -> None:
+    with pytest.raises(InputError, match=r"x\.json: its format_version is .*, not a number"):
+        check_version({VERSION: version}, 1, Path("x.json"))
+
+
+@pytest.mark.parametrize("name", ["../old.txt", "/etc/passwd", "..", "", "a/b", 1])
+@pytest.mark.parametrize("key", ["entries", "new"])
+def test_an_exchange_touches_nothing_outside(key: str, name: object, tmp_path: Path) -> None:
+    """A folder of results that came from somebody else."""
+    output = tmp_path / "out"
+    scratch = output / ".mpsfm-x"
+    (scratch / "new").mkdir(parents=True)
+    (scratch / "old").mkdir()
+    (tmp_path / "old.txt").write_text("the user's own")
+    plan = {"entries": [], "new": [], key: [name]}
+    (scratch / "ready.json").write_text(json.dumps(plan))
+    with pytest.raises(InputError, match=r"no run of ours left this .*; remove .*mpsfm-x"):
+        exchange_in(output)
+    assert (tmp_path / "old.txt").is_file()
+
+
+def test_an_exchange_follows_no_link(tmp_path: Path) -> None:
+    output, photos = tmp_path / "out", tmp_path / "photos"
+    (output / ".mpsfm-x").mkdir(parents=True)
+    photos.mkdir()
+    (photos / "a.png").touch()
+    (output / ".mpsfm-x" / "new").symlink_to(photos)
+    (output / ".mpsfm-x" / "ready.json").write_text('{"entries": [], "new": ["a.png"]}')
+    with pytest.raises(InputError, match="leads elsewhere"):
+        exchange_in(output)
+    (output / ".mpsfm-x" / "ready.json").unlink()
+    (output / ".mpsfm-y").symlink_to(photos)
+    exchange_in(output)
+    assert (photos / "a.png").is_file()
+
+
+def exchange_in(output: Path) -> None:
+    with claimed(output):
+        pass
