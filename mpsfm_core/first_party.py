@@ -56,6 +56,20 @@ FIRST_PARTY: Mapping[str, tuple[str, ...]] = MappingProxyType(
 EXECUTORS: Mapping[str, str] = MappingProxyType({"dask": "mpsfm-dask", "ray": "mpsfm-ray"})
 """Executor -> what to install for it."""
 
+VIEWERS: Mapping[str, str] = MappingProxyType({"viser": "mpsfm-viser", "rerun": "mpsfm-rerun"})
+"""Viewer -> what to install for it."""
+
+EXPORTS: Mapping[str, str] = MappingProxyType({"rerun": "mpsfm-rerun"})
+"""Format of an export -> what to install for it."""
+
+
+def install_hint(homes: Mapping[str, str], name: str) -> str:
+    """How to get what is named, as the end of a sentence; empty if it is none of ours.
+
+    ``homes``: :data:`VIEWERS`, :data:`EXPORTS`.
+    """
+    return f"; pip install {homes[name]}" if name in homes else ""
+
 
 def requirement_for(kind: str, name: str) -> str:
     """What to install for a provider, empty if it is none of ours."""

@@ -266,6 +266,24 @@ class ProviderSpec:
     contract: str | Callable[[Path], object] | None = None
 
 
+@dataclass(frozen=True)
+class ExportFormat:
+    """A format of another program that ``mpsfm export`` writes.
+
+    ``description``: one line for people. ``entries``: what it writes into its folder. ``write``:
+    called with a :class:`~mpsfm_core.results.exports.source.Source` and an empty folder; a plugin
+    gives ``"package.module:function"``, imported when the format is wanted. It raises
+    :class:`~mpsfm_core.errors.InputError` when the input lacks what the format needs. ``turned``:
+    gravity is -z unless the user wants otherwise, for programs that show or render the scene.
+    """
+
+    name: str
+    description: str
+    entries: tuple[str, ...]
+    write: str | Callable[[Any, Path], None]
+    turned: bool = False
+
+
 hookspec = pluggy.HookspecMarker("mpsfm")
 hookimpl = pluggy.HookimplMarker("mpsfm")
 
@@ -327,6 +345,10 @@ class Hooks:
     def mpsfm_viewers(self) -> Mapping[str, str]:  # type: ignore[empty-body]
         """The viewers of this plugin: name -> ``"package.module:Class"``, imported when one is
         wanted; see :mod:`mpsfm_core.viewing`."""
+
+    @hookspec
+    def mpsfm_export_formats(self) -> Sequence[ExportFormat]:  # type: ignore[empty-body]
+        """The formats that this plugin writes for ``mpsfm export``."""
 
     @hookspec
     def mpsfm_image_rejected(self, name: str, reason: str) -> None:

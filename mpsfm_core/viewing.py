@@ -17,6 +17,8 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import (
+    Bool,
+    DepthPrior,
     Float64,
     PinholeCamera,
     PosedImage,
@@ -83,10 +85,7 @@ def lifted(image: PosedImage, picture: UInt8 | None) -> Cloud:
     if depth is None:
         return Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     height, width = depth.shape
-    usable = depth.valid
-    if depth.variance is not None:
-        usable = usable & (depth.variance <= (MAX_RELATIVE_STD * depth.depth) ** 2)
-    pixels = np.flatnonzero(usable)
+    pixels = np.flatnonzero(certain(depth))
     pixels = pixels[:: max(1, -(-len(pixels) // _SHOWN_PIXELS))]
     xy = pixel_centers(width, height).reshape(-1, 2)[pixels]
     local = unproject(image.camera.resized(width, height), xy, depth.depth.ravel()[pixels])
@@ -95,6 +94,15 @@ def lifted(image: PosedImage, picture: UInt8 | None) -> Cloud:
     if picture is not None:
         rgb = np.asarray(resize_map(picture, width, height).reshape(-1, 3)[pixels], np.uint8)
     return Cloud(world, rgb)
+
+
+def certain(depth: DepthPrior) -> Bool:
+    """Which pixels (h, w) are worth showing: valid, and not less certain than
+    :data:`MAX_RELATIVE_STD`."""
+    if depth.variance is None:
+        return depth.valid
+    shown: Bool = depth.valid & (depth.variance <= (MAX_RELATIVE_STD * depth.depth) ** 2)
+    return shown
 
 
 def read_scene(folder: Path) -> tuple[SceneState, Cloud, Pictures]:
@@ -106,14 +114,15 @@ def read_scene(folder: Path) -> tuple[SceneState, Cloud, Pictures]:
         result = ResultFolder.open(folder)
         if result.failed:
             raise InputError(f"{folder}: the run failed, open {folder}/report.html instead")
-        scene, cloud = _of_model(result.model)
+        scene, cloud = scene_of(result.model)
         if (folder / DENSE).is_file():
             cloud = Cloud(*read_ply(folder / DENSE))
         return scene, cloud, views_in(folder)
-    return *_of_model(read_model(folder)), photos_in(folder / "images")
+    return *scene_of(read_model(folder)), photos_in(folder / "images")
 
 
-def _of_model(model: pycolmap.Reconstruction) -> tuple[SceneState, Cloud]:
+def scene_of(model: pycolmap.Reconstruction) -> tuple[SceneState, Cloud]:
+    """The images of a COLMAP model that have a pose, sorted by name, and its points."""
     images = []
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.has_pose:

@@ -37,13 +37,12 @@ def export(
 ) -> None:
     """Write a result in the format of another program."""
     from mpsfm_core.cli.tables import print_table
-    from mpsfm_core.results.exports.formats import FORMATS
     from mpsfm_core.results.exports.formats import export as write
+    from mpsfm_core.results.exports.formats import known_formats
 
     if to == "list":
-        print_table(
-            ("format", "what it is"), [(name, f.description) for name, f in FORMATS.items()]
-        )
+        known = known_formats()
+        print_table(("format", "what it is"), [(name, f.description) for name, f in known.items()])
         return
     done = write(folder, to, output, photos=images, turn=turn)
     if quiet:

@@ -41,11 +41,12 @@ def open_viewer(registry: Registry, name: str, output: Path, pictures: Pictures)
     from pkgutil import resolve_name
 
     from mpsfm_core.errors import InputError, did_you_mean
+    from mpsfm_core.first_party import VIEWERS, install_hint
 
     brought = registry.call_hook("mpsfm_viewers")
     known = {key: value for answer in brought for key, value in dict(answer).items()}
     if name not in known:
-        hint = did_you_mean(name, known) if known else "; pip install mpsfm-viser or mpsfm-rerun"
+        hint = install_hint(VIEWERS, name) or did_you_mean(name, known or VIEWERS)
         raise InputError(f"no viewer {name!r}{hint}")
     try:
         return resolve_name(known[name])(output, pictures)

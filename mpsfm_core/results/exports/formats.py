@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from mpsfm_core.errors import InputError, did_you_mean
 from mpsfm_core.files import replacing
+from mpsfm_core.first_party import EXPORTS, install_hint
 from mpsfm_core.formats import VERSION
+from mpsfm_core.providers import ExportFormat
+from mpsfm_core.registry import Registry
 from mpsfm_core.results.exports import (
     bundler,
     colmap_database,
@@ -29,43 +32,52 @@ DESCRIPTION_FORMAT = 1
 """Of :data:`DESCRIPTION`."""
 
 
-@dataclass(frozen=True)
-class Format:
-    """``description``: one line for people. ``entries``: what it writes into its folder.
-    ``write``: writes them; raises :class:`InputError`. ``turned``: gravity is -z unless the user
-    wants otherwise, for programs that show or render the scene."""
-
-    description: str
-    entries: tuple[str, ...]
-    write: Callable[[Source, Path], None]
-    turned: bool = False
-
-
-FORMATS = {
-    "nerfstudio": Format(
+FORMATS = (
+    ExportFormat(
+        "nerfstudio",
         "transforms.json with undistorted photos, depth, normals and points",
         nerfstudio.ENTRIES,
         nerfstudio.write,
         turned=True,
     ),
-    "gsplat": Format(
+    ExportFormat(
+        "gsplat",
         "COLMAP folder of undistorted photos with points, depth and normals for splatting",
         gsplat.ENTRIES,
         gsplat.write,
         turned=True,
     ),
-    "colmap-db": Format(
+    ExportFormat(
+        "colmap-db",
         "COLMAP database with cameras, keypoints and verified matches",
         colmap_database.ENTRIES,
         colmap_database.write,
     ),
-    "colmap-text": Format("COLMAP model as text", colmap_text.ENTRIES, colmap_text.write),
-    "glb": Format(
-        "points and cameras as glTF, for Blender and browsers", glb.ENTRIES, glb.write, turned=True
+    ExportFormat("colmap-text", "COLMAP model as text", colmap_text.ENTRIES, colmap_text.write),
+    ExportFormat(
+        "glb",
+        "points and cameras as glTF, for Blender and browsers",
+        glb.ENTRIES,
+        glb.write,
+        turned=True,
     ),
-    "bundler": Format("bundle.out of Bundler, undistorted", bundler.ENTRIES, bundler.write),
-    "nvm": Format("N-View Match of VisualSFM, undistorted", nvm.ENTRIES, nvm.write),
-}
+    ExportFormat("bundler", "bundle.out of Bundler, undistorted", bundler.ENTRIES, bundler.write),
+    ExportFormat("nvm", "N-View Match of VisualSFM, undistorted", nvm.ENTRIES, nvm.write),
+)
+"""Those of the core."""
+
+
+def known_formats(registry: Registry | None = None) -> dict[str, ExportFormat]:
+    """All formats by name: the core's, then the plugins'.
+
+    ``registry``: by default that of all installed plugins.
+    """
+    registry = registry or Registry.discover()
+    brought = [one for more in registry.call_hook("mpsfm_export_formats") for one in more]
+    known: dict[str, ExportFormat] = {}
+    for one in (*FORMATS, *brought):
+        known.setdefault(one.name, one)
+    return known
 
 
 def export(
@@ -75,19 +87,23 @@ def export(
     *,
     photos: Path | None = None,
     turn: bool | None = None,
+    registry: Registry | None = None,
 ) -> dict[str, Any]:
     """Write a result folder or COLMAP model in another format.
 
     ``output``: folder, by default ``exports/FORMAT`` below ``folder``. ``photos``: folder of the
     photos, if they are not where the run found them. ``turn``: whether gravity becomes -z and the
-    middle the origin, None for what suits the format.
+    middle the origin, None for what suits the format. ``registry``: by default that of all
+    installed plugins, which may bring formats.
 
     Returns what :data:`DESCRIPTION` says. Raises :class:`InputError` when the input is damaged or
     lacks what the format needs.
     """
-    if format_name not in FORMATS:
-        raise InputError(f"no format {format_name!r}{did_you_mean(format_name, FORMATS)}")
-    chosen = FORMATS[format_name]
+    known = known_formats(registry)
+    if format_name not in known:
+        hint = install_hint(EXPORTS, format_name) or did_you_mean(format_name, known)
+        raise InputError(f"no format {format_name!r}{hint}")
+    chosen = known[format_name]
     source = Source.read(folder, photos)
     if turn is None:
         turn = chosen.turned and not source.is_georeferenced
@@ -96,10 +112,21 @@ def export(
     output = output or folder / "exports" / format_name
     described = _describe(source, format_name)
     with replacing(output, (*chosen.entries, DESCRIPTION)) as fresh:
-        chosen.write(source, fresh)
+        _writer_of(chosen)(source, fresh)
         text = json.dumps(described, indent=2) + "\n"
         (fresh / DESCRIPTION).write_text(text, encoding="utf-8")
     return {**described, "output": str(output)}
+
+
+def _writer_of(chosen: ExportFormat) -> Callable[[Source, Path], None]:
+    if callable(chosen.write):
+        return chosen.write
+    try:
+        writer: Callable[[Source, Path], None] = resolve_name(chosen.write)
+    except Exception as error:  # a plugin's
+        text = f"format {chosen.name!r} cannot be written: {type(error).__name__}: {error}"
+        raise InputError(text) from error
+    return writer
 
 
 def _describe(source: Source, format_name: str) -> dict[str, Any]:

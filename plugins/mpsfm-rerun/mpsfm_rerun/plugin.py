@@ -1,13 +1,28 @@
-"""Names the viewer; rerun is imported when it is wanted."""
+"""Names the viewer and the format; rerun is imported when one is wanted."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from mpsfm_core import hookimpl
+from mpsfm_core.providers import ExportFormat
 
 
 @hookimpl
 def mpsfm_viewers() -> Mapping[str, str]:
     """``mpsfm view DIR --viewer rerun``, ``mpsfm reconstruct ... --viewer rerun``."""
     return {"rerun": "mpsfm_rerun.viewer:RerunViewer"}
+
+
+@hookimpl
+def mpsfm_export_formats() -> Sequence[ExportFormat]:
+    """``mpsfm export DIR --to rerun``."""
+    return [
+        ExportFormat(
+            "rerun",
+            "recording for the rerun viewer: cameras, photos, points, depth maps",
+            ("scene.rrd",),
+            "mpsfm_rerun.export:write",
+            turned=True,
+        )
+    ]

@@ -9,22 +9,27 @@ import numpy as np
 import rerun
 
 from mpsfm_core import hookimpl
-from mpsfm_core.data import PosedImage, SceneState
-from mpsfm_core.viewing import Cloud, Pictures, lifted
+from mpsfm_core.data import DepthPrior, PosedImage, SceneState
+from mpsfm_core.viewing import Cloud, Pictures, certain, lifted
 
 RECORDING = "scene.rrd"
 TIMELINE = "step"
 
 
 class RerunViewer:
-    """Writes ``OUTPUT/scene.rrd``; each scene is a step of the timeline ``step``."""
+    """Writes ``OUTPUT/scene.rrd``; each scene is a step of the timeline ``step``.
 
-    def __init__(self, output: Path, pictures: Pictures) -> None:
+    ``z_is_up``: of the world; else y is down, as in the first camera.
+    """
+
+    def __init__(self, output: Path, pictures: Pictures, z_is_up: bool = False) -> None:
         output.mkdir(parents=True, exist_ok=True)
         self.path = output / RECORDING
         self._recording = rerun.RecordingStream("mpsfm")
         self._recording.save(self.path)
-        self._recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
+        axes = rerun.ViewCoordinates
+        up = axes.RIGHT_HAND_Z_UP if z_is_up else axes.RIGHT_HAND_Y_DOWN
+        self._recording.log("world", up, static=True)
         self._pictures = pictures
         self._step = 0
         self._shown: set[str] = set()
@@ -46,14 +51,14 @@ class RerunViewer:
         self._recording.log("log", rerun.TextLog(text, level=rerun.TextLogLevel.WARN))
 
     def show(self, scene: SceneState, cloud: Cloud | None = None) -> None:
-        """The next step."""
+        """The next step. Depth is shown as points of the world, or beside ``cloud`` as maps."""
         self._step += 1
         self._recording.set_time(TIMELINE, sequence=self._step)
         names = {image.name for image in scene.images}
         for name in self._shown - names:
             self._recording.log(_place(name), rerun.Clear(recursive=True))
         for image in scene.images:
-            self._log_image(image, with_depth=cloud is None)
+            self._log_image(image, as_points=cloud is None)
         self._recording.log("world/points", rerun.Points3D(scene.points))
         if cloud is not None:
             self._recording.log("world/dense", rerun.Points3D(cloud.xyz, colors=cloud.rgb))
@@ -68,7 +73,7 @@ class RerunViewer:
     def wait(self) -> None:
         """There is a file to open."""
 
-    def _log_image(self, image: PosedImage, *, with_depth: bool) -> None:
+    def _log_image(self, image: PosedImage, *, as_points: bool) -> None:
         place, camera = _place(image.name), image.camera
         world_from_camera = rerun.Transform3D(
             translation=-image.rotation.T @ image.translation, mat3x3=image.rotation.T
@@ -90,10 +95,19 @@ class RerunViewer:
             self._recording.log(f"{place}/photo", rerun.Image(picture).compress(), static=True)
         if image.name not in self._shown:
             self._recording.log(f"{place}/photo", pinhole, static=True)
-        if with_depth:
+        if image.depth is not None and not as_points:
+            self._recording.log(f"depth/{_key(image.name)}", _depth_image(image.depth))
+        elif as_points:
             points = lifted(image, picture)
             depth_place = f"world/depth/{_key(image.name)}"
             self._recording.log(depth_place, rerun.Points3D(points.xyz, colors=points.rgb))
+
+
+def _depth_image(depth: DepthPrior) -> rerun.DepthImage:
+    """In steps of 16 bits, 0 where it is not certain."""
+    shown = np.where(certain(depth), depth.depth, 0.0)
+    steps = np.iinfo(np.uint16).max / max(float(shown.max()), 1e-12)
+    return rerun.DepthImage(np.round(shown * steps).astype(np.uint16), meter=steps)
 
 
 def _place(name: str) -> str:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
@@ -14,6 +17,7 @@ from rerun.chunk import RrdReader
 
 from mpsfm_core.data import DepthPrior, PinholeCamera, PosedImage, SceneState
 from mpsfm_core.registry import Registry
+from mpsfm_core.results.exports.formats import export
 from mpsfm_core.viewing import Cloud
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 32.0, 24.0)
@@ -58,4 +62,57 @@ def test_a_finished_scene_is_recorded_with_its_cloud(tmp_path: Path) -> None:
     viewer.finish()
     rows = recorded(tmp_path / RECORDING)
     assert rows["/world/dense"] == 1
-    assert not any("depth" in path for path in rows)
+    assert not any(path.startswith("/world/depth") for path in rows), "maps, not points"
+
+
+def values_of(path: Path, entity: str) -> dict[str, Any]:
+    """What is recorded of an entity: component -> values of the only row."""
+    return {
+        name: column.to_pylist()[0]
+        for chunk in RrdReader(str(path)).stream()
+        if str(chunk.entity_path) == entity
+        for name, column in zip(
+            chunk.to_record_batch().schema.names, chunk.to_record_batch().columns, strict=True
+        )
+        if ":" in name
+    }
+
+
+def test_a_model_is_exported(tmp_path: Path) -> None:
+    """With its photos and depth, gravity along -z; read by rerun's own reader."""
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig = 1, 1
+    options.num_frames_per_rig, options.num_points3D = 3, 20
+    model = pycolmap.synthesize_dataset(options)
+    for folder in ("sparse", "images", "depth"):
+        (tmp_path / folder).mkdir()
+    model.write(str(tmp_path / "sparse"))
+    names = sorted(image.name for image in model.images.values())
+    for name in names:
+        cv2.imwrite(str(tmp_path / "images" / name), np.full((60, 80, 3), 90, np.uint8))
+    depth = np.full((6, 8), 2.0, np.float32)
+    depth[0] = 4.0
+    np.savez(
+        tmp_path / "depth" / f"{names[0]}.npz",
+        depth=depth,
+        variance=np.full((6, 8), 1e-4, np.float32),
+        valid=np.arange(48).reshape(6, 8) != 47,
+        camera=[9.0, 9.0, 4.0, 3.0],
+    )
+    described = export(tmp_path, "rerun")
+    assert described["orientation"].startswith("z is up")
+    recording = tmp_path / "exports" / "rerun" / RECORDING
+    rows = recorded(recording)
+    assert sum(path.endswith("/photo") for path in rows) == 3
+    assert [path for path in rows if path.startswith("/depth/")] == [f"/depth/{names[0]}"]
+    assert values_of(recording, "/world")["ViewCoordinates:xyz"] == [[3, 5, 1]]  # right, back, up
+    world_from_model = np.array(described["world_from_model"])
+    points = np.array([model.points3D[i].xyz for i in sorted(model.points3D)])
+    turned = points @ world_from_model[:, :3].T + world_from_model[:, 3]
+    shown = values_of(recording, "/world/dense")
+    np.testing.assert_allclose(shown["Points3D:positions"], turned, atol=1e-5)
+    kept = values_of(recording, f"/depth/{names[0]}")
+    steps = np.array(kept["DepthImage:buffer"][0], np.uint8).view(np.uint16).reshape(6, 8)
+    expected = np.where(np.arange(48).reshape(6, 8) == 47, 0, depth)
+    np.testing.assert_allclose(steps / kept["DepthImage:meter"][0], expected, rtol=1e-4)

@@ -14,6 +14,8 @@ import trimesh
 from mpsfm_core.errors import InputError
 from mpsfm_core.geometry import angle_between_deg
 from mpsfm_core.inputs.nerfstudio import read_transforms
+from mpsfm_core.providers import ExportFormat
+from mpsfm_core.registry import Registry
 from mpsfm_core.results.exports.formats import FORMATS, export
 from mpsfm_core.results.ply import read_ply
 
@@ -33,18 +35,42 @@ def median_error(image, camera, depth, points) -> float:
     return float(np.median(np.abs(depth[row, column] / local[:, 2] - 1)))
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("chosen", FORMATS, ids=lambda chosen: chosen.name)
 def test_a_format_writes_what_it_says_and_leaves_guesses_out(
-    result: Path, tmp_path: Path, name: str
+    result: Path, tmp_path: Path, chosen: ExportFormat
 ) -> None:
-    described = export(result, name, tmp_path / "out")
+    described = export(result, chosen.name, tmp_path / "out")
     written = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert written == sorted((*FORMATS[name].entries, "export.json"))
+    assert written == sorted((*chosen.entries, "export.json"))
     assert described["left_out"] == ["guess.png"]
     assert described["images"] == 3
     assert described["metres_per_unit"] == 1.0
     saved = json.loads((tmp_path / "out" / "export.json").read_text())
     assert saved == {key: value for key, value in described.items() if key != "output"}
+
+
+def test_plugins_bring_formats(result: Path, tmp_path: Path, install_plugin) -> None:
+    install_plugin(
+        "mpsfm-count",
+        """
+        from mpsfm_core import hookimpl
+        from mpsfm_core.providers import ExportFormat
+
+        @hookimpl
+        def mpsfm_export_formats():
+            count = ExportFormat("count", "how many", ("n.txt",), f"{__name__}:write", turned=True)
+            return [count, ExportFormat("broken", "", (), f"{__name__}:nothing")]
+
+        def write(source, folder):
+            (folder / "n.txt").write_text(f"{len(source.names)} {source.z_is_up}")
+        """,
+    )
+    export(result, "count", tmp_path / "out")
+    assert (tmp_path / "out" / "n.txt").read_text() == "3 True"
+    with pytest.raises(InputError, match="'broken' cannot be written: AttributeError"):
+        export(result, "broken", tmp_path / "out")
+    with pytest.raises(InputError, match="no format 'rerun'; pip install mpsfm-rerun"):
+        export(result, "rerun", tmp_path / "out", registry=Registry())
 
 
 @pytest.mark.parametrize("turn", [True, False])
