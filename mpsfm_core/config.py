@@ -27,6 +27,7 @@ from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.options import MapperOptions, MappingOptions
 from mpsfm_core.options import (
     AS_DEPTH,
+    FROM_MULTIVIEW,
     Backend,
     Options,
     SettingPath,
@@ -92,6 +93,8 @@ class Config(Options):
     dense_matcher: Backend | None = None
     """Detector-free matcher, instead of the sparse one or beside it."""
     retrieval: Backend | None = None
+    multiview: Backend | None = None
+    """Network that sees several photos at once, needed by ``depth: {use: multiview}``."""
     depth: Backend
     normals: Backend
     """Of the depth network's own pass with ``use: as-depth``, if that gives normals."""
@@ -135,6 +138,7 @@ _BLOCKS: dict[str, Kind] = {
     "matcher": "matcher",
     "dense_matcher": "matcher",
     "retrieval": "retrieval",
+    "multiview": "multiview",
     "depth": "depth",
     "normals": "normals",
 }
@@ -395,16 +399,17 @@ def _calibration(
     values, path = backend.calibration, (*path, "calibration")
     if values is None:
         return None
-    if kind not in CALIBRATIONS:
+    quantity = "depth" if kind == "multiview" else kind
+    if quantity not in CALIBRATIONS:
         raise SettingsError((SettingProblem(path, f"a {kind} provider has no uncertainty"),))
     if isinstance(values, str):
         folder = next(layer.folder for layer in reversed(layers) if layer.says(path))
         file = folder / Path(values).expanduser()
         try:
-            values = dict(read_values(file, kind))
+            values = dict(read_values(file, quantity))
         except ConfigError as error:
             raise SettingsError((SettingProblem(path, str(error)),)) from error
-    return parse_settings(CALIBRATIONS[kind], values, path).model_dump(mode="json")
+    return parse_settings(CALIBRATIONS[quantity], values, path).model_dump(mode="json")
 
 
 def _missing_blocks(config: Config) -> list[SettingProblem]:
@@ -412,6 +417,8 @@ def _missing_blocks(config: Config) -> list[SettingProblem]:
     if config.matcher is None and config.dense_matcher is None:
         return [SettingProblem(("matcher",), "a matcher or a dense_matcher is needed")]
     problems = []
+    if config.depth.use == FROM_MULTIVIEW and config.multiview is None:
+        problems.append(SettingProblem(("multiview",), "is needed by depth.use: multiview"))
     if config.matcher is not None and config.features is None:
         text = f"is needed by the sparse matcher {config.matcher.use!r}"
         problems.append(SettingProblem(("features",), text))

@@ -327,6 +327,40 @@ class PairMatches:
 
 
 @dataclass(frozen=True, eq=False)
+class GroupPrior:
+    """What a multi-view network sees in a group of n views: all of it in one frame and one unit.
+
+    ``depth``: one prior a view, in the order of the views. They share one unit: metres if
+    ``metric``, else an unknown one. ``poses``: (n, 3, 4) float64, ``cam_from_group`` of each view
+    for a frame of the group's own, lengths in the unit of depth; or None. ``intrinsics``: (n, 4)
+    float64, fx, fy, cx, cy in COLMAP pixels of each view, or None. Both are proposals, which
+    matches judge.
+    """
+
+    depth: tuple[DepthPrior, ...]
+    poses: Float64 | None = None
+    intrinsics: Float64 | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.depth)
+        if len({prior.metric for prior in self.depth}) > 1:
+            raise DataError("depth", "must be metric in all views of a group or in none")
+        if self.poses is not None:
+            _array(self, "poses", np.float64, (count, 3, 4))
+            _finite(self, "poses")
+            rotations = self.poses[:, :, :3]
+            if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-3):
+                raise DataError("poses", "must be rotations and translations (n, 3, 4)")
+            if (np.linalg.det(rotations) < 0).any():
+                raise DataError("poses", "must not mirror")
+        if self.intrinsics is not None:
+            _array(self, "intrinsics", np.float64, (count, 4))
+            _finite(self, "intrinsics")
+            if (self.intrinsics[:, :2] <= 0).any():
+                raise DataError("intrinsics", "must have positive focal lengths")
+
+
+@dataclass(frozen=True, eq=False)
 class MappingImage:
     """One image as the mapper sees it.
 
@@ -334,7 +368,10 @@ class MappingImage:
     theirs behind the sparse ones. ``depth`` has a variance; ``depth`` and ``normals`` share one
     grid. ``keypoint_std_px``: localisation noise. ``focal_known``: False when the focal length is
     a guess that bundle adjustment may refine; images of equal camera then share it.
-    ``known_pose``: ``cam_from_world``, when the user brought one.
+    ``known_pose``: ``cam_from_world``, when the user brought one. ``depth_group``: images of equal
+    number have depth in one unit, so that they share one scale; None for a scale of its own.
+    ``proposed_pose``: ``cam_from_group`` for a frame that the images of the group share, lengths in
+    the unit of their depth.
     """
 
     name: str
@@ -345,6 +382,8 @@ class MappingImage:
     keypoint_std_px: float = 1.0
     focal_known: bool = True
     known_pose: Pose | None = None
+    depth_group: int | None = None
+    proposed_pose: Pose | None = None
 
     def __post_init__(self) -> None:
         _array(self, "keypoints", np.float64, (None, 2))

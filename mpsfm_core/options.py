@@ -28,6 +28,10 @@ AS_DEPTH = "as-depth"
 """As the normals provider: the depth network's own normals, of the same pass."""
 
 
+FROM_MULTIVIEW = "multiview"
+"""As the depth provider: the depth of the multi-view network, which sees several photos at once."""
+
+
 class Backend(Options):
     """The choice of one provider, or of several in the order of preference."""
 

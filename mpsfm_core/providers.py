@@ -30,6 +30,7 @@ from mpsfm_core.data import (
     DepthPrior,
     Features,
     Float32,
+    GroupPrior,
     NormalPrior,
     PairMatches,
     SceneState,
@@ -44,7 +45,9 @@ API_VERSION = 1
 
 ENTRY_POINT_GROUP = "mpsfm.plugins"
 
-Kind = Literal["depth", "normals", "features", "matcher", "retrieval", "mask", "wrapper"]
+Kind = Literal[
+    "depth", "normals", "multiview", "features", "matcher", "retrieval", "mask", "wrapper"
+]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 Capability = Literal[
@@ -59,6 +62,8 @@ Capability = Literal[
     "wraps-normals",  # wrapper for normals providers
     "intrinsics-aware",  # the output depends on the focal length
     "estimates-focal",  # depth provider that also has estimate_focal()
+    "proposes-poses",  # multi-view provider that says how the views lie to each other
+    "proposes-intrinsics",  # multi-view provider that says the intrinsics of the views
     "uncached",  # reads its output from files: nothing is kept, and a changed file is seen
 ]
 CAPABILITIES: tuple[Capability, ...] = get_args(Capability)
@@ -107,6 +112,17 @@ class NormalsProvider(Protocol):
     """Predicts normals of a view; ``depth`` is given when the spec says ``needs-depth``."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior: ...
+
+
+@runtime_checkable
+class MultiViewProvider(Protocol):
+    """Predicts the depth of several views at once, in one unit, and maybe how they lie.
+
+    ``views``: one or more of one scene, of any sizes. A map may have a grid of its own that covers
+    its view.
+    """
+
+    def predict_group(self, views: Sequence[View]) -> GroupPrior: ...
 
 
 @runtime_checkable
@@ -176,6 +192,7 @@ class Executor(Protocol):
 PROTOCOLS: dict[Kind, type] = {
     "depth": DepthProvider,
     "normals": NormalsProvider,
+    "multiview": MultiViewProvider,
     "features": FeatureProvider,
     "matcher": Matcher,
     "retrieval": RetrievalProvider,
@@ -238,9 +255,9 @@ class ProviderSpec:
     ``code_license``, ``weights_license``: SPDX ids or short texts. ``weights``: the files that it
     loads, a function of its options where these can name others; a run finds or fetches them
     before it looks at the first photo. ``accuracy``: what to expect, with its source, in a line.
-    ``calibration``: declared uncertainty of a depth or normals provider. ``contract``: how the
-    contract kit tests it without weights, a function (see :class:`mpsfm_core.testing.Setup`) by
-    reference like ``factory``.
+    ``calibration``: declared uncertainty of a depth, multi-view or normals provider. ``contract``:
+    how the contract kit tests it without weights, a function (see
+    :class:`mpsfm_core.testing.Setup`) by reference like ``factory``.
 
     An option of type :class:`~pathlib.Path` names a file or folder that the provider reads: a run
     ends at once where it does not exist.

@@ -228,14 +228,14 @@ class Registry:
             raise ProviderError(_sentence(entry.label, what, "tell its author")) from error
 
     def calibration(self, kind: Kind, backend: Backend) -> Calibration:
-        """The uncertainty model of a depth or normals backend.
+        """The uncertainty model of a depth, multi-view or normals backend.
 
         What the configuration says (``backend.calibration``, values only: a file was read when the
         configuration was loaded) goes first. Else the outermost wrapper and then the provider are
         asked: its plugin's ``mpsfm_calibration`` hook, then its specification. Else the class's
         defaults.
         """
-        model: type[Calibration] = DepthCalibration if kind == "depth" else NormalCalibration
+        model: type[Calibration] = NormalCalibration if kind == "normals" else DepthCalibration
         if isinstance(backend.calibration, Mapping):
             return parse_settings(model, backend.calibration, ("calibration",))
         wrappers: list[tuple[Kind, Backend]] = [("wrapper", w) for w in reversed(backend.wrap)]

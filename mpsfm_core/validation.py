@@ -9,7 +9,7 @@ specification promises.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -24,6 +24,7 @@ from mpsfm_core.data import (
     Features,
     Float32,
     Float64,
+    GroupPrior,
     NormalPrior,
     PairDepth,
     PairMatches,
@@ -40,6 +41,7 @@ from mpsfm_core.providers import (
     JointProvider,
     MaskProvider,
     Matcher,
+    MultiViewProvider,
     NormalsProvider,
     ProviderSpec,
     RetrievalProvider,
@@ -88,6 +90,14 @@ def run_normals(
     given = depth if "needs-depth" in spec.capabilities else None
     with provider_errors(spec, view.name):
         return validate_normals(spec, view, provider.predict(view, given))
+
+
+def run_multiview(
+    spec: ProviderSpec, provider: MultiViewProvider, views: Sequence[View]
+) -> GroupPrior:
+    """Predict the depth of a group of views."""
+    with provider_errors(spec, _group_name(views)):
+        return validate_multiview(spec, views, provider.predict_group(tuple(views)))
 
 
 def run_features(spec: ProviderSpec, provider: FeatureProvider, view: View) -> Features:
@@ -142,6 +152,23 @@ def validate_normals(spec: ProviderSpec, view: View, output: object) -> NormalPr
             if median > MAX_MEDIAN_NORMAL_VARIANCE:
                 raise DataError("variance", f"must be in rad^2, the median is {median:.3g}")
         return prior
+
+
+def validate_multiview(spec: ProviderSpec, views: Sequence[View], output: object) -> GroupPrior:
+    """Rules: type and values of :class:`GroupPrior`; one prior a view, each as for depth; poses and
+    intrinsics where the spec promises them."""
+    with _rules(spec, _group_name(views)):
+        group = _checked(output, GroupPrior, "output")
+        if not isinstance(group.depth, tuple) or len(group.depth) != len(views):
+            found = len(group.depth) if isinstance(group.depth, tuple) else _type(group.depth)
+            raise DataError("depth", f"must be a tuple of {len(views)} priors, got {found}")
+        for prior in group.depth:
+            _check_depth(spec, prior, "depth")
+        if group.poses is None:
+            _promised(spec, "proposes-poses", "poses")
+        if group.intrinsics is None:
+            _promised(spec, "proposes-intrinsics", "intrinsics")
+        return group
 
 
 def validate_features(spec: ProviderSpec, view: View, output: object) -> Features:
@@ -232,6 +259,7 @@ Checked = TypeVar(
     "Checked",
     DepthPrior,
     NormalPrior,
+    GroupPrior,
     Features,
     SparseMatches,
     DenseMatches,
@@ -304,6 +332,10 @@ def _array(output: object, field: str, dtype: np.dtype[Any], dimensions: int) ->
 
 def _pair_name(views: tuple[View, View]) -> str:
     return f"{views[0].name} - {views[1].name}"
+
+
+def _group_name(views: Sequence[View]) -> str:
+    return ", ".join(view.name for view in views)
 
 
 def _type(value: object) -> str:

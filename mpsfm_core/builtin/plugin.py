@@ -72,13 +72,22 @@ def _depth() -> list[ProviderSpec]:
         ProviderSpec(
             kind="depth",
             name="matcher",
-            factory="mpsfm_core.builtin.matcher_depth:MatcherDepth",
+            factory="mpsfm_core.builtin.elsewhere:MatcherDepth",
             capabilities=frozenset({"uncached"}),
             summary="the depth that the matcher predicts for its pairs (pair-depth)",
             code_license=_LICENSE,
             contract="mpsfm_core.testing.builtin_contracts:depth_of_matcher",
             # Reference: the scale of MASt3R's confidence, and no share of depth.
             calibration=DepthCalibration(std_scale=0.862, relative_std=0.0),
+        ),
+        ProviderSpec(
+            kind="depth",
+            name="multiview",
+            factory="mpsfm_core.builtin.elsewhere:MultiViewDepth",
+            capabilities=frozenset({"uncached"}),
+            summary="the depth of the multi-view network, which sees several photos at once",
+            code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:depth_of_multiview",
         ),
     ]
 

@@ -33,6 +33,7 @@ _TYPES: Mapping[str, type] = MappingProxyType(
             data.View,
             data.DepthPrior,
             data.NormalPrior,
+            data.GroupPrior,
             data.Features,
             data.SparseMatches,
             data.DenseMatches,

@@ -14,6 +14,7 @@ from mpsfm_core.data import (
     DepthPrior,
     Features,
     Float32,
+    GroupPrior,
     NormalPrior,
     PairMatches,
     View,
@@ -110,6 +111,11 @@ class RemoteProvider:
         """In pixels of the view."""
         focal: float | None = self._call("estimate_focal", view)
         return focal
+
+    def predict_group(self, views: Sequence[View]) -> GroupPrior:
+        """Depth of a group of views."""
+        group: GroupPrior = self._call("predict_group", tuple(views))
+        return group
 
     def extract(self, view: View) -> Features:
         """Features."""

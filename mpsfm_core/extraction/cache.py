@@ -16,7 +16,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast, get_args, get_type_hints
+from typing import Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import platformdirs
@@ -104,6 +104,12 @@ def digest(value: object) -> str:
 
 def pack(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
     """The arrays of a data object by path, without those that are None."""
+    if isinstance(value, tuple) and value and is_dataclass(value[0]):
+        return {
+            name: array
+            for index, part in enumerate(value)
+            for name, array in pack(part, f"{prefix}/{index}").items()
+        }
     if not is_dataclass(value):
         return {prefix or "value": np.asarray(value)}
     arrays: dict[str, NDArray[Any]] = {}
@@ -123,7 +129,9 @@ def unpack(cls: type[T], arrays: Arrays, prefix: str = "") -> T:
     for field in fields(cls):
         path = f"{prefix}/{field.name}" if prefix else field.name
         nested = _data_class(hints[field.name])
-        if nested and any(name.startswith(path + "/") for name in arrays):
+        if nested and get_origin(hints[field.name]) is tuple:
+            values[field.name] = _unpack_tuple(nested, arrays, path)
+        elif nested and any(name.startswith(path + "/") for name in arrays):
             values[field.name] = unpack(nested, arrays, path)
         elif path in arrays:
             values[field.name] = arrays[path].item() if arrays[path].ndim == 0 else arrays[path]
@@ -132,7 +140,13 @@ def unpack(cls: type[T], arrays: Arrays, prefix: str = "") -> T:
     return cls(**values)
 
 
+def _unpack_tuple(cls: type[T], arrays: Arrays, path: str) -> tuple[T, ...]:
+    names = {name.removeprefix(f"{path}/").partition("/")[0] for name in arrays if "/" in name}
+    count = sum(f"{index}" in names for index in range(len(names)))
+    return tuple(unpack(cls, arrays, f"{path}/{index}") for index in range(count))
+
+
 def _data_class(hint: object) -> type | None:
-    """The data class that a field's annotation names, alone or ``| None``."""
+    """The data class that a field's annotation names, alone, ``| None`` or in a tuple."""
     kinds = (hint, *get_args(hint))
     return next((k for k in kinds if isinstance(k, type) and is_dataclass(k)), None)

@@ -25,6 +25,7 @@ from mpsfm_core.extraction.cache import content_key
 from mpsfm_core.extraction.events import Silent
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.matching import PairMatcher
+from mpsfm_core.extraction.multiview import GroupPriors
 from mpsfm_core.extraction.predictions import Predictions
 from mpsfm_core.extraction.selection import PairSelection
 from mpsfm_core.extraction.workbench import Workbench
@@ -122,6 +123,8 @@ class _Station:
             "depth": priors.predicted,
             "normals": priors.full_size,
         }
+        if config.multiview is not None:
+            self.work["multiview"] = GroupPriors(bench).predict
         if table is not None:
             self.work["features"] = table.__getitem__
 

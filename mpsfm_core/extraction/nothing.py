@@ -11,6 +11,7 @@ import numpy as np
 from mpsfm_core.data import (
     DepthPrior,
     Features,
+    GroupPrior,
     NormalPrior,
     PairMatches,
     SparseMatches,
@@ -45,6 +46,7 @@ NOTHING: Mapping[type, Callable[[], object]] = MappingProxyType(
         Features: lambda: Features(np.zeros((0, 2)), np.zeros((0, 0), dtype=np.float32)),
         DepthPrior: _depth,
         NormalPrior: _normals,
+        GroupPrior: lambda: GroupPrior(()),
         JointPrior: lambda: JointPrior(_depth(), _normals()),
         PairMatches: _matches,
     }

@@ -61,6 +61,9 @@ class ExtractionOptions(Options):
 
     integration_size: int = Field(387, ge=16)
     """Longer side of the maps that the mapper refines (reference: normscale)."""
+    group_size: int = Field(8, ge=1)
+    """Photos that a multi-view network is shown at once (ours: its attention, and so its memory,
+    grows with the square of their number)."""
     edge_ratio: float | None = Field(1.015, gt=1)
     """Normals next to a larger ratio of neighbouring depths are not trusted; null trusts all
     (reference: continuity)."""

@@ -9,8 +9,11 @@ from mpsfm_core.data import DepthPrior, NormalPrior
 from mpsfm_core.errors import ConfigError
 from mpsfm_core.extraction import priors
 from mpsfm_core.extraction.matching import Candidates, PairMatcher
+from mpsfm_core.extraction.multiview import GroupPriors
 from mpsfm_core.extraction.raw_priors import RawPriors
 from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.options import FROM_MULTIVIEW
+from mpsfm_core.providers import Kind
 from mpsfm_core.registry import Registry
 from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 
@@ -19,18 +22,25 @@ FROM_MATCHER = "matcher"
 
 
 class Predictions:
-    """Runs the depth and normals providers; calibrates, resizes and masks what they say."""
+    """Runs the depth and normals providers; calibrates, resizes and masks what they say.
+
+    ``groups``: what the multi-view network said, where there is one.
+    """
 
     def __init__(
-        self, bench: Workbench, matcher: PairMatcher | None, candidates: list[Candidates]
+        self,
+        bench: Workbench,
+        matcher: PairMatcher | None,
+        candidates: list[Candidates],
+        groups: GroupPriors | None = None,
     ) -> None:
         self._bench = bench
         self._matcher = matcher
+        self._groups = groups if bench.config.depth.use == FROM_MULTIVIEW else None
         config, registry = bench.config, bench.registry
         self._raw = RawPriors(bench)
-        depth_calibration = registry.calibration("depth", config.depth)
+        depth_calibration = _depth_calibration(config, registry)
         normal_calibration = registry.calibration("normals", config.normals)
-        assert isinstance(depth_calibration, DepthCalibration)
         assert isinstance(normal_calibration, NormalCalibration)
         self._depth_calibration = depth_calibration
         self._normal_calibration = normal_calibration
@@ -40,10 +50,10 @@ class Predictions:
         """Run the stages; returns both priors of each image on its grid, with variances."""
         images = range(len(self._bench.images))
         depth = self._raw.depth
-        if not depth.can("uncached") and self._best is None:
+        if not depth.can("uncached"):
             self._bench.each("depth", images, self._predict_only, depth)
         slowest = self._raw.normals or depth
-        here = self._best is not None
+        here = self._best is not None or self._groups is not None
         return self._bench.each("normals", images, self._both, slowest, here=here)
 
     def _predict_only(self, index: int) -> None:
@@ -62,6 +72,8 @@ class Predictions:
 
     def predicted(self, index: int) -> tuple[DepthPrior, NormalPrior | None]:
         """Depth of an image as it is predicted, and its normals if they come along; cached."""
+        if self._groups is not None:
+            return self._groups.depth(index), None
         if self._best is not None:
             return self._from_matcher(index), None
         return self._raw.predict(index)
@@ -91,6 +103,17 @@ class Predictions:
         if options.edge_ratio is not None:
             normals = priors.distrust_edges(normals, depth, options.edge_ratio)
         return depth, normals
+
+
+def _depth_calibration(config: Config, registry: Registry) -> DepthCalibration:
+    """Of the network that gives the depth, unless the configuration says something of it."""
+    kind: Kind = "depth"
+    backend = config.depth
+    if backend.use == FROM_MULTIVIEW and config.multiview and backend.calibration is None:
+        kind, backend = "multiview", config.multiview
+    calibration = registry.calibration(kind, backend)
+    assert isinstance(calibration, DepthCalibration)
+    return calibration
 
 
 def check_depth_source(config: Config, registry: Registry) -> None:

@@ -1,8 +1,9 @@
 """Runs the chosen providers over the images and assembles the mapper's problem.
 
 Order: masks, features, first look or retrieval, matching, verification (both again where photos
-stay apart), depth, normals. Whatever a provider returns is validated, then cached; calibration and
-resizing come after the cache, so that a change of them predicts nothing anew.
+stay apart), groups of photos for a multi-view network, depth, normals. Whatever a provider returns
+is validated, then cached; calibration and resizing come after the cache, so that a change of them
+predicts nothing anew.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mpsfm_core.config import Config
-from mpsfm_core.data import Features, MappingImage, MappingProblem, SparseMatches
+from mpsfm_core.data import Features, MappingImage, MappingProblem, SparseMatches, VerifiedPair
 from mpsfm_core.extraction.backends import thread_count
 from mpsfm_core.extraction.dense import NO_POINTS
 from mpsfm_core.extraction.events import ExtractionEvents, Silent
 from mpsfm_core.extraction.execution import workers_elsewhere
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.matching import Candidates, PairMatcher, PairVerifier, assemble
+from mpsfm_core.extraction.multiview import GroupPriors
 from mpsfm_core.extraction.predictions import Predictions, check_depth_source
 from mpsfm_core.extraction.report import describe
 from mpsfm_core.extraction.selection import PairSelection
@@ -29,6 +31,7 @@ from mpsfm_core.extraction.workbench import Workbench
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.matches import ImportedMatches
+from mpsfm_core.options import FROM_MULTIVIEW
 from mpsfm_core.registry import Registry
 
 
@@ -78,7 +81,8 @@ def _extract(bench: Workbench, imported: ImportedMatches | None) -> Extraction:
     found = _match(bench) if imported is None else _verify(bench, imported)
     candidates, outcomes, located = found.candidates, found.outcomes, found.located
     assembled = assemble(candidates, outcomes, located)
-    priors = Predictions(bench, found.matcher, candidates).run()
+    groups = _see_groups(bench, assembled.pairs)
+    priors = Predictions(bench, found.matcher, candidates, groups).run()
     problem = MappingProblem(
         tuple(
             MappingImage(
@@ -88,12 +92,33 @@ def _extract(bench: Workbench, imported: ImportedMatches | None) -> Extraction:
                 *priors[index],
                 keypoint_std_px=assembled.std_px[index],
                 focal_known=image.focal_known,
+                **_place(bench, groups, index),
             )
             for index, image in enumerate(bench.images)
         ),
         assembled.pairs,
     )
-    return Extraction(problem, describe(bench, problem, found.proposed, candidates, outcomes))
+    described = describe(bench, problem, found.proposed, candidates, outcomes)
+    if groups is not None:
+        described["groups"] = groups.described()
+    return Extraction(problem, described)
+
+
+def _see_groups(bench: Workbench, pairs: tuple[VerifiedPair, ...]) -> GroupPriors | None:
+    """Show the multi-view network, where there is one, groups of photos that see the same."""
+    if bench.config.multiview is None:
+        return None
+    groups = GroupPriors(bench)
+    groups.run({(pair.image_a, pair.image_b): len(pair) for pair in pairs})
+    return groups
+
+
+def _place(bench: Workbench, groups: GroupPriors | None, index: int) -> dict[str, Any]:
+    """What the mapper is told of an image's group, if its depth is the group's."""
+    if groups is None or bench.config.depth.use != FROM_MULTIVIEW:
+        return {}
+    group, pose = groups.place(index)
+    return {"depth_group": group, "proposed_pose": pose}
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,7 +79,9 @@ def place_all(scene: Scene, left: Bool, seed: int) -> Placement | None:
     if rotations is None:
         return None
     differences = links.log_length[:, 0] - links.log_length[:, 1]
-    log_scales = agreed(links.a, links.b, differences, links.weight, scene.num_images)
+    unit = scene.depth_group_of  # priors in one unit share one scale
+    scales = agreed(unit[links.a], unit[links.b], differences, links.weight, scene.num_images)
+    log_scales = scales[unit]
     lengths = np.exp((log_scales[links.a] + log_scales[links.b] + links.log_length.sum(axis=1)) / 2)
     steps = -np.einsum("nji,nj->ni", rotations[links.b], links.translation) * lengths[:, None]
     centers = agreed(links.a, links.b, steps, links.weight / lengths, scene.num_images)

@@ -3,7 +3,8 @@
 Lifted points of an uncertain depth miss by many pixels over a wide baseline, so one PnP is not
 enough. Hypotheses come from PnP on the points of the scene, from PnP the other way round (the new
 image's own lifts seen in a registered image), and from the essential matrices of verified pairs
-with the length that depth gives them.
+with the length that depth gives them, and from what a network that saw several photos at once
+proposes.
 """
 
 from __future__ import annotations
@@ -115,6 +116,7 @@ class Hypotheses:
                 if self.image == pair.image_a:
                     relative = invert(*relative)
                 yield partial(self._scaled, self.found, reference, relative)
+            yield partial(self._proposed, reference)
 
     def of_halves(self) -> Iterator[Estimate]:
         """From random halves of the matches to the image that has most of them.
@@ -184,6 +186,18 @@ class Hypotheses:
         if not length:
             return None
         return self._placed(reference, (relative[0], relative[1] * length), "essential matrix")
+
+    def _proposed(self, reference: int) -> Hypothesis | None:
+        """As the image lies to the reference in the frame of the group that both are of."""
+        scene = self.scene
+        images, depth_map = scene.problem.images, scene.maps[reference]
+        own, other = images[self.image].proposed_pose, images[reference].proposed_pose
+        same = scene.depth_group_of[self.image] == scene.depth_group_of[reference]
+        if own is None or other is None or not same or not depth_map.active:
+            return None
+        rotation, translation = compose(own, invert(*other))
+        relative = rotation, depth_map.scale * translation
+        return self._placed(reference, relative, "multi-view network")
 
     def _placed(self, reference: int, relative: Pose, source: str) -> Hypothesis:
         """A pose relative to a reference as one in the world."""

@@ -78,10 +78,16 @@ class Refiner:
         """Scale an image's prior so that it agrees with its points (paper eq. 1).
 
         Points whose scale is far from that of the ``others`` are ignored if the prior is metric;
-        if none is left, the image takes their mean.
+        if none is left, the image takes their mean. A registered image whose depth has the same
+        unit has its scale already.
         """
         scene = self.scene
         depth_map = scene.maps[image]
+        same = scene.registered & (scene.depth_group_of == scene.depth_group_of[image])
+        for other in map(int, np.flatnonzero(same)):
+            if other != image and scene.maps[other].active:
+                depth_map.set_scale(scene.maps[other].scale)
+                return
         keypoints, z = self._observed_depth(image)
         rows = keypoints - scene.graph.offsets[image]
         valid = depth_map.keypoint_valid[rows] & (z > 0)
@@ -108,16 +114,19 @@ class Refiner:
     def rescale(self, images: list[int]) -> None:
         """Estimate all scales anew from points that rays determine.
 
-        Fixed poses hold the scale of the world; else those of metric priors stay near their median,
-        as a group of images that few matches hold to the rest agrees with its own points at any
-        scale, and their mean stays.
+        Images whose depth has one unit share one scale, and their points count alike. Fixed poses
+        hold the scale of the world; else those of metric priors stay near their median, as a group
+        of images that few matches hold to the rest agrees with its own points at any scale, and
+        their mean stays.
         """
         scene, tracks = self.scene, self.scene.tracks
         images = [image for image in images if scene.maps[image].active]
         stable = scene.track_angles_deg() >= self.options.anchor_min_angle_deg
         log_scales = np.array([np.log(scene.maps[image].scale) for image in images])
         updated = log_scales.copy()
-        for position, image in enumerate(images):
+        groups = scene.depth_group_of[images]
+        found: dict[int, list[Float64]] = {group: [] for group in groups.tolist()}
+        for group, image in zip(groups.tolist(), images, strict=True):
             depth_map = scene.maps[image]
             keypoints, z = self._observed_depth(image)
             rows = keypoints - scene.graph.offsets[image]
@@ -125,12 +134,16 @@ class Refiner:
             good = depth_map.keypoint_valid[rows] & (z > 0) & (prior > 0)
             good &= stable[tracks.point_of[keypoints]]
             good[good] &= self._near(z[good] / (depth_map.scale * prior[good]))
-            if good.sum() >= MIN_SCALE_POINTS:
-                updated[position] = np.median(np.log(z[good] / prior[good]))
+            found[group].append(np.log(z[good] / prior[good]))
+        for group, parts in found.items():
+            together = np.concatenate(parts)
+            if len(together) >= MIN_SCALE_POINTS:
+                updated[groups == group] = np.median(together)
         if len(images) and not self.fixed.any():
             center = np.median(updated)
-            limits = [self._scale_slack(image) for image in images]
-            updated = center + np.clip(updated - center, np.negative(limits), limits)
+            slack = np.array([self._scale_slack(image) for image in images])
+            limits = np.array([np.median(slack[groups == group]) for group in groups])
+            updated = center + np.clip(updated - center, -limits, limits)
             updated += log_scales.mean() - updated.mean()
         for image, log_scale in zip(images, updated, strict=True):
             scene.maps[image].set_scale(float(np.exp(log_scale)))

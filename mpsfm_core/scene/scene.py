@@ -40,6 +40,8 @@ class Scene:
         intrinsics: (n, 4) float64, fx, fy, cx, cy of each image.
         camera_of: (n,) int64, images of the same number have the same camera: those whose focal
             length is a guess, and the same guess.
+        depth_group_of: (n,) int64, images of the same number have depth in one unit: they share
+            the scale of their priors.
         keypoints: (k, 2) float64, of all images, numbered as in :attr:`graph`.
         maps: the depth map of each image.
         keypoint_prior, keypoint_log_std, keypoint_valid: (k,) unscaled prior depth at the
@@ -56,6 +58,7 @@ class Scene:
         self.keypoint_std_px: Float64 = np.array([i.keypoint_std_px for i in problem.images])
         self.intrinsics: Float64 = np.array([image.camera.params for image in problem.images])
         self.camera_of: Int64 = _shared_cameras(problem)
+        self.depth_group_of: Int64 = _depth_groups(problem)
         self.maps = [DepthMap(image) for image in problem.images]
         self.keypoint_log_std: Float64 = np.concatenate(
             [np.zeros(0), *(depth_map.keypoint_log_std for depth_map in self.maps)]
@@ -232,6 +235,16 @@ class Scene:
                     depth_map.set_refined(refined)
                 if active:
                     depth_map.set_scale(scale)
+
+
+def _depth_groups(problem: MappingProblem) -> Int64:
+    alone = len(problem.images)
+    numbers: dict[int, int] = {}
+    keys = [
+        alone + number if image.depth_group is None else image.depth_group
+        for number, image in enumerate(problem.images)
+    ]
+    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)
 
 
 def _shared_cameras(problem: MappingProblem) -> Int64:

@@ -8,7 +8,7 @@ import numpy as np
 
 from mpsfm_core.data import DenseMatches, Features, Float64, PairMatches
 from mpsfm_core.testing import measure
-from mpsfm_core.testing.case import Case
+from mpsfm_core.testing.case import Case, depth_in
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.measure import Shift
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
@@ -34,7 +34,8 @@ def judge(case: Case, example: Example, answer: Any) -> str:
     unknown = case.knows == "nothing" or case.kind in ("features", "retrieval")
     if unknown or (case.kind == "matcher" and case.knows == "painted"):
         return "answered; whether it is right is not known"
-    if case.kind == "depth":
+    if case.kind in ("depth", "multiview"):
+        answer = depth_in(answer)
         scale_free = not answer.metric or case.can("intrinsics-aware")
         errors = measure.log_errors(answer, example, any_scale=scale_free)
         error = _limit("relative error", measure.typical(errors), DEPTH_TOLERANCE)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core import validation
-from mpsfm_core.data import DepthPrior, Features, View
+from mpsfm_core.data import DepthPrior, Features, GroupPrior, View
 from mpsfm_core.errors import ProviderError
 from mpsfm_core.options import Backend
 from mpsfm_core.providers import Capability, Kind, ProviderContext, ProviderSpec
@@ -132,7 +132,7 @@ class Case:
         """The example that most checks ask about."""
         if self._main is None:
             look: Look = "painted" if self.knows == "painted" or self._oracle else "textured"
-            outdoor = self.kind in ("depth", "normals", "mask")
+            outdoor = self.kind in ("depth", "normals", "multiview", "mask")
             self._main = outdoor_example(look) if outdoor else indoor_example(look)
         return self._main
 
@@ -154,8 +154,9 @@ class Case:
         return self._provider
 
     def ask(self, example: Example, provider: Any = None) -> Any:
-        """The provider's answer, validated; a matcher is asked for the view and its partner."""
-        self.tell(example, *([example.partner] if self.kind == "matcher" else []))
+        """The provider's answer, validated; a matcher and a multi-view network are asked for the
+        view and its partner."""
+        self.tell(example, *([example.partner] if self.kind in ("matcher", "multiview") else []))
         return self.ask_about(example.view, example, provider)
 
     def ask_about(
@@ -170,6 +171,9 @@ class Case:
         if self.kind == "matcher":
             views = (view, example.partner.view)
             return validation.run_matcher(self._rules, provider, views, extra)
+        if self.kind == "multiview":
+            views = (view, example.partner.view)
+            return validation.run_multiview(self._rules, provider, views)
         if self.kind == "normals":
             return validation.run_normals(self._rules, provider, view, extra)
         run: Callable[[ProviderSpec, Any, View], Any] = _RUN[self.kind]
@@ -191,6 +195,12 @@ class Case:
         views = (a.view, b.view)
         features = self.features_of(*views)
         return validation.run_matcher(self._rules, self.provider, views, features)
+
+    def ask_group(self, *examples: Example) -> GroupPrior:
+        """A multi-view network's answer about several examples."""
+        self.tell(*examples)
+        views = [example.view for example in examples]
+        return validation.run_multiview(self._rules, self.provider, views)
 
     def tell(self, *examples: Example) -> None:
         """Let the provider know the truth, if that is where it knows it from."""
@@ -292,6 +302,12 @@ def setup_of(spec: ProviderSpec, folder: Path) -> Setup:
     if not isinstance(setup, Setup):
         raise ProviderError(f"{spec.contract!r} returns a {type(setup).__name__}, not a Setup")
     return setup
+
+
+def depth_in(answer: Any) -> DepthPrior:
+    """The depth of the view that was asked about; in a group's answer the first."""
+    prior: DepthPrior = answer.depth[0] if isinstance(answer, GroupPrior) else answer
+    return prior
 
 
 def arrays_of(answer: object, name: str = "answer") -> dict[str, NDArray[Any]]:

@@ -13,7 +13,7 @@ from mpsfm_core import validation
 from mpsfm_core.data import DepthPrior, NormalPrior
 from mpsfm_core.testing import measure
 from mpsfm_core.testing.accuracy import DEPTH_TOLERANCE, NORMALS_TOLERANCE_DEG, accept_shift
-from mpsfm_core.testing.case import Case, difference
+from mpsfm_core.testing.case import Case, depth_in, difference
 from mpsfm_core.testing.checks_maps import (
     accept_calibration,
     accept_std,
@@ -110,7 +110,7 @@ def check_depth_validity(case: Case) -> str:
 
 def check_depth_flip(case: Case) -> str:
     """The mirrored view has the mirrored depth."""
-    prior, mirrored = _ask(case), case.ask(case.main.mirror())
+    prior, mirrored = _ask(case), depth_in(case.ask(case.main.mirror()))
     if prior.shape != mirrored.shape:
         raise CheckFailed(f"has shape {mirrored.shape} on the mirrored view, else {prior.shape}")
     both = prior.valid & mirrored.valid[:, ::-1] & case.main.truth(prior.shape).smooth
@@ -130,7 +130,7 @@ def check_depth_same_in_larger_view(case: Case) -> str:
     case.needs("painted", "told", "seen")
     width, height = case.main.camera.size
     large = case.main.sized(2 * width, 2 * height)
-    small, prior = _ask(case), case.ask(large)
+    small, prior = _ask(case), depth_in(case.ask(large))
     medians = [
         float(np.median(measure.log_errors(p, e, any_scale=False)))
         for p, e in ((small, case.main), (prior, large))
@@ -149,7 +149,7 @@ def check_depth_intrinsics(case: Case) -> str:
     camera = case.main.camera
     longer = replace(camera, fx=FOCAL_FACTOR * camera.fx, fy=FOCAL_FACTOR * camera.fy)
     prior = _ask(case)
-    changed = case.ask_about(replace(case.main.view, camera=longer), case.main)
+    changed = depth_in(case.ask_about(replace(case.main.view, camera=longer), case.main))
     both = prior.valid & changed.valid
     if not both.any():
         raise CheckFailed("has no pixel that is valid with both focal lengths")
@@ -212,7 +212,7 @@ def check_depth_focal(case: Case) -> str:
     return f"{found[0]:.0f} px, the truth is {case.main.camera.fx:.0f} px"
 
 
-CHECKS = (
+OF_MAPS = (
     check_depth_is_z,
     check_depth_scale,
     check_depth_channel_order,
@@ -224,14 +224,14 @@ CHECKS = (
     check_depth_intrinsics,
     check_depth_variance,
     check_depth_calibration,
-    check_depth_joint,
-    check_depth_focal,
 )
+"""Of any depth map, whatever it was seen with."""
+
+CHECKS = (*OF_MAPS, check_depth_joint, check_depth_focal)
 
 
 def _ask(case: Case) -> DepthPrior:
-    prior: DepthPrior = case.ask(case.main)
-    return prior
+    return depth_in(case.ask(case.main))
 
 
 def _joint_normals(case: Case, normals: NormalPrior) -> str:

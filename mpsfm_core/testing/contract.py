@@ -18,6 +18,7 @@ from mpsfm_core.testing import (
     checks_features,
     checks_mask,
     checks_matcher,
+    checks_multiview,
     checks_normals,
     checks_retrieval,
     checks_wrapper,
@@ -41,6 +42,7 @@ CHECKS_BY_KIND: Mapping[Kind, tuple[Check, ...]] = MappingProxyType(
     {
         "depth": checks_depth.CHECKS,
         "normals": checks_normals.CHECKS,
+        "multiview": checks_multiview.CHECKS,
         "features": checks_features.CHECKS,
         "matcher": checks_matcher.CHECKS,
         "retrieval": checks_retrieval.CHECKS,
@@ -267,7 +269,7 @@ def tasks_of(spec: ProviderSpec) -> list[Task]:
 
 def all_checks() -> list[Check]:
     """Every check of the kit, the common ones first."""
-    special = [check for checks in CHECKS_BY_KIND.values() for check in checks]
+    special = dict.fromkeys(check for checks in CHECKS_BY_KIND.values() for check in checks)
     return [*STANDALONE, check_output_rules, *COMMON, *special]
 
 

@@ -6,6 +6,7 @@ Depth, normals and masks are read from painted views, as a stand-in network woul
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from mpsfm_core.data import (
     Features,
     Float32,
     Float64,
+    GroupPrior,
     NormalPrior,
     PairDepth,
     PairMatches,
@@ -143,6 +145,39 @@ class ToldMatcher:
     def depths(self, a: Example, b: Example) -> PairDepth:
         """Depth of both examples."""
         return PairDepth(*(depth_prior(example.truth().depth) for example in (a, b)))
+
+
+def tell_group(folder: Path, example: Example) -> None:
+    """Write down an example for :class:`ToldGroup`."""
+    truth = example.truth()
+    np.savez(
+        folder / f"group-{_name(example.view)}.npz",
+        depth=truth.depth,
+        pose=example.pose,
+        intrinsics=example.camera.params,
+    )
+
+
+class ToldGroup:
+    """Depth, poses and intrinsics of views that it is told."""
+
+    def __init__(self, options: ToldOptions, context: ProviderContext) -> None:
+        self.options = options
+
+    def predict_group(self, views: Sequence[View]) -> GroupPrior:
+        """The truth; a plane one metre before the origin for views it was not told of."""
+        depth, poses, intrinsics = zip(*(self.recall(view) for view in views), strict=True)
+        return GroupPrior(
+            tuple(depth_prior(values) for values in depth), np.array(poses), np.array(intrinsics)
+        )
+
+    def recall(self, view: View) -> tuple[Float64, Float64, Float64]:
+        """Depth (H, W), pose (3, 4) and intrinsics (4,) of a view."""
+        path = self.options.folder / f"group-{_name(view)}.npz"
+        if not path.exists():
+            return np.ones(view.image.shape[:2]), np.eye(3, 4), view.camera.params
+        with np.load(path) as stored:
+            return stored["depth"], stored["pose"], stored["intrinsics"]
 
 
 class Wrapper:

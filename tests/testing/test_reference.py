@@ -14,12 +14,20 @@ from mpsfm_core.testing import reference as ref
 
 PAINTED = Setup(knows="painted")
 JOINT = frozenset({"metric", "variance", "joint-normals", "estimates-focal"})
+EVERYTHING = ("metric", "variance", "proposes-poses", "proposes-intrinsics")
 MODULE = ref.__name__
 
 
 def told(folder: Path) -> Setup:
     return Setup(
         options={"folder": folder}, knows="told", tell=lambda example: ref.tell(folder, example)
+    )
+
+
+def told_group(folder: Path) -> Setup:
+    tell = ref.tell_group
+    return Setup(
+        options={"folder": folder}, knows="told", tell=lambda example: tell(folder, example)
     )
 
 
@@ -42,6 +50,11 @@ def spec(kind: Kind, name: str, *capabilities: str, options: str | None = None) 
             spec("matcher", "ToldMatcher", "dense", "pair-depth", options="ToldOptions"),
             told,
             {"matcher-no-features", "matcher-few-features", "name-does-not-matter"},
+        ),
+        (
+            spec("multiview", "ToldGroup", *EVERYTHING, options="ToldOptions"),
+            told_group,
+            {"name-does-not-matter", "depth-channel-order", "depth-intrinsics"},
         ),
         (spec("retrieval", "Thumbnail"), None, set()),
         (spec("mask", "PaintedMask"), PAINTED, set()),

@@ -1,4 +1,4 @@
-"""The choice of the matcher's own depth as the prior (the paper's MASt3R configuration)."""
+"""Choices of depth that another block of the configuration gives."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from mpsfm_core.providers import ProviderContext
 
 
 class MatcherDepth:
-    """Stands in the configuration as ``depth: {use: matcher}``.
+    """Stands in the configuration as ``depth: {use: matcher}`` (the paper's MASt3R configuration).
 
     The extraction takes the depth from the pairs that the matcher has predicted, the most certain
     pair of each image. One view alone has no pair, so that asking for it is an error.
     """
+
+    source = "the pairs of a matcher that predicts depth"
 
     def __init__(self, options: Options | None, context: ProviderContext) -> None:
         pass
@@ -21,6 +23,13 @@ class MatcherDepth:
     def predict(self, view: View) -> DepthPrior:
         """Always raises :class:`ProviderError`."""
         raise ProviderError(
-            f"the depth of {view.name!r} comes from the pairs of a matcher that predicts depth; "
-            f"it cannot be predicted from one view"
+            f"the depth of {view.name!r} comes from {self.source}; it cannot be predicted from one "
+            f"view"
         )
+
+
+class MultiViewDepth(MatcherDepth):
+    """Stands in the configuration as ``depth: {use: multiview}``: the extraction takes the depth
+    from the groups of photos that the multi-view network was shown."""
+
+    source = "a multi-view network"

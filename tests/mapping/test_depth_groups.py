@@ -1,0 +1,107 @@
+"""Images whose depth has one unit: they share a scale, and poses that come along only propose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera
+from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.mapping.correspondences import correspondences
+from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.mapper import Mapper
+from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
+from mpsfm_core.mapping.pose_hypotheses import Hypotheses, Hypothesis
+from mpsfm_core.mapping.registration import find_poses
+from mpsfm_core.scene.scene import Scene
+from mpsfm_core.testing.problems import Noise, mapping_problem
+from mpsfm_core.testing.scenes import arc_poses, room_scene
+
+CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
+UNITS = (1.0, 3.0)
+POSES = arc_poses(4, 14.0)
+
+
+def in_units(
+    groups: Sequence[int | None], poses: Sequence[Float64] | None = None
+) -> MappingProblem:
+    """Views of the room whose depth is in the unit of their group, with a little noise."""
+    noise = Noise(keypoints_px=0.5, depth=0.02)
+    problem = mapping_problem(
+        room_scene(), CAMERA, POSES[: len(groups)], noise=noise, declared_depth_std=0.02
+    )
+    images = []
+    for number, (image, group) in enumerate(zip(problem.images, groups, strict=True)):
+        unit = 1.0 if group is None else UNITS[group]
+        assert image.depth.variance is not None
+        depth = DepthPrior.from_arrays(
+            image.depth.depth * unit,
+            image.depth.variance * unit**2,
+            image.depth.valid,
+            metric=False,
+        )
+        pose = None
+        if poses is not None:
+            pose = poses[number][:, :3].copy(), unit * poses[number][:, 3]
+        images.append(replace(image, depth=depth, depth_group=group, proposed_pose=pose))
+    return MappingProblem(tuple(images), problem.pairs)
+
+
+@pytest.mark.parametrize("all_at_once", [True, False])
+def test_images_of_a_group_share_their_scale(all_at_once: bool) -> None:
+    options = MapperOptions()
+    initialization = options.initialization.model_copy(update={"all_at_once": all_at_once})
+    options = options.model_copy(update={"initialization": initialization})
+    mapper = Mapper(in_units([0, 0, 1, 1]), options, Silent())
+    mapper.reconstruct_next()
+    scene = mapper.group.scene
+    assert scene.registered.all()
+    scales = [depth_map.scale for depth_map in scene.maps]
+    assert scales[0] == scales[1] and scales[2] == scales[3]
+    assert scales[0] / scales[2] == pytest.approx(UNITS[1] / UNITS[0], rel=0.02)
+
+
+def test_without_groups_each_image_has_its_own_scale() -> None:
+    mapper = Mapper(in_units([None] * 3), MapperOptions(), Silent())
+    mapper.reconstruct_next()
+    assert len({depth_map.scale for depth_map in mapper.group.scene.maps}) == 3
+
+
+def proposals(problem: MappingProblem, reference: int = 0, image: int = 1) -> list[Hypothesis]:
+    """What the network proposes beside a reference that is in place at a scale of its own."""
+    scene = Scene(problem)
+    scene.register(reference, POSES[reference][:, :3], POSES[reference][:, 3])
+    scene.maps[reference].set_scale(1 / UNITS[problem.images[reference].depth_group or 0])
+    options = RegistrationOptions()
+    found = correspondences(scene, image, [reference], options)
+    made = [estimate() for estimate in Hypotheses(scene, image, found, options, 0).of_all()]
+    return [h for h in made if h is not None and h.source == "multi-view network"]
+
+
+def test_a_pose_is_proposed_at_the_scale_of_the_group() -> None:
+    """In a frame of the group's own, and in its unit."""
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    own_frame = [np.column_stack([pose[:, :3] @ turn, pose[:, 3]]) for pose in POSES]
+    (found,) = proposals(in_units([1, 1], own_frame))
+    np.testing.assert_allclose(found.rotation, POSES[1][:, :3], atol=1e-9)
+    np.testing.assert_allclose(found.translation, POSES[1][:, 3], atol=1e-9)
+
+
+def test_between_groups_nothing_is_proposed() -> None:
+    assert not proposals(in_units([0, 1], POSES))
+
+
+def test_a_wrong_proposal_decides_nothing() -> None:
+    """The pose that the matches support is taken, whatever the network says."""
+    wrong = [POSES[0], POSES[3], POSES[2], POSES[1]]
+    problem = in_units([0, 0, 0, 0], wrong)
+    scene = Scene(problem)
+    scene.register(0, POSES[0][:, :3], POSES[0][:, 3])
+    scene.maps[0].set_scale(1.0)
+    options = RegistrationOptions()
+    found = correspondences(scene, 1, [0], options)
+    best = find_poses(scene, 1, found, options, seed=0, attempt=0)[0]
+    assert rotation_angle_deg(best.rotation @ POSES[1][:, :3].T) < 1.0

@@ -1,0 +1,228 @@
+"""Multi-view providers with one fault each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mpsfm_core import DepthPrior, GroupPrior, View
+from mpsfm_core.geometry import invert, pixel_centers, rays
+from mpsfm_core.testing import Setup
+from mpsfm_core.testing import reference as ref
+from mpsfm_core.testing.checks_depth import OF_MAPS
+from mpsfm_core.testing.contract import CHECKS_BY_KIND, id_of
+from mpsfm_core.testing.reference import ToldGroup, depth_prior
+
+EVERYTHING = ("metric", "variance", "proposes-poses", "proposes-intrinsics")
+
+
+def told(folder: Path) -> Setup:
+    return Setup(
+        options={"folder": folder},
+        knows="told",
+        tell=lambda example: ref.tell_group(folder, example),
+    )
+
+
+class Changed(ToldGroup):
+    """The truth, changed in one way."""
+
+    def predict_group(self, views: Sequence[View]) -> GroupPrior:
+        return self.change(super().predict_group(views), views)
+
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        raise NotImplementedError
+
+
+def scaled(prior: DepthPrior, factor: Any) -> DepthPrior:
+    return depth_prior(prior.depth * factor)
+
+
+class RayLength(Changed):
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        lengths = [
+            np.linalg.norm(rays(v.camera, pixel_centers(*v.camera.size)), axis=-1) for v in views
+        ]
+        return replace(group, depth=tuple(map(scaled, group.depth, lengths)))
+
+
+class Std(Changed):
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        depth = tuple(replace(p, variance=np.sqrt(p.variance)) for p in group.depth)
+        return replace(group, depth=depth)
+
+
+class LastFirst(Changed):
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        return replace(group, depth=group.depth[::-1])
+
+
+class EachItsOwn(Changed):
+    """Normalises each map by itself."""
+
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        means = [3 / max(float(np.median(p.depth[p.valid])), 1e-6) for p in group.depth]
+        growing = [mean * 1.1**i for i, mean in enumerate(means)]
+        return replace(group, depth=tuple(map(scaled, group.depth, growing)))
+
+
+class AlongTheFirst(Changed):
+    """Hands on the z of point maps, which are in the frame of the first view."""
+
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        first, depth = group.poses[0], []
+        for prior, pose, view in zip(group.depth, group.poses, views, strict=True):
+            rotation, translation = invert(pose[:, :3], pose[:, 3])
+            points = rays(view.camera, pixel_centers(*view.camera.size)) * prior.depth[..., None]
+            z = (points @ rotation.T + translation) @ first[2, :3] + first[2, 3]
+            depth.append(depth_prior(np.where(prior.valid, z, 0)))
+        return replace(group, depth=tuple(depth))
+
+
+class GroupFromCamera(Changed):
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        poses = [np.column_stack(invert(p[:, :3], p[:, 3])) for p in group.poses]
+        return replace(group, poses=np.array(poses))
+
+
+class OpenGL(Changed):
+    """Cameras that look along -z with y up."""
+
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        return replace(group, poses=np.diag([1.0, -1.0, -1.0]) @ group.poses)
+
+
+class CentersForTranslations(Changed):
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        poses = group.poses.copy()
+        poses[:, :, 3] = [invert(p[:, :3], p[:, 3])[1] for p in poses]
+        return replace(group, poses=poses)
+
+
+class UnitSteps(Changed):
+    """Poses normalised by themselves, depth left in metres."""
+
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        return replace(group, poses=group.poses * (1, 1, 1, 5))
+
+
+class OwnGrid(Changed):
+    """The focal length on the network's grid of 518 pixels."""
+
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        widths = np.array([[view.camera.width] for view in views])
+        return replace(group, intrinsics=group.intrinsics * 518 / widths)
+
+
+class RowsFirst(Changed):
+    """The principal point as row and column."""
+
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        return replace(group, intrinsics=group.intrinsics[:, [0, 1, 3, 2]])
+
+
+class NeedsTwo(Changed):
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        if len(views) < 2:
+            raise IndexError("index 1 is out of bounds for dimension 1 with size 1")
+        return group
+
+
+class OneSize(Changed):
+    """Stacks the images."""
+
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        np.stack([view.image for view in views])
+        return group
+
+
+class CropsToTheSmallest(Changed):
+    """As the authors' own loaders do: the borders of larger views are lost."""
+
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        rows = min(view.camera.height for view in views)
+        columns = min(view.camera.width for view in views)
+        depth = []
+        for prior in group.depth:
+            top, left = (
+                (have - want) // 2 for have, want in zip(prior.shape, (rows, columns), strict=True)
+            )
+            depth.append(depth_prior(prior.depth[top : top + rows, left : left + columns]))
+        return replace(group, depth=tuple(depth))
+
+
+class Fewer(Changed):
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        return GroupPrior(group.depth[1:])
+
+
+class NoPoses(Changed):
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        return replace(group, poses=None)
+
+
+class Sheared(Changed):
+    """A matrix as a network gives it, which nobody made a rotation."""
+
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        return replace(group, poses=1.1 * group.poses)
+
+
+class Mirrored(Changed):
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        return replace(group, poses=np.diag([-1.0, 1.0, 1.0]) @ group.poses)
+
+
+class SomeInMetres(Changed):
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        first, *others = group.depth
+        return replace(group, depth=(replace(first, metric=False), *others))
+
+
+class Chains(Changed):
+    """Goes on in the frame of the group before, as a stream of video would."""
+
+    seen = 0
+
+    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+        self.seen += 1
+        return replace(group, poses=group.poses + np.array([0, 0, 0, self.seen]))
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [
+        (RayLength, "depth-is-z", "is the length of the ray"),
+        (Std, "depth-variance", "is the std itself"),
+        (LastFirst, "multiview-order", "another order than the views"),
+        (EachItsOwn, "multiview-one-unit", "differ in their unit, by"),
+        (AlongTheFirst, "multiview-own-axis", "it is z of the first view"),
+        (GroupFromCamera, "multiview-poses", "they are group_from_cam"),
+        (OpenGL, "multiview-poses", "off by .* degrees"),
+        (CentersForTranslations, "multiview-poses", "goes another way"),
+        (UnitSteps, "multiview-pose-unit", "are 5 times as long as depth says"),
+        (OwnGrid, "multiview-intrinsics", "fx is .* off"),
+        (RowsFirst, "multiview-intrinsics", "cx is 33% off"),
+        (NeedsTwo, "multiview-alone", "index 1 is out of bounds"),
+        (OneSize, "multiview-sizes", "must have the same shape"),
+        (CropsToTheSmallest, "multiview-sizes", "relative error|shifted"),
+        (Fewer, "output-rules", "must be a tuple of 2 priors, got 1"),
+        (NoPoses, "output-rules", "lacks what the specification declares: 'proposes-poses'"),
+        (Sheared, "output-rules", "must be rotations and translations"),
+        (Mirrored, "output-rules", "must not mirror"),
+        (SomeInMetres, "output-rules", "metric in all views of a group or in none"),
+        (Chains, "no-state", "asked after other views"),
+    ],
+)
+def test_multiview(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+    caught("multiview", factory, check, message, told, *EVERYTHING, options=ref.ToldOptions)
+
+
+def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
+    checks = {id_of(check) for check in CHECKS_BY_KIND["multiview"] if check not in OF_MAPS}
+    assert checks - named(test_multiview) == set()
