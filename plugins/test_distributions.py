@@ -22,6 +22,8 @@ DISTRIBUTIONS = {"cv2": "opencv-python-headless", "rerun": "rerun-sdk"}
 """Of imports that are called otherwise."""
 WITH_THE_CORE = {"mpsfm_core", "pydantic"}
 """Options are pydantic models."""
+WITHOUT_THEIR_DEPENDENCIES = {"depth_anything_3"}
+"""They ask for packages that fit beside nothing; a specification says how to get them."""
 FOR_TESTS_ONLY = ("contract.py", "stand_in.py")
 HEAVY = {"viser", "rerun", "torch", "transformers", "onnxruntime", "kornia", "cv2", "scipy", "onnx"}
 
@@ -64,7 +66,8 @@ def test_what_is_imported_is_declared(folder: Path) -> None:
     for module in package.rglob("*.py"):
         known = [*project["dependencies"], *(tests if module.name in FOR_TESTS_ONLY else [])]
         declared = {re.split(r"[<>=]", dependency)[0] for dependency in known}
-        for name in set(imports_of(module)) - WITH_THE_CORE - {package.name}:
+        known_names = WITH_THE_CORE | WITHOUT_THEIR_DEPENDENCIES | {package.name}
+        for name in set(imports_of(module)) - known_names:
             wanted = DISTRIBUTIONS.get(name, name.replace("_", "-"))
             assert name in sys.stdlib_module_names or wanted in declared, f"{module.name}: {name}"
 

@@ -9,6 +9,7 @@ import pytest
 
 from mpsfm_core import ProviderContext, ProviderSpec, View
 from mpsfm_core.errors import InputError, ProviderError
+from mpsfm_core.providers import KINDS
 from mpsfm_core.registry import Registry
 from mpsfm_core.testing import Setup, run_checks
 from mpsfm_core.testing.contract import (
@@ -159,12 +160,4 @@ def test_ids_are_unique_and_every_check_says_what_it_is_about() -> None:
     assert len(set(ids)) == len(ids)
     assert all(check_of(name) is check for name, check in zip(ids, checks, strict=True))
     assert all((check.__doc__ or "").strip().endswith(".") for check in checks)
-    assert set(CHECKS_BY_KIND) == {
-        "depth",
-        "normals",
-        "features",
-        "matcher",
-        "retrieval",
-        "mask",
-        "wrapper",
-    }
+    assert set(CHECKS_BY_KIND) == set(KINDS)

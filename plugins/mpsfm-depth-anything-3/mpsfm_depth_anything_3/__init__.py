@@ -1,0 +1,1 @@
+"""Depth Anything 3 as an MP-SfM provider."""

@@ -1,0 +1,31 @@
+"""Announces the provider; imports nothing heavy."""
+
+from __future__ import annotations
+
+from mpsfm_core import ProviderSpec, hookimpl
+from mpsfm_core.uncertainty.model import DepthCalibration
+from mpsfm_depth_anything_3.options import LICENSES, DepthAnything3Options, weights
+
+
+@hookimpl
+def mpsfm_providers() -> list[ProviderSpec]:
+    """Depth, poses and intrinsics of groups of photos."""
+    return [
+        ProviderSpec(
+            kind="multiview",
+            name="depth-anything-3",
+            factory="mpsfm_depth_anything_3.provider:DepthAnything3",
+            options=DepthAnything3Options,
+            capabilities=frozenset({"variance", "proposes-poses", "proposes-intrinsics"}),
+            summary="Depth Anything 3: depth, poses and intrinsics of several photos at once",
+            requires=("torch", "depth_anything_3"),
+            install_hint="pip install --no-deps depth-anything-3 (its code asks for much that is "
+            "not needed here)",
+            code_license="Apache-2.0",
+            weights_license=f"{LICENSES['da3-small']} (small, base), {LICENSES['da3-large']}",
+            weights=weights,
+            # A guess: not measured, as the weights could not be had where this was written.
+            calibration=DepthCalibration(std_scale=1.0, relative_std=0.05),
+            contract="mpsfm_depth_anything_3.contract:contract",
+        )
+    ]

@@ -1,0 +1,112 @@
+"""Depth Anything 3 of the authors' package, on groups of views."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_model
+
+from mpsfm_core import DepthPrior, GroupPrior, ProviderContext, View
+from mpsfm_core.data import Float64
+from mpsfm_core.errors import WeightsError
+from mpsfm_core.geometry import resize_map
+from mpsfm_core.torch_runtime import inference, use_threads
+from mpsfm_depth_anything_3.options import DepthAnything3Options
+
+_PATCH = 14
+_MEAN = np.float32([0.485, 0.456, 0.406])
+_STD = np.float32([0.229, 0.224, 0.225])
+_WARNINGS = 1
+"""The library's level of messages without its talk."""
+
+
+class DepthAnything3:
+    """Depth of all views in one unit, with poses and intrinsics.
+
+    Views keep their aspect ratio; those of a group that differ in size are padded to the same on
+    all sides, with the mean colour, where the authors' loader would cut borders off.
+    """
+
+    def __init__(self, options: DepthAnything3Options, context: ProviderContext) -> None:
+        use_threads(context)
+        self._options = options
+        self._device = context.device
+        path = context.resolve_weights(options.file, options.sha256)
+        self._network = network_of(options.network)
+        try:
+            load_model(as_published(self._network), path)
+        except (SafetensorError, OSError) as error:
+            raise WeightsError(f"{path} is no safetensors file: {error}") from error
+        except RuntimeError as error:
+            reason = str(error).splitlines()[1].strip()
+            raise WeightsError(f"{path} is not of {options.network}: {reason}") from error
+        self._network.to(self._device)
+
+    def predict_group(self, views: Sequence[View]) -> GroupPrior:
+        """Depth in one unit (metres of the nested network), with its std by the confidence."""
+        sizes = [_network_size(view, self._options.resize) for view in views]
+        width, height = np.max(sizes, axis=0).tolist()
+        starts = [((width - w) // 2, (height - h) // 2) for w, h in sizes]
+        pixels = np.zeros((len(views), height, width, 3), np.float32)
+        for image, view, (left, top), (w, h) in zip(pixels, views, starts, sizes, strict=True):
+            rgb = resize_map(view.image, w, h) / np.float32(255)
+            image[top : top + h, left : left + w] = (rgb - _MEAN) / _STD
+        given = torch.from_numpy(pixels).permute(0, 3, 1, 2)[None].contiguous()
+        with inference():
+            found = self._network(given.to(self._device))
+        depth, confidence = (found[key][0].cpu().numpy() for key in ("depth", "depth_conf"))
+        mean = float(depth.mean())
+        metric = bool(found.get("is_metric", False))
+        priors = []
+        for (left, top), (w, h), z, sure in zip(starts, sizes, depth, confidence, strict=True):
+            inside = slice(top, top + h), slice(left, left + w)
+            std = self._options.relative_std * mean / sure[inside]
+            priors.append(DepthPrior.from_arrays(z[inside], std**2, metric=metric))
+        return GroupPrior(
+            tuple(priors),
+            found["extrinsics"][0, :, :3].double().cpu().numpy(),
+            _intrinsics(found["intrinsics"][0].double().cpu().numpy(), views, starts, sizes),
+        )
+
+
+def network_of(name: str) -> Any:
+    """The architecture, whose parts the library looks up in files of its own."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about what it uses of omegaconf and torch
+        from depth_anything_3.cfg import create_object, load_config
+        from depth_anything_3.registry import MODEL_REGISTRY
+        from depth_anything_3.utils.logger import logger
+
+        logger.level = _WARNINGS  # it prints to the terminal
+        return create_object(load_config(MODEL_REGISTRY[name])).eval()
+
+
+def as_published(network: Any) -> torch.nn.Module:
+    """The network inside of an interface, as files with weights have it; tensors that parts of it
+    share are in them once."""
+    return torch.nn.ModuleDict({"model": network})
+
+
+def _network_size(view: View, longest: int) -> tuple[int, int]:
+    """``(width, height)`` in whole patches; the aspect ratio is kept up to that."""
+    scale = longest / max(view.camera.size)
+    width, height = (max(1, round(side * scale / _PATCH)) for side in view.camera.size)
+    return width * _PATCH, height * _PATCH
+
+
+def _intrinsics(
+    found: Float64,
+    views: Sequence[View],
+    starts: Sequence[tuple[int, int]],
+    sizes: Sequence[tuple[int, int]],
+) -> Float64:
+    """From matrices (n, 3, 3) of the network's grid to fx, fy, cx, cy of the views."""
+    scale = np.array([view.camera.size for view in views]) / np.array(sizes)
+    focal = found[:, [0, 1], [0, 1]] * scale
+    center = (found[:, :2, 2] - np.array(starts)) * scale
+    return np.concatenate([focal, center], axis=1)
