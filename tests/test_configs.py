@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,10 @@ from mpsfm_core.config import Config, describe_shipped, load_config, shipped_con
 from mpsfm_core.errors import ConfigError
 from mpsfm_core.first_party import FIRST_PARTY, requirement_for
 from mpsfm_core.options import AS_DEPTH, SettingsError, dotted
-from mpsfm_core.provision import provide
+from mpsfm_core.provision import look_up, provide
 from mpsfm_core.registry import CORE, Registry
 from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.weights import is_remote
 
 NAMES = sorted(shipped_configs())
 ROOT = Path(__file__).parents[1]
@@ -83,6 +85,22 @@ def test_says_what_it_has_to_be_told(name: str, registry: Registry) -> None:
         parent = yaml.safe_load(texts[parent]).get("extends")
     for option in required(load_config(name, (), registry, complete=False), registry):
         assert f"--set {option}=" in text
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_needs_nothing_but_what_can_be_fetched_or_exported(
+    name: str, registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No file has to be named, but for the maps of a sensor."""
+    monkeypatch.setenv("MPSFM_EXPORTS", str(tmp_path))
+    for exported in ("mast3r", "roma", "dsine"):
+        file = tmp_path / f"{exported}.onnx"
+        file.touch()
+        (tmp_path / f"{exported}.json").write_text(json.dumps({"file": str(file)}))
+    maps = [f"depth.options.directory={tmp_path}"] if name == "sensor-depth" else []
+    config = load_config(name, [*maps, f"runtime.cache_dir={tmp_path}"], registry)
+    files = [f for choice in look_up(config, registry).choices for f in choice.to_fetch]
+    assert all(is_remote(file.uri) and file.license != "unknown" for file in files)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
@@ -11,9 +13,11 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
+from mpsfm_core.cli.arguments import Overrides
+
 if TYPE_CHECKING:
     from mpsfm_core.providers import WeightsFile
-    from mpsfm_core.weights import Progress
+    from mpsfm_core.weights import Progress, WeightStore
 
 app = typer.Typer(no_args_is_help=True, help="Weights: list, download, check.")
 
@@ -23,6 +27,16 @@ Targets: TypeAlias = Annotated[
         metavar="NAME_OR_URI...", help="Providers (xfeat, matcher/loftr) or URIs of weights files."
     ),
 ]
+Wanted: TypeAlias = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="NAME_OR_URI...",
+        help="Configurations (indoor, my.yaml), providers (xfeat, matcher/loftr) or URIs.",
+    ),
+]
+_RESTRICTED = re.compile(r"\bNC\b|non-?commercial|research", re.IGNORECASE)
+"""Licences that forbid commercial use, by their text."""
+
 CacheDir: TypeAlias = Annotated[
     Path | None,
     typer.Option("--cache", metavar="DIR", help="Instead of $MPSFM_CACHE or the user's cache."),
@@ -56,21 +70,33 @@ def list_models(
 
 @app.command()
 def fetch(
-    targets: Targets,
+    targets: Wanted,
     sha256: Annotated[
         str | None, typer.Option("--sha256", help="Expected hash, for a single URI.")
+    ] = None,
+    overrides: Overrides = None,
+    accepted: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--accept",
+            metavar="PROVIDER",
+            help="Accept the non-commercial licence of its weights without being asked.",
+        ),
     ] = None,
     cache: CacheDir = None,
 ) -> None:
     """Download weights that are missing, check them, and print where they are.
 
-    Their licences go to stderr.
+    Of a configuration all that a run with it needs. What will be downloaded is shown first, with
+    licences and the total size; weights that are not for commercial use are asked for by name.
     """
     from mpsfm_core.weights import WeightStore
 
-    files = _select(targets)
-    for file in files:
-        typer.echo(f"licence of {file.uri}: {file.license}", err=True)
+    wanted = _wanted(targets, overrides or [])
+    store = WeightStore(cache)
+    for provider in _show_plan(wanted, store):
+        _ask_for(provider, accepted or [])
+    files = [file for _, file in wanted]
     with _progress_bars() as progress:
         store = WeightStore(cache, progress=progress)
         paths = [store.resolve(file.uri, sha256 or file.sha256) for file in files]
@@ -139,6 +165,66 @@ def _select(targets: list[str]) -> list[WeightsFile]:
             )
         chosen |= {file.uri: file for file in found or [WeightsFile(target)]}
     return list(chosen.values())
+
+
+def _wanted(targets: list[str], overrides: list[str]) -> list[tuple[str, WeightsFile]]:
+    """The files that configurations, providers and URIs stand for, each once, with the name of a
+    provider that loads it."""
+    from mpsfm_core.config import load_config, shipped_configs
+    from mpsfm_core.provision import look_up
+    from mpsfm_core.registry import Registry
+
+    chosen: dict[str, tuple[str, WeightsFile]] = {}
+    for target in targets:
+        if target not in shipped_configs() and not target.endswith((".yaml", ".yml")):
+            found = [(target, file) for file in _select([target])]
+        else:
+            registry = Registry.discover()
+            provision = look_up(load_config(target, overrides, registry), registry)
+            found = [
+                (spec.name, file)
+                for path, kind, backend in provision.config.backends()
+                for spec in [registry.spec(kind, backend.use)]
+                for file in registry.weights(kind, backend.use, backend.options)
+            ]
+        for name, file in found:
+            chosen.setdefault(file.uri, (name, file))
+    return list(chosen.values())
+
+
+def _show_plan(wanted: list[tuple[str, WeightsFile]], store: WeightStore) -> list[tuple[str, str]]:
+    """Tell on stderr what will be downloaded; the providers whose licence forbids commercial use,
+    with that licence."""
+    from mpsfm_core.weights import is_remote
+
+    total, unknown, restricted = 0, 0, {}
+    for name, file in wanted:
+        typer.echo(f"licence of {file.uri}: {file.license}", err=True)
+        if not is_remote(file.uri) or store.locate(file.uri) is not None:
+            continue
+        size = file.size or store.size(file.uri)
+        total, unknown = total + (size or 0), unknown + (size is None)
+        if _RESTRICTED.search(file.license):
+            restricted[name] = file.license
+    rest = f", and {unknown} of unknown size" if unknown else ""
+    if total or unknown:
+        typer.echo(f"to be downloaded: {total / 1e6:.0f} MB{rest}", err=True)
+    return list(restricted.items())
+
+
+def _ask_for(restricted: tuple[str, str], accepted: list[str]) -> None:
+    """Raise unless the user accepts a licence that forbids commercial use."""
+    from mpsfm_core.errors import InputError
+
+    name, license = restricted
+    if name in accepted:
+        return
+    question = f"The weights of {name} are not for commercial use ({license}). To accept, type"
+    if not sys.stdin.isatty() or typer.prompt(f"{question} {name}", err=True) != name:
+        raise InputError(
+            f"the weights of {name} are not for commercial use ({license}): nothing was "
+            f"downloaded; '--accept {name}' accepts that"
+        )
 
 
 def _is_uri(target: str) -> bool:

@@ -10,8 +10,8 @@ from mpsfm_core import Options
 class DsineOptions(Options):
     """The network."""
 
-    model: str
-    """Path or URI of the ONNX file (the README says how it is made)."""
+    model: str = "export:dsine"
+    """Path or URI of the ONNX file; by default what ``mpsfm models export dsine`` made."""
     sha256: str | None = None
     """Expected hash of ``model``."""
     size: int = Field(1200, ge=32, le=2000)

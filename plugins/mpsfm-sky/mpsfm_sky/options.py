@@ -6,13 +6,16 @@ from typing import Literal
 
 from pydantic import Field
 
-from mpsfm_core import Options
+from mpsfm_core import Options, WeightsFile
+
+SKYSEG = WeightsFile("hf://JianyuanWang/skyseg@main/skyseg.onnx", license="MIT")
+"""The reference's network, from where the authors of VGGT take it; its hash is recorded."""
 
 
 class SkyOptions(Options):
     """A sky segmentation network in an ONNX file."""
 
-    model: str
+    model: str = SKYSEG.uri
     """Path or URI."""
     network: Literal["skyseg", "skysegsmall"] = "skyseg"
     """How it wants the image: ``skyseg`` 320 x 320, normalised (the reference's); ``skysegsmall``
