@@ -31,7 +31,6 @@ those that led an image to a wrong place look alike there, others tell.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -47,8 +46,6 @@ from mpsfm_core.optimize.depth_integration import RefinedDepth
 from mpsfm_core.optimize.thinning import thinned, thinned_camera, thinning_step
 from mpsfm_core.scene.scene import Scene
 
-MAX_GRIDS = 64
-"""Thinned maps that are kept: views that overlap come one after the other."""
 STEPS = 4
 """Errors tried to either side along a pixel's ray, evenly spaced up to the limit (ours)."""
 SAMPLING = 2
@@ -77,7 +74,7 @@ class DepthCheck:
     def __init__(self, scene: Scene, options: ConsistencyOptions) -> None:
         self._scene = scene
         self._options = options
-        self._grids: OrderedDict[int, tuple[_MapState, _Grid]] = OrderedDict()
+        self._grids: dict[int, tuple[_MapState, _Grid]] = {}
 
     def of_image(self, image: int, std_factor: float = 1.0) -> Inconsistency:
         """How much an image contradicts the registered views that it overlaps with most.
@@ -130,12 +127,9 @@ class DepthCheck:
         """The depth map of an image, thinned out, with what it was worth when it came about."""
         depth_map = self._scene.maps[image]
         state = _MapState(depth_map.refined, depth_map.scale, depth_map.camera, std_factor)
-        known = self._grids.pop(image, None)
+        known = self._grids.get(image)
         if known is None or known[0] != state:
-            known = state, self._make_grid(image, std_factor)
-        self._grids[image] = known
-        if len(self._grids) > MAX_GRIDS:
-            self._grids.popitem(last=False)
+            known = self._grids[image] = state, self._make_grid(image, std_factor)
         return known[1]
 
     def _make_grid(self, image: int, std_factor: float) -> _Grid:
@@ -163,16 +157,42 @@ def overlapping_views(scene: Scene, image: int, limit: int) -> list[int]:
     at = xy[..., 1].astype(np.int64), xy[..., 0].astype(np.int64)
     points = unproject(depth_map.camera, xy, depth_map.depth[at].astype(np.float64))
     world = (points[depth_map.valid[at]] - scene.translations[image]) @ scene.rotations[image]
-    local = np.einsum("nij,pj->npi", scene.rotations[others], world)
-    local += scene.translations[others][:, None]
-    size = np.array([scene.problem.images[i].camera.size for i in others]).reshape(-1, 1, 2)
-    focal, center = np.split(scene.intrinsics[others][:, None], 2, axis=2)
-    front = local[..., 2] > 1e-9
-    pixel = focal * local[..., :2] / np.where(front, local[..., 2], 1.0)[..., None] + center
-    inside = front & ((pixel >= 0) & (pixel < size)).all(axis=2)
-    share = inside.sum(axis=1) / OVERLAP_GRID**2
+    sizes = np.array([scene.problem.images[i].camera.size for i in others]).reshape(-1, 2)
+    inside = points_inside(
+        world,
+        scene.rotations[others],
+        scene.translations[others],
+        scene.intrinsics[others],
+        sizes.astype(np.float64),
+    )
+    share = inside / OVERLAP_GRID**2
     order = np.argsort(-share, kind="stable")[:limit]
     return [int(others[k]) for k in order if share[k] >= MIN_OVERLAP]
+
+
+@jit.kernel()
+def points_inside(
+    points: Float64, rotations: Float64, translations: Float64, intrinsics: Float64, sizes: Float64
+) -> Int64:
+    """How many of the points (p, 3) project into each of n views, (n,) int64.
+
+    ``rotations`` (n, 3, 3), ``translations`` (n, 3): cam_from_world. ``intrinsics`` (n, 4): fx, fy,
+    cx, cy, and ``sizes`` (n, 2) in pixels.
+    """
+    counts = np.zeros(len(rotations), np.int64)
+    for view in range(len(rotations)):
+        r, t = rotations[view], translations[view]
+        fx, fy, cx, cy = intrinsics[view]
+        width, height = sizes[view]
+        for k in range(len(points)):
+            x, y, z = points[k]
+            depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
+            if depth <= 1e-9:
+                continue
+            u = fx * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]) / depth + cx
+            v = fy * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) / depth + cy
+            counts[view] += 0 <= u < width and 0 <= v < height
+    return counts
 
 
 class _Grid(NamedTuple):

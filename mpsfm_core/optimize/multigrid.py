@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core import jit
-from mpsfm_core.data import Float32, Float64
+from mpsfm_core.data import Float32, Float64, Int64
 
 _kernel, _helper = (
     jit.kernel(fastmath={"contract", "reassoc"}),
@@ -38,6 +38,8 @@ _kernel, _helper = (
 SOLVED = 1e-10
 """Relative error that only rounding is left below."""
 _TINY = 1e-30  # less is nothing
+_PLANES, _FIRST_WEIGHTS = 19, 11
+"""Of a level, and the first of those that hold its interpolation weights."""
 _Squares = tuple[float, ...]
 """Six couplings, then four masses, of a cell."""
 _Corners = tuple[float, float, float, float]
@@ -89,10 +91,15 @@ class Multigrid:
     """
 
     def __init__(self, height: int, width: int) -> None:
-        self._levels = [_empty_level(height, width)]
+        shapes = [(height, width)]
         while height > 1 or width > 1:
             height, width = (height + 1) // 2, (width + 1) // 2
-            self._levels.append(_empty_level(height, width))
+            shapes.append((height, width))
+        framed = np.array(shapes, dtype=np.int64) + 2
+        first = np.concatenate([[0], np.cumsum(_PLANES * framed.prod(axis=1))])
+        # One block of memory: large enough for huge pages, which matters from about 300 000 pixels.
+        self._grids = _Grids(np.zeros(first[-1]), first, framed)
+        self._levels = [_level(self._grids, number) for number in range(len(framed))]
         self._vectors = np.zeros((4, *self._levels[0].x.shape))
 
     def update(self, east: Float32, south: Float32, mass: Float32) -> None:
@@ -105,55 +112,96 @@ class Multigrid:
         finest.east[1:-1, 1:-2] = east[:, :-1]
         finest.south[1:-2, 1:-1] = south[:-1]
         finest.mass[1:-1, 1:-1] = mass
-        for fine, coarse in zip(self._levels, self._levels[1:], strict=False):
-            _prepare_smoother(fine)
-            _derive_interpolation(fine, coarse)
-            _coarsen(fine, coarse, fine is not finest)
-        _prepare_smoother(self._levels[-1])
+        _derive_levels(self._grids)
 
     def solve(self, rhs: Float64, iterations: int, tolerance: float = 0.0) -> Solution:
         """Preconditioned conjugate gradients for A x = rhs (h, w) from x = 0."""
-        finest = self._levels[0]
-        x, residual, direction, image = self._vectors
+        x, residual, direction, _ = self._vectors
         x[:] = direction[:] = 0
         residual[1:-1, 1:-1] = rhs
-        finest.rhs[:] = residual
-        done, first, previous, product = 0, 0.0, 1.0, 0.0
-        while done < iterations:
-            self._v_cycle()
-            product = _dot(residual, finest.x)
-            first = first or product
-            if not product > max(tolerance, SOLVED) ** 2 * first:
-                break
-            _turn(product / previous, finest.x, direction)
-            curvature = _apply(finest, direction, image)
-            if not curvature > 0:
-                break
-            _step(product / curvature, direction, image, x, residual, finest.rhs)
-            done, previous = done + 1, product
-        error = float(np.sqrt(max(product, 0.0) / first)) if first > 0 else 0.0
+        self._levels[0].rhs[:] = residual
+        done, error = _conjugate_gradients(self._grids, self._vectors, iterations, tolerance)
         return Solution(x[1:-1, 1:-1].copy(), done, error)
 
-    def _v_cycle(self) -> None:
-        """`x` of the finest level becomes an approximate solution for its `rhs`."""
-        finest, coarsest = self._levels[0], self._levels[-1]
-        for fine, coarse in zip(self._levels, self._levels[1:], strict=False):
-            fine.x[:] = 0
-            _smooth(fine, fine is not finest, False)
-            _restrict(fine, coarse, fine is not finest)
-        coarsest.x[1, 1] = coarsest.rhs[1, 1] / coarsest.diagonal[1, 1]
-        for fine, coarse in zip(self._levels[-2::-1], self._levels[:0:-1], strict=True):
-            _prolong(coarse, fine)
-            _smooth(fine, fine is not finest, True)
+
+class _Grids(NamedTuple):
+    """The levels, finest first, one after the other in `memory`: `first` (n + 1,) where each
+    begins, `shapes` (n, 2) of their grids, frame included."""
+
+    memory: Float64
+    first: Int64
+    shapes: Int64
 
 
-def _empty_level(height: int, width: int) -> _Level:
-    # One block of memory: large enough for huge pages, which matters from about 300 000 pixels.
-    planes = np.zeros((19, height + 2, width + 2))
-    return _Level._make([*planes[:11], planes[11:]])
+@_helper
+def _level(grids: _Grids, number: int) -> _Level:
+    height, width = grids.shapes[number]
+    planes = grids.memory[grids.first[number] : grids.first[number + 1]]
+    p = planes.reshape((_PLANES, height, width))
+    # one by one, as compiled code wants it
+    return _Level(
+        p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[_FIRST_WEIGHTS:]
+    )
 
 
 @_kernel
+def _derive_levels(grids: _Grids) -> None:
+    """All levels from the couplings and the mass of the finest."""
+    last = len(grids.shapes) - 1
+    for number in range(last):
+        fine, coarse = _level(grids, number), _level(grids, number + 1)
+        _prepare_smoother(fine)
+        _derive_interpolation(fine, coarse)
+        _coarsen(fine, coarse, number > 0)
+    _prepare_smoother(_level(grids, last))
+
+
+@_kernel
+def _conjugate_gradients(
+    grids: _Grids, vectors: Float64, iterations: int, tolerance: float
+) -> tuple[int, float]:
+    """Solve for `rhs` of the finest level; iterations and the relative error as in `Solution`.
+
+    `vectors`: x, residual, direction and image, framed; the residual is the right-hand side.
+    """
+    finest = _level(grids, 0)
+    x, residual, direction, image = vectors[0], vectors[1], vectors[2], vectors[3]
+    done, first, previous, product = np.int64(0), 0.0, 1.0, 0.0
+    while done < iterations:
+        _v_cycle(grids)
+        product = _dot(residual, finest.x)
+        if first == 0.0:
+            first = product
+        if not product > max(tolerance, SOLVED) ** 2 * first:
+            break
+        _turn(product / previous, finest.x, direction)
+        curvature = _apply(finest, direction, image)
+        if not curvature > 0:
+            break
+        _step(product / curvature, direction, image, x, residual, finest.rhs)
+        done, previous = done + 1, product
+    error = np.sqrt(max(product, 0.0) / first) if first > 0 else 0.0
+    return done, error
+
+
+@_helper
+def _v_cycle(grids: _Grids) -> None:
+    """A V-cycle: `x` of the finest level becomes an approximate solution for its `rhs`."""
+    last = len(grids.shapes) - 1
+    for number in range(last):
+        fine = _level(grids, number)
+        fine.x[:] = 0
+        _smooth(fine, number > 0, False)
+        _restrict(fine, _level(grids, number + 1), number > 0)
+    coarsest = _level(grids, last)
+    coarsest.x[1, 1] = coarsest.rhs[1, 1] / coarsest.diagonal[1, 1]
+    for number in range(last - 1, -1, -1):
+        fine = _level(grids, number)
+        _prolong(_level(grids, number + 1), fine)
+        _smooth(fine, number > 0, True)
+
+
+@_helper
 def _prepare_smoother(level: _Level) -> None:
     """Diagonal and line pivots; in a form without differences, exact for any ratio of sizes."""
     east, south, southeast, southwest = level.east, level.south, level.southeast, level.southwest
@@ -189,7 +237,7 @@ def _inverse(value: float) -> float:
     return 1.0 / value if value > _TINY else 0.0
 
 
-@_kernel
+@_helper
 def _smooth(level: _Level, nine_point: bool, backward: bool) -> None:
     """Gauss-Seidel over three blocks; `backward` is the adjoint of forward."""
     if backward:
@@ -265,7 +313,7 @@ def _residual_row(level: _Level, i: int, nine_point: bool, row: Float64) -> None
             row[j] += falling + rising
 
 
-@_kernel
+@_helper
 def _restrict(fine: _Level, coarse: _Level, nine_point: bool) -> None:
     """The right-hand side of `coarse` is the residual of `fine`, gathered by the interpolation."""
     residual, weights = fine.work, coarse.weights
@@ -288,7 +336,7 @@ def _restrict(fine: _Level, coarse: _Level, nine_point: bool) -> None:
             coarse.rhs[i, j] = total
 
 
-@_kernel
+@_helper
 def _prolong(coarse: _Level, fine: _Level) -> None:
     """Add the interpolated correction of `coarse` to `fine`."""
     weights, x = coarse.weights, coarse.x
@@ -305,7 +353,7 @@ def _prolong(coarse: _Level, fine: _Level) -> None:
             fine.x[r + 1, c + 1] += top + bottom
 
 
-@_kernel
+@_helper
 def _derive_interpolation(fine: _Level, coarse: _Level) -> None:
     """Dendy's weights: each fine pixel solves its own equation, collapsed onto its line."""
     east, south, southeast, southwest = fine.east, fine.south, fine.southeast, fine.southwest
@@ -365,7 +413,7 @@ def _shares(first: float, second: float, mass: float) -> tuple[float, float]:
     return first * inverse, second * inverse
 
 
-@_kernel
+@_helper
 def _coarsen(fine: _Level, coarse: _Level, nine_point: bool) -> None:
     """Galerkin product, cell by cell: each fine coupling and mass is a square of coarse values."""
     weights = coarse.weights
@@ -464,7 +512,7 @@ def _add_coupling(q: _Squares, coupling: float, a: _Corners, b: _Corners) -> _Sq
     )
 
 
-@_kernel
+@_helper
 def _apply(level: _Level, x: Float64, image: Float64) -> float:
     """`image` = A x on the finest level; returns x' A x."""
     east, south, mass = level.east, level.south, level.mass
@@ -480,7 +528,7 @@ def _apply(level: _Level, x: Float64, image: Float64) -> float:
     return curvature
 
 
-@_kernel
+@_helper
 def _step(
     length: float, direction: Float64, image: Float64, x: Float64, residual: Float64, rhs: Float64
 ) -> None:
@@ -491,14 +539,14 @@ def _step(
             rhs[i, j] = residual[i, j]
 
 
-@_kernel
+@_helper
 def _turn(factor: float, preconditioned: Float64, direction: Float64) -> None:
     for i in range(1, direction.shape[0] - 1):
         for j in range(1, direction.shape[1] - 1):
             direction[i, j] = preconditioned[i, j] + factor * direction[i, j]
 
 
-@_kernel
+@_helper
 def _dot(a: Float64, b: Float64) -> float:
     total = 0.0
     for i in range(1, a.shape[0] - 1):

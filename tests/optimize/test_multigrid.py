@@ -107,8 +107,7 @@ def preconditioner_of(planes: Planes) -> np.ndarray:
     solver.update(*planes)
     columns = []
     for unit in np.eye(planes[0].size):
-        solver._levels[0].rhs[1:-1, 1:-1] = unit.reshape(shape)
-        solver._v_cycle()
+        solver.solve(unit.reshape(shape), 1)
         columns.append(solver._levels[0].x[1:-1, 1:-1].ravel().copy())
     return np.array(columns)
 
