@@ -26,6 +26,7 @@ from mpsfm_core.extraction.cache import cache_folder, content_key
 from mpsfm_core.files import remove_unfinished, write_file
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.state import Frozen, fingerprint
+from mpsfm_core.npz import read_npz
 from mpsfm_core.registry import core_version
 from mpsfm_core.stages import Stages
 
@@ -132,13 +133,12 @@ class DiskCheckpoints:
 def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], Frozen]:
     """Header and state of a file; raises :class:`DataError` when it is damaged."""
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+        arrays = read_npz(path)
         header = json.loads(arrays.pop(_HEADER).tobytes())
         missing = {"code", "version", "registered", "time"} - header.keys()
         if missing:
             raise ValueError(f"no {', '.join(missing)}")
-    except Exception as error:  # zip, numpy and json readers share no base class
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataError("checkpoint", f"it is damaged ({error})") from error
     return header, arrays
 

@@ -470,6 +470,7 @@ def _densify_model(
 
 def _depths_of_points(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Float64:
     seen = [point.point3D_id for point in image.points2D if point.has_point3D()]
+    seen = [number for number in seen if model.exists_point3D(number)]
     if not seen or not image.has_pose:
         return np.zeros(0)
     xyz = np.array([model.points3D[number].xyz for number in seen])

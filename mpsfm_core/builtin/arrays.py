@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from mpsfm_core.builtin.options import FileOptions
 from mpsfm_core.data import View
 from mpsfm_core.errors import InputError
+from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.inputs.pixels import check_size
+from mpsfm_core.npz import read_npz
 
 _SUFFIXES = (".npz", ".npy", ".exr", ".png", ".tif", ".tiff")
 _SINGLE_CHANNELS = ("Z", "Y", "depth.Z", "Depth.Z", "R", "V")
@@ -74,15 +77,16 @@ def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> No
 
 
 def _read_numpy(path: Path, main: str) -> dict[str, NDArray[Any]]:
+    if path.suffix == ".npz":
+        return read_npz(path)
     # From memory, because numpy leaves a damaged file open.
-    loaded = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
-    if isinstance(loaded, np.ndarray):
-        return {main: loaded}
-    return {name: loaded[name] for name in loaded.files}
+    return {main: np.lib.format.read_array(io.BytesIO(path.read_bytes()), allow_pickle=False)}
 
 
 def _read_image(path: Path) -> NDArray[Any]:
-    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    content = path.read_bytes()
+    check_size(content, path, InputOptions().max_pixels)
+    data = np.frombuffer(content, dtype=np.uint8)
     pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if pixels is None:
         raise ValueError("it is damaged or no image")

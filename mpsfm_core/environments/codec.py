@@ -127,7 +127,7 @@ def unpack(text: bytes, block: memoryview, copy: bool) -> Any:
 
     try:
         return build(json.loads(text))
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, MemoryError, RecursionError) as error:
         raise DataError("value", f"does not follow the protocol: {error}") from error
 
 

@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
-
 from mpsfm_core.data import Pose
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy, read_ply
 from mpsfm_core.evaluation.depth_accuracy import depth_accuracy, mean_accuracy
 from mpsfm_core.evaluation.prior_quality import read_depth
+from mpsfm_core.results.depth_maps import load_depth_map
 
 
 def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
@@ -28,8 +27,10 @@ def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
         file = truth / photo.with_suffix(".png")
         if not file.is_file():
             continue
-        with np.load(path) as arrays:
-            depth, valid = arrays["depth"], arrays["valid"]
+        arrays = load_depth_map(path)
+        if not {"depth", "valid"} <= arrays.keys():
+            raise InputError(f"{path}: is no depth map of a run")
+        depth, valid = arrays["depth"], arrays["valid"]
         true = read_depth(file)
         for scaled in found:
             accuracy = depth_accuracy(depth, valid, true, median_scaled=scaled)

@@ -21,6 +21,8 @@ from mpsfm_core.data import Float32
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.scene_folder import SceneFolder
 from mpsfm_core.files import write_file
+from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.inputs.pixels import check_size, read_bytes
 from mpsfm_core.testing.degraded_depth import DepthErrors, degrade_depth
 
 QUALITIES = ("sensor", "degraded", "config")
@@ -62,7 +64,10 @@ def prior_settings(
 
 def read_depth(path: Path) -> Float32:
     """True depth (h, w) in metres, 0 where unknown; raises :class:`InputError`."""
-    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    stored = None
+    if path.is_file():
+        check_size(read_bytes(path), path, InputOptions().max_pixels)
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.ndim != 2 or stored.dtype != np.uint16:
         raise InputError(f"{path}: no 16-bit depth image")
     return np.asarray(stored * np.float32(_MILLIMETRE))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import io
 import json
 import logging
 import os
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 
 from mpsfm_core.errors import OutputError
 from mpsfm_core.files import remove_unfinished, write_file
+from mpsfm_core.npz import read_npz
 from mpsfm_core.weights import CACHE_VARIABLE
 
 _log = logging.getLogger(__name__)
@@ -52,16 +52,13 @@ class Cache:
         """The entry as an object of ``cls``, None when there is none that can be read."""
         path = self._path(kind, key)
         try:
-            data = path.read_bytes()
+            return unpack(cls, read_npz(path))
         except FileNotFoundError:
             return None
         except OSError as error:
             _log.warning("cache entry %s cannot be read (%s): computing it again", path, error)
             return None
-        try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-                return unpack(cls, {name: archive[name] for name in archive.files})
-        except Exception as error:  # readers of damaged files raise what their parsers raise
+        except Exception as error:  # what a class says to values that it does not expect
             _log.warning("cache entry %s is damaged (%s): computing it again", path, error)
             return None
 

@@ -87,6 +87,8 @@ def _matches(
     for pair_id, count, columns, data in database.execute(
         f"SELECT pair_id, rows, cols, data FROM {table}"
     ):
+        if not isinstance(pair_id, int):
+            raise InputError(f"{path}, {table}: {pair_id!r} is no pair of images")
         second = pair_id % _MAX_IMAGES
         pair = (pair_id - second) // _MAX_IMAGES, second
         where = f"{path}, {table} of images {pair[0]} and {pair[1]}"

@@ -145,7 +145,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
             entries = _from_text(path)
         else:
             entries = _from_yaml(path)
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError, OverflowError) as error:
         raise InputError(f"intrinsics {path} cannot be read: {error}") from error
     _check_lists(path, entries)
     return Intrinsics(path, entries)

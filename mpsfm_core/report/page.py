@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Float64
+from mpsfm_core.errors import InputError, MpsfmError
 from mpsfm_core.files import write_file
 from mpsfm_core.report import pictures
 from mpsfm_core.report.findings import findings, partner_counts, verdict
@@ -46,7 +47,13 @@ def write_report(folder: Path) -> Path:
     Raises :class:`~mpsfm_core.errors.InputError` when the folder holds no results or damaged
     ones, :class:`OSError` when the disk is full.
     """
-    text = render(ResultFolder.open(folder))
+    result = ResultFolder.open(folder)
+    try:
+        text = render(result)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, MpsfmError):
+            raise
+        raise InputError(f"{folder}: its results are damaged: {error!r}") from error
     write_file(folder / REPORT, text.encode("utf-8"))
     return folder / REPORT
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,13 +16,14 @@ from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
 from mpsfm_core.errors import InputError
 from mpsfm_core.inputs.images import SUMMARY
 from mpsfm_core.inputs.models import read_model
+from mpsfm_core.npz import read_npz
 from mpsfm_core.results.depth_maps import load_depth_map
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.summary import read_summary
 from mpsfm_core.results.views import MATCHES
 from mpsfm_core.results.writer import DENSE, DEPTH, VIEWS
 
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+_UNREADABLE = (ValueError, KeyError, TypeError, IndexError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,14 +171,12 @@ class ResultFolder:
                 )
                 for row, (a, b) in enumerate(data["pairs"])
             ]
-        except (*_UNREADABLE, IndexError) as error:
+        except _UNREADABLE as error:
             raise InputError(f"{file}: is damaged: {error}") from error
 
 
 def _load(file: Path) -> dict[str, Any]:
     try:
-        data = io.BytesIO(file.read_bytes())  # numpy leaves a damaged file open
-        with np.load(data, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except _UNREADABLE as error:
+        return read_npz(file)
+    except (OSError, ValueError) as error:
         raise InputError(f"{file}: is damaged: {error}") from error

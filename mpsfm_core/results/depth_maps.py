@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mpsfm_core.data import DepthPrior, PinholeCamera
 from mpsfm_core.errors import InputError
 from mpsfm_core.formats import VERSION, check_version
+from mpsfm_core.npz import read_npz
 from mpsfm_core.scene.reconstruction import Reconstruction
 
 FORMAT = 1
@@ -62,9 +63,8 @@ def load_depth_map(path: Path) -> dict[str, NDArray[Any]]:
     Raises :class:`InputError` when it is damaged or of a newer version.
     """
     try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except Exception as error:  # numpy has no base class for what damaged archives raise
+        arrays = read_npz(path)
+    except (OSError, ValueError) as error:
         raise InputError(f"{path}: is no depth map of a run, or damaged: {error}") from error
     check_version(arrays, FORMAT, path)
     return arrays

@@ -113,7 +113,8 @@ def _read_all(reader: Reader, name: str, seed: bytes, numbers: range, sender: in
     with tempfile.TemporaryDirectory() as folder:
         for number in numbers:
             os.write(sender, f"{number} \n".encode())
-            path = Path(folder) / name
+            path = Path(folder) / str(number) / name
+            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(case(name, seed, number))
             signal.alarm(LIMIT_S)
             try:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import logging
+import shutil
+import sqlite3
 import struct
 import warnings
 from collections.abc import Callable
@@ -18,11 +21,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mpsfm_core import checkpoints
+from mpsfm_core import checkpoints, npz
 from mpsfm_core.builtin.arrays import read_arrays
 from mpsfm_core.config import load_config
 from mpsfm_core.data import DepthPrior, Features
-from mpsfm_core.errors import MpsfmError
+from mpsfm_core.errors import InputError, MpsfmError, WeightsError
 from mpsfm_core.evaluation.cloud_accuracy import read_ply
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.records import read_record
@@ -31,16 +34,20 @@ from mpsfm_core.extraction.cache import Cache, content_key
 from mpsfm_core.inputs.header import declared_pixels, is_cut_jpeg, read_header
 from mpsfm_core.inputs.images import load_images, read_image_list
 from mpsfm_core.inputs.intrinsics import read_intrinsics
-from mpsfm_core.inputs.models import read_poses
+from mpsfm_core.inputs.models import read_model, read_poses
 from mpsfm_core.mapping.state import freeze, thaw
 from mpsfm_core.registry import Registry
+from mpsfm_core.report.page import write_report
+from mpsfm_core.results.depth_maps import read_depth_map
+from mpsfm_core.results.exports.formats import export
 from mpsfm_core.uncertainty.file import read_values
 from mpsfm_core.weights import WeightStore
 from mpsfm_core.yaml_text import parse_yaml
 
 from .mutation import failures
+from .readers import GOLDEN, TABLES, of_others, used
 
-QUICK, SLOW = 12, 110
+QUICK, SLOW, FURTHER = 12, 110, 25
 
 _IMAGE = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
 _TAGS = [(0x0112, 3, 1, 6), (0xA405, 3, 1, 28)]
@@ -240,18 +247,114 @@ def test_many_mutations(tmp_path: Path, registry: Registry) -> None:
     check(tmp_path, registry, range(QUICK, SLOW))
 
 
-def test_mutated_networks(tmp_path: Path) -> None:
-    onnx = pytest.importorskip("mpsfm_onnx.stand_in", reason="needs mpsfm-onnx and onnxruntime")
-    assert onnx is not None
-    import onnx as format
+@pytest.mark.slow
+@pytest.mark.parametrize("table", TABLES)
+def test_further_files(table: str, tmp_path: Path) -> None:
+    found = []
+    for name, (seed, reader) in TABLES[table]().items():
+        path = tmp_path / "well-formed" / str(len(found)) / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(seed)
+        reader(path)
+        found += failures(reader, name, seed, range(FURTHER))
+    assert not found, "\n".join(found)
 
-    tensor = format.helper.make_tensor_value_info
-    node = format.helper.make_node("Add", ["x", "x"], ["y"])
-    inputs, outputs = [tensor("x", 1, [1, 3])], [tensor("y", 1, [1, 3])]
-    graph = format.helper.make_graph([node], "g", inputs, outputs)
-    opset = [format.helper.make_opsetid("", 17)]
-    seed = format.helper.make_model(graph, opset_imports=opset, ir_version=8).SerializeToString()
-    assert not list(failures(as_onnx, "net.onnx", seed, range(60)))
+
+def test_what_was_found_in_further_files(tmp_path: Path) -> None:
+    """A pair of no images, a summary without times, a model whose points are gone."""
+    table = of_others()
+    path = tmp_path / "a.db"
+    path.write_bytes(table["a.db"][0])
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.execute("CREATE TABLE other AS SELECT * FROM matches")
+        database.execute("UPDATE other SET pair_id = NULL")
+        database.execute("DROP TABLE matches")
+        database.execute("ALTER TABLE other RENAME TO matches")
+    with pytest.raises(InputError, match=r"a\.db, matches: None is no pair of images"):
+        table["intrinsics/a.db"][1](path)
+    out = Path(shutil.copytree(GOLDEN / "out", tmp_path / "out"))
+    (out / "sparse" / "points3D.bin").write_bytes(bytes(8))
+    with pytest.raises(InputError, match="out: its results are damaged"):
+        write_report(out)
+    used(out)
+    summary = json.loads((out / "summary.json").read_text())
+    summary["stages"] = {"mapping": {}}
+    (out / "summary.json").write_text(json.dumps(summary))
+    with pytest.raises(InputError, match="out: its results are damaged"):
+        write_report(out)
+
+
+def test_a_small_file_cannot_stand_for_gigabytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(npz, "MOST_BYTES", 1_000_000)
+    path = tmp_path / "depth.npz"
+    np.savez_compressed(path, depth=np.zeros((1000, 1000), np.float32))
+    with pytest.raises(InputError, match="unpacks to 4 MB, 1 at most"):
+        read_arrays(path, "depth")
+    with pytest.raises(InputError, match="unpacks to 4 MB, 1 at most"):
+        read_depth_map(path)
+    np.savez(path, depth=np.zeros((1000, 1000), np.float32))  # is as large as it says
+    assert read_arrays(path, "depth")["depth"].shape == (1000, 1000)
+    image = tmp_path / "large.png"
+    image.write_bytes(encoded(".png")[:16] + struct.pack(">II", 40_000, 40_000))
+    with pytest.raises(InputError, match="has 1600 million pixels"):
+        read_arrays(image, "depth")
+    with pytest.raises(InputError, match="has 1600 million pixels"):
+        read_depth(image)
+
+
+def test_an_export_writes_nothing_elsewhere(tmp_path: Path) -> None:
+    out = Path(shutil.copytree(GOLDEN / "out", tmp_path / "out"))
+    model = read_model(out)
+    for name in ("../../0.png", "/tmp/0.png", "a/../../0.png"):
+        model.images[1].name = name
+        model.write_binary(str(out / "sparse"))
+        with pytest.raises(InputError, match=r"the name of image .* leads elsewhere"):
+            export(out, "gsplat")
+
+
+def network(*nodes: Any, initializers: Any = (), domain: str = "") -> Any:
+    onnx = pytest.importorskip("onnx", reason="needs onnx")
+    pytest.importorskip("mpsfm_onnx.model", reason="needs mpsfm-onnx and onnxruntime")
+    tensor = onnx.helper.make_tensor_value_info
+    graph = onnx.helper.make_graph(
+        list(nodes), "g", [tensor("x", 1, [1, 3])], [tensor("y", 1, None)], list(initializers)
+    )
+    opset = [onnx.helper.make_opsetid("", 17)]
+    opset += [onnx.helper.make_opsetid(domain, 1)] if domain else []
+    return onnx.helper.make_model(graph, opset_imports=opset, ir_version=8)
+
+
+def test_mutated_networks() -> None:
+    onnx = pytest.importorskip("onnx", reason="needs onnx")
+    node = onnx.helper.make_node("Add", ["x", "x"], ["y"])
+    assert not list(failures(as_onnx, "net.onnx", network(node).SerializeToString(), range(60)))
+
+
+@pytest.mark.parametrize("place", ["../secret.bin", "a/../../secret.bin", "absolute", "link.bin"])
+def test_a_network_reads_no_file_outside_its_folder(place: str, tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx", reason="needs onnx")
+    secret = tmp_path / "secret.bin"
+    secret.write_bytes(np.ones(3, np.float32).tobytes())
+    (tmp_path / "models" / "a").mkdir(parents=True)
+    (tmp_path / "models" / "link.bin").symlink_to(secret)
+    weights = onnx.TensorProto(name="w", data_type=1, dims=[3], data_location=1)
+    weights.external_data.add(key="location", value=str(secret) if place == "absolute" else place)
+    node = onnx.helper.make_node("Add", ["x", "w"], ["y"])
+    path = tmp_path / "models" / "net.onnx"
+    path.write_bytes(network(node, initializers=[weights]).SerializeToString())
+    with pytest.raises(WeightsError, match=r"net\.onnx cannot be opened as an ONNX model"):
+        as_onnx(path)
+
+
+def test_a_network_of_foreign_operators_is_refused(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx", reason="needs onnx")
+    node = onnx.helper.make_node("Run", ["x"], ["y"], domain="evil")
+    path = tmp_path / "net.onnx"
+    path.write_bytes(network(node, domain="evil").SerializeToString())
+    with pytest.raises(WeightsError, match="cannot be opened as an ONNX model"):
+        as_onnx(path)
 
 
 @given(st.binary(max_size=200) | st.binary(max_size=60).map(lambda b: b"\xff\xd8\xff\xe1" + b))

@@ -44,7 +44,10 @@ def import_scene(kind: str, source: Path, target: Path, every: int = 1) -> Scene
         raise InputError(f"no dataset {kind!r}{did_you_mean(kind, IMPORTERS)}")
     if target.exists() and any(target.iterdir()):
         raise InputError(f"{target} is not empty")
-    frames = IMPORTERS[kind](source)[::every]
+    try:
+        frames = IMPORTERS[kind](source)[::every]
+    except (OSError, ValueError) as error:
+        raise InputError(f"{source}: cannot be read as {kind}: {error}") from error
     if len(frames) < 2:
         raise InputError(f"{source}: {len(frames)} usable images, two or more are needed")
     write_frames(target, frames)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -72,6 +72,10 @@ class Source:
         for image in list(model.images.values()):
             if image.name in guesses:
                 model.deregister_frame(image.frame_id)
+        for image in model.images.values():
+            path = PurePath(str(image.name))
+            if path.is_absolute() or path.drive or ".." in path.parts:
+                raise InputError(f"{folder}: the name of image {image.name!r} leads elsewhere")
         if not model.num_reg_images():
             raise InputError(f"{folder}: the model has no image with a pose")
         if photos is None:
