@@ -31,16 +31,11 @@ from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.benchmark import PairsOfSets, problem_of_sets
-from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy, thinned
+from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
-from mpsfm_core.geometry import (
-    camera_center,
-    pixel_centers,
-    sample_bilinear,
-    transform,
-    unproject,
-)
+from mpsfm_core.evaluation.true_surface import depth_file, surface_of_depth
+from mpsfm_core.geometry import pixel_centers, sample_bilinear, transform
 from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.inputs.models import read_model
 from mpsfm_core.inputs.options import InputOptions
@@ -182,7 +177,7 @@ def set_errors(
     if scene.depth is None:
         return {"points_near": points_near(scene, reconstruction, maps, aligned.scale)}
     found = [
-        map_errors(depth, aligned.scale, read_depth(scene.depth / f"{Path(name).stem}.png"))
+        map_errors(depth, aligned.scale, read_depth(depth_file(scene.depth, name)))
         for name, depth in maps.items()
     ]
     result = {key: float(np.nanmean([each[key] for each in found])) for key in found[0]}
@@ -222,17 +217,8 @@ def scan_of(scene: SceneFolder, names: Sequence[str]) -> Float64:
     """World points of all true depth maps of the images."""
     assert scene.depth is not None
     photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
-    parts = []
-    for name in names:
-        truth = read_depth(scene.depth / f"{Path(name).stem}.png")
-        height, width = truth.shape
-        camera = photos[photos.names.index(name)].pinhole.resized(width, height)
-        known = truth > 0
-        local = unproject(camera, pixel_centers(width, height)[known], truth[known])
-        rotation, translation = scene.truth[name]
-        world = local @ rotation + camera_center(rotation, translation)
-        parts.append(thinned(world, min(TOLERANCES) / 2))
-    return np.concatenate(parts)
+    cameras = {photo.name: photo.pinhole for photo in photos}
+    return surface_of_depth(scene.depth, names, cameras, scene.truth, min(TOLERANCES) / 2)
 
 
 def points_near(

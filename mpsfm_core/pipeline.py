@@ -20,7 +20,8 @@ from mpsfm_core.checkpoints import DiskCheckpoints
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import Float64, MappingProblem, Pose, View
 from mpsfm_core.dense.fusion import fuse_depth_maps
-from mpsfm_core.dense.options import DenseOptions
+from mpsfm_core.dense.mesh import Mesh, mesh_of_depth_maps
+from mpsfm_core.dense.options import DenseOptions, MeshOptions
 from mpsfm_core.dense.sparse_depth import depth_of_points
 from mpsfm_core.dense.stage import DenseReport, densify
 from mpsfm_core.errors import ConfigError, InputError, ReconstructionError
@@ -42,14 +43,25 @@ from mpsfm_core.mapping import mapper
 from mpsfm_core.provision import Provision, provide
 from mpsfm_core.registry import Registry, core_version
 from mpsfm_core.report.page import write_report
+from mpsfm_core.results.colmap_model import write_model
 from mpsfm_core.results.depth_maps import read_depth_map, write_depth_maps
+from mpsfm_core.results.exports.source import Source
 from mpsfm_core.results.georeference import georeference
+from mpsfm_core.results.mesh import write_mesh
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos
 from mpsfm_core.results.ply import write_cloud
 from mpsfm_core.results.summary import FORMAT as SUMMARY_FORMAT
 from mpsfm_core.results.summary import describe_images, describe_pairs, describe_reconstructions
-from mpsfm_core.results.writer import DENSE, DEPTH, Component, write_failure, write_results
+from mpsfm_core.results.writer import (
+    DENSE,
+    DEPTH,
+    MESH,
+    SPARSE,
+    Component,
+    write_failure,
+    write_results,
+)
 from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
 from mpsfm_core.stages import Stages
 
@@ -421,7 +433,7 @@ def densify_model(
     options: DenseOptions | None = None,
     workers: int | None = None,
 ) -> DenseReport:
-    """Measure depth in the photos of a model and write ``depth/`` and ``dense.ply``.
+    """Measure depth in the photos of a model; write it, ``dense.ply`` and the model.
 
     The search starts from the maps in ``model/depth`` if the model is an output folder of ours,
     else from the range of the points that an image sees; images without either are left out.
@@ -462,7 +474,8 @@ def _densify_model(
         return photos.view(rows[name])
 
     dense, report = densify(known, view_of, options or DenseOptions(), workers)
-    with replacing(output, (DENSE, DEPTH)) as folder:
+    with replacing(output, (SPARSE, DENSE, DEPTH)) as folder:
+        write_model(folder / SPARSE, colmap)
         write_depth_maps(folder / DEPTH, dense)
         write_cloud(folder / DENSE, fuse_depth_maps(dense, view_of, ResultOptions()))
     return report
@@ -476,3 +489,42 @@ def _depths_of_points(model: pycolmap.Reconstruction, image: pycolmap.Image) -> 
     xyz = np.array([model.points3D[number].xyz for number in seen])
     matrix = np.asarray(image.cam_from_world().matrix())
     return transform(matrix[:, :3], matrix[:, 3], xyz)[:, 2]
+
+
+def mesh_model(
+    folder: PathLike,
+    photos: PathLike | None = None,
+    options: MeshOptions | None = None,
+) -> Mesh:
+    """Write ``mesh.ply`` and ``mesh.glb`` into a result folder that has depth maps.
+
+    ``photos``: the folder of the photos, if they are not where the run found them. The PLY file has
+    the axes of the model; the GLB has gravity down.
+
+    Raises:
+        InputError: folder or photos cannot be read, there are no depth maps, they show no surface,
+            or the libraries for meshes are not installed.
+    """
+    with claimed(Path(folder)):
+        source = Source.read(Path(folder), _path(photos))
+        registered = []
+        for index, (image, photo) in enumerate(
+            zip(source.registered(), source.images, strict=True)
+        ):
+            file = source.folder / DEPTH / f"{image.name}.npz"
+            if file.is_file():
+                matrix, ids = np.asarray(image.cam_from_world().matrix()), np.zeros(0, np.int64)
+                pose, depth = (matrix[:, :3], matrix[:, 3]), read_depth_map(file)[1]
+                registered.append(
+                    RegisteredImage(index, photo.name, photo.pinhole, *pose, ids, depth, 1.0)
+                )
+        if not registered:
+            raise InputError(f"{folder}: has no depth maps; mpsfm dense makes them")
+        known = Reconstruction(tuple(registered), np.zeros((0, 3)), np.zeros(0))
+        rows = {image.name: image.index for image in registered}
+        mesh = mesh_of_depth_maps(
+            known, lambda name: source.images.view(rows[name]), options or MeshOptions()
+        )
+        with replacing(source.folder, MESH) as written:
+            write_mesh(written, mesh, source)
+    return mesh

@@ -25,6 +25,7 @@ from mpsfm_core.cli import (
     env,
     evaluate,
     export,
+    mesh,
     models,
     plugins,
     reconstruct,
@@ -52,6 +53,7 @@ def build_app() -> typer.Typer:
     app.command("reconstruct")(reconstruct.reconstruct)
     app.command("demo")(demo.demo)
     app.command("dense")(dense.dense)
+    app.command("mesh")(mesh.mesh)
     app.command("export")(export.export)
     app.command("report")(report.report)
     app.command("view")(view.view)

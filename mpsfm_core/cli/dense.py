@@ -22,7 +22,7 @@ def dense(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Measure depth in the photos of a model: DIR/depth and DIR/dense.ply.
+    """Measure depth in the photos of a model: DIR/depth, DIR/dense.ply and the model, DIR/sparse.
 
     The search starts from the maps in MODEL/depth if MODEL is an output folder of ours, else from
     the range of the model's points.

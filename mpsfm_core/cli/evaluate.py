@@ -29,11 +29,20 @@ def evaluate(
         Path | None,
         typer.Option(metavar="FILE.ply", help="Scan in the frame of GT; for MODEL/dense.ply."),
     ] = None,
+    distance: Annotated[
+        list[float] | None,
+        typer.Option(
+            metavar="D",
+            min=1e-6,
+            help="Of the cloud, in the unit of GT; may be repeated. Default: 1 to 50 cm.",
+        ),
+    ] = None,
 ) -> None:
     """Print pose AUC at 1, 5 and 20 degrees, trajectory errors and registered share as JSON.
 
     Images are matched by name. Images of GT that MODEL lacks count as unregistered. With true
-    depth or a scan, also how far the depth maps and the dense cloud of an output folder are off.
+    depth or a scan, also how far the depth maps and the dense cloud of an output folder are off;
+    without a scan, the true depth of its images is the scan.
     """
     import json
 
@@ -47,12 +56,25 @@ def evaluate(
     poses, true_poses = read_poses(model), read_poses(truth)
     report = evaluate(poses, true_poses, names, CONVENTIONS[convention])
     if gt_depth is not None or scan is not None:
-        from mpsfm_core.evaluation.output_folder import evaluate_cloud, evaluate_depth
+        from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES
+        from mpsfm_core.evaluation.output_folder import (
+            evaluate_cloud,
+            evaluate_depth,
+            read_points,
+            true_surface,
+        )
 
+        tolerances, cloud = sorted(set(distance or TOLERANCES)), model / "dense.ply"
         if gt_depth is not None:
             report["depth"] = evaluate_depth(model, gt_depth)
         if scan is not None:
-            report["cloud"] = evaluate_cloud(model / "dense.ply", scan, poses, true_poses)
+            surface = read_points(scan)
+        elif gt_depth is not None and cloud.is_file():
+            surface = true_surface(truth, gt_depth, sorted(poses), tolerances)
+        else:
+            surface = None
+        if surface is not None:
+            report["cloud"] = evaluate_cloud(cloud, surface, poses, true_poses, tolerances)
     typer.echo(json.dumps(report, indent=2))
 
 

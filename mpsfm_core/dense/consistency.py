@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from mpsfm_core.data import Bool, Float32, Float64, UInt8
-from mpsfm_core.dense.view import DenseView
+from mpsfm_core.dense.view import PosedGrid
+from mpsfm_core.jit import kernel
 
 _STDS = 3.0
 """Difference of two depths in std that still agree."""
@@ -23,60 +23,46 @@ _MIN_TOLERANCE, _MAX_TOLERANCE = 0.005, 0.05
 class Agreement:
     """What other views say of a map, (h, w).
 
-    ``agree``, ``through``: uint8, number of views whose own depth is the same, and of those that
-    look through the point to something behind it. ``change``: float32, sum over those that agree
-    of their log depth minus ours. ``noise``: std of log depth that differences between depths
-    that agree speak for; errors of poses are in it.
+    ``confirmed``: bool, where a view agrees: two wrong depths rarely do (of those that one of three
+    views confirms 95 % are right to 2 % on rendered_kitchen, whatever the others say).
+    ``mean_change``: float32, from our log depth to the mean of ours and those that agree.
+    ``noise``: std of log depth that differences between depths that agree speak for; errors of
+    poses are in it.
     """
 
-    agree: UInt8
-    through: UInt8
-    change: Float32
+    confirmed: Bool
+    mean_change: Float32
     noise: float
-
-    @property
-    def mean_change(self) -> Float32:
-        """From our log depth to the mean of ours and those that agree."""
-        mean: Float32 = np.divide(self.change, 1 + self.agree, dtype=np.float32)
-        return mean
-
-    @property
-    def confirmed(self) -> Bool:
-        """Where a view agrees: two wrong depths rarely do (of those that one of three views
-        confirms 95 % are right to 2 % on rendered_kitchen, whatever the others say)."""
-        confirmed: Bool = self.agree > 0
-        return confirmed
 
 
 def compare_depth(
-    view: DenseView,
+    grid: PosedGrid,
     log_depth: Float32,
     log_std: Float32,
-    others: Sequence[tuple[DenseView, Float32, Float32]],
+    others: Iterable[tuple[PosedGrid, Float32, Float32]],
 ) -> Agreement:
     """Compare a map with those of other views, each with its log depth and its std."""
     agree = np.zeros(log_depth.shape, np.uint8)
-    through = np.zeros(log_depth.shape, np.uint8)
     change = np.zeros(log_depth.shape, np.float32)
     total = 0.0
     for other, depth, std in others:
-        turned, shift = other.pixels_from(view)
-        total += _compare(log_depth, log_std, turned, shift, depth, std, agree, through, change)
+        turned, shift = other.pixels_from(grid)
+        total += _compare(log_depth, log_std, turned, shift, depth, std, agree, change)
     noise = math.sqrt(total / 2 / max(1, int(agree.sum(dtype=np.int64))))
-    return Agreement(agree, through, change, noise)
+    return Agreement(agree > 0, (change / (1 + agree)).astype(np.float32), noise)
 
 
-def splat_depth(view: DenseView, others: Sequence[tuple[DenseView, Float32, Bool]]) -> Float32:
+def splat_depth(grid: PosedGrid, others: Iterable[tuple[PosedGrid, Float32, Bool]]) -> Float32:
     """Log depth (h, w) that the given pixels of other views have in this one: the nearest at each
     pixel, infinite where there is none."""
-    seen = np.full(view.grey.shape, np.inf, np.float32)
+    seen = np.full(grid.shape, np.inf, np.float32)
     for other, depth, which in others:
-        turned, shift = view.pixels_from(other)
+        turned, shift = grid.pixels_from(other)
         _splat(depth, which, turned, shift, seen)
     return seen
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _compare(
     log_depth: Float32,
     log_std: Float32,
@@ -85,7 +71,6 @@ def _compare(
     other: Float32,
     other_std: Float32,
     agree: UInt8,
-    through: UInt8,
     change: Float32,
 ) -> float:
     height, width = log_depth.shape
@@ -110,12 +95,10 @@ def _compare(
                 agree[i, j] += 1
                 change[i, j] += difference
                 total += difference**2
-            elif difference > tolerance:
-                through[i, j] += 1
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel()
 def _splat(depth: Float32, which: Bool, turned: Float64, shift: Float64, seen: Float32) -> None:
     height, width = depth.shape
     rows, columns = seen.shape

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +36,15 @@ _MUCH_SURER = 0.5
 any distance (ours)."""
 
 
+class _Verdict(NamedTuple):
+    """Of points (n,): which stay, which of them an image shows that is more certain, and how many
+    images agree on each, its own counted."""
+
+    stays: Bool
+    better_elsewhere: Bool
+    views: UInt8
+
+
 class Cloud(NamedTuple):
     """Points of a surface, (n, ...).
 
@@ -65,18 +73,11 @@ def fuse_depth_maps(
     without a confirmed pose. Above ``options.dense_max_points`` a random share of each map's pixels
     is taken.
     """
-    reconstruction = replace(reconstruction, images=reconstruction.confirmed_images)
-    images = reconstruction.images
-    limit = max(options.dense_max_relative_std, _WORSE * _median_relative_std(images))
-    usable = [_certain(image, limit) for image in images]
-    neighbors = choose_sources(images, _NEIGHBORS)
+    images = reconstruction.confirmed_images
     found = []
-    for row, (image, near) in enumerate(zip(images, neighbors, strict=True)):
-        pixels = np.flatnonzero(usable[row])
-        points, variance = _lift(image, pixels)
-        others = [(images[j], usable[j], j < row) for j in near]
-        kept, views = _votes(points, variance, others, options.dense_consistency_sigmas)
-        found.append((pixels[kept], views[kept]))
+    for pixels, verdict in _judged(images, options):
+        kept = verdict.stays & ~verdict.better_elsewhere
+        found.append((pixels[kept], verdict.views[kept]))
     total = sum(len(pixels) for pixels, _ in found)
     share = min(1.0, options.dense_max_points / max(1, total))
     rng = np.random.default_rng(seed)
@@ -89,6 +90,29 @@ def fuse_depth_maps(
         std = np.sqrt(variance).astype(np.float32)
         parts.append(Cloud(points, colors, normals, std, views[chosen]))
     return Cloud(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def consistent_pixels(images: Sequence[RegisteredImage], options: ResultOptions) -> list[Bool]:
+    """For each image (h, w): certain pixels that not more images see through than confirm."""
+    masks = []
+    for image, (pixels, verdict) in zip(images, _judged(images, options), strict=True):
+        mask = np.zeros(image.depth.shape, np.bool_)
+        mask.ravel()[pixels[verdict.stays]] = True
+        masks.append(mask)
+    return masks
+
+
+def _judged(
+    images: Sequence[RegisteredImage], options: ResultOptions
+) -> Iterator[tuple[Int64, _Verdict]]:
+    """For each image its certain pixels, flat, and what the others say of them."""
+    limit = max(options.dense_max_relative_std, _WORSE * _median_relative_std(images))
+    usable = [_certain(image, limit) for image in images]
+    for row, near in enumerate(choose_sources(images, _NEIGHBORS)):
+        pixels = np.flatnonzero(usable[row])
+        points, variance = _lift(images[row], pixels)
+        others = [(images[j], usable[j], j < row) for j in near]
+        yield pixels, _votes(points, variance, others, options.dense_consistency_sigmas)
 
 
 _EMPTY = Cloud(
@@ -135,8 +159,8 @@ def _votes(
     variance: Float64,
     others: Sequence[tuple[RegisteredImage, Bool, bool]],
     sigmas: float,
-) -> tuple[Bool, UInt8]:
-    """Which points stay, and how many images agree on each.
+) -> _Verdict:
+    """What other images say of points.
 
     ``others``: images, which of their pixels may become points, and whether they come first among
     equally certain ones.
@@ -160,7 +184,7 @@ def _votes(
         same = np.abs(ahead) <= _SAME * local[seen, 2]
         same |= other_variance <= _MUCH_SURER**2 * variance[seen]
         theirs[seen[agrees & surer & same & sample_nearest(usable, xy[seen])]] = True
-    return (votes >= 0) & ~theirs, views
+    return _Verdict(votes >= 0, theirs, views)
 
 
 def _normals(image: RegisteredImage) -> Float32:

@@ -9,13 +9,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from mpsfm_core.data import Float32, Float64, UInt8
+from mpsfm_core.jit import kernel
 
-_kernel = njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"}
-)
+_FASTMATH = {"contract", "reassoc", "arcp"}
+"""Sums in any order; NaN and infinity keep their meaning."""
 
 UNSEEN = 255
 """Cost of a label at which a view does not see the pixel."""
@@ -23,7 +22,7 @@ WORST = 250
 """Of a label that a view contradicts: correlation 0 or less."""
 
 
-@_kernel
+@kernel(fastmath=_FASTMATH)
 def correlation_costs(
     reference: Float32,
     base: Float32,
@@ -111,7 +110,7 @@ def correlation_costs(
                 costs[label, i, j] = np.uint8(min(max(cost, 0.0), WORST))
 
 
-@_kernel
+@kernel(fastmath=_FASTMATH)
 def joined_costs(costs: UInt8, share: float, unseen: float, joined: Float32) -> None:
     """Mean cost over the better views of each pixel and label.
 
@@ -143,7 +142,7 @@ def joined_costs(costs: UInt8, share: float, unseen: float, joined: Float32) -> 
                 joined[i, j, label] = total / (WORST * kept)
 
 
-@_kernel
+@kernel(fastmath=_FASTMATH)
 def _aggregate_path(
     costs: Float32,
     guide: Float32,
@@ -210,7 +209,7 @@ def aggregated_costs(
                 _aggregate_path(costs, guide, small, large, edge, row_step, column_step, total)
 
 
-@_kernel
+@kernel(fastmath=_FASTMATH)
 def best_labels(
     total: Float32, costs: Float32, offsets: Float64, offset: Float32, cost: Float32
 ) -> None:

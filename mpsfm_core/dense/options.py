@@ -1,4 +1,4 @@
-"""Settings of the dense stage. Those without a source are ours: first choices, and
+"""Settings of the dense stage and of the mesh. Those without a source are ours: first choices, and
 what a few photos of one scene say; ``python -m benchmarks.dense`` measures them."""
 
 from __future__ import annotations
@@ -37,3 +37,13 @@ class DenseOptions(Options):
     """Std of a match, in pixels of the map."""
     correlation_px: float = Field(40.0, gt=0)
     """Distance over which errors of the refined depth hang together, pixels of the map."""
+
+
+class MeshOptions(Options):
+    """One triangle mesh from the maps."""
+
+    voxel_px: float = Field(2.0, gt=0)
+    """Size of a voxel, in pixels of the maps at their median depth: what one pixel tells apart is
+    noise, and memory grows with the third power."""
+    max_triangles: int = Field(500_000, ge=4)
+    """More are joined where the surface is flat (about 20 bytes each in the files)."""

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import Bool, DepthPrior, View
+from mpsfm_core.data import Bool, DepthPrior, Float32, View
 from mpsfm_core.dense.consistency import Agreement, compare_depth, splat_depth
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.posterior import Observed, posterior, with_known
 from mpsfm_core.dense.source_views import choose_sources
-from mpsfm_core.dense.stereo import StereoDepth, match_depth
-from mpsfm_core.dense.view import DenseView
+from mpsfm_core.dense.stereo import match_depth
+from mpsfm_core.dense.view import DenseView, PosedGrid
+from mpsfm_core.geometry import resize_map
 from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
 
 _MAX_COST = 0.9
@@ -25,6 +28,10 @@ _NOISE_FACTOR = 1.25
 _SEEN_STDS = 1.5
 """Depth seen from elsewhere counts up to so many std of the known depth from it: what is further
 may be seen past an edge (ours)."""
+_SEEN_FROM = 16
+"""Views whose depth is seen in a view, at most, so that time grows with the number of photos."""
+_KEPT_ROUNDS = 4
+"""Photos that are kept, in those that are matched with one: neighbours share them."""
 _SEEN_FACTOR = 3.0
 """Its std in that of the view's own matches (ours)."""
 
@@ -53,25 +60,31 @@ def densify(
     """
     posed = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
     images = [reconstruction.images[row] for row in posed]
-    sources = choose_sources(images, options.num_sources)
-    views = _Views(images, view_of, options.max_size)
+    near = choose_sources(images, max(options.num_sources, _SEEN_FROM))
+    sources = [others[: options.num_sources] for others in near]
+    views = _Views(images, view_of, options)
 
-    def matched(row: int) -> StereoDepth:
-        return match_depth(views[row], [views[other] for other in sources[row]], options)
+    def matched(row: int) -> _Found:
+        view = views[row]
+        stereo = match_depth(view, [views[other] for other in sources[row]], options)
+        # where the photo may be used and says anything
+        supported = view.usable & (stereo.cost < _MAX_COST)
+        return _Found(view.grid, stereo.log_depth, stereo.parallax, supported)
 
     rows = [row for row, others in enumerate(sources) if others]
-    found: dict[int, StereoDepth] = {}
+    found: dict[int, _Found] = {}
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
-        for row, stereo in zip(rows, pool.map(matched, rows), strict=True):
-            found[row] = stereo
+        for row, own in zip(rows, pool.map(matched, rows), strict=True):
+            found[row] = own
             progress(len(found), len(rows))
-    agreed = {row: _compared(row, views, found, sources) for row in found}
+    agreed = {row: _compared(row, found, sources[row], options) for row in found}
     maps = list(reconstruction.images)
     for row in found:
-        known = Observed(views[row].log_depth, views[row].log_std)
-        measured = with_known(_measured(row, views, found, agreed), known)
+        view = views[row]
+        known = Observed(view.log_depth, view.log_std)
+        measured = with_known(_measured(row, view, found, agreed, near[row], options), known)
         joined = posterior(known, measured, options.correlation_px)
-        maps[posed[row]] = _with_depth(images[row], views[row], joined)
+        maps[posed[row]] = _with_depth(images[row], view, joined)
     names = [image.name for image in images]
     report = DenseReport(
         {names[row]: [names[other] for other in others] for row, others in enumerate(sources)},
@@ -85,63 +98,77 @@ def _share(agreement: Agreement | None) -> float:
 
 
 class _Views:
-    """Photos on the grid of the stage, made when they are needed."""
+    """Photos on the grid of the stage, made when they are needed; the last ones are kept."""
 
     def __init__(
-        self, images: Sequence[RegisteredImage], view_of: Callable[[str], View], max_size: int
+        self,
+        images: Sequence[RegisteredImage],
+        view_of: Callable[[str], View],
+        options: DenseOptions,
     ) -> None:
-        self._images, self._view_of, self._max_size = images, view_of, max_size
-        self._made: dict[int, DenseView] = {}
+        self._images, self._view_of, self._options = images, view_of, options
+        self._made = lru_cache(_KEPT_ROUNDS * (1 + options.num_sources))(self._make)
 
     def __getitem__(self, row: int) -> DenseView:
-        if row not in self._made:
-            image = self._images[row]
-            self._made[row] = DenseView.of(image, self._view_of(image.name), self._max_size)
-        return self._made[row]
+        return self._made(row)
+
+    def _make(self, row: int) -> DenseView:
+        image = self._images[row]
+        return DenseView.of(image, self._view_of(image.name), self._options.max_size)
+
+
+class _Found(NamedTuple):
+    """What is kept of a matched photo: ``supported`` (h, w) says where it says anything."""
+
+    grid: PosedGrid
+    log_depth: Float32
+    parallax: Float32
+    supported: Bool
+
+    def log_std(self, options: DenseOptions) -> Float32:
+        """Of a right match, (h, w)."""
+        parallax = resize_map(self.parallax, *self.grid.camera.size)
+        return (options.match_std_px / parallax).astype(np.float32)
 
 
 def _compared(
-    row: int, views: _Views, found: dict[int, StereoDepth], sources: list[list[int]]
+    row: int, found: Mapping[int, _Found], sources: Sequence[int], options: DenseOptions
 ) -> Agreement:
     """A map beside those of its sources."""
     own = found[row]
-    others = [
-        (views[other], found[other].log_depth, found[other].log_std)
-        for other in sources[row]
+    others = (
+        (found[other].grid, found[other].log_depth, found[other].log_std(options))
+        for other in sources
         if other in found
-    ]
-    return compare_depth(views[row], own.log_depth, own.log_std, others)
+    )
+    return compare_depth(own.grid, own.log_depth, own.log_std(options), others)
 
 
 def _measured(
-    row: int, views: _Views, found: dict[int, StereoDepth], agreed: dict[int, Agreement]
+    row: int,
+    view: DenseView,
+    found: Mapping[int, _Found],
+    agreed: Mapping[int, Agreement],
+    near: Sequence[int],
+    options: DenseOptions,
 ) -> Observed:
     """What the photos say of a view: its own depth where others agree, and where they do not the
     depth of others' confirmed pixels, if that is about what was known."""
-    view, agreement = views[row], agreed[row]
-    confirmed = agreement.confirmed & _supported(view, found[row])
-    log_depth = found[row].log_depth + agreement.mean_change
-    std = np.hypot(found[row].log_std, np.float32(_NOISE_FACTOR * agreement.noise))
-    others = [
-        (
-            views[other],
-            found[other].log_depth,
-            agreed[other].confirmed & _supported(views[other], found[other]),
-        )
-        for other in found
-        if other != row
-    ]
-    seen = splat_depth(view, others)
+    own, agreement = found[row], agreed[row]
+    confirmed = agreement.confirmed & own.supported
+    log_depth = own.log_depth + agreement.mean_change
+    std = np.hypot(own.log_std(options), np.float32(_NOISE_FACTOR * agreement.noise))
+    others = (
+        (found[j].grid, found[j].log_depth, agreed[j].confirmed & found[j].supported)
+        for j in sorted(near)
+        if j in found
+    )
+    seen = splat_depth(own.grid, others)
     usable = ~confirmed & (np.abs(seen - view.log_depth) < _SEEN_STDS * view.log_std)
     return Observed(
         np.where(usable, seen, log_depth).astype(np.float32),
         np.where(usable, _SEEN_FACTOR * std, np.where(confirmed, std, np.inf)).astype(np.float32),
     )
-
-
-def _supported(view: DenseView, stereo: StereoDepth) -> Bool:
-    """Where the photo may be used and says anything."""
-    return view.usable & (stereo.cost < _MAX_COST)
 
 
 def _with_depth(image: RegisteredImage, view: DenseView, joined: Observed) -> RegisteredImage:

@@ -42,15 +42,16 @@ _SAMPLES = 8
 
 @dataclass(frozen=True, eq=False)
 class StereoDepth:
-    """What the photos say. All (h, w) float32.
+    """What the photos say, float32.
 
-    ``log_depth``; ``cost``: 1 - correlation of the better views, 0 to 1; ``log_std``: of the log
-    depth of a right match, by its parallax.
+    ``log_depth``: (h, w). ``cost``: (h, w), 1 - correlation of the better views, 0 to 1.
+    ``parallax``: on a coarse grid that covers the map, pixels of the map that a point moves in the
+    source views when its log depth changes by one.
     """
 
     log_depth: Float32
     cost: Float32
-    log_std: Float32
+    parallax: Float32
 
 
 def match_depth(
@@ -71,7 +72,7 @@ def match_depth(
             log_depth = resize_map(cv2.medianBlur(log_depth, 3), *own.camera.size)
             offsets = (np.arange(-_FINE_LABELS, _FINE_LABELS + 1) * step).astype(np.float64)
         log_depth, cost = _search(own, others, log_depth, offsets, options)
-    return StereoDepth(log_depth, cost, (options.match_std_px / parallax).astype(np.float32))
+    return StereoDepth(log_depth, cost, parallax)
 
 
 def _search(
@@ -103,7 +104,7 @@ def _search(
 
 
 def _parallax(view: DenseView, sources: Sequence[DenseView]) -> Float32:
-    """Pixels that a point moves in the source views when its log depth changes by one, (h, w).
+    """As :attr:`StereoDepth.parallax`.
 
     The largest among the views; far from all of them the small number that it is.
     """
@@ -121,4 +122,4 @@ def _parallax(view: DenseView, sources: Sequence[DenseView]) -> Float32:
         ahead = seen[..., 2] > 1e-6
         found = np.maximum(found, np.where(ahead, np.linalg.norm(moved, axis=-1), 0))
     smallest = max(float(np.median(found)) * 0.05, 1e-3)
-    return resize_map(np.maximum(found, smallest), width, height)
+    return np.maximum(found, smallest).astype(np.float32)

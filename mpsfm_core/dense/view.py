@@ -13,19 +13,37 @@ from mpsfm_core.scene.reconstruction import RegisteredImage
 
 
 @dataclass(frozen=True, eq=False)
-class DenseView:
-    """A photo on the grid of its ``camera``.
+class PosedGrid:
+    """Where the pixels of a photo look: ``camera`` on its grid, ``rotation`` (3, 3) and
+    ``translation`` (3,), ``cam_from_world``."""
 
-    ``grey``: (h, w) float32 in [0, 1]. ``usable``: (h, w) bool, False where the photo is masked.
-    ``log_depth``, ``log_std``: (h, w) float32, depth known before and its std, natural logarithm of
-    world units; where nothing was known the median, with a std that says so. ``rotation`` (3, 3),
-    ``translation`` (3,): ``cam_from_world``.
-    """
-
-    name: str
     camera: PinholeCamera
     rotation: Float64
     translation: Float64
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.camera.height, self.camera.width
+
+    def pixels_from(self, other: PosedGrid) -> tuple[Float64, Float64]:
+        """``(turned, shift)``: pixel (x, y, 1) of ``other`` with depth d is here at the homogeneous
+        pixel ``d * turned @ (x, y, 1) + shift``."""
+        rotation = self.rotation @ other.rotation.T
+        translation = self.translation - rotation @ other.translation
+        matrix = self.camera.matrix
+        return matrix @ rotation @ np.linalg.inv(other.camera.matrix), matrix @ translation
+
+
+@dataclass(frozen=True, eq=False)
+class DenseView(PosedGrid):
+    """A photo on its grid.
+
+    ``grey``: (h, w) float32 in [0, 1]. ``usable``: (h, w) bool, False where the photo is masked.
+    ``log_depth``, ``log_std``: (h, w) float32, depth known before and its std, natural logarithm of
+    world units; where nothing was known the median, with a std that says so.
+    """
+
     grey: Float32
     usable: Bool
     log_depth: Float32
@@ -43,7 +61,6 @@ class DenseView:
             usable = resize_map(view.mask, width, height, linear=False) > 0
         log_depth, log_std = _known(image.depth)
         return cls(
-            image.name,
             image.camera.resized(width, height),
             image.rotation,
             image.translation,
@@ -59,7 +76,6 @@ class DenseView:
             return self
         width, height = (max(2, size // factor) for size in self.camera.size)
         return DenseView(
-            self.name,
             self.camera.resized(width, height),
             self.rotation,
             self.translation,
@@ -69,13 +85,10 @@ class DenseView:
             resize_map(self.log_std, width, height),
         )
 
-    def pixels_from(self, other: DenseView) -> tuple[Float64, Float64]:
-        """``(turned, shift)``: pixel (x, y, 1) of ``other`` with depth d is here at the homogeneous
-        pixel ``d * turned @ (x, y, 1) + shift``."""
-        rotation = self.rotation @ other.rotation.T
-        translation = self.translation - rotation @ other.translation
-        matrix = self.camera.matrix
-        return matrix @ rotation @ np.linalg.inv(other.camera.matrix), matrix @ translation
+    @property
+    def grid(self) -> PosedGrid:
+        """Without the photo and what is known of its depth."""
+        return PosedGrid(self.camera, self.rotation, self.translation)
 
 
 UNKNOWN_LOG_STD = 1.0

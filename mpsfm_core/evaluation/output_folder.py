@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from mpsfm_core.data import Pose
+from mpsfm_core.data import Float64, Pose
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.alignment import trajectory_errors
-from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy, read_ply
+from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES, cloud_accuracy, read_ply
 from mpsfm_core.evaluation.depth_accuracy import depth_accuracy, mean_accuracy
 from mpsfm_core.evaluation.prior_quality import read_depth
+from mpsfm_core.evaluation.true_surface import depth_file, surface_of_depth
+from mpsfm_core.inputs.models import read_model, reconstruction_poses
+from mpsfm_core.inputs.undistortion import pinhole_camera
 from mpsfm_core.results.depth_maps import load_depth_map
 
 
@@ -23,8 +26,7 @@ def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
     """
     found: dict[bool, list[Any]] = {True: [], False: []}
     for path in sorted((output / "depth").rglob("*.npz")):
-        photo = PurePosixPath(path.relative_to(output / "depth").as_posix()).with_suffix("")
-        file = truth / photo.with_suffix(".png")
+        file = depth_file(truth, path.relative_to(output / "depth").with_suffix("").as_posix())
         if not file.is_file():
             continue
         arrays = load_depth_map(path)
@@ -42,18 +44,39 @@ def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
 
 
 def evaluate_cloud(
-    cloud: Path, scan: Path, estimated: Mapping[str, Pose], truth: Mapping[str, Pose]
+    cloud: Path,
+    truth: Float64,
+    estimated: Mapping[str, Pose],
+    true_poses: Mapping[str, Pose],
+    tolerances: Sequence[float] = TOLERANCES,
 ) -> dict[str, Any]:
-    """A cloud in the frame of ``estimated`` against a scan in that of ``truth``.
+    """A cloud in the frame of ``estimated`` against points (n, 3) in that of ``true_poses``.
 
-    The frames are aligned by the cameras' centres. Raises :class:`InputError` when that is not
-    possible, or a file cannot be read or has no points.
+    The frames are aligned by the cameras' centres. ``tolerances``: in the unit of the truth.
+    Raises :class:`InputError` when that is not possible, or the cloud has no points.
     """
-    errors = trajectory_errors(estimated, truth)
+    errors = trajectory_errors(estimated, true_poses)
     if errors is None:
         raise InputError("the cloud cannot be aligned: fewer than three common cameras")
-    points, true_points = read_ply(cloud), read_ply(scan)
-    for path, found in ((cloud, points), (scan, true_points)):
-        if not len(found):
-            raise InputError(f"{path} has no points, there is nothing to compare")
-    return cloud_accuracy(errors.truth_from_estimate.apply(points), true_points)
+    points = read_points(cloud)
+    return cloud_accuracy(errors.truth_from_estimate.apply(points), truth, tolerances)
+
+
+def read_points(path: Path) -> Float64:
+    """Points (n, 3) of a PLY file; raises :class:`InputError` when it has none."""
+    points = read_ply(path)
+    if not len(points):
+        raise InputError(f"{path} has no points, there is nothing to compare")
+    return points
+
+
+def true_surface(
+    model: Path, depth: Path, images: Collection[str], tolerances: Sequence[float] = TOLERANCES
+) -> Float64:
+    """What :func:`surface_of_depth` says with the cameras and poses of a true model."""
+    true = read_model(model)
+    cameras = {
+        str(image.name): pinhole_camera(true.cameras[image.camera_id], 0.0)
+        for image in true.images.values()
+    }
+    return surface_of_depth(depth, images, cameras, reconstruction_poses(true), min(tolerances) / 2)

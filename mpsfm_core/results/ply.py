@@ -1,4 +1,4 @@
-"""Binary PLY point clouds."""
+"""Binary PLY files: point clouds and meshes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core.data import Float32, Float64, UInt8
+from mpsfm_core.data import Float32, Float64, Int64, UInt8
 from mpsfm_core.dense.fusion import Cloud
 from mpsfm_core.errors import InputError
 
@@ -20,6 +20,7 @@ _TYPES = {
     **{"uint32": "<u4", "float": "<f4", "double": "<f8", "float32": "<f4", "float64": "<f8"},
 }
 _LONGEST_HEADER = 1 << 16
+_FACE = np.dtype([("count", "u1"), ("rows", "<i4", 3)])
 
 
 def write_ply(
@@ -28,10 +29,12 @@ def write_ply(
     colors: UInt8,
     normals: Float32 | None = None,
     further: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+    triangles: Int64 | None = None,
 ) -> None:
     """Write points (n, 3) with RGB colours (n, 3) as little-endian float32 and uint8.
 
-    ``normals``: (n, 3). ``further``: properties (n,) by name, float32 or uint8.
+    ``normals``: (n, 3). ``further``: properties (n,) by name, float32 or uint8. ``triangles``:
+    (m, 3), rows of the points.
     """
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", points.T.astype("<f4"), strict=True))
     if normals is not None:
@@ -48,9 +51,13 @@ def write_ply(
         "format binary_little_endian 1.0",
         f"element vertex {len(points)}",
         *(f"property {kind} {name}" for name, kind in kinds.items()),
-        "end_header",
     ]
-    path.write_bytes("\n".join([*header, ""]).encode("ascii") + vertices.tobytes())
+    faces = np.empty(0 if triangles is None else len(triangles), _FACE)
+    if triangles is not None:
+        faces["count"], faces["rows"] = 3, triangles
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    text = "\n".join([*header, "end_header", ""]).encode("ascii")
+    path.write_bytes(text + vertices.tobytes() + faces.tobytes())
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:

@@ -4,12 +4,14 @@
 
     OUTPUT/sparse/          COLMAP model of the original photos (binary)
            sparse_text/     the same as text, if asked for
-           components/N/    models of further, disconnected groups of images, largest first
+           components/N/    models of further, disconnected groups of images, largest first, each
+                            with its own depth/ and dense.ply
            undistorted/     images/ and sparse/ for tools that want pinhole cameras; only written
                             when a photo is distorted
            points.ply       the points of the first model
            dense.ply        the refined depth maps, fused
            depth/NAME.npz   refined depth, variance and camera of each registered image
+           mesh.ply, .glb   made later, from the depth maps
            transforms.json  for nerfstudio, if asked for
            views/           small views, priors and matches of all images, for the report
            summary.json     what was used, what came out, and why not more
@@ -39,24 +41,27 @@ from mpsfm_core.results.ply import write_cloud, write_ply
 from mpsfm_core.results.views import write_views
 from mpsfm_core.scene.reconstruction import Reconstruction
 
+SPARSE = "sparse"
 DENSE = "dense.ply"
 DEPTH = "depth"
+MESH = ("mesh.ply", "mesh.glb")
 VIEWS = "views"
 REPORT = "report.html"
 ENTRIES = (
-    "sparse",
+    SPARSE,
     "sparse_text",
     "components",
     "undistorted",
     "points.ply",
     DENSE,
+    *MESH,
     DEPTH,
     "transforms.json",
     VIEWS,
     REPORT,
     SUMMARY,
 )
-"""What belongs to us in an output folder. The report is made from the rest of it, later."""
+"""What belongs to us in an output folder. Report and mesh are made from the rest of it, later."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,17 +109,15 @@ def write_results(
     """
     best, rest = components[0], components[1:]
     with replacing(output, ENTRIES) as folder:
-        write_model(folder / "sparse", best.model)
+        write_model(folder / SPARSE, best.model)
         if options.text_model:
             write_model(folder / "sparse_text", best.model, text=True)
         for number, component in enumerate(rest, start=1):
-            write_model(folder / "components" / str(number), component.model)
+            own = folder / "components" / str(number)
+            write_model(own, component.model)
+            _write_dense(own, component, photos, options, seed)
         write_ply(folder / "points.ply", best.reconstruction.points, best.colors)
-        if options.dense_cloud:
-            dense = fuse_depth_maps(best.reconstruction, photos.view, options, seed)
-            write_cloud(folder / DENSE, dense)
-        if options.depth_maps:
-            write_depth_maps(folder / DEPTH, best.reconstruction)
+        _write_dense(folder, best, photos, options, seed)
         if photos.any_distorted(best.reconstruction):
             _write_undistorted(folder / "undistorted", best, photos)
         if options.nerfstudio:
@@ -122,6 +125,17 @@ def write_results(
         if options.report:
             write_views(folder / VIEWS, photos.problem, photos.view)
         _write_json(folder / SUMMARY, summarize())
+
+
+def _write_dense(
+    folder: Path, component: Component, photos: Photos, options: ResultOptions, seed: int
+) -> None:
+    """The depth maps and their cloud, as far as they are asked for."""
+    if options.dense_cloud:
+        cloud = fuse_depth_maps(component.reconstruction, photos.view, options, seed)
+        write_cloud(folder / DENSE, cloud)
+    if options.depth_maps:
+        write_depth_maps(folder / DEPTH, component.reconstruction)
 
 
 def write_failure(

@@ -11,8 +11,10 @@ from typer.testing import CliRunner
 
 from mpsfm_core.cli import build_app
 from mpsfm_core.errors import InputError
+from mpsfm_core.evaluation import read_poses
 from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy, read_ply
 from mpsfm_core.evaluation.depth_accuracy import depth_accuracy, mean_accuracy
+from mpsfm_core.evaluation.output_folder import true_surface
 from mpsfm_core.evaluation.prior_quality import write_depth
 from mpsfm_core.results.ply import write_ply
 
@@ -135,3 +137,21 @@ def test_the_command_compares_depth_and_cloud(scene_folder: Path, tmp_path: Path
     arguments[4] = str(tmp_path / "other")
     result = CliRunner().invoke(build_app(), arguments)
     assert result.exit_code == 2 and "no depth map has a true one" in result.stderr
+
+
+def test_true_depth_is_the_scan_where_there_is_none(scene_folder: Path, tmp_path: Path) -> None:
+    gt, depth = scene_folder / "gt", scene_folder / "gt_depth"
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "sparse").symlink_to(gt)
+    flat = np.full((24, 32), 2.0, dtype=np.float32)
+    np.savez(tmp_path / "depth" / "0001.png.npz", depth=flat, valid=flat > 0)
+    surface = true_surface(gt, depth, sorted(read_poses(gt)), [0.05])
+    far = surface + np.array([0, 0, 50])
+    cloud = np.concatenate([surface, far])
+    write_ply(tmp_path / "dense.ply", cloud, np.zeros((len(cloud), 3), dtype=np.uint8))
+    arguments = ["evaluate", str(tmp_path), str(gt), "--gt-depth", str(depth)]
+    result = CliRunner().invoke(build_app(), [*arguments, "--distance", "0.05", "--distance", "1"])
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)["cloud"]
+    assert found["completeness"] == {"0.05": 1.0, "1.0": 1.0}
+    assert found["accuracy"]["0.05"] == pytest.approx(0.5, abs=0.02)

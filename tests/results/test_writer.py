@@ -204,6 +204,9 @@ def test_further_components_are_models_of_their_own(solved, tmp_path: Path) -> N
     other = pycolmap.Reconstruction(str(tmp_path / "out" / "components" / "1"))
     assert {image.name for image in main.images.values()} == {"images/0.png", "images/1.png"}
     assert {image.name for image in other.images.values()} == {"images/1.png", "images/2.png"}
+    maps = tmp_path / "out" / "components" / "1" / "depth" / "images"
+    assert sorted(path.name for path in maps.iterdir()) == ["1.png.npz", "2.png.npz"]
+    assert (tmp_path / "out" / "components" / "1" / "dense.ply").is_file()
 
 
 def test_images_that_nothing_confirms_are_in_the_model_without_points(

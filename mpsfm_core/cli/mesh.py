@@ -1,0 +1,42 @@
+"""``mpsfm mesh``: one surface from the depth maps of a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mpsfm_core.cli.arguments import Quiet
+
+
+def mesh(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Result folder of a run or of mpsfm dense.")
+    ],
+    images: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="The photos, if they are not where the run found them."),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="voxel_px or max_triangles."),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Join the depth maps in a mesh with colours: DIR/mesh.ply and DIR/mesh.glb.
+
+    Needs pip install 'mpsfm-core[mesh]'.
+    """
+    from mpsfm_core.dense.options import MeshOptions
+    from mpsfm_core.options import parse_settings
+    from mpsfm_core.pipeline import mesh_model
+    from mpsfm_core.yaml_text import parse_yaml
+
+    values = {}
+    for text in overrides or ():
+        key, _, value = text.partition("=")
+        values[key] = parse_yaml(value, f"--set {text}")
+    made = mesh_model(folder, images, parse_settings(MeshOptions, values))
+    if not quiet:
+        typer.echo(f"{len(made.triangles)} triangles; written to {folder}/mesh.ply and mesh.glb")

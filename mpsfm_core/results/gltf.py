@@ -1,0 +1,106 @@
+"""Binary glTF 2.0 files. glTF has y up and metres."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpsfm_core.data import Float64, Int64, UInt8
+
+POINTS, LINES, TRIANGLES = 0, 1, 4
+"""Kinds of meshes."""
+Y_UP_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""Between our axes of cameras and glTF's; of the world too, if it is as COLMAP leaves it."""
+_FLOAT, _BYTE, _UINT = 5126, 5121, 5125
+_LISTS = ("nodes", "meshes", "cameras", "accessors", "bufferViews")
+
+
+class GltfScene:
+    """Collects nodes and their numbers."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+        self._json: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "mpsfm"},
+            "scene": 0,
+            "scenes": [{"nodes": []}],
+            **{name: [] for name in (*_LISTS, "materials", "extensionsUsed")},
+        }
+
+    def add(self, node: dict[str, Any], root: bool = True) -> int:
+        """A node, of the scene itself or of another node; its number."""
+        number = len(self._json["nodes"])
+        self._json["nodes"].append(node)
+        if root:
+            self._json["scenes"][0]["nodes"].append(number)
+        return number
+
+    def mesh(
+        self,
+        name: str,
+        mode: int,
+        points: Float64,
+        colors: UInt8 | None,
+        triangles: Int64 | None = None,
+    ) -> int:
+        """Points (n, 3), ends of lines, or corners of triangles (m, 3), which are rows of the
+        points; maybe with RGB colours (n, 3). Its number."""
+        positions = points.astype("<f4")
+        bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+        attributes = {"POSITION": self._accessor(positions, "VEC3", _FLOAT, bounds)}
+        if colors is not None:
+            opaque = np.concatenate([colors, np.full((len(colors), 1), 255, np.uint8)], axis=1)
+            described = {"normalized": True}
+            attributes["COLOR_0"] = self._accessor(opaque, "VEC4", _BYTE, described)
+        primitive: dict[str, Any] = {"mode": mode, "attributes": attributes}
+        if triangles is not None:
+            indices = triangles.astype("<u4").ravel()
+            primitive["indices"] = self._accessor(indices, "SCALAR", _UINT, {})
+            primitive["material"] = self._photographed()
+        self._json["meshes"].append({"name": name, "primitives": [primitive]})
+        return len(self._json["meshes"]) - 1
+
+    def _photographed(self) -> int:
+        """A material that is seen from both sides and has its light in its colours."""
+        if not self._json["materials"]:
+            unlit = "KHR_materials_unlit"
+            self._json["extensionsUsed"].append(unlit)
+            self._json["materials"].append({"doubleSided": True, "extensions": {unlit: {}}})
+        return 0
+
+    def camera(self, name: str, half: Float64) -> int:
+        """A camera that sees so far to the sides and up at z = -1; its number."""
+        described = {
+            "aspectRatio": float(half[0] / half[1]),
+            "yfov": float(2 * np.arctan(half[1])),
+            "znear": 0.01,
+        }
+        camera = {"name": name, "type": "perspective", "perspective": described}
+        self._json["cameras"].append(camera)
+        return len(self._json["cameras"]) - 1
+
+    def encode(self) -> bytes:
+        """The file."""
+        self._json["buffers"] = [{"byteLength": len(self._data)}]
+        parts = {name: value for name, value in self._json.items() if value != []}
+        text = json.dumps(parts, separators=(",", ":")).encode("utf-8")
+        text += b" " * (-len(text) % 4)
+        chunks = struct.pack("<I4s", len(text), b"JSON") + text
+        chunks += struct.pack("<I4s", len(self._data), b"BIN\0") + bytes(self._data)
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+    def _accessor(
+        self, values: NDArray[Any], kind: str, component: int, further: dict[str, Any]
+    ) -> int:
+        view = {"buffer": 0, "byteOffset": len(self._data), "byteLength": values.nbytes}
+        self._data += values.tobytes() + bytes(-values.nbytes % 4)
+        self._json["bufferViews"].append(view)
+        number = len(self._json["bufferViews"]) - 1
+        described = {"componentType": component, "count": len(values), "type": kind}
+        self._json["accessors"].append({"bufferView": number, **described, **further})
+        return len(self._json["accessors"]) - 1

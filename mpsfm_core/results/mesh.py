@@ -1,0 +1,25 @@
+"""A mesh as files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mpsfm_core.dense.mesh import Mesh
+from mpsfm_core.results.exports.source import Source
+from mpsfm_core.results.gltf import FLIP, TRIANGLES, Y_UP_FROM_Z, GltfScene
+from mpsfm_core.results.ply import write_ply
+from mpsfm_core.results.writer import MESH
+
+
+def write_mesh(folder: Path, mesh: Mesh, source: Source) -> None:
+    """Write ``mesh.ply`` with the axes of the model, and ``mesh.glb`` with gravity down."""
+    ply, glb = MESH
+    write_ply(folder / ply, mesh.vertices, mesh.colors, triangles=mesh.triangles)
+    turned = source if source.is_georeferenced else source.turned()
+    upright = (turned.world_from_model * mesh.vertices) @ (
+        Y_UP_FROM_Z if turned.z_is_up else FLIP
+    ).T
+    scene = GltfScene()
+    number = scene.mesh("surface", TRIANGLES, upright, mesh.colors, mesh.triangles)
+    scene.add({"name": "surface", "mesh": number})
+    (folder / glb).write_bytes(scene.encode())

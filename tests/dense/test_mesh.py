@@ -1,0 +1,168 @@
+"""A mesh from depth maps of a room whose surfaces are known."""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+from typer.testing import CliRunner
+
+from mpsfm_core.cli import build_app
+from mpsfm_core.data import DepthPrior
+from mpsfm_core.dense.mesh import Mesh, mesh_of_depth_maps
+from mpsfm_core.dense.options import MeshOptions
+from mpsfm_core.errors import InputError
+from mpsfm_core.geometry import pixel_centers, unproject
+from mpsfm_core.results.colmap_model import build_model, pinhole, write_model
+from mpsfm_core.results.depth_maps import write_depth_maps
+from mpsfm_core.scene.reconstruction import Reconstruction
+
+from .conftest import CAMERA, Room
+
+STD = 0.01
+
+
+def measured(room: Room, std: float = STD, seed: int = 0) -> Reconstruction:
+    """True depth with independent relative noise."""
+    rng = np.random.default_rng(seed)
+    images = []
+    for image in room.reconstruction.images:
+        true = room.truth[image.name]
+        noisy = true * np.exp(std * rng.standard_normal(true.shape)).astype(np.float32)
+        depth = DepthPrior.from_arrays(noisy, (max(std, 1e-3) * noisy) ** 2)
+        images.append(replace(image, depth=depth))
+    return replace(room.reconstruction, images=tuple(images))
+
+
+def surface(room: Room) -> np.ndarray:
+    """World points of all true maps."""
+    parts = []
+    for image in room.reconstruction.images:
+        local = unproject(CAMERA, pixel_centers(*CAMERA.size), room.truth[image.name])
+        parts.append((local.reshape(-1, 3) - image.translation) @ image.rotation)
+    return np.concatenate(parts)
+
+
+@pytest.fixture(scope="module")
+def mesh(room: Room) -> Mesh:
+    return mesh_of_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
+
+
+def test_the_mesh_lies_on_the_surfaces_and_covers_them(room: Room, mesh: Mesh) -> None:
+    truth = surface(room)
+    depth = float(np.median(np.concatenate([t.ravel() for t in room.truth.values()])))
+    pixel = depth / CAMERA.fx
+    to_truth = cKDTree(truth).query(mesh.vertices)[0]
+    assert np.median(to_truth) < pixel and np.quantile(to_truth, 0.95) < 3 * pixel
+    to_mesh = cKDTree(mesh.vertices).query(truth)[0]
+    assert (to_mesh < 4 * pixel).mean() > 0.95
+
+
+def test_averaging_makes_it_smoother_than_the_maps(room: Room, mesh: Mesh) -> None:
+    image = room.reconstruction.images[0]
+    local = mesh.vertices @ image.rotation.T + image.translation
+    xy = CAMERA.fx * local[:, :2] / local[:, 2:] + (CAMERA.cx, CAMERA.cy)
+    seen = ((xy > 2) & (xy < np.array(CAMERA.size) - 2)).all(axis=1)
+    column, row = xy[seen].astype(int).T
+    error = np.log(local[seen, 2] / room.truth[image.name][row, column])
+    assert np.median(np.abs(error)) < 0.5 * STD
+
+
+def test_triangles_face_the_cameras_and_have_the_photos_colours(room: Room) -> None:
+    mesh = mesh_of_depth_maps(measured(room, std=0.0), room.views.__getitem__, MeshOptions())
+    corners = mesh.vertices[mesh.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    centers = [-(i.rotation.T @ i.translation) for i in room.reconstruction.images]
+    towards = np.mean(centers, axis=0) - corners.mean(axis=1)
+    area = np.linalg.norm(normals, axis=1)
+    assert area[(normals * towards).sum(axis=1) > 0].sum() > 0.97 * area.sum()
+    image = room.reconstruction.images[0]
+    local = unproject(CAMERA, pixel_centers(*CAMERA.size), room.truth[image.name])
+    points = (local - image.translation) @ image.rotation
+    _, nearest = cKDTree(mesh.vertices).query(points[5:-5:9, 5:-5:9].reshape(-1, 3))
+    seen = room.views[image.name].image[5:-5:9, 5:-5:9].reshape(-1, 3).astype(float)
+    assert np.median(np.abs(mesh.colors[nearest] - seen)) < 20
+
+
+def test_the_number_of_triangles_has_a_limit(room: Room, mesh: Mesh) -> None:
+    limit = len(mesh.triangles) // 4
+    options = MeshOptions(max_triangles=limit)
+    small = mesh_of_depth_maps(measured(room), room.views.__getitem__, options)
+    assert 0.8 * limit < len(small.triangles) <= limit + 2
+    assert np.median(cKDTree(surface(room)).query(small.vertices)[0]) < 0.05
+
+
+def test_a_wrong_uncertain_map_does_not_bend_what_others_know(room: Room) -> None:
+    exact = measured(room)
+    wrong = exact.images[1].depth
+    vague = DepthPrior.from_arrays(wrong.depth * 1.04, (0.05 * wrong.depth) ** 2)
+    images = list(exact.images)
+    images[1] = replace(images[1], depth=vague)
+    bent = replace(exact, images=tuple(images))
+    mesh = mesh_of_depth_maps(bent, room.views.__getitem__, MeshOptions())
+    to_truth = cKDTree(surface(room)).query(mesh.vertices)[0]
+    assert np.median(to_truth) < 0.25 * 0.04 * np.median(wrong.depth)
+
+
+def test_maps_without_a_certain_pixel_are_told(room: Room) -> None:
+    none = [
+        replace(i, depth=DepthPrior(i.depth.depth, i.depth.variance, np.zeros_like(i.depth.valid)))
+        for i in room.reconstruction.images
+    ]
+    with pytest.raises(InputError, match="no pixel"):
+        mesh_of_depth_maps(
+            replace(room.reconstruction, images=tuple(none)),
+            room.views.__getitem__,
+            MeshOptions(),
+        )
+
+
+def test_missing_libraries_are_told(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)
+    with pytest.raises(InputError, match=r"mpsfm-core\[mesh\]"):
+        mesh_of_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
+
+
+@pytest.fixture
+def result(room: Room, tmp_path: Path) -> Path:
+    """A folder with a model, depth maps and photos."""
+    exact = measured(room)
+    nothing = np.zeros((0, 2))
+    cameras, colors = [pinhole(CAMERA)] * len(exact.images), np.zeros((0, 3), np.uint8)
+    built = build_model(exact, cameras, [nothing] * len(exact.images), colors)
+    write_model(tmp_path / "sparse", built)
+    write_depth_maps(tmp_path / "depth", exact)
+    (tmp_path / "images").mkdir()
+    for name, view in room.views.items():
+        cv2.imwrite(str(tmp_path / "images" / name), view.image[..., ::-1])
+    return tmp_path
+
+
+def test_the_command_writes_files_that_others_read(result: Path) -> None:
+    done = CliRunner().invoke(build_app(), ["mesh", str(result), "--set", "max_triangles=2000"])
+    assert done.exit_code == 0, done.output
+    ply = trimesh.load(result / "mesh.ply", process=False)
+    glb = trimesh.load(result / "mesh.glb", process=False)
+    [surface] = glb.geometry.values()
+    assert 1000 < len(ply.faces) <= 2002 and len(surface.faces) == len(ply.faces)
+    assert ply.area == pytest.approx(surface.area, rel=1e-4)
+    assert len(np.unique(ply.visual.vertex_colors, axis=0)) > 100
+    data = (result / "mesh.glb").read_bytes()
+    described = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    [primitive] = described["meshes"][0]["primitives"]
+    assert primitive["mode"] == 4 and {"POSITION", "COLOR_0"} == set(primitive["attributes"])
+
+
+def test_a_folder_without_depth_is_told(result: Path) -> None:
+    for path in (result / "depth").iterdir():
+        path.unlink()
+    done = CliRunner().invoke(build_app(), ["mesh", str(result)])
+    assert done.exit_code == 2 and "has no depth maps" in done.output
