@@ -85,10 +85,11 @@ def run_method(method: str, problem: MappingProblem, options: MapperOptions) -> 
     except Exception as raised:  # whatever a mapper raises is its result
         error = f"{type(raised).__name__}: {raised}"
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
-    return Outcome(models, seconds, cpu_seconds, _peak_mib(), error)
+    return Outcome(models, seconds, cpu_seconds, peak_mib(), error)
 
 
-def _peak_mib() -> float:
+def peak_mib() -> float:
+    """Most memory that this process held so far; 0 where the system does not tell."""
     if sys.platform == "win32":
         return 0.0
     import resource  # not on Windows

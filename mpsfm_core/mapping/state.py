@@ -283,13 +283,15 @@ def canonical(value: T) -> T:
     """The same data with every array in C order and in memory of its own.
 
     Results of sums and products depend, in the last bit, on how their arrays lie in memory, and a
-    problem whose parts come from the cache may differ there from one that was just computed.
+    problem whose parts come from the cache may differ there from one that was just computed. A view
+    of a whole array gives that array, as maps are most of what there is; it is not to be changed.
     """
     made: Any = value
     if isinstance(value, np.ndarray):
-        if value.base is not None or not value.flags.c_contiguous:
+        if _is_whole(value):
+            made = value.base
+        elif value.base is not None or not value.flags.c_contiguous:
             made = np.array(value, order="C")
-            made.flags.writeable = value.flags.writeable
     elif isinstance(value, tuple):
         items = [canonical(item) for item in value]
         if any(new is not old for new, old in zip(items, value, strict=True)):
@@ -301,6 +303,18 @@ def canonical(value: T) -> T:
             for name, item in attributes.items():
                 object.__setattr__(made, name, item)
     return cast(T, made)
+
+
+def _is_whole(array: NDArray[Any]) -> bool:
+    """Whether an array is a view of all of another one, which lies in order."""
+    owner = array.base
+    return (
+        type(owner) is np.ndarray
+        and owner.base is None
+        and owner.flags.c_contiguous
+        and (owner.dtype, owner.shape, owner.strides) == (array.dtype, array.shape, array.strides)
+        and _address(owner) == _address(array)
+    )
 
 
 def _parts(value: object) -> Iterator[object]:

@@ -1,0 +1,109 @@
+"""The paper's efficiency table: CPU seconds of the steps of mapping, and memory.
+
+    python -m benchmarks.efficiency [--views 25 49 100 250 505]
+
+Halls of :mod:`benchmarks.everyday` with honest priors, on maps as large as those of photos.
+Whatever a step calls belongs to it. The paper's rows of one kind (global, local, after
+registration) are summed; they are of other scenes (ETH3D) and of the authors' machine: growth
+compares, seconds hardly do. All sizes run in one process, the smallest first, so that the peak of
+memory is that of the largest so far, with its problem.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import time
+from collections.abc import Mapping
+from pathlib import PurePath
+from types import MappingProxyType
+from typing import NamedTuple
+
+from threadpoolctl import threadpool_limits
+
+from mpsfm_core.evaluation.methods import peak_mib
+from mpsfm_core.mapping import mapper
+from mpsfm_core.testing.halls import HONEST, hall_problem
+
+MAP_WIDTH = 387
+"""As the extraction room leaves maps (``extraction.integration_size``)."""
+WHOLE = "mapping"
+
+
+class Step(NamedTuple):
+    """``functions``: (file, name) of those that do it, none of which calls another. ``paper``:
+    seconds by number of images."""
+
+    functions: frozenset[tuple[str, str]]
+    paper: Mapping[int, float]
+
+
+def _step(*functions: tuple[str, str], paper: tuple[float, ...] = ()) -> Step:
+    sizes = (25, 44, 110, 505) if paper else ()
+    return Step(frozenset(functions), dict(zip(sizes, paper, strict=True)))
+
+
+STEPS: Mapping[str, Step] = MappingProxyType(
+    {
+        "placing all images at once": _step(("global_start.py", "place_all")),
+        "bundle adjustment": _step(
+            ("bundle_adjustment.py", "adjust_bundle"), paper=(3.43, 21.34, 48.59, 636.6)
+        ),
+        "depth refinement, with covariances": _step(
+            ("refinement.py", "integrate"), paper=(9.19, 34.1, 81.33, 472.54)
+        ),
+        "of it covariances of points": _step(
+            ("refinement.py", "_covariances"), paper=(2.26, 11.06, 19.94, 153.8)
+        ),
+        "depth check": _step(
+            ("group.py", "_conflicts"),
+            ("group.py", "_contradiction"),
+            paper=(0.44, 0.73, 2.01, 13.9),
+        ),
+        "tracks": _step(
+            ("triangulation.py", "triangulate_image"),
+            ("triangulation.py", "complete_and_merge"),
+            ("triangulation.py", "lift_low_parallax"),
+            ("filtering.py", "filter_points"),
+        ),
+        WHOLE: _step(("mapper.py", "reconstruct")),
+    }
+)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--views", type=int, nargs="+", default=[25, 49, 100, 250, 505])
+    sizes = sorted(parser.parse_args().views)
+    _measured(9)  # loads what is compiled
+    columns = {views: _measured(views) for views in sizes}
+    print(f"| CPU seconds | {' | '.join(map(str, sizes))} | paper: 25 | 44 | 110 | 505 |")
+    print("|---" * (len(sizes) + 5) + "|")
+    for name, step in STEPS.items():
+        ours = [f"{columns[views][name]:.2f}" for views in sizes]
+        theirs = [f"{step.paper[n]:g}" if step.paper else "" for n in (25, 44, 110, 505)]
+        print(f"| {' | '.join([name, *ours, *theirs])} |")
+    peaks = [f"{columns[views]['peak']:.0f}" for views in sizes]
+    print(f"| {' | '.join(['peak of memory, MiB', *peaks])} | | | | |")
+
+
+def _measured(views: int) -> dict[str, float]:
+    """CPU seconds of each step, of all threads together, and ``peak`` in MiB."""
+    problem = hall_problem(views, HONEST, map_width=MAP_WIDTH).problem
+    profile = cProfile.Profile(time.process_time)
+    with threadpool_limits(1):
+        profile.enable()
+        mapper.reconstruct(problem)
+        profile.disable()
+    profile.create_stats()
+    found = dict.fromkeys(STEPS, 0.0)
+    for (file, _, function), (*_, seconds, _) in profile.stats.items():
+        for name, step in STEPS.items():
+            if (PurePath(file).name, function) in step.functions:
+                found[name] += seconds
+    return {**found, "peak": peak_mib()}
+
+
+if __name__ == "__main__":
+    main()
