@@ -40,8 +40,7 @@ VARIANTS: Mapping[str, Mapping[str, object]] = {
     "next view by visible points": {"registration": {"next_view": "visible-points"}},
     "poses of RANSAC as they are": {"registration": {"num_improved": 0}},
     "declared depth noise": {"refinement": {"measure_depth_noise": False}},
-    "no rescaling of priors": {"refinement": {"rescale": False}},
-    "metric scales free of each other": {"refinement": {"max_scale_deviations": 1000.0}},
+    "scales of priors stay as first estimated": {"refinement": {"free_scales": False}},
     "matches count the same": {"weigh_by_score": False},
     "new images with the final loss": {"refinement": {"first_reprojection_scale": 1.0}},
     "reprojection loss of the reference": {

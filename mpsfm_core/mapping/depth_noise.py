@@ -20,22 +20,15 @@ from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64
 from mpsfm_core.geometry import pixel_centers
+from mpsfm_core.mapping.statistics import MAD_TO_STD, group_medians
 from mpsfm_core.scene.scene import Scene
 
-MAD_TO_STD = 1.4826
-"""Of normal errors: from the median of their absolute values to their std."""
 CELLS = 4
 """Residuals are compared in a grid of this many cells per side (ours)."""
 MIN_RESIDUALS = 50
 """Fewer say too little: the declaration stands (ours)."""
 MIN_INDEPENDENT = 0.05
 """Share of the variance of depth that is independent, at least (ours)."""
-FEW_VIEWS = 3
-"""Up to so many views, what all residuals of a pair have in common is left out: it may be due to
-the scales of two images, which are free and no part of what a prior declares. Ours: a shift of 1 %
-between two images, taken for noise, made depth worth so little that bundle adjustment left right
-poses. On hololens_room with sensor depth, AUC@20 of the triplets 50.9 -> 53.9, leq5 24.2 -> 24.6,
-leq10 28.7 -> 28.3, leq30 41.7 -> 42.3. For all views it takes `all` there from 54 to 36."""
 MULTIPLIER_RANGE = (0.1, 10.0)
 """Bounds of the multiplier (ours): a declaration is not off by more without being broken."""
 WITNESS_VIEWS, WITNESS_ANGLE_DEG = 3, 2.0
@@ -80,12 +73,16 @@ class DepthNoise(NamedTuple):
 
 
 def measure_depth_noise(scene: Scene) -> DepthNoise:
-    """Compare the scaled priors of all pairs of registered views at their common points."""
+    """Compare the scaled priors of all pairs of registered views at their common points.
+
+    What all residuals of a pair have in common is left out: it may be due to the scales of the two
+    images, which are unknowns of bundle adjustment and no part of what a prior declares.
+    """
     residuals, groups = _cross_view_residuals(scene)
     if len(residuals) < MIN_RESIDUALS:
         return DepthNoise()
-    if scene.registered.sum() <= FEW_VIEWS:
-        residuals = residuals - _medians(residuals, groups // CELLS**2)
+    pairs, pair = np.unique(groups // CELLS**2, return_inverse=True)
+    residuals = residuals - group_medians(residuals, pair, len(pairs))[pair]
     spread = MAD_TO_STD * float(np.median(np.abs(residuals)))
     multiplier = float(np.clip(spread, *MULTIPLIER_RANGE))
     clipped = np.clip(residuals / max(spread, 1e-12), -3, 3)
@@ -159,14 +156,6 @@ def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
     row, column = np.clip(place, 0, CELLS - 1).astype(np.int64).T
     pair = graph.image_of[source] * scene.num_images + graph.image_of[target]
     return residuals, (pair * CELLS + row) * CELLS + column
-
-
-def _medians(values: Float64, groups: Int64) -> Float64:
-    """(m,) the median of the group that each value is in."""
-    _, group = np.unique(groups, return_inverse=True)
-    medians = np.array([np.median(values[group == row]) for row in range(group.max() + 1)])
-    of_each: Float64 = medians[group]
-    return of_each
 
 
 def _clustering(values: Float64, groups: Int64) -> tuple[float, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, PosedImage, SceneState
+from mpsfm_core.mapping.statistics import MAD_TO_STD
 from mpsfm_core.scene.reconstruction import MetricScale, Reconstruction, RegisteredImage
 from mpsfm_core.scene.scene import Scene
 
@@ -25,7 +26,7 @@ def metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | None:
     if not log_scales:
         return None
     center = float(np.median(log_scales))
-    spread = 1.4826 * float(np.median(np.abs(np.array(log_scales) - center)))
+    spread = MAD_TO_STD * float(np.median(np.abs(np.array(log_scales) - center)))
     trusted = len(log_scales) >= MIN_METRIC_IMAGES and spread <= MAX_METRIC_SPREAD
     trusted = trusted and not keep_units
     return MetricScale(float(np.exp(-center)), spread, len(log_scales), trusted)

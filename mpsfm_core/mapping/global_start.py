@@ -19,6 +19,7 @@ from scipy.sparse.linalg import splu
 
 from mpsfm_core.data import Bool, Float64, Int64, VerifiedPair
 from mpsfm_core.geometry import camera_center, rotation_angle_deg, triangulation_angle_deg
+from mpsfm_core.mapping.statistics import MAD_TO_STD, group_medians
 from mpsfm_core.mapping.triangulation import midpoints
 from mpsfm_core.scene.scene import Scene
 
@@ -36,7 +37,7 @@ MAX_SHIFT = 0.3
 baselines by several degrees (ours)."""
 ROUNDS = 20
 """Of least squares, each of which weighs pairs by how well the last one agreed with them (ours)."""
-_WARNING = 1
+_FATAL = 3
 
 
 class Placement(NamedTuple):
@@ -118,7 +119,9 @@ def averaged_rotations(links: _Links, num_images: int, seed: int) -> Float64 | N
     options = pycolmap.RotationEstimatorOptions()
     options.random_seed = seed
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(level, _WARNING)  # it reports what it left out on stderr
+    pycolmap.logging.minloglevel = max(
+        level, _FATAL
+    )  # it tells on stderr what it left out, and that nothing is left
     try:
         if not pycolmap.run_rotation_averaging(options, graph, reconstruction, []):
             return None
@@ -155,7 +158,7 @@ def agreed(a: Int64, b: Int64, steps: Float64, weights: Float64, count: int) -> 
         np.add.at(side, a, -weight[:, None] * values)
         found = splu(laplacian).solve(side)
         off = np.linalg.norm(found[b] - found[a] - values, axis=1)
-        scale = max(1.4826 * float(np.median(off)), 1e-12)
+        scale = max(MAD_TO_STD * float(np.median(off)), 1e-12)
         robust = 1 / (1 + (off / scale) ** 2)
     found -= found.mean(axis=0)
     return found.reshape(count, *steps.shape[1:])
@@ -186,23 +189,10 @@ def _links(scene: Scene, pairs: list[VerifiedPair]) -> _Links:
             np.stack([scene.keypoint_prior[source] / z_a, scene.keypoint_prior[target] / z_b])
         )
     counts = np.bincount(of[use], minlength=len(pairs))
-    lengths = np.stack([_medians(values[use], of[use], len(pairs)) for values in logs], axis=1)
+    lengths = np.stack([group_medians(values[use], of[use], len(pairs)) for values in logs], axis=1)
     weight = np.array([len(pair) for pair in pairs], dtype=np.float64)
     links = _Links(a, b, rotation, translation, lengths, weight)
     return links.select(counts >= MIN_MATCHES)
-
-
-def _medians(values: Float64, groups: Int64, count: int) -> Float64:
-    """(count,) median of the values of each group; NaN for those without any."""
-    order = np.lexsort((values, groups))
-    sizes = np.bincount(groups, minlength=count)
-    first = np.cumsum(sizes) - sizes
-    medians = np.full(count, np.nan)
-    some = sizes > 0
-    low, high = first + (sizes - 1) // 2, first + sizes // 2
-    ordered = values[order]
-    medians[some] = (ordered[low[some]] + ordered[high[some]]) / 2
-    return medians
 
 
 def _well_held(links: _Links, count: int) -> Bool:

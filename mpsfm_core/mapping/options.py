@@ -124,12 +124,10 @@ class RefinementOptions(Options):
     measure_keypoint_noise: bool = True
     """Widen the reprojection loss where keypoints are clean
     (:mod:`mpsfm_core.mapping.keypoint_noise`); off: as ``bundle`` says."""
-    rescale: bool = True
-    """Estimate the scales of all priors anew in global refinement (reference: regular_resc)."""
-    max_scale_deviations: float = Field(2.0, gt=0)
-    """Standard deviations of a metric prior, by the measured noise, that its scale may differ from
-    the median of all then (ours: 1 is better for depth as good as declared, but costs FastDepth
-    images on rendered_kitchen)."""
+    free_scales: bool = True
+    """Bundle adjustment estimates the scales of priors beside poses and points; off: they stay as
+    estimated when the image was registered. (The reference estimates them in turn with it, which
+    converges slowly: what a scale pulls askew, points and poses hold there.)"""
     local_images: int = Field(5, ge=2)
     """Images of a local bundle, the new one included (reference; COLMAP: 6)."""
     local_iterations: int = Field(2, ge=0)

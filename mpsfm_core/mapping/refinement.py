@@ -55,6 +55,8 @@ class Refiner:
         self.triangulation = options.triangulation
         self.scores = scores
         self.fixed: Bool = np.zeros(scene.num_images, dtype=np.bool_)
+        groups = scene.depth_group_of
+        self._shares_scale: Bool = np.bincount(groups, minlength=1)[groups] > 1
         self.noise = DepthNoise()
         self.loss_scale = options.refinement.bundle.reprojection_scale
         self.clean_matches = False
@@ -111,51 +113,32 @@ class Refiner:
             if scales and not self.scene.maps[image].active:
                 self.scene.maps[image].set_scale(float(np.median(scales)))
 
-    def rescale(self, images: list[int]) -> None:
-        """Estimate all scales anew from points that rays determine.
+    def rescale_groups(self) -> None:
+        """Estimate scales that several images share anew, from points that rays determine.
 
-        Images whose depth has one unit share one scale, and their points count alike. Fixed poses
-        hold the scale of the world; else those of metric priors stay near their median, as a group
-        of images that few matches hold to the rest agrees with its own points at any scale, and
-        their mean stays.
+        Those of single images are unknowns of bundle adjustment.
         """
         scene, tracks = self.scene, self.scene.tracks
-        images = [image for image in images if scene.maps[image].active]
         stable = scene.track_angles_deg() >= self.options.anchor_min_angle_deg
-        log_scales = np.array([np.log(scene.maps[image].scale) for image in images])
-        updated = log_scales.copy()
-        groups = scene.depth_group_of[images]
-        found: dict[int, list[Float64]] = {group: [] for group in groups.tolist()}
-        for group, image in zip(groups.tolist(), images, strict=True):
+        found: dict[int, list[Float64]] = {}
+        for image in map(int, np.flatnonzero(self._shares_scale & scene.registered)):
             depth_map = scene.maps[image]
+            if not depth_map.active:
+                continue
             keypoints, z = self._observed_depth(image)
             rows = keypoints - scene.graph.offsets[image]
             prior = depth_map.prior_at_keypoints(rows)
             good = depth_map.keypoint_valid[rows] & (z > 0) & (prior > 0)
             good &= stable[tracks.point_of[keypoints]]
             good[good] &= self._near(z[good] / (depth_map.scale * prior[good]))
-            found[group].append(np.log(z[good] / prior[good]))
+            group = int(scene.depth_group_of[image])
+            found.setdefault(group, []).append(np.log(z[good] / prior[good]))
         for group, parts in found.items():
             together = np.concatenate(parts)
             if len(together) >= MIN_SCALE_POINTS:
-                updated[groups == group] = np.median(together)
-        if len(images) and not self.fixed.any():
-            center = np.median(updated)
-            slack = np.array([self._scale_slack(image) for image in images])
-            limits = np.array([np.median(slack[groups == group]) for group in groups])
-            updated = center + np.clip(updated - center, -limits, limits)
-            updated += log_scales.mean() - updated.mean()
-        for image, log_scale in zip(images, updated, strict=True):
-            scene.maps[image].set_scale(float(np.exp(log_scale)))
-
-    def _scale_slack(self, image: int) -> float:
-        """How far the logarithm of an image's scale may be from that of the others."""
-        depth_map = self.scene.maps[image]
-        log_std = depth_map.keypoint_log_std[depth_map.keypoint_valid]
-        if not depth_map.prior.metric or not len(log_std):
-            return np.inf
-        std = self.noise.multiplier * float(np.median(log_std))
-        return self.options.max_scale_deviations * std
+                for image in map(int, np.flatnonzero(scene.depth_group_of == group)):
+                    if scene.maps[image].active:
+                        scene.maps[image].set_scale(float(np.exp(np.median(together))))
 
     def integrate(self, images: list[int]) -> None:
         """Refine the depth maps of some images against the current points.
@@ -179,7 +162,7 @@ class Refiner:
         depth_scale: float = 1.0,
         max_iterations: int | None = None,
     ) -> None:
-        """Bundle-adjust the poses of some images and the points they see.
+        """Bundle-adjust poses of some images, scales of their depth and the points they see.
 
         ``local``: long tracks stay. ``focal``: guessed focal lengths
         are refined too. ``reprojection_scale``, ``depth_scale`` multiply the scales of the losses.
@@ -205,6 +188,7 @@ class Refiner:
         options = self.options.bundle
         depth_scale *= options.depth_scale * self.noise.loss_factor
         weight = scene.graph.keypoint_weight[observations]
+        expected, std = self._expected_log_scales(images)
         _, first, camera_rows = np.unique(
             scene.camera_of[images], return_index=True, return_inverse=True
         )
@@ -222,6 +206,9 @@ class Refiner:
                 obs_log_depth=log_depth if regularized else None,
                 obs_std_log_depth=log_std * self.noise.std_factor,
                 variable_pose=moving,
+                expected_log_scales=expected,
+                std_log_scales=std,
+                variable_scale=self._has_free_scale(variable)[images],
                 variable_point=~long_track if local else None,
                 scale_anchor=int(np.argmax(moving)) if free_scale else None,
                 variable_focal=self._guessed(images)[first] if focal else None,
@@ -239,6 +226,9 @@ class Refiner:
         scene.rotations[images] = result.rotations
         scene.translations[images] = result.translations
         tracks.xyz[points] = result.points
+        for row in np.flatnonzero(result.log_scales):
+            depth_map = scene.maps[images[row]]
+            depth_map.set_scale(depth_map.scale * float(np.exp(result.log_scales[row])))
 
     def refine_locally(self, image: int) -> None:
         """Refine an image and its neighbours until little changes.
@@ -267,8 +257,7 @@ class Refiner:
         if self.focal_is_stable():
             self.adjust(images, focal=True)
         for _ in range(options.global_iterations):
-            if options.rescale:
-                self.rescale(images)
+            self.rescale_groups()
             self._measure_keypoint_noise()
             self._measure_noise()
             if self._alternates:
@@ -400,6 +389,35 @@ class Refiner:
         log_depth[usable] = np.log(depth[usable])
         log_std[usable] = scene.keypoint_log_std[observations[usable]]
         return log_depth, np.maximum(log_std, 1e-6)
+
+    def _has_free_scale(self, variable: list[int]) -> Bool:
+        """(n,) bool, images of whose depth bundle adjustment estimates the scale."""
+        if not self.options.free_scales:
+            return np.zeros(self.scene.num_images, dtype=np.bool_)
+        return self.scene.mask(variable) & ~self._shares_scale
+
+    def _expected_log_scales(self, images: Int64) -> tuple[Float64, Float64]:
+        """By how much the logarithms of some images' scales are expected to change, and the std of
+        that: (m,) each.
+
+        Metric priors agree on a metre, give or take the spread of those of all registered images.
+        What priors declare, by the measured noise, counts as one more of them (a unit information
+        prior). Of relative ones nothing is known.
+        """
+        maps, scene = self.scene.maps, self.scene
+        metric = np.array([m.prior.metric and m.typical_log_std > 0 for m in maps], dtype=np.bool_)
+        posed = np.array([m.active for m in maps], dtype=np.bool_) & metric & scene.registered
+        log_scales = np.log(scene.scales())
+        expected, std = np.zeros(len(images)), np.full(len(images), np.inf)
+        if posed.any():
+            off = log_scales[posed] - np.median(log_scales[posed])
+            declared = np.median(
+                [m.typical_log_std for m, of in zip(maps, posed, strict=True) if of]
+            )
+            squares = (self.noise.multiplier * declared) ** 2 + (off**2).sum()
+            std[metric[images]] = np.sqrt(squares / len(off))
+            expected[:] = np.median(log_scales[posed]) - log_scales[images]
+        return expected, std
 
     def _near(self, ratio: Float64) -> Bool:
         limit = self.options.max_depth_ratio

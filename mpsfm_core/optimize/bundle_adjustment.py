@@ -1,8 +1,10 @@
 """Depth-regularised bundle adjustment (paper: C_BA + C_reg with the refined depth maps fixed).
 
-Minimises over camera poses, 3D points and, if wanted, focal lengths
+Minimises over camera poses, 3D points and, if wanted, focal lengths and the scales ``exp(s)`` of
+depth maps
 
-    1/2 sum rho_r(|project(R X + t) - xy|^2 / std_px^2) + 1/2 sum rho_d((log z - log d)^2 / std^2)
+    1/2 sum rho_r(|project(R X + t) - xy|^2 / std_px^2)
+    + 1/2 sum rho_d((log z - log d - s)^2 / std^2) + 1/2 sum (s - expected)^2 / std_s^2
 
 with Levenberg-Marquardt: the points are eliminated (3 x 3 blocks), the cameras solved for, the
 points follow by back-substitution and then settle one by one.
@@ -53,6 +55,7 @@ class BundleResult:
 
     rotations: Float64
     translations: Float64
+    log_scales: Float64
     intrinsics: Float64
     points: Float64
     initial_cost: float
@@ -126,8 +129,10 @@ class _NormalEquations:
     def __init__(self, p: Prepared, options: BundleOptions, run: Run) -> None:
         layout = p.bundle.layout
         poses, focals = len(layout.pair), int(layout.focal_slot.max(initial=-1)) + 1
-        size = kernels.POSE * poses + focals
-        shapes = (len(p.pairs), 6, 6), (focals, 6 * poses), (focals, focals), size, size, size
+        size = kernels.VIEW * poses + focals
+        view = int(kernels.VIEW)
+        block, border = (len(p.pairs), view, view), (focals, view * poses)
+        shapes = block, border, (focals, focals), size, size, size
         self.parts = [kernels.System(*(np.empty(shape) for shape in shapes)) for _ in p.ranges]
         self.scratch = [kernels.make_scratch(p.longest) for _ in p.ranges]
         self.total = self.parts[0]
@@ -160,23 +165,32 @@ class _NormalEquations:
         for part in self.parts[1:]:
             for array, more in zip(self.total, part, strict=True):
                 array += more
+        self._expect_scales(state)
         self.total.rhs[:] += self.total.gradient
-        self._hold_scale()
-        return cost
+        self._hold()
+        return cost + self.p.scale_prior.cost(state)
 
-    def _hold_scale(self) -> None:
-        """Take the translation coordinate that fixes the scale out of the system."""
-        if self.p.anchor is None:
-            return
-        image, axis = self.p.anchor
-        slot = self.p.bundle.layout.pose_slot[image]
-        row = kernels.POSE * slot + 3 + axis
-        blocks = self.total.blocks
-        blocks[self.p.pairs[:, 0] == slot, 3 + axis, :] = 0.0
-        blocks[self.p.pairs[:, 1] == slot, :, 3 + axis] = 0.0
-        self.total.border[:, row] = 0.0
+    def _expect_scales(self, state: kernels.State) -> None:
+        """Add what is expected of the scales of depth maps."""
+        prior, layout = self.p.scale_prior, self.p.bundle.layout
+        rows = kernels.VIEW * prior.slot + kernels.SCALE
+        own = layout.pair[prior.slot, prior.slot]
+        self.total.blocks[own, kernels.SCALE, kernels.SCALE] += prior.weight
+        self.total.diagonal[rows] += prior.weight
+        off = state.log_scales[prior.image] - prior.log_scale
+        self.total.gradient[rows] += prior.weight * off
+
+    def _hold(self) -> None:
+        """Take what does not move of images with a slot out of the system."""
+        held, pairs, blocks = self.p.held, self.p.pairs, self.total.blocks
+        some = np.asarray(held.any(axis=1))
+        for side, axis in ((0, 2), (1, 1)):
+            rows = np.flatnonzero(some[pairs[:, side]])
+            blocks[rows] *= np.expand_dims(~held[pairs[rows, side]], axis)
+        entries = np.flatnonzero(held)
+        self.total.border[:, entries] = 0.0
         for vector in (self.total.gradient, self.total.diagonal, self.total.rhs):
-            vector[row] = 0.0
+            vector[entries] = 0.0
 
     def step(
         self, state: kernels.State, trial: kernels.State, damping: float, cost: float
@@ -193,7 +207,7 @@ class _NormalEquations:
             return np.inf, -np.inf, np.inf
         focals = delta[self.total.border.shape[1] :]
         np.clip(focals, -MAX_FOCAL_STEP, MAX_FOCAL_STEP, out=focals)
-        for old, new in zip(state[:3], trial[:3], strict=True):
+        for old, new in zip(state[:-1], trial[:-1], strict=True):
             np.copyto(new, old)
         kernels.move_cameras(delta, self.p.bundle.layout, state, trial)
 
@@ -213,6 +227,7 @@ class _NormalEquations:
             return costs
 
         visible, lost, promised = (float(x) for x in np.sum(self.run(move), axis=0))
+        visible += self.p.scale_prior.cost(trial)
         promised += 0.5 * float(delta @ (boost * delta - self.total.gradient))
         return visible, cost - visible - lost, promised
 
@@ -231,7 +246,8 @@ class _NormalEquations:
         poses = total.border.shape[1]
         own = np.triu(total.blocks[self.p.pairs[:, 0] == self.p.pairs[:, 1]])
         own += np.triu(own, 1).transpose(0, 2, 1)
-        own[:, range(6), range(6)] += boost[:poses].reshape(-1, 6)
+        size = own.shape[-1]
+        own[:, range(size), range(size)] += boost[:poses].reshape(-1, size)
         inverse = np.linalg.inv(own)
         corner = np.diagonal(total.corner) + boost[poses:]
 
@@ -241,7 +257,7 @@ class _NormalEquations:
             return out
 
         def precondition(x: Float64) -> Float64:
-            first = np.einsum("nab,nb->na", inverse, x[:poses].reshape(-1, 6))
+            first = np.einsum("nab,nb->na", inverse, x[:poses].reshape(-1, size))
             return np.concatenate([first.ravel(), x[poses:] / corner])
 
         return _conjugate_gradients(multiply, precondition, -total.rhs)

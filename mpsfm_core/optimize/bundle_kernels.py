@@ -6,9 +6,9 @@ own no memory: numba's reference counting made them 1.7 times slower (our measur
 off (``_nrt=False``) and the caller passes what they work in. Inlining halved the time before that.
 
 Observations are sorted by point, then by image. Poses and focal lengths that may move have a
-slot each; camera-side vectors hold 6 numbers for each pose slot (rotation, translation), then
-one for each focal slot. A pose moves as ``R <- exp(w) R, t <- t + dt``, a focal length as
-``f <- f exp(a)``.
+slot each; camera-side vectors hold 7 numbers for each pose slot (rotation, translation, logarithm
+of the scale of the image's depth map), then one for each focal slot. A pose moves as
+``R <- exp(w) R, t <- t + dt``, the scale as ``s <- s + ds``, a focal length as ``f <- f exp(a)``.
 """
 
 from __future__ import annotations
@@ -39,8 +39,10 @@ MAX_OWN_STEPS = 10
 losses make points with outliers converge slowly; this takes a third of the iterations and half of
 the time, to a lower cost at the same tolerance (our measurement)."""
 OWN_STEP_DAMPING = 1e-6
-POSE, FOCAL = np.int64(6), np.int64(1)
-"""Numbers of a pose and of a focal length."""
+VIEW, FOCAL = np.int64(7), np.int64(1)
+"""Numbers of a view (its pose, then the scale of its depth map) and of a focal length."""
+SCALE = 6
+"""Which of them the scale is."""
 _ONLY = np.int64(0)
 """Row of a block that has one row."""
 
@@ -61,12 +63,14 @@ class Observations(NamedTuple):
 
 class Layout(NamedTuple):
     """Which parameters move (slot -1: constant), and where pairs of poses are stored:
-    ``pair[i, j]``, ``i <= j``, is the row of pose slots i, j in :attr:`System.blocks`, or -1."""
+    ``pair[i, j]``, ``i <= j``, is the row of pose slots i, j in :attr:`System.blocks`, or -1. Of an
+    image with a pose slot the scale may move (``variable_scale``), or the pose, or both."""
 
     camera_of_image: Int32
     pose_slot: Int32
     focal_slot: Int32
     variable_point: Bool
+    variable_scale: Bool
     pair: Int32
 
 
@@ -88,10 +92,12 @@ class Bundle(NamedTuple):
 
 
 class State(NamedTuple):
-    """What is estimated: cam_from_world (n, 3, 3), (n, 3); intrinsics (k, 4); points (p, 3)."""
+    """What is estimated: cam_from_world (n, 3, 3), (n, 3); logarithms of the scales by which depth
+    maps are multiplied (n,); intrinsics (k, 4); points (p, 3)."""
 
     rotations: Float64
     translations: Float64
+    log_scales: Float64
     intrinsics: Float64
     points: Float64
 
@@ -99,7 +105,7 @@ class State(NamedTuple):
 class System(NamedTuple):
     """The camera-side normal equations of a range of points, or summed over all.
 
-    ``blocks`` (pairs, 6, 6), ``border`` (focals, 6 poses) and ``corner`` (focals, focals) hold
+    ``blocks`` (pairs, 7, 7), ``border`` (focals, 7 poses) and ``corner`` (focals, focals) hold
     the reduced matrix, of a pose with itself only the upper triangle; ``gradient`` and
     ``diagonal`` (d,) are those before the points are eliminated, ``rhs`` (d,) is what
     elimination adds to the gradient.
@@ -116,7 +122,7 @@ class System(NamedTuple):
 class Scratch(NamedTuple):
     """Working memory of one range for tracks of up to ``longest`` observations.
 
-    ``y``, ``yf``: (longest, 3, 6) and (longest, 3, 1), coupling of the point with pose slots
+    ``y``, ``yf``: (longest, 3, 7) and (longest, 3, 1), coupling of the point with pose slots
     ``slots`` and focal slots ``focals``. ``before``: (longest, 2), cost and depth. ``block``:
     (1, 10), laid out as a row of ``eliminated``.
     """
@@ -137,6 +143,7 @@ class Sight(NamedTuple):
     ``q`` is the rotated point, ``x, y, z`` the camera point; ``g`` is the gradient of the cost
     with respect to it and ``h`` the Gauss-Newton matrix (``hxy`` is 0). Pose, point and focal
     length all act by displacing the camera point: by ``w x q + dt``, ``R dX``, ``(x, y, 0) da``.
+    ``gs``, ``hss`` and ``hzs``: the same of the scale of the depth map, which is no displacement.
     """
 
     visible: bool
@@ -155,6 +162,9 @@ class Sight(NamedTuple):
     hxz: float
     hyz: float
     hzz: float
+    gs: float
+    hss: float
+    hzs: float
 
 
 def make_scratch(longest: int) -> Scratch:
@@ -163,9 +173,9 @@ def make_scratch(longest: int) -> Scratch:
     return Scratch(
         slots=np.empty(longest, np.int64),
         focals=np.empty(longest, np.int64),
-        y=np.empty((longest, 3, POSE)),
+        y=np.empty((longest, 3, VIEW)),
         yf=np.empty((longest, 3, 1)),
-        columns=np.empty((3, POSE)),
+        columns=np.empty((3, VIEW)),
         before=np.empty((longest, 2)),
         block=np.empty((1, 10)),
         vector=np.empty(3),
@@ -230,7 +240,8 @@ def observe(k: int, p: int, bundle: Bundle, state: State) -> Sight:
     y = qy + state.translations[image, 1]
     z = qz + state.translations[image, 2]
     if not (z > MIN_DEPTH and z * MAX_SLOPE > abs(x) + abs(y)):
-        return Sight(False, 0.0, qx, qy, qz, x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        n = 0.0
+        return Sight(False, n, qx, qy, qz, x, y, z, n, n, n, n, n, n, n, n, n, n, n)
     inverse = 1.0 / z
     u, v = x * inverse, y * inverse
     camera = bundle.layout.camera_of_image[image]
@@ -245,21 +256,28 @@ def observe(k: int, p: int, bundle: Bundle, state: State) -> Sight:
     gz = -gx * u - gy * v
     hxx, hyy = weight * fx * fx, weight * fy * fy
     hzz = hxx * u * u + hyy * v * v
+    hxz, hyz = -hxx * u, -hyy * v
+    gs = hss = hzs = 0.0
     if obs.depth_weight[k] > 0.0:
-        rd = (np.log(z) - obs.log_depth[k]) * obs.depth_weight[k]
+        slope_s = obs.depth_weight[k]
+        rd = (np.log(z) - obs.log_depth[k] - state.log_scales[image]) * slope_s
         depth_rho, weight = evaluate(robust.depth_loss, rd * rd, robust.depth_scale)
-        slope = obs.depth_weight[k] * inverse
+        slope = slope_s * inverse
         rho += depth_rho
         gz += weight * slope * rd
         hzz += weight * slope * slope
+        if bundle.layout.variable_scale[image]:
+            gs = -weight * slope_s * rd
+            hss = weight * slope_s * slope_s
+            hzs = -weight * slope * slope_s
     return Sight(
-        True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, -hxx * u, -hyy * v, hzz
+        True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, hxz, hyz, hzz, gs, hss, hzs
     )
 
 
 @_helper
 def _fill_pose_columns(s: Sight, columns: Float64) -> None:
-    """columns (3, 6) <- h [dx/dw | dx/dt]."""
+    """columns (3, 7) <- h [dx/dw | dx/dt | scale]."""
     columns[0, 0] = s.hxz * s.qy
     columns[0, 1] = s.hxx * s.qz - s.hxz * s.qx
     columns[0, 2] = -s.hxx * s.qy
@@ -275,26 +293,30 @@ def _fill_pose_columns(s: Sight, columns: Float64) -> None:
     columns[2, 3] = columns[0, 5] = s.hxz
     columns[2, 4] = columns[1, 5] = s.hyz
     columns[2, 5] = s.hzz
+    columns[0, 6] = columns[1, 6] = 0.0
+    columns[2, 6] = s.hzs
 
 
 @_helper
 def _add_pose(s: Sight, columns: Float64, slot: int, row: int, system: System) -> None:
     """Add the pose's gradient, diagonal and the upper triangle of its own block."""
     blocks, gradient, diagonal = system.blocks, system.gradient, system.diagonal
-    n = POSE * slot
+    n = VIEW * slot
     gradient[n] += s.qy * s.gz - s.qz * s.gy
     gradient[n + 1] += s.qz * s.gx - s.qx * s.gz
     gradient[n + 2] += s.qx * s.gy - s.qy * s.gx
     gradient[n + 3] += s.gx
     gradient[n + 4] += s.gy
     gradient[n + 5] += s.gz
+    gradient[n + 6] += s.gs
     diagonal[n] += s.qy * columns[2, 0] - s.qz * columns[1, 0]
     diagonal[n + 1] += s.qz * columns[0, 1] - s.qx * columns[2, 1]
     diagonal[n + 2] += s.qx * columns[1, 2] - s.qy * columns[0, 2]
     diagonal[n + 3] += s.hxx
     diagonal[n + 4] += s.hyy
     diagonal[n + 5] += s.hzz
-    for b in range(POSE):
+    diagonal[n + 6] += s.hss
+    for b in range(VIEW):
         c0, c1, c2 = columns[0, b], columns[1, b], columns[2, b]
         blocks[row, 0, b] += s.qy * c2 - s.qz * c1
         if b >= 1:
@@ -306,6 +328,8 @@ def _add_pose(s: Sight, columns: Float64, slot: int, row: int, system: System) -
     blocks[row, 4, 4] += s.hyy
     blocks[row, 4, 5] += s.hyz
     blocks[row, 5, 5] += s.hzz
+    blocks[row, 5, 6] += s.hzs
+    blocks[row, 6, 6] += s.hss
 
 
 @_helper
@@ -314,12 +338,12 @@ def _add_focal(
 ) -> None:
     """Add the focal length's gradient, diagonal, own entry and coupling with the pose."""
     own = s.x * s.x * s.hxx + s.y * s.y * s.hyy
-    system.gradient[POSE * poses + focal] += s.x * s.gx + s.y * s.gy
-    system.diagonal[POSE * poses + focal] += own
+    system.gradient[VIEW * poses + focal] += s.x * s.gx + s.y * s.gy
+    system.diagonal[VIEW * poses + focal] += own
     system.corner[focal, focal] += own
     if slot >= 0:
-        for a in range(POSE):
-            system.border[focal, POSE * slot + a] += s.x * columns[0, a] + s.y * columns[1, a]
+        for a in range(VIEW):
+            system.border[focal, VIEW * slot + a] += s.x * columns[0, a] + s.y * columns[1, a]
 
 
 @_helper
@@ -416,16 +440,16 @@ def _eliminate_from_poses(
     blocks, rhs, slots, y = system.blocks, system.rhs, scratch.slots, scratch.y
     for a in range(count):
         own = pair[slots[a], slots[a]]
-        for i in range(POSE):
+        for i in range(VIEW):
             y0, y1, y2 = y[a, 0, i], y[a, 1, i], y[a, 2, i]
-            rhs[POSE * slots[a] + i] -= y0 * z0 + y1 * z1 + y2 * z2
-            for j in range(i, POSE):
+            rhs[VIEW * slots[a] + i] -= y0 * z0 + y1 * z1 + y2 * z2
+            for j in range(i, VIEW):
                 blocks[own, i, j] -= y0 * y[a, 0, j] + y1 * y[a, 1, j] + y2 * y[a, 2, j]
         for b in range(a + 1, count):
             row = pair[slots[a], slots[b]]
-            for i in range(POSE):
+            for i in range(VIEW):
                 y0, y1, y2 = y[a, 0, i], y[a, 1, i], y[a, 2, i]
-                for j in range(POSE):
+                for j in range(VIEW):
                     blocks[row, i, j] -= y0 * y[b, 0, j] + y1 * y[b, 1, j] + y2 * y[b, 2, j]
 
 
@@ -444,10 +468,10 @@ def _eliminate_from_focals(
     focals, yf, slots, y = scratch.focals, scratch.yf, scratch.slots, scratch.y
     for f in range(num_focals):
         y0, y1, y2 = yf[f, 0, 0], yf[f, 1, 0], yf[f, 2, 0]
-        system.rhs[POSE * poses + focals[f]] -= y0 * z0 + y1 * z1 + y2 * z2
+        system.rhs[VIEW * poses + focals[f]] -= y0 * z0 + y1 * z1 + y2 * z2
         for a in range(count):
-            for i in range(POSE):
-                system.border[focals[f], POSE * slots[a] + i] -= (
+            for i in range(VIEW):
+                system.border[focals[f], VIEW * slots[a] + i] -= (
                     y0 * y[a, 0, i] + y1 * y[a, 1, i] + y2 * y[a, 2, i]
                 )
         for g in range(num_focals):
@@ -512,7 +536,7 @@ def reduce_points(
                 if fresh:
                     slots[count] = slot
                     count += 1
-                _add_coupling(columns, POSE, state.rotations, image, scratch.y, count - 1, fresh)
+                _add_coupling(columns, VIEW, state.rotations, image, scratch.y, count - 1, fresh)
             if focal >= 0:
                 n = _find_or_add(focals, num_focals, focal)
                 columns[0, 0] = s.x * s.hxx
@@ -530,7 +554,7 @@ def reduce_points(
         z1 = eliminated[p, 1] * g0 + eliminated[p, 2] * g1
         z2 = eliminated[p, 3] * g0 + eliminated[p, 4] * g1 + eliminated[p, 5] * g2
         for a in range(count):
-            _whiten(eliminated, p, scratch.y, a, POSE)
+            _whiten(eliminated, p, scratch.y, a, VIEW)
         for f in range(num_focals):
             _whiten(eliminated, p, scratch.yf, f, FOCAL)
         _eliminate_from_poses(count, z0, z1, z2, layout.pair, system, scratch)
@@ -560,19 +584,20 @@ def _joint_step(
         scratch.before[k - obs.start[p], 0] = s.cost if s.visible else -1.0
         scratch.before[k - obs.start[p], 1] = s.z
         image = obs.image[k]
-        dx = dy = dz = 0.0
+        dx = dy = dz = ds = 0.0
         if layout.pose_slot[image] >= 0:
-            n = POSE * layout.pose_slot[image]
+            n = VIEW * layout.pose_slot[image]
             dx = delta[n + 1] * s.qz - delta[n + 2] * s.qy + delta[n + 3]
             dy = delta[n + 2] * s.qx - delta[n] * s.qz + delta[n + 4]
             dz = delta[n] * s.qy - delta[n + 1] * s.qx + delta[n + 5]
+            ds = delta[n + SCALE]
         focal = layout.focal_slot[layout.camera_of_image[image]]
         if focal >= 0:
-            dx += s.x * delta[POSE * len(layout.pair) + focal]
-            dy += s.y * delta[POSE * len(layout.pair) + focal]
+            dx += s.x * delta[VIEW * len(layout.pair) + focal]
+            dy += s.y * delta[VIEW * len(layout.pair) + focal]
         ux = s.hxx * dx + s.hxz * dz
         uy = s.hyy * dy + s.hyz * dz
-        uz = s.hxz * dx + s.hyz * dy + s.hzz * dz
+        uz = s.hxz * dx + s.hyz * dy + s.hzz * dz + s.hzs * ds
         g0 += rotation[image, 0, 0] * ux + rotation[image, 1, 0] * uy + rotation[image, 2, 0] * uz
         g1 += rotation[image, 0, 1] * ux + rotation[image, 1, 1] * uy + rotation[image, 2, 1] * uz
         g2 += rotation[image, 0, 2] * ux + rotation[image, 1, 2] * uy + rotation[image, 2, 2] * uz
@@ -683,8 +708,10 @@ def move_cameras(delta: Float64, layout: Layout, state: State, trial: State) -> 
         slot = layout.pose_slot[image]
         if slot < 0:
             continue
-        n = POSE * slot
+        n = VIEW * slot
         turn = rotation_of(delta[n], delta[n + 1], delta[n + 2])
+        if layout.variable_scale[image]:
+            trial.log_scales[image] += delta[n + SCALE]
         for a in range(3):
             trial.translations[image, a] += delta[n + 3 + a]
             for b in range(3):
@@ -694,7 +721,7 @@ def move_cameras(delta: Float64, layout: Layout, state: State, trial: State) -> 
                 trial.rotations[image, a, b] = value
     for camera in range(len(layout.focal_slot)):
         if layout.focal_slot[camera] >= 0:
-            scale = np.exp(delta[POSE * len(layout.pair) + layout.focal_slot[camera]])
+            scale = np.exp(delta[VIEW * len(layout.pair) + layout.focal_slot[camera]])
             trial.intrinsics[camera, 0] *= scale
             trial.intrinsics[camera, 1] *= scale
 
@@ -706,14 +733,14 @@ def assemble(system: System, boost: Float64, pair: Int32, out: Float64) -> None:
     for i in range(poses):
         for j in range(i, poses):
             if pair[i, j] >= 0:
-                for a in range(POSE):
-                    for b in range(a if i == j else 0, POSE):
-                        out[POSE * j + b, POSE * i + a] = system.blocks[pair[i, j], a, b]
+                for a in range(VIEW):
+                    for b in range(a if i == j else 0, VIEW):
+                        out[VIEW * j + b, VIEW * i + a] = system.blocks[pair[i, j], a, b]
     for f in range(len(system.corner)):
-        for a in range(POSE * poses):
-            out[POSE * poses + f, a] = system.border[f, a]
+        for a in range(VIEW * poses):
+            out[VIEW * poses + f, a] = system.border[f, a]
         for g in range(f + 1):
-            out[POSE * poses + f, POSE * poses + g] = system.corner[f, g]
+            out[VIEW * poses + f, VIEW * poses + g] = system.corner[f, g]
     for a in range(len(boost)):
         out[a, a] += boost[a]
 
@@ -724,13 +751,13 @@ def multiply(system: System, boost: Float64, pairs: Int64, x: Float64, out: Floa
     for a in range(len(x)):
         out[a] = boost[a] * x[a]
     for n in range(len(pairs)):
-        i, j = POSE * pairs[n, 0], POSE * pairs[n, 1]
-        for a in range(POSE):
+        i, j = VIEW * pairs[n, 0], VIEW * pairs[n, 1]
+        for a in range(VIEW):
             value = 0.0
-            for b in range(a if i == j else 0, POSE):
+            for b in range(a if i == j else 0, VIEW):
                 value += system.blocks[n, a, b] * x[j + b]
             out[i + a] += value
-            for b in range(a + 1 if i == j else 0, POSE):
+            for b in range(a + 1 if i == j else 0, VIEW):
                 out[j + b] += system.blocks[n, a, b] * x[i + a]
     poses = system.border.shape[1]
     for f in range(len(system.corner)):

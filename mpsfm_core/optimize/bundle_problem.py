@@ -64,11 +64,14 @@ class BundleProblem:
     ``obs_xy[j]`` (m, 2), COLMAP pixels, with standard deviation ``obs_std_px`` ((m,) or one
     number). ``obs_log_depth`` (m,): log of the depth map there, NaN where it has none (None:
     nowhere); ``obs_std_log_depth`` ((m,) or one number) its standard deviation, the square root
-    of variance / depth^2.
+    of variance / depth^2. The depth of image i is multiplied by a scale of logarithm
+    ``log_scales[i]`` ((n,), None: 0), expected at ``expected_log_scales`` (the same) give or take
+    ``std_log_scales`` ((n,) or one number, may be infinite).
 
     ``variable_pose`` (n,), ``variable_point`` (p,), ``variable_focal`` (k,), bool: what moves;
     None: all poses, all points, no focal length. A focal length keeps its aspect ratio; images
-    with the same camera share it. Gauge: hold a pose constant. Where no depth fixes the scale,
+    with the same camera share it. ``variable_scale`` (n,) bool, None: none. Gauge: hold a pose
+    constant. Where no depth fixes the scale,
     ``scale_anchor`` is the index of a variable pose of which one translation coordinate is held
     too: the one that a change of scale about the first constant pose moves most.
     """
@@ -87,20 +90,41 @@ class BundleProblem:
     variable_pose: Bool | None = None
     variable_point: Bool | None = None
     variable_focal: Bool | None = None
+    log_scales: Float64 | None = None
+    expected_log_scales: Float64 | None = None
+    std_log_scales: Float64 | float = np.inf
+    variable_scale: Bool | None = None
     scale_anchor: int | None = None
+
+
+class ScalePrior(NamedTuple):
+    """Expected logarithms of the scales of some depth maps: ``image`` (s,), ``slot`` (s,) their
+    pose slots, ``log_scale`` (s,), ``weight`` (s,) 1 / variance."""
+
+    image: Int64
+    slot: Int64
+    log_scale: Float64
+    weight: Float64
+
+    def cost(self, state: kernels.State) -> float:
+        """Half the sum of squares."""
+        off = state.log_scales[self.image] - self.log_scale
+        return 0.5 * float(off @ (self.weight * off))
 
 
 class Prepared(NamedTuple):
     """A checked problem as the kernels want it.
 
-    ``pairs`` (b, 2): pose slots of each block of the reduced matrix. ``anchor``: image and axis
-    of the translation coordinate that is held, or None. ``longest``: observations of a point.
+    ``pairs`` (b, 2): pose slots of each block of the reduced matrix. ``scale_prior``: what is
+    expected of the scales that move. ``held`` (s, 7) bool: what does not move of images with a
+    slot. ``longest``: observations of a point.
     """
 
     bundle: kernels.Bundle
     state: kernels.State
     pairs: Int64
-    anchor: tuple[int, int] | None
+    scale_prior: ScalePrior
+    held: Bool
     ranges: list[Range]
     longest: int
 
@@ -124,16 +148,23 @@ def prepare(problem: BundleProblem, options: BundleOptions) -> Prepared:
     variable_pose = _mask(problem.variable_pose, "variable_pose", images, True)
     variable_point = _mask(problem.variable_point, "variable_point", points, True)
     variable_focal = _mask(problem.variable_focal, "variable_focal", cameras, False)
-    poses = np.count_nonzero(variable_pose)
+    variable_scale = _mask(problem.variable_scale, "variable_scale", images, False)
+    moving = variable_pose | variable_scale
+    poses = np.count_nonzero(moving)
     layout = kernels.Layout(
         _indices(problem.camera_of_image, "camera_of_image", images, cameras),
-        _slots(variable_pose),
+        _slots(moving),
         _slots(variable_focal),
         variable_point,
+        variable_scale,
         np.full((poses, poses), -1, dtype=np.int32),
     )
     kernels.number_pairs(obs, layout.pose_slot, variable_point, layout.pair)
     pairs = np.argwhere(layout.pair >= 0)
+    held = np.repeat(~variable_pose[:, None], kernels.VIEW, axis=1)
+    held[:, kernels.SCALE] = ~variable_scale
+    if problem.scale_anchor is not None:
+        held[_scale_gauge(problem.scale_anchor, variable_pose, state)] = True
     robust = kernels.Robust(
         int(options.reprojection_loss),
         options.reprojection_scale,
@@ -144,7 +175,8 @@ def prepare(problem: BundleProblem, options: BundleOptions) -> Prepared:
         kernels.Bundle(obs, layout, robust),
         state,
         pairs,
-        _scale_gauge(problem.scale_anchor, variable_pose, state),
+        _scale_prior(problem, variable_scale, layout.pose_slot),
+        held[moving],
         _ranges(obs.start, len(pairs)),
         int(np.diff(obs.start).max(initial=0)),
     )
@@ -174,6 +206,7 @@ def _state(problem: BundleProblem) -> kernels.State:
     return kernels.State(
         _numbers(problem.rotations, "rotations", (count, 3, 3)).copy(),
         _numbers(problem.translations, "translations", (count, 3)).copy(),
+        _log_scales(problem.log_scales, "log_scales", count).copy(),
         _numbers(problem.intrinsics, "intrinsics", (len(problem.intrinsics), 4)).copy(),
         _numbers(problem.points, "points", (len(problem.points), 3)).copy(),
     )
@@ -207,6 +240,23 @@ def _sorted_by_point(
     kernels.sort_by(image, np.arange(len(image)), np.zeros(images + 2, np.int64), by_image)
     kernels.sort_by(point, by_image, start, order)
     return start[:-1], order
+
+
+def _log_scales(values: Float64 | None, name: str, count: int) -> Float64:
+    return _numbers(np.zeros(count) if values is None else values, name, (count,))
+
+
+def _scale_prior(
+    problem: BundleProblem, variable: Bool, pose_slot: NDArray[np.int32]
+) -> ScalePrior:
+    count = len(variable)
+    expected = _log_scales(problem.expected_log_scales, "expected_log_scales", count)
+    std = np.broadcast_to(np.asarray(problem.std_log_scales, dtype=np.float64), (count,))
+    if not (std > 0).all():
+        raise DataError("std_log_scales", "must be positive")
+    image = np.flatnonzero(variable & np.isfinite(std))
+    slot = pose_slot[image].astype(np.int64)
+    return ScalePrior(image, slot, expected[image], 1.0 / std[image] ** 2)
 
 
 def _numbers(values: ArrayLike, name: str, shape: tuple[int, ...]) -> Float64:
@@ -247,22 +297,19 @@ def _slots(variable: Bool) -> NDArray[np.int32]:
     return np.where(variable, np.cumsum(variable) - 1, -1).astype(np.int32)
 
 
-def _scale_gauge(
-    anchor: int | None, variable: Bool, state: kernels.State
-) -> tuple[int, int] | None:
-    if anchor is None:
-        return None
+def _scale_gauge(anchor: int, variable: Bool, state: kernels.State) -> tuple[int, int]:
+    """The image and the coordinate of its pose that is held for a scale."""
     if not (0 <= anchor < len(variable) and variable[anchor]) or variable.all():
         raise DataError("scale_anchor", "must be a variable pose beside a constant one")
     first = int(np.argmin(variable))
     center = -state.rotations[first].T @ state.translations[first]
     offset = state.rotations[anchor] @ center + state.translations[anchor]
-    return anchor, int(np.argmax(np.abs(offset)))
+    return anchor, 3 + int(np.argmax(np.abs(offset)))
 
 
 def _ranges(start: Int64, pairs: int) -> list[Range]:
     """Ranges of points with about equally many observations; the problem alone decides."""
-    room = MAX_BUFFER_BYTES // (8 * 36 * max(pairs, 1))
+    room = MAX_BUFFER_BYTES // (8 * int(kernels.VIEW) ** 2 * max(pairs, 1))
     count = max(1, min(MAX_RANGES, int(start[-1]) // RANGE_SIZE, room))
     ends = np.searchsorted(start, start[-1] * np.arange(1, count) / count)
     edges = [0, *ends.tolist(), len(start) - 1]

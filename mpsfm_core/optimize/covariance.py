@@ -27,7 +27,8 @@ def point_covariances(problem: BundleProblem, options: BundleOptions | None = No
     """
     options = options or BundleOptions()
     nothing = np.zeros(len(problem.rotations), dtype=np.bool_)
-    p = prepare(replace(problem, variable_pose=nothing, scale_anchor=None), options)
+    held = replace(problem, variable_pose=nothing, variable_scale=None, scale_anchor=None)
+    p = prepare(held, options)
     covariances = np.empty((len(p.state.points), 3, 3))
     scratch = [kernels.make_scratch(0) for _ in p.ranges]
     with workers(p.ranges, options.threads) as run:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mpsfm_core import jit
 from mpsfm_core.data import Float64, Pose
-from mpsfm_core.optimize.bundle_kernels import MIN_DEPTH, POSE, rotation_of
+from mpsfm_core.optimize.bundle_kernels import MIN_DEPTH, rotation_of
 
 DAMPING = 1e-6
 """Relative, of the normal equations: keeps few matches from being singular (ours)."""
@@ -56,6 +56,8 @@ class _Foot(NamedTuple):
     av: float
 
 
+POSE = np.int64(6)
+"""Numbers of a pose."""
 _kernel, _helper = jit.kernel(), jit.helper()
 
 

@@ -21,6 +21,7 @@ class DepthMap:
         keypoint_valid: (n,) bool, the prior is valid around the keypoint.
         active: whether the scale has been set, so that the depth means something in the world.
         keypoint_log_std: (n,) float64, std of the prior's log depth at the keypoints.
+        typical_log_std: its median where the prior is valid; NaN without such a keypoint.
     """
 
     def __init__(self, image: MappingImage) -> None:
@@ -36,6 +37,8 @@ class DepthMap:
         ).astype(np.float32)
         self._prior_at, self.keypoint_valid = self._sample(image.depth.depth)
         self.keypoint_log_std: Float64 = self._sample(self.log_std)[0]
+        known = self.keypoint_log_std[self.keypoint_valid]
+        self.typical_log_std = float(np.median(known)) if len(known) else np.nan
         self.scale = 1.0
         self.active = False
         self.refined: RefinedDepth | None = None

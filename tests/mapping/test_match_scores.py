@@ -71,7 +71,7 @@ def test_matches_that_the_matcher_doubts_hardly_bend_the_poses() -> None:
         problem = problem_with_doubtful_matches(seed)
         weighed += pose_errors_deg(problem, weigh_by_score=True)
         alike += pose_errors_deg(problem, weigh_by_score=False)
-    assert np.mean(weighed) < 0.7 * np.mean(alike)
+    assert np.mean(weighed) < 0.75 * np.mean(alike)
 
 
 def test_keypoints_weigh_by_their_best_match_relative_to_the_mean() -> None:

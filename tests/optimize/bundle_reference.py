@@ -143,23 +143,24 @@ def ceres_adjuster(
 
 
 class LogDepthCost(pyceres.CostFunction):  # type: ignore[misc]
-    """(log z - log d) / std on a pose (quaternion xyzw, translation) and a point."""
+    """(log z - log d - s) / std on a pose (quaternion xyzw, translation), a point and the scale."""
 
     def __init__(self, log_depth: float, std: float) -> None:
         super().__init__()
         self.set_num_residuals(1)
-        self.set_parameter_block_sizes([7, 3])
+        self.set_parameter_block_sizes([7, 3, 1])
         self.log_depth = log_depth
         self.std = std
 
     def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
         """Ceres' callback."""
-        (qx, qy, qz, qw, _, _, tz), (x, y, z) = parameters
+        (qx, qy, qz, qw, _, _, tz), (x, y, z), (log_scale,) = parameters
         row = np.array(
             [2 * (qx * qz - qy * qw), 2 * (qy * qz + qx * qw), 1 - 2 * (qx * qx + qy * qy)]
         )
         depth = row @ (x, y, z) + tz
-        residuals[0] = (np.log(depth) - self.log_depth) / self.std if depth > 0 else 0.0
+        off = np.log(depth) - self.log_depth - log_scale if depth > 0 else 0.0
+        residuals[0] = off / self.std
         scale = 1 / (depth * self.std) if depth > 0 else 0.0
         if jacobians is not None and jacobians[0] is not None:
             by_quaternion = [
@@ -171,18 +172,42 @@ class LogDepthCost(pyceres.CostFunction):  # type: ignore[misc]
             jacobians[0][:] = scale * np.array([*by_quaternion, 0, 0, 1])
         if jacobians is not None and jacobians[1] is not None:
             jacobians[1][:] = scale * row
+        if jacobians is not None and jacobians[2] is not None:
+            jacobians[2][:] = -1 / self.std if depth > 0 else 0.0
+        return True
+
+
+class ScaleCost(pyceres.CostFunction):  # type: ignore[misc]
+    """(s - expected) / std of the logarithm of a scale."""
+
+    def __init__(self, expected: float, std: float) -> None:
+        super().__init__()
+        self.set_num_residuals(1)
+        self.set_parameter_block_sizes([1])
+        self.expected = expected
+        self.std = std
+
+    def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
+        """Ceres' callback."""
+        residuals[0] = (parameters[0][0] - self.expected) / self.std
+        if jacobians is not None and jacobians[0] is not None:
+            jacobians[0][:] = 1 / self.std
         return True
 
 
 def solve_with_ceres(
     problem: BundleProblem, *, refine_focal: bool = False
-) -> tuple[float, float, pycolmap.Reconstruction]:
-    """Initial and final cost of the problem in Ceres, and the reconstruction it leaves.
+) -> tuple[float, float, pycolmap.Reconstruction, Float64]:
+    """Initial and final cost of the problem in Ceres, the reconstruction it leaves, and the
+    logarithms of the scales (n,).
 
     All poses but the first and all points are variable, as :func:`make_problem` has it.
     """
     rec = to_pycolmap(problem)
     plain = problem.obs_log_depth is None
+    count = len(problem.rotations)
+    given = np.zeros(count) if problem.log_scales is None else problem.log_scales
+    log_scales = [np.array([value]) for value in given]
     adjuster = ceres_adjuster(rec, 1e-13, refine_focal=refine_focal, fix_scale=plain)
     if not plain:
         ceres = adjuster.problem
@@ -193,11 +218,22 @@ def solve_with_ceres(
             pose = rec.images[int(problem.obs_image[k]) + 1].frame.rig_from_world.params
             point = rec.points3D[int(problem.obs_point[k]) + 1].xyz
             keep.append(LogDepthCost(problem.obs_log_depth[k], std[k]))
-            ceres.add_residual_block(keep[-1], loss, [pose, point])
+            scale = log_scales[int(problem.obs_image[k])]
+            ceres.add_residual_block(keep[-1], loss, [pose, point, scale])
         # a constant pose becomes variable with the first residual that is added on it
         ceres.set_parameter_block_constant(rec.images[1].frame.rig_from_world.params)
+        free = np.zeros(count, bool) if problem.variable_scale is None else problem.variable_scale
+        expected = np.zeros(count)
+        if problem.expected_log_scales is not None:
+            expected = problem.expected_log_scales
+        for i, scale in enumerate(log_scales):
+            if not free[i]:
+                ceres.set_parameter_block_constant(scale)
+            elif np.isfinite(problem.std_log_scales):
+                keep.append(ScaleCost(expected[i], float(problem.std_log_scales)))
+                ceres.add_residual_block(keep[-1], None, [scale])
     summary = adjuster.solve().ceres_summary
-    return summary.initial_cost, summary.final_cost, rec
+    return summary.initial_cost, summary.final_cost, rec, np.concatenate(log_scales)
 
 
 def whitened_residuals(

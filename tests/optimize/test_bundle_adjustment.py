@@ -26,11 +26,11 @@ from tests.optimize.bundle_reference import (
 )
 
 TIGHT = BundleOptions(function_tolerance=1e-13, max_iterations=1000)
-PARAMETERS = ("rotations", "translations", "intrinsics", "points")
+PARAMETERS = ("rotations", "translations", "log_scales", "intrinsics", "points")
 
 
 def assert_same_optimum(start: BundleProblem, *, refine_focal: bool = False) -> None:
-    initial, final, rec = solve_with_ceres(start, refine_focal=refine_focal)
+    initial, final, rec, log_scales = solve_with_ceres(start, refine_focal=refine_focal)
     result = adjust_bundle(start, TIGHT)
     assert result.converged
     assert result.initial_cost == pytest.approx(initial, rel=1e-12)
@@ -43,6 +43,7 @@ def assert_same_optimum(start: BundleProblem, *, refine_focal: bool = False) -> 
         -np.einsum("nji,nj->ni", r, t)
         for r, t in ((result.rotations, result.translations), (turns, shifts))
     ]
+    np.testing.assert_allclose(result.log_scales, log_scales, atol=1e-6)
     if start.obs_log_depth is None:
         # the scale is a convention: Ceres may hold another coordinate of the second camera
         centers = [(c - c[0]) / np.linalg.norm(c[1] - c[0]) for c in centers]
@@ -55,6 +56,57 @@ def assert_same_optimum(start: BundleProblem, *, refine_focal: bool = False) -> 
 @pytest.mark.parametrize("seed", range(3))
 def test_same_optimum_as_ceres_with_depth(seed: int) -> None:
     assert_same_optimum(perturb(make_problem(6, 60, 3.5), seed, amount=2.0))
+
+
+@pytest.mark.parametrize("std", [0.02, np.inf])
+@pytest.mark.parametrize("expected", [None, 0.05])
+def test_same_optimum_as_ceres_with_scales_of_depth(std: float, expected: float | None) -> None:
+    """Depth maps that are off by 10 % each; beside what is expected of that, and without."""
+    assert_same_optimum(with_scales(perturb(make_problem(6, 60, 3.5), 0), std, expected))
+
+
+def with_scales(problem: BundleProblem, std: float, expected: float | None) -> BundleProblem:
+    """All scales but the third's are to be found, also of the image whose pose is held; the depth
+    of each image is off by 10 %."""
+    count = len(problem.rotations)
+    rng = np.random.default_rng(0)
+    off = rng.normal(0, 0.1, count)
+    return replace(
+        problem,
+        obs_log_depth=problem.obs_log_depth + off[problem.obs_image],
+        log_scales=rng.normal(0, 0.01, count),
+        expected_log_scales=None if expected is None else np.full(count, expected),
+        std_log_scales=std,
+        variable_scale=np.arange(count) != 2,
+    )
+
+
+def test_scales_of_exact_depth_are_found() -> None:
+    """Beside the first image's, which is held."""
+    truth = exact(make_problem(6, 200, 4))
+    off = np.array([0.0, 0.1, -0.2, 0.3, 0.0, -0.1])
+    wrong = replace(truth, obs_log_depth=truth.obs_log_depth + off[truth.obs_image])
+    free = replace(wrong, variable_scale=np.arange(6) > 0)
+    for options in (TIGHT, TIGHT.model_copy(update={"dense_poses": 0})):
+        result = adjust_bundle(perturb(free, 0, 0.5), options)
+        np.testing.assert_allclose(result.log_scales, -off, atol=1e-6)
+        np.testing.assert_allclose(result.points, truth.points, atol=1e-5)
+
+
+def test_scales_move_beside_fixed_poses() -> None:
+    truth = exact(make_problem(5, 300, 3))
+    off = np.array([0.1, 0.2, -0.2, 0.3, -0.1])
+    start = replace(
+        truth,
+        points=perturb(truth, 0, 3.0).points,
+        obs_log_depth=truth.obs_log_depth + off[truth.obs_image],
+        variable_pose=np.zeros(5, dtype=np.bool_),
+        variable_scale=np.ones(5, dtype=np.bool_),
+    )
+    result = adjust_bundle(start, TIGHT)
+    assert_fixed(start, result, ("rotations", "translations", "intrinsics"))
+    np.testing.assert_allclose(result.log_scales, -off, atol=1e-6)
+    np.testing.assert_allclose(result.points, truth.points, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -122,8 +174,9 @@ def exact(problem: BundleProblem) -> BundleProblem:
 
 
 def assert_fixed(problem: BundleProblem, result: BundleResult, names: tuple[str, ...]) -> None:
+    given = replace(problem, log_scales=np.zeros(len(problem.rotations)))
     for name in names:
-        np.testing.assert_array_equal(getattr(result, name), getattr(problem, name))
+        np.testing.assert_array_equal(getattr(result, name), getattr(given, name))
 
 
 def test_points_only() -> None:
@@ -232,7 +285,8 @@ def test_input_is_neither_changed_nor_kept() -> None:
     for name, array in arrays.items():
         np.testing.assert_array_equal(array, copies[name])
     for name in PARAMETERS:
-        assert not np.shares_memory(getattr(result, name), getattr(start, name))
+        given = getattr(start, name)
+        assert given is None or not np.shares_memory(getattr(result, name), given)
 
 
 def test_integer_types_and_strides_of_the_input_do_not_matter() -> None:
@@ -373,6 +427,10 @@ def test_iteration_limit_is_reported() -> None:
         ("variable_pose", np.ones(5)),
         ("variable_point", np.ones(3, dtype=np.bool_)),
         ("variable_focal", np.ones(2, dtype=np.bool_)),
+        ("log_scales", np.zeros(4)),
+        ("expected_log_scales", np.full(5, np.nan)),
+        ("std_log_scales", 0.0),
+        ("variable_scale", np.ones(4, dtype=np.bool_)),
         ("scale_anchor", 0),
         ("scale_anchor", 7),
     ],

@@ -17,7 +17,8 @@ STEP = 1e-6
 
 def small_problem() -> BundleProblem:
     """Everything at once: two cameras with focal lengths to refine, a constant and variable
-    poses and points, a track that sees an image twice, missing depth, a single view."""
+    poses, scales of depth and points, a track that sees an image twice, missing depth, a single
+    view."""
     problem = perturb(make_problem(5, 12, 3), seed=3)
     # the longest track sees its last image twice
     point = np.bincount(problem.obs_point).argmax()
@@ -40,11 +41,19 @@ def small_problem() -> BundleProblem:
         obs_std_log_depth=rng.uniform(0.02, 0.1, len(keep)),
         variable_point=np.arange(12) != 5,
         variable_focal=np.array([True, True]),
+        log_scales=rng.normal(0, 0.05, 5),
+        expected_log_scales=rng.normal(0, 0.05, 5),
+        std_log_scales=rng.uniform(0.05, 0.1, 5),
+        variable_scale=np.array([True, True, False, True, True]),
+        variable_pose=np.array([False, True, True, True, True]),
     )
 
 
 def moved(p: Prepared, delta: Float64, points: Float64) -> kernels.State:
-    """The state moved by a camera-side vector and point displacements (p, 3)."""
+    """The state moved by a camera-side vector, of which what is held stays, and point displacements
+    (p, 3)."""
+    delta = delta.copy()
+    delta[: p.held.size][p.held.ravel()] = 0.0
     trial = kernels.State(*(array.copy() for array in p.state))
     kernels.move_cameras(delta, p.bundle.layout, p.state, trial)
     trial.points[:] += points
@@ -58,7 +67,7 @@ def sights(p: Prepared, state: kernels.State) -> list[kernels.Sight]:
 
 
 def residuals(p: Prepared, state: kernels.State) -> Float64:
-    """(3 m,) whitened residuals, computed in plain numpy."""
+    """(3 m + s,) whitened residuals, those of scales last, computed in plain numpy."""
     obs, layout = p.bundle.obs, p.bundle.layout
     points = np.repeat(np.arange(len(state.points)), np.diff(obs.start))
     camera = np.einsum("mij,mj->mi", state.rotations[obs.image], state.points[points])
@@ -66,13 +75,17 @@ def residuals(p: Prepared, state: kernels.State) -> Float64:
     k = state.intrinsics[layout.camera_of_image[obs.image]]
     xy = k[:, :2] * camera[:, :2] / camera[:, 2:] + k[:, 2:]
     pixel = (xy - obs.xy) * obs.weight[:, None]
-    depth = (np.log(camera[:, 2]) - obs.log_depth) * obs.depth_weight
-    return np.column_stack([pixel, depth]).ravel()
+    scaled = obs.log_depth + state.log_scales[obs.image]
+    depth = (np.log(camera[:, 2]) - scaled) * obs.depth_weight
+    prior = p.scale_prior
+    scales = (state.log_scales[prior.image] - prior.log_scale) * np.sqrt(prior.weight)
+    return np.concatenate([np.column_stack([pixel, depth]).ravel(), scales])
 
 
 def numeric_jacobian(p: Prepared) -> Float64:
-    """Jacobian (3 m, d + 3 v) of the residuals: camera side, then variable points."""
-    size = sum(p.bundle.layout.pair.shape[:1]) * 6 + int(p.bundle.layout.focal_slot.max()) + 1
+    """Jacobian (3 m + s, d + 3 v) of the residuals: camera side, then variable points."""
+    poses, focals = len(p.bundle.layout.pair), int(p.bundle.layout.focal_slot.max()) + 1
+    size = kernels.VIEW * poses + focals
     variable = np.flatnonzero(p.bundle.layout.variable_point)
     columns = []
     for n in range(size + 3 * len(variable)):
@@ -103,7 +116,8 @@ def test_gradient_of_every_loss(reprojection_loss: Loss, depth_loss: Loss) -> No
     gradient = np.concatenate([normal.total.gradient, by_point[variable].ravel()])
 
     def cost(delta: Float64, points: Float64) -> float:
-        return sum(sight.cost for sight in sights(p, moved(p, delta, points)))
+        state = moved(p, delta, points)
+        return p.scale_prior.cost(state) + sum(sight.cost for sight in sights(p, state))
 
     size = len(normal.total.gradient)
     numeric = np.empty_like(gradient)
@@ -174,7 +188,8 @@ def test_step_solves_the_damped_normal_equations(sparse: bool, monkeypatch) -> N
     size = len(gradient) - 3 * p.bundle.layout.variable_point.sum()
     diagonal = np.diagonal(matrix).copy()
     diagonal[size:] = np.repeat(diagonal[size:].reshape(-1, 3).mean(axis=1), 3)
-    expected = np.linalg.solve(matrix + damping * np.diag(diagonal), -gradient)
+    held = diagonal == 0  # scales that are constant
+    expected = np.linalg.solve(matrix + np.diag(damping * diagonal + held), -gradient)
     with workers(p.ranges, 1) as run:
         normal = _NormalEquations(p, options, run)
         cost = normal.linearize(p.state, damping)
