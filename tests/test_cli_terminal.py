@@ -96,13 +96,32 @@ def go_through(left: TimeLeft, clock: Clock, seconds_a_unit: dict[str, float]) -
 def test_the_second_run_is_foretold_by_the_first(tmp_path: Path) -> None:
     clock = Clock()
     speeds = {"features": 2.0, "matching": 3.0, "verification": 0.1, "depth": 0.1}
-    speeds |= {"normals": 0.2, "mapping": 9.0, "results": 1.0}
+    speeds |= {"normals": 0.2, "mapping": 9.0, "dense": 4.0, "results": 1.0, "report": 0.5}
     first = TimeLeft(tmp_path, clock)
     assert first.seconds() is None
     go_through(first, clock, speeds)
     first.keep()
     errors = go_through(TimeLeft(tmp_path, clock), clock, speeds)
     assert np.abs(errors).max() < 0.15
+
+
+def test_a_stage_that_is_switched_off_is_not_waited_for(tmp_path: Path) -> None:
+    clock = Clock()
+    left = TimeLeft(tmp_path, clock)
+    left.started("features", 10)
+    left.finished("features")
+    left.started("mapping", 10)
+    with_dense = left.seconds()
+    left.finished("mapping")
+    left.started("results", 10)
+    without = left.seconds()
+    assert with_dense is not None
+    assert without is not None
+    assert with_dense > without + 10  # ten images of mapping, and of dense
+    left.finished("results")
+    left.started("report", 10)
+    left.finished("report")
+    assert left.seconds() == 0
 
 
 def test_a_damaged_record_of_speeds_is_no_worry(tmp_path: Path) -> None:

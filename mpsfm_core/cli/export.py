@@ -48,8 +48,9 @@ def export(
     if quiet:
         return
     typer.echo(f"{done['images']} images, {done['points']} points; {done['orientation']}")
-    metres = done["metres_per_unit"]
-    typer.echo(f"  unit {'unknown' if metres is None else f'{metres:.3g} m'}")
+    metres, spread = done["metres_per_unit"], done["scale_spread"]
+    unit = "unknown" if metres is None else f"{metres:.3g} m, to about {spread:.0%}"
+    typer.echo(f"  unit {unit}")
     for name in done["left_out"]:
         typer.echo(f"  left out, its pose is not confirmed: {name}")
     typer.echo(f"written to {done['output']}")

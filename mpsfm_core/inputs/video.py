@@ -77,7 +77,8 @@ def extract_frames(
         (fresh / FRAMES).mkdir()
         for number, frame in _frames(video, frozenset(chosen)):
             path = fresh / FRAMES / f"frame_{number:06d}.jpg"
-            cv2.imwrite(str(path), frame, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            encoded = cv2.imencode(path.suffix, frame, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1]
+            path.write_bytes(encoded.tobytes())
         (fresh / FRAMES / _LIST).write_text(json.dumps(origin), encoding="utf-8")
     return folder
 

@@ -77,7 +77,7 @@
 
   const scaleWord = (metric) => (metric === null ? "unknown" : metric.trusted ? "metres" : "uncertain");
   const scaleDetail = (metric) =>
-    metric === null ? "no depth in metres" : `${plural(metric.num_images, "depth map")}, spread ${percent(metric.spread)}`;
+    metric === null ? "no depth in metres" : `by ${number(metric.num_images)} ${metric.by}, spread ${percent(metric.spread)}`;
 
   // ---------------------------------------------------------------- one photo
   const MAPS = [["photo", "Photo"], ["prior", "Prior"], ["refined", "Refined"], ["std", "Std"], ["normals", "Normals"]];

@@ -140,6 +140,7 @@ def _describe(source: Source, format_name: str) -> dict[str, Any]:
         "points": source.model.num_points3D(),
         "left_out": list(source.left_out),
         "metres_per_unit": source.metres_per_unit,
+        "scale_spread": source.scale_spread,
         "orientation": orientation,
         "world_from_model": source.world_from_model.matrix().tolist(),
     }

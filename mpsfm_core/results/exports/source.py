@@ -88,12 +88,21 @@ class Source:
     @property
     def metres_per_unit(self) -> float | None:
         """Metres in a unit of the exported world, None if unknown."""
-        described = self.summary.get("reconstructions") or [{}]
-        metric = described[0].get("metric_scale")
-        if metric is None:
+        if self._metric is None:
             return None
-        before = 1.0 if metric["trusted"] else float(metric["metres_per_unit"])
+        before = 1.0 if self._metric["trusted"] else float(self._metric["metres_per_unit"])
         return before / float(self.world_from_model.scale)
+
+    @property
+    def scale_spread(self) -> float | None:
+        """Relative standard deviation of the scale among what told it, None if unknown."""
+        return None if self._metric is None else float(self._metric["spread"])
+
+    @property
+    def _metric(self) -> Mapping[str, Any] | None:
+        described = self.summary.get("reconstructions") or [{}]
+        metric: Mapping[str, Any] | None = described[0].get("metric_scale")
+        return metric
 
     @cached_property
     def names(self) -> list[str]:
@@ -139,7 +148,8 @@ class Source:
         return self.gravity is not None or self.is_georeferenced
 
     def turned(self) -> Source:
-        """With gravity along -z, and the middle of the points, else of the cameras, as origin."""
+        """In metres where these are known, with gravity along -z; the origin is the middle of the
+        points, else of the cameras."""
         gravity = estimate_gravity(self._rotations(), self._world_normals())
         first = self._rotations()[0]
         rotation = rotation_to_z(gravity.up, first[0])
@@ -147,7 +157,8 @@ class Source:
         if not len(points):
             points = np.stack([image.projection_center() for image in self.registered()])
         middle = np.median(points @ rotation.T, axis=0)
-        moved = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation), -middle)
+        scale = self.metres_per_unit or 1.0
+        moved = pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), -scale * middle)
         return replace(self._transformed(moved), gravity=gravity)
 
     def registered(self) -> list[pycolmap.Image]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -249,6 +250,31 @@ def test_turned_worlds_have_gravity_down_and_their_middle_at_the_origin(
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     middle = np.median([point.xyz for point in model.points3D.values()], axis=0)
     np.testing.assert_allclose(middle, 0, atol=1e-9)
+
+
+def test_a_turned_world_is_in_metres_as_far_as_they_are_known(result: Path, tmp_path: Path) -> None:
+    """A scale that is not trusted stays out of the model, and goes into what is rendered."""
+    folder = tmp_path / "result"
+    shutil.copytree(result, folder)
+    summary = json.loads((folder / "summary.json").read_text())
+    metric = {"metres_per_unit": 2.0, "spread": 0.4, "num_images": 3, "trusted": False}
+    summary["reconstructions"] = [{"metric_scale": metric}]
+    (folder / "summary.json").write_text(json.dumps(summary))
+    assert export(folder, "colmap-text")["metres_per_unit"] == 2.0
+    described = export(folder, "gsplat")
+    assert described["metres_per_unit"] == 1.0
+    assert described["scale_spread"] == 0.4
+    exported = folder / "exports" / "gsplat"
+    model = pycolmap.Reconstruction(str(exported / "sparse" / "0"))
+    points = np.array([model.points3D[i].xyz for i in sorted(model.points3D)])
+    before = np.array([p.xyz for _, p in sorted(model_of(result).points3D.items())])
+    lengths = [np.linalg.norm(cloud[1:] - cloud[0], axis=1) for cloud in (points, before)]
+    np.testing.assert_allclose(lengths[0], 2 * lengths[1], rtol=1e-6)
+    image = model.find_image_with_name("a/0.png")
+    with np.load(exported / "maps" / "a" / "0.png.npz") as maps:
+        camera = model.cameras[image.camera_id]
+        assert median_error(image, camera, maps["depth"], points) < 0.01
+        assert np.median(maps["depth_std"] / maps["depth"]) == pytest.approx(0.01, rel=0.01)
 
 
 def test_a_colmap_model_is_exported_with_the_photos_that_are_named(
