@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import importlib.util
 import re
 import shlex
@@ -12,6 +14,8 @@ from pathlib import Path
 import pytest
 import typer.main
 
+import mpsfm_core
+from mpsfm_core import load_config
 from mpsfm_core.cli import build_app
 
 ROOT = Path(__file__).parents[1]
@@ -38,6 +42,33 @@ def test_commands_are_understood(page: Path) -> None:
         node.make_context("mpsfm", arguments)
 
 
+def blocks_of(page: Path, language: str) -> list[str]:
+    """The blocks of a language in a page."""
+    text = page.read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_configurations_are_understood(page: Path, tmp_path: Path) -> None:
+    for number, block in enumerate(blocks_of(page, "yaml")):
+        if block.startswith("extends:"):
+            file = tmp_path / f"{number}.yaml"
+            file.write_text(block)
+            load_config(file)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_asks_for_what_there_is(page: Path) -> None:
+    for block in blocks_of(page, "python"):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mpsfm_core"):
+                module = importlib.import_module(str(node.module))
+                for alias in node.names:
+                    assert hasattr(module, alias.name), f"{node.module}.{alias.name}"
+            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "mpsfm_core":
+                assert hasattr(mpsfm_core, node.attr), node.attr
+
+
 def test_the_first_pages_have_commands() -> None:
     assert len(commands_of(ROOT / "docs" / "first-run.md")) >= 3
     assert len(commands_of(ROOT / "README.md")) >= 3
@@ -57,6 +88,8 @@ def test_the_site_builds_and_asks_no_other_server(tmp_path: Path) -> None:
     assert (tmp_path / "pictures" / "report.jpg").is_file()
     reference = (tmp_path / "reference.html").read_text(encoding="utf-8")
     assert 'id="mpsfm_core.data.DepthPrior"' in reference
+    for picture in tmp_path.rglob("*.svg"):
+        assert "url(http" not in picture.read_text().replace('"', ""), picture.name
     for page in tmp_path.glob("*.html"):
         fetched = re.findall(
             r"<(?:script|img|link)[^>]*(?:src|href)=\"(https?://[^\"]*)", page.read_text()

@@ -39,8 +39,10 @@ def showing_progress(registry: Registry, quiet: bool) -> Iterator[None]:
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=console) as progress:
-        registry.register(Bars(progress, left), name="progress bars")
+        bars = Bars(progress, left)
+        registry.register(bars, name="progress bars")
         yield
+        bars.end()
         left.keep()
 
 
@@ -89,6 +91,11 @@ class Bars:
         """Registered images are the mapper's progress."""
         self._registered = f"{registered} of {total} images registered"
         self.mpsfm_stage_progress("mapping", registered, total)
+
+    def end(self) -> None:
+        """The whole run is done."""
+        done = " - ".join(("run", *filter(None, (self._registered,))))
+        self._progress.update(self._run, description=done, completed=1, total=1)
 
     def _tell(self) -> None:
         """The line of the whole run."""

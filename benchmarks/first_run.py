@@ -1,0 +1,119 @@
+"""A new user's way: a phone's video, a reconstruction in the browser, a folder for splatting.
+
+    python -m benchmarks.first_run [--gsplat FOLDER]
+
+Films the first frames of hololens_room (a real room, a camera worn on the head, motion blur) as
+H.264, which needs PyAV (pip install av); gives the commands that docs/first-run.md gives, opens the
+page in headless Chromium, and reads the exported folder with gsplat's own loader, if FOLDER is the
+``examples`` folder of its repository. Prints a table; processor time is what other work on the
+machine hardly changes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks._browser import headless
+from benchmarks._scenes import shared_folder
+
+FPS = 10
+_LOADER = """
+import sys
+import torch
+sys.path.insert(0, sys.argv[1])
+from datasets.colmap import Dataset, Parser
+parser = Parser(data_dir=sys.argv[2], normalize=True)
+for split in ("train", "val"):
+    for item in Dataset(parser, split=split, load_depths=True):
+        assert item["image"].shape[-1] == 3 and torch.isfinite(item["camtoworld"]).all()
+        assert len(item["points"]) > 0 and (item["depths"] > 0).all()
+print(len(parser.image_names), "images and", len(parser.points), "points")
+"""
+
+
+def film(photos: Sequence[Path], video: Path) -> None:
+    """Encode photos as H.264."""
+    try:
+        import av
+    except ImportError as error:
+        raise SystemExit("pip install av") from error
+    import cv2
+
+    with av.open(str(video), "w") as container:
+        stream = container.add_stream("libx264", rate=FPS)
+        pictures = [cv2.imread(str(photo)) for photo in photos]
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt = "yuv420p"
+        for picture in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        container.mux(stream.encode())
+
+
+def timed(command: Sequence[str]) -> tuple[float, float, str]:
+    """Seconds of processor and of the clock that a command takes, and what it prints."""
+    before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    if ended.returncode:
+        raise SystemExit(f"{' '.join(command)} ended with {ended.returncode}")
+    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return used, time.perf_counter() - started, ended.stdout
+
+
+def look(page: Path) -> str:
+    """Open a report and wait until its scene is drawn."""
+    with headless() as browser:
+        started = time.perf_counter()
+        browser.get(page.resolve().as_uri())
+        while not browser.execute_script("return window.report !== undefined"):
+            if time.perf_counter() - started > 300:
+                raise SystemExit(f"{page}: does not show its scene")
+            time.sleep(0.1)
+        faults = [line for line in browser.get_log("browser") if line["level"] == "SEVERE"]
+        if faults:
+            raise SystemExit(f"{page}: {faults[0]['message']}")
+        browser.save_screenshot(str(page.with_name("report.png")))
+        return str(browser.execute_script("return document.getElementById('verdict').innerText"))
+
+
+def main() -> None:
+    """Read the command line and go through the commands."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--output", type=Path, default=Path("first-run"))
+    parser.add_argument("--frames", type=int, default=12)
+    parser.add_argument("--gsplat", type=Path, help="examples/ of gsplat's repository")
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    photos = sorted((shared_folder() / "data" / "hololens_room" / "images").iterdir())
+    video, out = options.output / "room.mp4", options.output / "out"
+    film(photos[: options.frames], video)
+    os.environ.setdefault("MPSFM_CACHE", str(options.output / "cache"))
+    mpsfm = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+    rows = []
+    for arguments in (
+        ["reconstruct", str(video), "-o", str(out)],
+        ["export", str(out), "--to", "gsplat"],
+    ):
+        used, clock, said = timed([*mpsfm, *arguments])
+        rows.append((f"`mpsfm {' '.join(arguments)}`", used, clock, said.splitlines()[0]))
+    rows.append(("`report.html` in Chromium", None, None, look(out / "report.html")))
+    if options.gsplat is not None:
+        folder = out / "exports" / "gsplat"
+        loader = [sys.executable, "-c", _LOADER, str(options.gsplat), str(folder)]
+        used, clock, said = timed(loader)
+        rows.append(("gsplat's own loader", used, clock, said.splitlines()[-1]))
+    print("| step | processor s | clock s | it says |\n| --- | ---: | ---: | --- |")
+    for step, used, clock, said in rows:
+        numbers = ["" if value is None else f"{value:.0f}" for value in (used, clock)]
+        print(f"| {step} | {numbers[0]} | {numbers[1]} | {said} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""All pictures of the documentation, from the sample scene: ``python -m benchmarks.pictures``.
+
+Reconstructs the sample scene on a pseudo terminal, and two of its photos that share nothing, which
+fails; then looks at both reports and at the viewer in headless Chromium. Needs chromium,
+chromedriver, selenium and mpsfm-viser.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import json
+import os
+import pty
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+
+from benchmarks._browser import headless
+
+ROOT = Path(__file__).resolve().parents[1]
+PICTURES = ROOT / "docs" / "pictures"
+WIDTH = 1100
+"""Of a picture, in pixels."""
+_APART = ("view_0.jpg", "view_4.jpg")
+"""They look at opposite walls."""
+_COLUMNS = 118
+_MAPS = ("photo", "prior", "refined", "std", "normals")
+_MPSFM = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+
+
+def on_terminal(*arguments: str, code: int = 0) -> str:
+    """What a command prints on a terminal."""
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "COLUMNS": str(_COLUMNS), "TERM": "xterm-256color"}
+    process = subprocess.Popen(
+        [*_MPSFM, *arguments], stdin=theirs, stdout=theirs, stderr=theirs, env=environment
+    )
+    os.close(theirs)
+    said = b""
+    while True:
+        try:
+            part = os.read(ours, 65536)
+        except OSError:  # Linux: the other side is closed
+            break
+        if not part:
+            break
+        said += part
+    if process.wait() != code:
+        raise SystemExit(f"mpsfm {' '.join(arguments)} ended with {process.returncode}")
+    return said.decode("utf-8", errors="replace")
+
+
+def draw_terminal(said: str, command: str, path: Path) -> None:
+    """As SVG, by rich. Bars that were drawn again and again are there once, as they ended."""
+    lines = [""]
+    for part in re.split(r"(\x1b\[1A|\x1b\[2K|\r|\n)", said):
+        if part == "\x1b[1A":
+            lines.pop()
+        elif part == "\x1b[2K":
+            lines[-1] = ""
+        elif part == "\n":
+            lines.append("")
+        elif part != "\r":
+            lines[-1] += part
+    with Path(os.devnull).open("w") as nowhere:
+        console = Console(record=True, width=_COLUMNS, file=nowhere, force_terminal=True)
+        console.print(Text(f"$ {command}", style="bold"))
+        console.print(Text.from_ansi("\n".join(lines).rstrip()))
+    drawn = console.export_svg(title="mpsfm", unique_id="mpsfm")
+    drawn = re.sub(r"@font-face \{.*?\}", "", drawn, flags=re.DOTALL)  # fetched from elsewhere
+    path.write_text(drawn, encoding="utf-8")
+
+
+def shoot(browser: Any, name: str) -> None:
+    """The window as JPEG."""
+    png = np.frombuffer(browser.get_screenshot_as_png(), np.uint8)
+    picture = cv2.imdecode(png, cv2.IMREAD_COLOR)
+    size = (WIDTH, round(picture.shape[0] * WIDTH / picture.shape[1]))
+    picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    _write(name, picture)
+
+
+def _write(name: str, picture: np.ndarray) -> None:
+    encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
+    (PICTURES / name).write_bytes(encoded.tobytes())
+
+
+def wait_for(browser: Any, script: str) -> None:
+    """Until an expression is true."""
+    end = time.monotonic() + 300
+    while not browser.execute_script(f"return {script}"):
+        if time.monotonic() > end:
+            raise SystemExit(f"never true: {script}")
+        time.sleep(0.2)
+
+
+def shoot_report(browser: Any, folder: Path) -> None:
+    """The first screen, a photo, and the points in each of their colours."""
+    browser.get((folder / "report.html").resolve().as_uri())
+    wait_for(browser, "window.report !== undefined")
+    time.sleep(3)  # textures
+    shoot(browser, "report.jpg")
+    browser.execute_script("document.getElementById('view').scrollIntoView({behavior: 'instant'})")
+    browser.execute_script("document.querySelectorAll('#strip button')[2].click()")
+    for color, name in (("std", "colour_std.jpg"), ("error", "colour_error.jpg")):
+        _colour(browser, color)
+        shoot(browser, name)
+    _colour(browser, "views")
+    browser.execute_script("document.querySelectorAll('.tabs button')[2].click()")
+    time.sleep(1)
+    shoot(browser, "photo.jpg")
+    browser.execute_script(
+        "document.getElementById('matches').scrollIntoView({behavior: 'instant'})"
+    )
+    time.sleep(1)
+    shoot(browser, "matches.jpg")
+
+
+def _colour(browser: Any, color: str) -> None:
+    browser.execute_script(
+        "const choice = document.getElementById('colour'); choice.value = arguments[0];"
+        "choice.dispatchEvent(new Event('change'))",
+        color,
+    )
+    time.sleep(2)
+
+
+def draw_maps(folder: Path, row: int = 5) -> None:
+    """Side by side what a run knows of a photo, from the data in its report."""
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
+    assert found is not None
+    pictures = json.loads(found[1])["photos"][row]["pictures"]
+    strip = []
+    for name in _MAPS:
+        data = base64.b64decode(pictures[name]["src"].partition(",")[2])
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        strip.append(cv2.resize(picture, (320, 240), interpolation=cv2.INTER_AREA))
+    _write("maps.jpg", np.hstack(strip))
+
+
+def shoot_viewer(browser: Any, folder: Path) -> None:
+    """``mpsfm view`` as people see it."""
+    environment = {**os.environ, "MPSFM_VIEWER_PORT": "18790", "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(
+        [*_MPSFM, "view", str(folder)], stdout=subprocess.PIPE, text=True, env=environment
+    )
+    try:
+        assert process.stdout is not None
+        address = next(line for line in process.stdout if "http" in line).split()[0]
+        browser.get(address)
+        wait_for(browser, "document.querySelector('canvas') !== null")
+        time.sleep(20)  # the scene comes through a socket
+        shoot(browser, "viewer.jpg")
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def main() -> None:
+    """Make them all."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--output", type=Path, help="keeps the results there")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = options.output or Path(scratch)
+        out, failed, photos = folder / "out", folder / "failed", folder / "photos"
+        photos.mkdir(parents=True, exist_ok=True)
+        for name in _APART:
+            shutil.copy(ROOT / "examples" / "sample_scene" / "images" / name, photos)
+        shown = "mpsfm demo --output out"
+        said = on_terminal("demo", "--offline", "--output", str(out))
+        draw_terminal(said.replace(str(out), "out"), shown, PICTURES / "terminal.svg")
+        on_terminal("reconstruct", str(photos), "--offline", "-o", str(failed), code=3)
+        draw_maps(out)
+        with headless() as browser:
+            shoot_report(browser, out)
+            browser.get((failed / "report.html").resolve().as_uri())
+            wait_for(browser, "document.querySelector('#photo img.main') !== null")
+            time.sleep(1)
+            shoot(browser, "failed.jpg")
+            shoot_viewer(browser, out)
+
+
+if __name__ == "__main__":
+    main()
