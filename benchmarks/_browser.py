@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +19,12 @@ _ARGUMENTS = (
 )
 
 
+def picture_of(browser: Any) -> bytes:
+    """The window as PNG, however long it takes; the driver's own command gives up after 10 s."""
+    taken = browser.execute_cdp_cmd("Page.captureScreenshot", {"format": "png"})
+    return base64.b64decode(taken["data"])
+
+
 @contextmanager
 def headless(width: int = 1440, height: int = 1000) -> Iterator[Any]:
     """Selenium's driver of a window of this size. Ends the script where there is no browser."""
@@ -32,9 +39,11 @@ def headless(width: int = 1440, height: int = 1000) -> Iterator[Any]:
     options.binary_location = chromium
     for argument in (*_ARGUMENTS, f"--window-size={width},{height}"):
         options.add_argument(argument)
+    options.page_load_strategy = "none"  # who wants to see something waits for it
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
-    browser.set_script_timeout(300)
+    browser.command_executor.client_config.timeout = 600  # seconds; drawn without a GPU
+    browser.set_script_timeout(600)
     try:
         yield browser
     finally:

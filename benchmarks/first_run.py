@@ -20,7 +20,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks._browser import headless
+from benchmarks._browser import headless, picture_of
 from benchmarks._scenes import shared_folder
 
 FPS = 10
@@ -79,7 +79,7 @@ def look(page: Path) -> str:
         faults = [line for line in browser.get_log("browser") if line["level"] == "SEVERE"]
         if faults:
             raise SystemExit(f"{page}: {faults[0]['message']}")
-        browser.save_screenshot(str(page.with_name("report.png")))
+        page.with_name("report.png").write_bytes(picture_of(browser))
         return str(browser.execute_script("return document.getElementById('verdict').innerText"))
 
 

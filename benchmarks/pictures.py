@@ -26,7 +26,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from benchmarks._browser import headless
+from benchmarks._browser import headless, picture_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = ROOT / "docs" / "pictures"
@@ -84,7 +84,7 @@ def draw_terminal(said: str, command: str, path: Path) -> None:
 
 def shoot(browser: Any, name: str) -> None:
     """The window as JPEG."""
-    png = np.frombuffer(browser.get_screenshot_as_png(), np.uint8)
+    png = np.frombuffer(picture_of(browser), np.uint8)
     picture = cv2.imdecode(png, cv2.IMREAD_COLOR)
     size = (WIDTH, round(picture.shape[0] * WIDTH / picture.shape[1]))
     picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
@@ -171,7 +171,9 @@ def shoot_viewer(browser: Any, folder: Path) -> None:
 def main() -> None:
     """Make them all."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--output", type=Path, help="keeps the results there")
+    parser.add_argument(
+        "--output", type=Path, help="keeps results; those that are there are not made again"
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.output or Path(scratch)
@@ -180,16 +182,18 @@ def main() -> None:
         for name in _APART:
             shutil.copy(ROOT / "examples" / "sample_scene" / "images" / name, photos)
         shown = "mpsfm demo --output out"
-        said = on_terminal("demo", "--offline", "--output", str(out))
-        draw_terminal(said.replace(str(out), "out"), shown, PICTURES / "terminal.svg")
-        on_terminal("reconstruct", str(photos), "--offline", "-o", str(failed), code=3)
+        if not (out / "report.html").is_file():
+            said = on_terminal("demo", "--offline", "--output", str(out))
+            draw_terminal(said.replace(str(out), "out"), shown, PICTURES / "terminal.svg")
+        if not (failed / "report.html").is_file():
+            on_terminal("reconstruct", str(photos), "--offline", "-o", str(failed), code=3)
         draw_maps(out)
         with headless() as browser:
-            shoot_report(browser, out)
             browser.get((failed / "report.html").resolve().as_uri())
             wait_for(browser, "document.querySelector('#photo img.main') !== null")
             time.sleep(1)
             shoot(browser, "failed.jpg")
+            shoot_report(browser, out)
             shoot_viewer(browser, out)
 
 

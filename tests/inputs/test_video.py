@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import cv2
@@ -98,3 +99,28 @@ def test_a_video_that_is_cut_off_is_used_as_far_as_it_goes(turn, tmp_path: Path)
     video.write_bytes(data[: len(data) // 2])
     chosen = choose_frames(video, VideoOptions())
     assert 3 <= len(chosen) <= 8
+
+
+def test_a_phone_that_is_held_upright_gives_upright_frames(turn, tmp_path: Path) -> None:
+    """Phones store the sensor's rows and note in the track's header how to turn them."""
+    video = tmp_path / "v.mp4"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 30, SIZE)
+    for frame in turn:
+        writer.write(frame)
+    writer.release()
+    data = bytearray(video.read_bytes())
+    header = data.index(b"tkhd") + 4
+    matrix = (
+        header + (4 + 32 if data[header] else 4 + 20) + 16
+    )  # ISO 14496-12: version, times, others
+    one, least = 1 << 16, 1 << 30
+    clockwise = (0, one, 0, -one, 0, 0, SIZE[1] * one, 0, least)
+    data[matrix : matrix + 36] = struct.pack(">9i", *clockwise)
+    video.write_bytes(data)
+    frames = sorted(extract_frames(video, tmp_path, VideoOptions()).glob("*.jpg"))
+    assert len(frames) >= 5
+    for path in frames:
+        seen, stored = cv2.imread(str(path)), turn[int(path.stem[6:])]
+        expected = cv2.rotate(stored, cv2.ROTATE_90_CLOCKWISE)
+        assert seen.shape == expected.shape
+        assert np.corrcoef(seen.ravel(), expected.ravel())[0, 1] > 0.8
