@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib
 import json
 import logging
 import platform
 import time
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any, cast
 
@@ -40,8 +40,8 @@ _SHARE = 0.02
 """Of the time of a run that saving may take (ours)."""
 _KEPT_S = 30 * 24 * 3600.0
 """Checkpoints that nobody came back to are taken away then (ours)."""
-_LIBRARIES = ("numpy", "scipy", "numba")
-_NUMERICS = ("data.py", "geometry.py", "mapping", "optimize", "scene")
+_LIBRARIES = ("numpy", "scipy", "numba", "pycolmap", "cv2")
+_NUMERICS = ("data.py", "geometry.py", "jit.py", "mapping", "optimize", "scene")
 
 
 class DiskCheckpoints:
@@ -152,5 +152,5 @@ def code_key() -> str:
         path = package / name
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             found.update(f"{file.relative_to(package)}\n".encode() + file.read_bytes())
-    versions = [metadata.version(name) for name in _LIBRARIES]
+    versions = [importlib.import_module(name).__version__ for name in _LIBRARIES]
     return content_key(FORMAT, found.hexdigest(), versions, platform.machine())

@@ -8,7 +8,6 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -76,7 +75,6 @@ EXPECTED = {
     "mpsfm-twin-a": ("is brought by mpsfm-twin-a and mpsfm-twin-b", "uninstall all but one"),
     "mpsfm-twin-b": ("is brought by mpsfm-twin-a and mpsfm-twin-b", "uninstall all but one"),
     "mpsfm-imports": ("No module named 'a_library_that_nobody_has'", "pip install the package of"),
-    "mpsfm-waits": ("did not load within 1 s", "pip uninstall mpsfm-waits"),
 }
 
 
@@ -88,33 +86,26 @@ def silent_server() -> Iterator[tuple[str, int]]:
 
 
 @pytest.fixture
-def environment(
-    install_plugin: InstallPlugin,
-    silent_server: tuple[str, int],
-    monkeypatch: pytest.MonkeyPatch,
-) -> dict[str, str]:
-    """All of them installed, and one that waits for the network: for processes and for us."""
+def environment(install_plugin: InstallPlugin, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """All of them installed, for processes and for us, with a limit that no load of the machine
+    makes a healthy plugin exceed."""
     for name, source in BROKEN.items():
         install_plugin(name, source)
-    waiting = "import socket\nwith socket.create_connection({!r}) as server: server.recv(1)"
-    install_plugin("mpsfm-waits", waiting.format(silent_server))
     install_plugin("mpsfm-healthy", HEALTHY)
     again = "[mpsfm.plugins]\nagain = mpsfm_healthy_plugin\n"
     install_plugin("mpsfm-twice", "", entry_points=again)
-    monkeypatch.setenv("MPSFM_PLUGIN_TIMEOUT_S", "1")
+    monkeypatch.setenv("MPSFM_PLUGIN_TIMEOUT_S", "120")
     path = os.pathsep.join([sys.path[0], str(ROOT), *sys.path])
     return {**os.environ, "PYTHONPATH": path}
 
 
 def mpsfm(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", "from mpsfm_core.cli import main; main()", *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=180)
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
 
 
 def test_the_list_says_what_is_wrong_and_what_to_do(environment: dict[str, str]) -> None:
-    started = time.monotonic()
     ended = mpsfm(environment, "plugins", "list", "--json")
-    assert time.monotonic() - started < 30
     assert ended.returncode == 0
     lines: dict[str, dict[str, Any]] = {p["distribution"]: p for p in json.loads(ended.stdout)}
     for name, (reason, hint) in EXPECTED.items():
@@ -128,6 +119,22 @@ def test_the_list_says_what_is_wrong_and_what_to_do(environment: dict[str, str])
     for name, (reason, hint) in EXPECTED.items():
         (row,) = [" ".join(row.split()) for row in table if f" {name} 1.0 " in row]
         assert "unavailable: " in row and reason in row and hint in row, name
+
+
+def test_a_plugin_that_waits_for_the_network_is_given_up(
+    install_plugin: InstallPlugin, silent_server: tuple[str, int]
+) -> None:
+    """The server never answers, so that the command ends at all is the limit's doing."""
+    waiting = "import socket\nwith socket.create_connection({!r}) as server: server.recv(1)"
+    install_plugin("mpsfm-waits", waiting.format(silent_server))
+    path = os.pathsep.join([sys.path[0], str(ROOT), *sys.path])
+    limited = {**os.environ, "PYTHONPATH": path, "MPSFM_PLUGIN_TIMEOUT_S": "1"}
+    ended = mpsfm(limited, "plugins", "list", "--json")
+    assert ended.returncode == 0
+    lines = {p["distribution"]: p for p in json.loads(ended.stdout)}
+    assert "did not load within 1 s" in lines["mpsfm-waits"]["reason"]
+    assert "pip uninstall mpsfm-waits" in lines["mpsfm-waits"]["install_hint"]
+    assert lines["mpsfm-core"]["available"]
 
 
 def test_the_others_work_and_the_broken_ones_raise_only_when_chosen(

@@ -370,3 +370,46 @@ def test_a_provider_that_hangs_has_a_time_limit(world) -> None:
             world.extract(runtime=runtime)
     finally:
         released.set()
+
+
+def with_nan() -> DepthPrior:
+    values = np.full((4, 4), 2.0, np.float32)
+    prior = DepthPrior(values, None, np.ones((4, 4), np.bool_))
+    values[1, 1] = np.nan  # the prior looks at the same memory
+    return prior
+
+
+def test_nan_in_one_of_many_photos_leaves_that_one_out(world) -> None:
+    world.break_on["depth", "view1.png"] = with_nan
+    runtime = RuntimeOptions(cache_dir=world.cache, workers=2, on_error="skip")
+    found = world.extract(runtime=runtime)
+    assert list(found.report["failed"]) == ["view1.png"]
+    assert (
+        "'truth', image 'view1.png': depth: must be finite" in found.report["failed"]["view1.png"]
+    )
+
+
+def test_a_provider_cannot_change_its_inputs_unnoticed(world) -> None:
+    """Views are read-only; who writes to one is named, and what the others see is as it was."""
+    seen: dict[str, np.ndarray] = {}
+
+    class Scribbles:
+        def describe(self, view):
+            seen[view.name] = view.image.copy()
+            if view.name == "view2.png":
+                view.image[:10] = 0
+            return np.eye(4, dtype=np.float32)[int(view.name[4])]
+
+    factory = lambda options, context: Scribbles()  # noqa: E731
+    world.registry.add(ProviderSpec(kind="retrieval", name="scribbles", factory=factory))
+    options = PairOptions(mode="retrieval", top_k=1)
+    changes = {"pairs": options, "retrieval": Backend(use="scribbles")}
+    with pytest.raises(
+        ProviderRunError, match=r"'scribbles', image 'view2\.png': ValueError: .*read-only"
+    ):
+        world.extract(**changes)
+    runtime = RuntimeOptions(cache_dir=world.cache, workers=1)
+    before = seen["view2.png"]
+    with pytest.raises(ProviderRunError):
+        world.extract(runtime=runtime, **changes)
+    assert np.array_equal(before, seen["view2.png"]) and before[:10].any()
