@@ -516,7 +516,7 @@ def _finite(owner: object, name: str) -> None:
 
 
 def _positive_where_valid(values: Float32, valid: Bool, name: str) -> None:
-    if (values[valid] <= 0).any():
+    if ((values <= 0) & valid).any():
         raise DataError(name, "must be positive where valid")
 
 

@@ -243,6 +243,22 @@ def file_named_by(
 
 
 @dataclass(frozen=True)
+class ModelExport:
+    """How the file of a network is made from its authors' code (:mod:`mpsfm_core.model_export`).
+
+    ``script``: module of the plugin that does it, run as a program and never imported.
+    ``repository``: ``OWNER/NAME`` on GitHub; ``commit``: the one that it was tested with.
+    ``license``: of the authors' weights. ``packages``: what their code needs besides torch.
+    """
+
+    script: str
+    repository: str
+    commit: str
+    license: str
+    packages: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class ProviderSpec:
     """How a plugin announces one provider, without importing it.
 
@@ -332,6 +348,11 @@ class Hooks:
 
         Raises :class:`~mpsfm_core.errors.ConfigError` when it cannot be had.
         """
+
+    @hookspec
+    def mpsfm_exports(self) -> Mapping[str, ModelExport]:  # type: ignore[empty-body]
+        """The networks that this plugin can make a file of from their authors' code, by the name
+        that ``mpsfm models export`` and ``export:NAME`` know them by."""
 
     @hookspec
     def mpsfm_notice(self, text: str) -> None:

@@ -146,11 +146,11 @@ def test_what_nobody_publishes_is_exported_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MPSFM_EXPORTS", str(tmp_path))
-    code, _, message = models("fetch", "export:mast3r")
-    assert code == 2 and "mpsfm models export mast3r --code CHECKOUT" in " ".join(message.split())
+    code, _, message = models("fetch", "export:dsine")
+    assert code == 2 and "mpsfm models export dsine --code CHECKOUT" in " ".join(message.split())
     (tmp_path / "elsewhere.onnx").write_bytes(CONTENT)
-    (tmp_path / "mast3r.json").write_text(json.dumps({"file": str(tmp_path / "elsewhere.onnx")}))
-    assert models("path", "export:mast3r")[1].strip() == str(tmp_path / "elsewhere.onnx")
+    (tmp_path / "dsine.json").write_text(json.dumps({"file": str(tmp_path / "elsewhere.onnx")}))
+    assert models("path", "export:dsine")[1].strip() == str(tmp_path / "elsewhere.onnx")
 
 
 def test_local_file(uri: str, tmp_path: Path) -> None:

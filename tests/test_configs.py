@@ -91,14 +91,18 @@ def test_says_what_it_has_to_be_told(name: str, registry: Registry) -> None:
 def test_needs_nothing_but_what_can_be_fetched_or_exported(
     name: str, registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No file has to be named, but for the maps of a sensor."""
+    """Files have to be named for the maps of a sensor, and for two networks that nobody publishes
+    and nothing exports yet."""
     monkeypatch.setenv("MPSFM_EXPORTS", str(tmp_path))
-    for exported in ("mast3r", "roma", "dsine"):
-        file = tmp_path / f"{exported}.onnx"
-        file.touch()
-        (tmp_path / f"{exported}.json").write_text(json.dumps({"file": str(file)}))
-    maps = [f"depth.options.directory={tmp_path}"] if name == "sensor-depth" else []
-    config = load_config(name, [*maps, f"runtime.cache_dir={tmp_path}"], registry)
+    file = tmp_path / "dsine.onnx"
+    file.touch()
+    (tmp_path / "dsine.json").write_text(json.dumps({"file": str(file)}))
+    named = {
+        "sensor-depth": [f"depth.options.directory={tmp_path}"],
+        "paper-mast3r": [f"matcher.options.model={file}"],
+        "paper-dense": [f"{m}.options.model={file}" for m in ("matcher", "dense_matcher")],
+    }.get(name, [])
+    config = load_config(name, [*named, f"runtime.cache_dir={tmp_path}"], registry)
     files = [f for choice in look_up(config, registry).choices for f in choice.to_fetch]
     assert all(is_remote(file.uri) and file.license != "unknown" for file in files)
 

@@ -105,6 +105,66 @@ def fetch(
 
 
 @app.command()
+def export(
+    name: Annotated[str, typer.Argument(help="dsine, mast3r, roma, metric3d, moge.")],
+    code: Annotated[
+        list[Path],
+        typer.Option(
+            metavar="CHECKOUT", help="Of the authors' code; again for libraries that it needs."
+        ),
+    ],
+    checkpoint: Annotated[
+        str,
+        typer.Option(
+            metavar="FILE_OR_URI", help="Their weights; 'random' tries the export without."
+        ),
+    ],
+    output: Annotated[
+        Path | None, typer.Option(metavar="FILE.onnx", help="Instead of the user's data folder.")
+    ] = None,
+    size: Annotated[str, typer.Option(help="Of a network that comes in several.")] = "",
+    sha256: Annotated[str | None, typer.Option(help="Expected hash of the checkpoint.")] = None,
+    environment: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Run their code there (mpsfm env create).")
+    ] = None,
+    cache: CacheDir = None,
+) -> None:
+    """Make the file of a network that nobody publishes, from its authors' code and weights.
+
+    Their code runs in a process of its own. The file is checked against what their network says,
+    and its provider takes it by name from then on.
+    """
+    from mpsfm_core.environments.store import find_environment
+    from mpsfm_core.errors import InputError, did_you_mean
+    from mpsfm_core.model_export.run import export_model
+    from mpsfm_core.registry import Registry
+    from mpsfm_core.weights import WeightStore
+
+    known = {
+        n: r for found in Registry.discover().call_hook("mpsfm_exports") for n, r in found.items()
+    }
+    if name not in known:
+        raise InputError(f"no installed plugin exports {name!r}{did_you_mean(name, known)}")
+    python = find_environment(environment).python if environment else None
+    with _progress_bars() as progress:
+        manifest = export_model(
+            name,
+            known[name],
+            code,
+            checkpoint,
+            output,
+            sha256=sha256,
+            size=size,
+            python=python,
+            store=WeightStore(cache, progress=progress),
+        )
+    worst = max(manifest["largest_differences"].values())
+    typer.echo(f"licence of the weights: {manifest['license']}", err=True)
+    typer.echo(f"differs from the authors' network by {worst:.1e} at most", err=True)
+    typer.echo(manifest["file"])
+
+
+@app.command()
 def verify(
     targets: Annotated[list[str] | None, typer.Argument(metavar="[NAME_OR_URI...]")] = None,
     cache: CacheDir = None,

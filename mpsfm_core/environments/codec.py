@@ -9,7 +9,7 @@ calibrations.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -93,7 +93,9 @@ class Packed:
 def unpack(text: bytes, block: memoryview, copy: bool) -> Any:
     """The value again. Its arrays are read-only views of the block, or copies if so asked.
 
-    Raises :class:`~mpsfm_core.errors.DataError` for what is no value of a type above.
+    Data types are put together without the checks of their values: the other side's constructors
+    made them, and :mod:`mpsfm_core.validation` checks every answer of a provider, wherever it
+    lives. Raises :class:`~mpsfm_core.errors.DataError` for what is no value of a type above.
     """
 
     def array(description: list[Any]) -> NDArray[Any]:
@@ -103,7 +105,7 @@ def unpack(text: bytes, block: memoryview, copy: bool) -> Any:
             return np.empty(shape, dtype)
         view: NDArray[Any] = np.frombuffer(block, dtype, count, start).reshape(shape)
         if copy:
-            return np.array(view)
+            view = np.array(view)
         view.flags.writeable = False
         return view
 
@@ -111,8 +113,8 @@ def unpack(text: bytes, block: memoryview, copy: bool) -> Any:
         if not isinstance(plain, dict):
             return plain
         if "type" in plain:
-            kind: Callable[..., Any] = _TYPES[plain["type"]]
-            return kind(**{key: build(entry) for key, entry in plain["fields"].items()})
+            values = {key: build(entry) for key, entry in plain["fields"].items()}
+            return _put_together(_TYPES[plain["type"]], values)
         ((kind_of, content),) = plain.items()
         if kind_of == "array":
             return array(content)
@@ -129,6 +131,18 @@ def unpack(text: bytes, block: memoryview, copy: bool) -> Any:
         return build(json.loads(text))
     except (ValueError, KeyError, TypeError, AttributeError, MemoryError, RecursionError) as error:
         raise DataError("value", f"does not follow the protocol: {error}") from error
+
+
+def _put_together(kind: type, values: dict[str, Any]) -> Any:
+    if issubclass(kind, BaseModel):
+        return kind(**values)
+    assert is_dataclass(kind)
+    if values.keys() != {field.name for field in fields(kind)}:
+        raise DataError("value", f"is no {kind.__name__}")
+    made = object.__new__(kind)
+    for name, value in values.items():
+        object.__setattr__(made, name, value)
+    return made
 
 
 def _fields(value: Any) -> list[tuple[str, Any]]:

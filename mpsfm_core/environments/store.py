@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Sequence
 from importlib import metadata
@@ -32,6 +33,7 @@ FOLDER_VARIABLE = "MPSFM_ENVIRONMENTS"
 _NAME = re.compile(r"[a-z0-9]+([._-][a-z0-9]+)*")
 _CORE = "mpsfm-core"
 _DESCRIPTION = "providers.json"
+_UNFINISHED = ".unfinished-"
 _ASKING_S = 120.0
 """For a question that no network is needed for."""
 
@@ -75,6 +77,12 @@ class Environment:
             worker = self._worker
         return worker.ask(request, _ASKING_S)
 
+    def close(self) -> None:
+        """End the worker that answers questions."""
+        if self._worker is not None:
+            self._worker.close()
+            self._worker = None
+
     def describe(self) -> list[dict[str, Any]]:
         """What its providers are, without starting it: as of when it was made."""
         path = self.folder / _DESCRIPTION
@@ -111,7 +119,8 @@ def all_environments() -> list[Environment]:
     root = environments_folder()
     if not root.is_dir():
         return []
-    found = (Environment(folder) for folder in sorted(root.iterdir()))
+    folders = (f for f in sorted(root.iterdir()) if not f.name.startswith(_UNFINISHED))
+    found = (Environment(folder) for folder in folders)
     return [environment for environment in found if environment.python.exists()]
 
 
@@ -143,15 +152,16 @@ def create_environment(
     environment = Environment(environments_folder() / name)
     if environment.folder.exists():
         raise InputError(f"{environment.label} exists; 'mpsfm env remove {name}' removes it")
-    environment.folder.mkdir(parents=True)
-    try:
-        for command in _commands(environment, [*_core(), *packages], python):
+    environments_folder().mkdir(parents=True, exist_ok=True)
+    # made beside its place, so that one that was killed half-way is not there at all
+    with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=environments_folder()) as scratch:
+        made = Environment(Path(scratch) / name)
+        for command in _commands(made, [*_core(), *packages], python):
             _run(command, environment.label)
-        found = environment.refresh()
-    except BaseException:
-        shutil.rmtree(environment.folder, ignore_errors=True)
-        raise
-    return environment, found
+        made.refresh()
+        made.close()
+        made.folder.rename(environment.folder)
+    return environment, environment.describe()
 
 
 def remove_environment(name: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -153,6 +154,26 @@ def test_names(monkeypatch, tmp_path):
     (tmp_path / "there").mkdir()
     with pytest.raises(InputError, match="mpsfm env remove there"):
         store.create_environment("there", ["x"])
+
+
+def test_it_is_there_as_a_whole_or_not_at_all(monkeypatch, tmp_path):
+    """It is made beside its place: others do not see one that is being made."""
+    monkeypatch.setenv(store.FOLDER_VARIABLE, str(tmp_path))
+    seen = []
+
+    def made(command, label):
+        python = Path(command[0])
+        python.parent.mkdir(parents=True, exist_ok=True)
+        python.touch()
+        seen.append([environment.name for environment in store.all_environments()])
+
+    monkeypatch.setattr(store, "_commands", lambda e, packages, python: [[str(e.python)]])
+    monkeypatch.setattr(store, "_run", made)
+    monkeypatch.setattr(store.Environment, "ask", lambda self, **request: [])
+    environment, found = store.create_environment("new", ["x"])
+    assert (seen, found) == ([[]], [])
+    assert [e.name for e in store.all_environments()] == ["new"] and environment.python.exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
 @pytest.mark.slow

@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from mpsfm_core.model_export.authors import MaskedWrites
+
 warnings.simplefilter("ignore")
 
 
@@ -49,13 +51,14 @@ def export(
     opset: int = 17,
 ) -> None:
     """The network as ``network.onnx``."""
-    torch.onnx.export(
-        model,
-        arguments,
-        "network.onnx",
-        input_names=list(inputs),
-        output_names=list(outputs),
-        dynamic_axes=dynamic,
-        opset_version=opset,
-        dynamo=False,
-    )
+    with MaskedWrites():
+        torch.onnx.export(
+            model,
+            arguments,
+            "network.onnx",
+            input_names=list(inputs),
+            output_names=list(outputs),
+            dynamic_axes=dynamic,
+            opset_version=opset,
+            dynamo=False,
+        )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
-from mpsfm_core.providers import file_named_by
+from mpsfm_core.providers import ModelExport, file_named_by
 from mpsfm_core.uncertainty.model import NormalCalibration
 from mpsfm_dsine.options import DsineOptions
 
@@ -28,3 +28,17 @@ def mpsfm_providers() -> list[ProviderSpec]:
             contract="mpsfm_dsine.contract:setup",
         )
     ]
+
+
+@hookimpl
+def mpsfm_exports() -> dict[str, ModelExport]:
+    """From the authors' code and checkpoint."""
+    return {
+        "dsine": ModelExport(
+            script="mpsfm_dsine.export",
+            repository="baegwangbin/DSINE",
+            commit="ef0c2afa32b4dd19cb8ca4567c652802cd92591c",
+            license="of the authors' checkpoint (code MIT)",
+            packages=("geffnet",),
+        )
+    }

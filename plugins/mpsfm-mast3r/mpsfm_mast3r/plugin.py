@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
+from mpsfm_core import ProviderSpec, hookimpl
 from mpsfm_core.options import Options
 from mpsfm_core.providers import Capability, file_named_by
 from mpsfm_mast3r.options import DenseOptions, SparseOptions
@@ -29,6 +29,6 @@ def _spec(name: str, how: Capability, options: type[Options], summary: str) -> P
         install_hint="pip install mpsfm-mast3r",
         code_license="Apache-2.0",
         weights_license="CC-BY-NC-SA-4.0",
-        weights=file_named_by("model", WeightsFile("export:mast3r", license="CC-BY-NC-SA-4.0")),
+        weights=file_named_by("model"),
         contract=f"mpsfm_mast3r.contract:{how}",
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel
 
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
-from mpsfm_core.providers import Capability, Kind
+from mpsfm_core.providers import Capability, Kind, ModelExport
 from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 from mpsfm_onnx.description import load_description
 from mpsfm_onnx.options import MOGE_2, Moge2Options, OnnxOptions
@@ -42,6 +42,20 @@ def mpsfm_providers() -> list[ProviderSpec]:
         _moge("depth", "Moge2", "metric", "joint-normals"),
         _moge("normals", "Moge2Normals"),
     ]
+
+
+@hookimpl
+def mpsfm_exports() -> dict[str, ModelExport]:
+    """From the authors' code and checkpoint."""
+    return {
+        "moge": ModelExport(
+            script="mpsfm_onnx.export_moge",
+            repository="microsoft/MoGe",
+            commit="07444410f1e33f402353b99d6ccd26bd31e469e8",
+            license="MIT",
+            packages=("github.com/EasternJournalist/utils3d", "moderngl"),
+        )
+    }
 
 
 @hookimpl

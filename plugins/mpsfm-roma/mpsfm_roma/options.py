@@ -10,8 +10,8 @@ from mpsfm_core import Options
 class RomaOptions(Options):
     """The network."""
 
-    model: str = "export:roma"
-    """Path or URI of the ONNX file; by default what ``mpsfm models export roma`` made."""
+    model: str
+    """Path or URI of the ONNX file (the README says how it is made)."""
     sha256: str | None = None
     """Expected hash of ``model``."""
     height: int = Field(672, ge=14, multiple_of=14)

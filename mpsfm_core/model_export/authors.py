@@ -1,0 +1,138 @@
+"""For the scripts of plugins that export a network, in the process of the authors' code.
+
+A script is run as a program with the checkouts on its search path::
+
+    from mpsfm_core.model_export.authors import Job
+
+    if __name__ == "__main__":
+        job = Job.given()
+        model = TheirNetwork()
+        model.load_state_dict(job.checkpoint()["model"])
+        job.export(model, {"image": torch.rand(1, 3, 96, 128)}, ["normal"])
+
+Imports torch: for such scripts only.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.overrides import TorchFunctionMode
+
+OPSET = 17
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a script is asked for. ``weights``: the checkpoint, None for seeded random weights.
+    ``output``: where the file goes. ``size``: of the network, where it comes in several."""
+
+    weights: Path | None
+    output: Path
+    size: str = ""
+
+    @classmethod
+    def given(cls) -> Job:
+        """From the program's argument; random weights are seeded from here on."""
+        warnings.simplefilter("ignore")
+        torch.manual_seed(0)
+        said = json.loads(sys.argv[1])
+        weights = said["weights"]
+        return cls(Path(weights) if weights else None, Path(said["output"]), said["size"])
+
+    def checkpoint(self, *allowed: type) -> Any:
+        """The content of the checkpoint, on the CPU: tensors and plain values, no code.
+
+        ``allowed``: classes without code of their own that it may hold too.
+        """
+        assert self.weights is not None
+        if self.weights.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(self.weights)
+        with torch.serialization.safe_globals(list(allowed)):
+            return torch.load(self.weights, map_location="cpu", weights_only=True)
+
+    def export(
+        self,
+        model: torch.nn.Module,
+        example: Mapping[str, torch.Tensor],
+        outputs: Sequence[str],
+        dynamic: Mapping[str, Mapping[int, str]] | None = None,
+        further: Sequence[Mapping[str, torch.Tensor]] = (),
+    ) -> None:
+        """Write the network, and what it says of the example and of ``further`` inputs.
+
+        ``dynamic``: of each tensor the axes that may have other lengths, with a name; then
+        ``further`` should have such.
+        """
+        model = model.eval()
+        with torch.inference_mode():
+            answers = [_answer(model, given) for given in (example, *further)]
+        with MaskedWrites():
+            torch.onnx.export(
+                model,
+                tuple(tensor.clone() for tensor in example.values()),
+                str(self.output),
+                input_names=list(example),
+                output_names=list(outputs),
+                dynamic_axes=dynamic,
+                opset_version=OPSET,
+                dynamo=False,
+            )
+        arrays: dict[str, Any] = {}
+        for number, (given, found) in enumerate(zip((example, *further), answers, strict=True)):
+            arrays |= {f"{number}/in/{name}": tensor.numpy() for name, tensor in given.items()}
+            named = zip(outputs, found, strict=True)
+            arrays |= {f"{number}/out/{name}": tensor.numpy() for name, tensor in named}
+        np.savez(self.output.with_suffix(".npz"), **arrays)
+
+
+class MaskedWrites(TorchFunctionMode):
+    """Writes ``tensor[index][mask] = x`` as ``tensor[index] = where(mask, x, ...)``, which
+    is the same.
+
+    The exporter of torch 2.13 (``dynamo=False``) loses what was written to a tensor before a masked
+    write to a view of it: ``axes[:, 0] = x; axes[:, 0][invalid] = 0.0`` is 0 everywhere in the
+    file. That made the normals of DSINE wrong by 100 degrees.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._last: tuple[torch.Tensor, torch.Tensor, Any] | None = None
+        """The last view that was taken, its tensor and the index."""
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Any,
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        """As of torch; see the class."""
+        if func is torch.Tensor.__getitem__:
+            view = func(*args)
+            self._last = view, args[0], args[1]
+            return view
+        if func is torch.Tensor.__setitem__ and self._last is not None:
+            target, mask, value = args
+            view, tensor, index = self._last
+            if target is view and isinstance(mask, torch.Tensor) and mask.dtype == torch.bool:
+                tensor[index] = torch.where(mask, torch.full_like(view, value), view)
+                return None
+        return func(*args, **(kwargs or {}))
+
+
+def _answer(model: torch.nn.Module, given: Mapping[str, torch.Tensor]) -> tuple[Any, ...]:
+    found = model(*(tensor.clone() for tensor in given.values()))
+    if isinstance(found, Mapping):  # the exporter takes the values, in their order
+        found = tuple(found.values())
+    return tuple(found) if isinstance(found, (list, tuple)) else (found,)

@@ -1,0 +1,88 @@
+"""DSINE with concentration as ONNX, by its authors' code; run as a program, see
+:mod:`mpsfm_core.model_export`."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import geffnet
+import torch
+from models.dsine import v02_kappa
+
+from mpsfm_core.model_export.authors import Job
+
+_ENCODERS = {"": 5, "b0": 0, "b5": 5}
+_SIDES = ((96, 128), (160, 96))
+
+
+class Last(torch.nn.Module):
+    """The last of the refinements, as the authors' scripts take it."""
+
+    def __init__(self, model: torch.nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, image: torch.Tensor, intrins: torch.Tensor) -> torch.Tensor:
+        found: torch.Tensor = self.model(image, intrins=intrins.clone(), mode="test")[-1]
+        return found
+
+
+class _Here:
+    """Coordinates that the constructor wants on the first GPU."""
+
+    def __init__(self, coordinates: torch.Tensor) -> None:
+        self._coordinates = coordinates
+
+    def to(self, device: Any) -> torch.Tensor:
+        return self._coordinates
+
+
+def network(encoder: int) -> Last:
+    """As the authors' experiment exp002_kappa, with EfficientNet-B0 or -B5."""
+    settings = SimpleNamespace(
+        NNET_encoder_B=encoder,
+        NNET_decoder_NF={0: 1280, 5: 2048}[encoder],
+        NNET_decoder_BN=False,
+        NNET_decoder_down=8,
+        NNET_learned_upsampling=True,
+        NNET_output_dim=4,
+        NNET_feature_dim=64,
+        NNET_hidden_dim=64,
+        NRN_prop_ps=5,
+        NRN_num_iter_train=5,
+        NRN_num_iter_test=5,
+        NRN_ray_relu=True,
+    )
+    coordinates, create = v02_kappa.get_pixel_coords, geffnet.create_model
+    v02_kappa.get_pixel_coords = lambda h, w: _Here(coordinates(h, w))
+    geffnet.create_model = lambda name, pretrained: create(name, pretrained=False)
+    return Last(v02_kappa.DSINE_v02_kappa(settings)).eval()
+
+
+def export(job: Job, model: Last) -> None:
+    """Images of any size in steps of 32, and their intrinsics."""
+    examples = []
+    for height, width in _SIDES:
+        intrinsics = torch.tensor([[100.0, 0, width / 2], [0, 100.0, height / 2], [0, 0, 1]])
+        image = torch.randn(1, 3, height, width)
+        examples.append({"image": image, "intrins": intrinsics[None]})
+    axes = {2: "height", 3: "width"}
+    job.export(model, examples[0], ["normal"], {"image": axes, "normal": axes}, examples[1:])
+
+
+def main() -> None:
+    """Export the network of the checkpoint."""
+    job = Job.given()
+    model = network(_ENCODERS[job.size])
+    if job.weights is not None:
+        state = job.checkpoint()["model"]
+        state = {name.removeprefix("module."): tensor for name, tensor in state.items()}
+        missing = model.model.load_state_dict(state, strict=False).missing_keys
+        if missing:
+            raise SystemExit(f"the checkpoint lacks {missing[0]} and {len(missing) - 1} more")
+    export(job, model)
+
+
+if __name__ == "__main__":
+    main()
