@@ -5,8 +5,9 @@
 A case is a scene, a bucket of its sets and a depth prior. The mapped sets (poses, points, refined
 depth) are kept in the output folder, so that only what comes after the mapper is run again. Depth
 is compared in the scale of the cameras, the cloud after aligning the cameras' centres, with all
-true depth maps of the set as the scan. ``fountain`` has no true depth: there it is the share of the
-true model's points whose depth is right to 1 %. The last line of ``--json`` is one JSON object.
+true depth maps of the set as the scan. ``fountain`` has no true depth: there it is the share of
+matches, triangulated with the true poses, whose depth is right to 1 %. The last line of ``--json``
+is one JSON object.
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 
 from benchmarks._scenes import shared_folder
 from benchmarks.accuracy import FASTDEPTH, PRIORS
-from mpsfm_core.data import DepthPrior, Float64, NormalPrior
+from mpsfm_core.data import DepthPrior, Float64, MappingProblem, NormalPrior, Pose
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
@@ -33,13 +35,22 @@ from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.benchmark import PairsOfSets, problem_of_sets
 from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy
 from mpsfm_core.evaluation.prior_quality import read_depth
-from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
+from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
 from mpsfm_core.evaluation.true_surface import depth_file, surface_of_depth
-from mpsfm_core.geometry import pixel_centers, sample_bilinear, transform
+from mpsfm_core.geometry import (
+    camera_center,
+    pixel_centers,
+    project,
+    rays,
+    sample_bilinear,
+    scale_pixels,
+    transform,
+    triangulation_angle_deg,
+)
 from mpsfm_core.inputs.images import ImageSet, load_images
-from mpsfm_core.inputs.models import read_model
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.mapper import reconstruct
+from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.registry import Registry
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.scene.reconstruction import Reconstruction
@@ -53,7 +64,9 @@ WAYS = ("mapper", "dense")
 CERTAIN = 0.02
 """Relative std up to which depth counts as measured in the photos."""
 POINT_NEAR = 0.01
-"""The same at points of a true model."""
+"""The same at true points."""
+ANGLE, ERROR_PX = 3.0, 1.0
+"""Of true points: smallest angle of their rays in degrees, largest reprojection error."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +116,8 @@ def main() -> None:
         case = CASES[name]
         scene = read_scene(shared_folder() / "data" / case.scene)
         mapped = mapped_sets(name, arguments.output)
-        rows += measured(name, scene, mapped)
+        problem = None if scene.depth else problem_of_case(name, arguments.output)[0]
+        rows += measured(name, scene, mapped, problem)
         print(table(rows[-1:]), file=sys.stderr)
     print(table(rows))
     if arguments.json:
@@ -115,6 +129,21 @@ def mapped_sets(name: str, output: Path) -> list[MappedSet]:
     kept = output / f"{name}.pickle"
     if kept.is_file():
         return list(pickle.loads(kept.read_bytes()))
+    problem, options, sets = problem_of_case(name, output)
+    mapped = []
+    for item in sets:
+        subset = problem.subset(list(item.images))
+        best = reconstruct(subset, options).reconstructions[0]
+        normals = {image.name: image.normals for image in subset.images}
+        mapped.append(MappedSet(best, normals))
+    kept.write_bytes(pickle.dumps(mapped))
+    return mapped
+
+
+def problem_of_case(
+    name: str, output: Path
+) -> tuple[MappingProblem, MapperOptions, list[EvaluationSet]]:
+    """What is mapped for a case; extracted now, or earlier and kept in the output folder."""
     case = CASES[name]
     scene = read_scene(shared_folder() / "data" / case.scene)
     sets = scene.chosen([case.bucket])
@@ -128,17 +157,12 @@ def mapped_sets(name: str, output: Path) -> list[MappedSet]:
     problem, options = problem_of_sets(
         scene, sets, case.prior, str(config), ("runtime.workers=1",), output / name, registry
     )
-    mapped = []
-    for item in sets:
-        subset = problem.subset(list(item.images))
-        best = reconstruct(subset, options).reconstructions[0]
-        normals = {image.name: image.normals for image in subset.images}
-        mapped.append(MappedSet(best, normals))
-    kept.write_bytes(pickle.dumps(mapped))
-    return mapped
+    return problem, options, sets
 
 
-def measured(name: str, scene: SceneFolder, mapped: Sequence[MappedSet]) -> list[dict[str, Any]]:
+def measured(
+    name: str, scene: SceneFolder, mapped: Sequence[MappedSet], problem: MappingProblem | None
+) -> list[dict[str, Any]]:
     """Means over the sets of a case, a row for each way to make the maps."""
     photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
     rows = []
@@ -152,7 +176,8 @@ def measured(name: str, scene: SceneFolder, mapped: Sequence[MappedSet]) -> list
                 seconds = (time.process_time() - started) / len(model.images)
             maps = {image.name: image.depth for image in model.images}
             cloud, *_ = fuse_depth_maps(model, view_of(photos), ResultOptions())
-            found.append({**set_errors(scene, model, maps, cloud), "cpu_s_photo": seconds})
+            errors = set_errors(scene, problem, model, maps, cloud)
+            found.append({**errors, "cpu_s_photo": seconds})
         rows.append({"case": name, "maps": way, **_means(found)})
     return rows
 
@@ -165,17 +190,22 @@ def view_of(photos: ImageSet) -> Any:
 
 def set_errors(
     scene: SceneFolder,
+    problem: MappingProblem | None,
     reconstruction: Reconstruction,
     maps: Mapping[str, DepthPrior],
     cloud: Float64,
 ) -> dict[str, float]:
-    """Errors of the depth maps and of the cloud (n, 3) of one set; empty if it has no scale."""
+    """Errors of the depth maps and of the cloud (n, 3) of one set; empty if it has no scale.
+
+    ``problem``: what was mapped, where matches tell the true depth.
+    """
     errors = trajectory_errors(reconstruction.poses, scene.truth)
     if errors is None:
         return {}
     aligned = errors.truth_from_estimate
     if scene.depth is None:
-        return {"points_near": points_near(scene, reconstruction, maps, aligned.scale)}
+        assert problem is not None
+        return points_near(problem, scene.truth, maps, aligned.scale)
     found = [
         map_errors(depth, aligned.scale, read_depth(depth_file(scene.depth, name)))
         for name, depth in maps.items()
@@ -221,30 +251,53 @@ def scan_of(scene: SceneFolder, names: Sequence[str]) -> Float64:
     return surface_of_depth(scene.depth, names, cameras, scene.truth, min(TOLERANCES) / 2)
 
 
+def triangulated(problem: MappingProblem, truth: Mapping[str, Pose]) -> dict[str, Float64]:
+    """Keypoints and their true depth (n, 3) by image: matches, triangulated with the true poses.
+
+    Those whose rays meet within a pixel, at an angle that leaves no doubt of the depth.
+    """
+    found: dict[str, list[Float64]] = {}
+    for pair in problem.pairs:
+        images = [problem.images[pair.image_a], problem.images[pair.image_b]]
+        if not all(image.name in truth for image in images):
+            continue
+        poses = [truth[image.name] for image in images]
+        matrices = [np.column_stack(pose) for pose in poses]
+        pixels = [image.keypoints[rows] for image, rows in zip(images, pair.matches.T, strict=True)]
+        local = [rays(image.camera, xy) for image, xy in zip(images, pixels, strict=True)]
+        points = np.full((len(pair.matches), 3), np.nan)
+        for row, (a, b) in enumerate(zip(*local, strict=True)):
+            point = pycolmap.triangulate_point(*matrices, a[:2], b[:2])
+            if point is not None:
+                points[row] = point.ravel()
+        good = triangulation_angle_deg(*(camera_center(*pose) for pose in poses), points) > ANGLE
+        seen = [transform(*pose, points) for pose in poses]
+        for image, xy, each in zip(images, pixels, seen, strict=True):
+            off = np.linalg.norm(project(image.camera, each) - xy, axis=1)
+            good &= (each[:, 2] > 0) & (off < ERROR_PX)
+        for image, xy, each in zip(images, pixels, seen, strict=True):
+            found.setdefault(image.name, []).append(np.column_stack([xy, each[:, 2]])[good])
+    return {name: np.concatenate(parts) for name, parts in found.items()}
+
+
 def points_near(
-    scene: SceneFolder,
-    reconstruction: Reconstruction,
+    problem: MappingProblem,
+    truth: Mapping[str, Pose],
     maps: Mapping[str, DepthPrior],
     scale: float,
-) -> float:
-    """Share of the true model's observations whose depth in the map is right to 1 %."""
-    model = read_model(scene.path / "gt")
+) -> dict[str, float]:
+    """Share of true points whose depth in the map is right to 1 %, and how many there are."""
+    cameras = {image.name: image.camera for image in problem.images}
     right = total = 0
-    for image in model.images.values():
-        if image.name not in maps:
+    for name, points in triangulated(problem, truth).items():
+        if name not in maps:
             continue
-        seen = [p for p in image.points2D if p.has_point3D()]
-        xyz = np.array([model.points3D[p.point3D_id].xyz for p in seen])
-        true = transform(*scene.truth[image.name], xyz)[:, 2]
-        depth = maps[image.name]
-        size = model.cameras[image.camera_id]
-        xy = np.array([p.xy for p in seen]) * (
-            np.array(depth.shape[::-1]) / (size.width, size.height)
-        )
+        depth, true = maps[name], points[:, 2]
+        xy = scale_pixels(points[:, :2], cameras[name].size, depth.shape[::-1])
         found, ok = sample_bilinear(depth.depth, depth.valid, xy)
         right += int((ok & (np.abs(scale * found - true) <= POINT_NEAR * true)).sum())
-        total += len(seen)
-    return right / total
+        total += len(points)
+    return {"points_near": right / max(1, total), "true_points": float(total)}
 
 
 def _means(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
