@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,25 +13,6 @@ from mpsfm_core.errors import InputError
 
 TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 """In the scan's unit (ETH3D, metres)."""
-_TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 
 
 def cloud_accuracy(
@@ -70,38 +50,6 @@ def thinned(points: Float64, size: float) -> Float64:
     cells: Int64 = np.floor(points / size).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     return points[np.sort(first)]
-
-
-def read_ply(path: Path) -> Float64:
-    """Vertices (n, 3) float64 of a PLY file, text or binary; colours, normals, faces are ignored.
-
-    Raises :class:`InputError` when it cannot be read.
-    """
-    try:
-        data = path.read_bytes()
-        end = data.index(b"end_header")
-        start = data.index(b"\n", end) + 1
-        return _vertices(data[:end].decode("ascii").splitlines(), data[start:])
-    except (OSError, ValueError, LookupError, StopIteration) as error:
-        raise InputError(f"{path}: not a readable PLY file: {error}") from error
-
-
-def _vertices(header: list[str], body: bytes) -> Float64:
-    words = [line.split() for line in header]
-    order = _ORDERS[next(w[1] for w in words if w and w[0] == "format")]
-    elements = [k for k, w in enumerate(words) if w and w[0] == "element"]
-    if not elements or words[elements[0]][1] != "vertex":
-        raise ValueError("its first element must be the vertices")
-    count = int(words[elements[0]][2])
-    own = words[elements[0] + 1 : elements[1] if len(elements) > 1 else None]
-    properties = [(w[2], order + _TYPES[w[1]]) for w in own if w and w[0] == "property"]
-    if order:
-        table = np.frombuffer(body, dtype=properties, count=count)
-        return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    columns = [[name for name, _ in properties].index(axis) for axis in "xyz"]
-    lines = body.decode("ascii").splitlines()[:count]
-    rows = np.array([line.split() for line in lines], dtype=np.float64).reshape(count, -1)
-    return np.asarray(rows[:, columns])
 
 
 def _harmonic(a: float, b: float) -> float:

@@ -9,13 +9,14 @@ from typing import Any
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.alignment import trajectory_errors
-from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES, cloud_accuracy, read_ply
+from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES, cloud_accuracy
 from mpsfm_core.evaluation.depth_accuracy import depth_accuracy, mean_accuracy
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.true_surface import depth_file, surface_of_depth
 from mpsfm_core.inputs.models import read_model, reconstruction_poses
 from mpsfm_core.inputs.undistortion import pinhole_camera
 from mpsfm_core.results.depth_maps import load_depth_map
+from mpsfm_core.results.ply import read_ply
 
 
 def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
@@ -64,7 +65,7 @@ def evaluate_cloud(
 
 def read_points(path: Path) -> Float64:
     """Points (n, 3) of a PLY file; raises :class:`InputError` when it has none."""
-    points = read_ply(path)
+    points, _ = read_ply(path)
     if not len(points):
         raise InputError(f"{path} has no points, there is nothing to compare")
     return points

@@ -1,4 +1,4 @@
-"""Binary PLY files: point clouds and meshes."""
+"""PLY files: point clouds and meshes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from mpsfm_core.dense.fusion import Cloud
 from mpsfm_core.errors import InputError
 
 _TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4"},
-    **{"uint32": "<u4", "float": "<f4", "double": "<f8", "float32": "<f4", "float64": "<f8"},
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _LONGEST_HEADER = 1 << 16
 _FACE = np.dtype([("count", "u1"), ("rows", "<i4", 3)])
 
@@ -42,7 +43,7 @@ def write_ply(
     columns |= zip(("red", "green", "blue"), colors.T, strict=True)
     columns |= further
     kinds = {name: "uchar" if x.dtype == np.uint8 else "float" for name, x in columns.items()}
-    layout = [(name, _TYPES[kind]) for name, kind in kinds.items()]
+    layout = [(name, "<" + _TYPES[kind]) for name, kind in kinds.items()]
     vertices = np.empty(len(points), dtype=layout)
     for name, values in columns.items():
         vertices[name] = values
@@ -67,7 +68,7 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
 
 
 def read_ply(path: Path) -> tuple[Float64, UInt8]:
-    """Points (n, 3) and RGB colours (n, 3) of a binary little-endian PLY; grey without colours.
+    """Points (n, 3) and RGB colours (n, 3) of a PLY file, text or binary; grey without colours.
 
     Raises :class:`InputError` when it is another kind of file, or cut off.
     """
@@ -75,32 +76,54 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
-    end = data.find(b"end_header\n", 0, _LONGEST_HEADER)
+    end = data.find(b"end_header", 0, _LONGEST_HEADER)
+    start = data.find(b"\n", end) + 1 if end >= 0 else 0
     lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
-    if lines[:2] != ["ply", "format binary_little_endian 1.0"]:
-        raise InputError(f"{path}: is no binary little-endian PLY file")
-    layout: list[tuple[str, str]] = []
-    count = 0
-    for line in lines[2:]:
-        match line.split():
-            case ["element", "vertex", number] if number.isdecimal():
-                count = int(number)
-            case ["element", *_]:
-                break  # vertices come first
-            case ["property", kind, name] if kind in _TYPES:
-                layout.append((name, _TYPES[kind]))
-    names = [name for name, _ in layout]
-    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
-        raise InputError(f"{path}: its points have no x, y and z, or have them twice")
-    vertex = np.dtype(layout)
-    body = memoryview(data)[end + len(b"end_header\n") :]
-    if len(body) < count * vertex.itemsize:
+    words = lines[1].split() if len(lines) > 1 else []
+    if lines[:1] != ["ply"] or words[:1] != ["format"] or words[1] not in _ORDERS or not start:
+        raise InputError(f"{path}: is no PLY file")
+    vertex, count = _layout(path, lines[2:], _ORDERS[words[1]])
+    body = data[start:]
+    if words[1] == "ascii":
+        vertices = _read_text(path, body, vertex, count)
+    elif len(body) < count * vertex.itemsize:
         raise InputError(f"{path}: is cut off, {count} points are announced")
-    vertices = np.frombuffer(body, vertex, count)
+    else:
+        vertices = np.frombuffer(body, vertex, count)
     points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
     if not np.isfinite(points).all():
         raise InputError(f"{path}: has points that are not finite")
     rgb = ("red", "green", "blue")
-    if not set(rgb) <= set(names):
+    if not set(rgb) <= set(vertex.names or ()):
         return points, np.full((count, 3), 128, np.uint8)
     return points, np.stack([vertices[color] for color in rgb], axis=1).astype(np.uint8)
+
+
+def _layout(path: Path, header: list[str], order: str) -> tuple[np.dtype[Any], int]:
+    """What a vertex consists of, and how many there are."""
+    layout: list[tuple[str, str]] = []
+    count: int | None = None
+    for line in header:
+        match line.split():
+            case ["element", "vertex", number] if number.isdecimal() and count is None:
+                count = int(number)
+            case ["element", *_]:
+                break  # vertices come first
+            case ["property", kind, name] if kind in _TYPES:
+                layout.append((name, order + _TYPES[kind]))
+            case ["property", *_]:
+                raise InputError(f"{path}: its points have a property of a strange type: {line}")
+    names = [name for name, _ in layout]
+    if count is None or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+        raise InputError(f"{path}: its points have no x, y and z, or have them twice")
+    return np.dtype(layout), count
+
+
+def _read_text(path: Path, body: bytes, vertex: np.dtype[Any], count: int) -> NDArray[Any]:
+    lines = body.decode("ascii", "replace").splitlines()[:count]
+    if len(lines) < count:
+        raise InputError(f"{path}: is cut off, {count} points are announced")
+    try:
+        return np.array([tuple(map(float, line.split())) for line in lines], dtype=vertex)
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{path}: has a point that cannot be read: {error}") from error

@@ -26,7 +26,6 @@ from mpsfm_core.builtin.arrays import read_arrays
 from mpsfm_core.config import load_config
 from mpsfm_core.data import DepthPrior, Features
 from mpsfm_core.errors import InputError, MpsfmError, WeightsError
-from mpsfm_core.evaluation.cloud_accuracy import read_ply
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.records import read_record
 from mpsfm_core.evaluation.scene_folder import _read_sets
@@ -40,6 +39,7 @@ from mpsfm_core.registry import Registry
 from mpsfm_core.report.page import write_report
 from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.exports.formats import export
+from mpsfm_core.results.ply import read_ply
 from mpsfm_core.uncertainty.file import read_values
 from mpsfm_core.weights import WeightStore
 from mpsfm_core.yaml_text import parse_yaml
