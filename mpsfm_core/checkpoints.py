@@ -1,8 +1,8 @@
-"""States of the mapper on disk, so that a run that was killed goes on where it was.
+"""What mapping and the dense stage have found, on disk, so that a run that was killed goes on.
 
-One file a problem, in the cache. It counts for the same problem and options and the same code and
-numerical libraries; anything else is a new start, as results are to be those of a run that was
-never disturbed.
+Of the mapper its state, one file a problem; of the dense stage a file an image; both in the cache.
+They count for the same problem and options and the same code and numerical libraries; anything else
+is a new start, as results are to be those of a run that was never disturbed.
 """
 
 from __future__ import annotations
@@ -14,20 +14,23 @@ import json
 import logging
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from mpsfm_core.data import MappingProblem
+from mpsfm_core.dense.options import DenseOptions
+from mpsfm_core.dense.stereo import StereoDepth
 from mpsfm_core.errors import DataError
-from mpsfm_core.extraction.cache import cache_folder, content_key
+from mpsfm_core.extraction.cache import Cache, cache_folder, content_key
 from mpsfm_core.files import remove_unfinished, write_file
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.state import Frozen, fingerprint
 from mpsfm_core.npz import read_npz
 from mpsfm_core.registry import core_version
+from mpsfm_core.scene.reconstruction import Reconstruction
 from mpsfm_core.stages import Stages
 
 _log = logging.getLogger(__name__)
@@ -41,7 +44,7 @@ _SHARE = 0.02
 _KEPT_S = 30 * 24 * 3600.0
 """Checkpoints that nobody came back to are taken away then (ours)."""
 _LIBRARIES = ("numpy", "scipy", "numba", "pycolmap", "cv2")
-_NUMERICS = ("data.py", "geometry.py", "jit.py", "mapping", "optimize", "scene")
+_NUMERICS = ("data.py", "geometry.py", "jit.py", "mapping", "optimize", "scene", "dense")
 
 
 class DiskCheckpoints:
@@ -130,6 +133,42 @@ class DiskCheckpoints:
                 path.unlink(missing_ok=True)
 
 
+class DenseCheckpoints:
+    """What the dense stage has found for the images of a reconstruction.
+
+    ``photos``: names the content of the photos of all images.
+    """
+
+    def __init__(
+        self,
+        cache_dir: Path | None,
+        reconstruction: Reconstruction,
+        photos: Sequence[str],
+        options: DenseOptions,
+    ) -> None:
+        self._cache = Cache(cache_dir)
+        self._all = content_key(
+            code_key(), fingerprint(reconstruction), list(photos), options.model_dump(mode="json")
+        )
+        self._names = [image.name for image in reconstruction.images]
+
+    def load(self, name: str) -> StereoDepth | None:
+        """As :class:`mpsfm_core.dense.stage.FoundBefore`."""
+        return self._cache.load("dense", self._key(name), StereoDepth)
+
+    def save(self, name: str, depth: StereoDepth) -> None:
+        """As :class:`mpsfm_core.dense.stage.FoundBefore`."""
+        self._cache.store("dense", self._key(name), depth)
+
+    def forget(self) -> None:
+        """The run is finished."""
+        for name in self._names:
+            self._cache.forget("dense", self._key(name))
+
+    def _key(self, name: str) -> str:
+        return content_key(self._all, name)
+
+
 def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], Frozen]:
     """Header and state of a file; raises :class:`DataError` when it is damaged."""
     try:
@@ -145,7 +184,7 @@ def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], Frozen]:
 
 @functools.cache
 def code_key() -> str:
-    """Names the code that decides the mapper's result to the last bit."""
+    """Names the code that decides what mapper and dense stage find to the last bit."""
     package = Path(__file__).parent
     found = hashlib.sha256()
     for name in _NUMERICS:

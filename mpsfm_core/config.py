@@ -73,9 +73,9 @@ class RuntimeOptions(Options):
     photos end it in any case."""
     timeout_s: float | None = Field(1800.0, gt=0)
     """Seconds that a provider may take for one photo or pair, null for any time."""
-    checkpoint_s: float | None = Field(60.0, ge=0)
+    checkpoint_s: float | None = Field(10.0, ge=0)
     """Seconds between checkpoints of the mapping, more where writing one takes long; a run that
-    was killed goes on from the last. Null writes none."""
+    was killed goes on from the last. Null writes none, and none of the dense stage either."""
     offline: bool = False
     """Never download; a missing weights file is an error."""
 

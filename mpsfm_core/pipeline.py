@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from threadpoolctl import threadpool_limits
 
 from mpsfm_core import precompile
-from mpsfm_core.checkpoints import DiskCheckpoints
+from mpsfm_core.checkpoints import DenseCheckpoints, DiskCheckpoints
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import Float64, MappingProblem, Pose, View
 from mpsfm_core.dense.fusion import fuse_depth_maps
@@ -64,6 +63,7 @@ from mpsfm_core.results.writer import (
 )
 from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
 from mpsfm_core.stages import Stages
+from mpsfm_core.threads import allowed, limited
 
 PathLike = str | Path
 
@@ -139,7 +139,7 @@ def reconstruct(
     folder, target = Path(images), _path(output)
     run = _Run(config, registry, target, fresh)
     with ExitStack() as stack:
-        stack.enter_context(threadpool_limits(config.runtime.workers))
+        stack.enter_context(limited(config.runtime.workers))
         if target is not None:
             check_apart(target, folder)
             stack.enter_context(claimed(target))
@@ -171,6 +171,7 @@ class _Run:
         self._dense: list[dict[str, Any]] | None = None
         self._imported: ImportedMatches | None = None
         self._place: dict[str, object] | None = None
+        self._checkpoints: list[DiskCheckpoints | DenseCheckpoints] = []
 
     def __call__(
         self,
@@ -190,7 +191,7 @@ class _Run:
             with stage("video"):
                 folder = self._frames(folder)
         self._folder = folder
-        compilation = precompile.begin()
+        compilation = precompile.begin() if allowed() > 1 else None
         with stage("inputs"):
             images = load_images(
                 folder,
@@ -210,12 +211,11 @@ class _Run:
             with stage("compilation"):
                 compilation.wait()
         with stage("mapping"):
-            options, checkpoints = config.mapper_options(), self._checkpoints(problem)
+            options, checkpoints = config.mapper_options(), self._mapper_checkpoints(problem)
             mapping = mapper.reconstruct(problem, options, self._stages, checkpoints)
         photos = Photos(images, problem)
         if not mapping.reconstructions:
-            if checkpoints is not None:
-                checkpoints.forget()
+            self._forget_checkpoints()
             self._give_up(images, extraction, mapping, photos)
         if config.results.georeference and not known:
             mapping = self._georeference(images, mapping)
@@ -234,12 +234,11 @@ class _Run:
             else:
                 seed = config.runtime.seed
                 write_results(self._output, components, photos, config.results, summarize, seed)
-        if checkpoints is not None:
-            checkpoints.forget()
+        self._forget_checkpoints()
         self._report()
         return ReconstructionResult(models[0], models[1:], mapping, summary, self._output)
 
-    def _checkpoints(self, problem: MappingProblem) -> DiskCheckpoints | None:
+    def _mapper_checkpoints(self, problem: MappingProblem) -> DiskCheckpoints | None:
         config = self._provision.config
         if config.runtime.checkpoint_s is None:
             return None
@@ -252,7 +251,24 @@ class _Run:
         )
         if self._fresh:
             checkpoints.forget()
+        self._checkpoints.append(checkpoints)
         return checkpoints
+
+    def _dense_checkpoints(self, part: Reconstruction, photos: Photos) -> DenseCheckpoints | None:
+        config = self._provision.config
+        if config.runtime.checkpoint_s is None:
+            return None
+        keys = [photos.key(image) for image in part.images]
+        checkpoints = DenseCheckpoints(config.runtime.cache_dir, part, keys, config.dense)
+        if self._fresh:
+            checkpoints.forget()
+        self._checkpoints.append(checkpoints)
+        return checkpoints
+
+    def _forget_checkpoints(self) -> None:
+        """The run is finished."""
+        for checkpoints in self._checkpoints:
+            checkpoints.forget()
 
     def _densified(
         self, mapping: MappingResult, photos: Photos
@@ -268,8 +284,9 @@ class _Run:
                     part,
                     photos.view,
                     config.dense,
-                    config.runtime.workers,
+                    None,
                     partial(self._stages.stage_progress, "dense"),
+                    self._dense_checkpoints(part, photos),
                 )
                 parts.append(dense)
                 reports.append(asdict(report))
@@ -442,12 +459,12 @@ def densify_model(
         InputError: model or photos cannot be read, names do not match, the model has no points, or
             ``output`` cannot be written.
     """
-    with claimed(Path(output)):
-        return _densify_model(Path(model), Path(images), Path(output), options, workers)
+    with claimed(Path(output)), limited(workers):
+        return _densify_model(Path(model), Path(images), Path(output), options)
 
 
 def _densify_model(
-    model: Path, images: Path, output: Path, options: DenseOptions | None, workers: int | None
+    model: Path, images: Path, output: Path, options: DenseOptions | None
 ) -> DenseReport:
     colmap, poses = read_model(model), read_poses(model)
     matched = match_names(find_images(images), poses)
@@ -473,7 +490,7 @@ def _densify_model(
     def view_of(name: str) -> View:
         return photos.view(rows[name])
 
-    dense, report = densify(known, view_of, options or DenseOptions(), workers)
+    dense, report = densify(known, view_of, options or DenseOptions())
     with replacing(output, (SPARSE, DENSE, DEPTH)) as folder:
         write_model(folder / SPARSE, colmap)
         write_depth_maps(folder / DEPTH, dense)

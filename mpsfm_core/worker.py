@@ -17,6 +17,7 @@ from mpsfm_core.errors import ProviderError
 from mpsfm_core.options import Backend
 from mpsfm_core.providers import API_VERSION, ProviderContext
 from mpsfm_core.registry import CORE, Registry, core_version
+from mpsfm_core.threads import limited
 
 
 class Service:
@@ -26,6 +27,7 @@ class Service:
         self._channel = channel
         self._registry: Registry | None = None
         self._provider: Any = None
+        self._threads: int | None = None
 
     def serve(self) -> None:
         """Greet, and answer until the main process is gone."""
@@ -51,7 +53,8 @@ class Service:
     def _answer(self, request: Mapping[str, Any]) -> Any:
         what = request["do"]
         if what == "call":
-            return getattr(self._provider, request["method"])(*request["arguments"])
+            with limited(self._threads):
+                return getattr(self._provider, request["method"])(*request["arguments"])
         registry = self._registry or Registry.discover(environments=False)
         self._registry = registry
         if what == "describe":
@@ -64,6 +67,7 @@ class Service:
                 threads=request["threads"],
                 seed=request["seed"],
             )
+            self._threads = context.threads
             self._provider = registry.create(kind, name, request["options"] or None, context)
             return None
         if what == "setup":

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -16,10 +15,11 @@ from mpsfm_core.dense.consistency import Agreement, compare_depth, splat_depth
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.posterior import Observed, posterior, with_known
 from mpsfm_core.dense.source_views import choose_sources
-from mpsfm_core.dense.stereo import match_depth
+from mpsfm_core.dense.stereo import StereoDepth, match_depth
 from mpsfm_core.dense.view import DenseView, PosedGrid
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.threads import allowed
 
 _MAX_COST = 0.9
 """Of depth that counts as measured: black photos agree on everything (ours)."""
@@ -45,17 +45,29 @@ class DenseReport:
     confirmed: dict[str, float]
 
 
+class FoundBefore(Protocol):
+    """Keeps what was found in the photos, for a run that goes on after it was killed."""
+
+    def load(self, name: str) -> StereoDepth | None:
+        """Of an image with the same reconstruction, photos and options; None if there is none."""
+
+    def save(self, name: str, depth: StereoDepth) -> None:
+        """Keep that of an image; called from several threads."""
+
+
 def densify(
     reconstruction: Reconstruction,
     view_of: Callable[[str], View],
     options: DenseOptions,
     workers: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    found_before: FoundBefore | None = None,
 ) -> tuple[Reconstruction, DenseReport]:
     """The reconstruction with depth that was measured in the photos where that is possible.
 
-    ``view_of``: undistorted view by name. ``workers``: images at once, None for one a core; what
-    comes out does not depend on it. ``progress``: is told how many images of how many are matched.
+    ``view_of``: undistorted view by name. ``workers``: images at once, None for as many as the run
+    may use; what comes out does not depend on it. ``progress``: is told how many images of how many
+    are matched. ``found_before``: has what a run that was killed found, and keeps what this finds.
     Images that no other one overlaps keep their maps, and so do those without confirmed pose.
     """
     posed = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
@@ -65,15 +77,19 @@ def densify(
     views = _Views(images, view_of, options)
 
     def matched(row: int) -> _Found:
-        view = views[row]
-        stereo = match_depth(view, [views[other] for other in sources[row]], options)
+        view, name = views[row], images[row].name
+        stereo = found_before.load(name) if found_before else None
+        if stereo is None:
+            stereo = match_depth(view, [views[other] for other in sources[row]], options)
+            if found_before:
+                found_before.save(name, stereo)
         # where the photo may be used and says anything
         supported = view.usable & (stereo.cost < _MAX_COST)
         return _Found(view.grid, stereo.log_depth, stereo.parallax, supported)
 
     rows = [row for row, others in enumerate(sources) if others]
     found: dict[int, _Found] = {}
-    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+    with ThreadPoolExecutor(workers or allowed()) as pool:
         for row, own in zip(rows, pool.map(matched, rows), strict=True):
             found[row] = own
             progress(len(found), len(rows))

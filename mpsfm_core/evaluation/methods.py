@@ -15,7 +15,6 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 
 import pycolmap
-from threadpoolctl import threadpool_limits
 
 from mpsfm_core.data import MappingProblem, PinholeCamera, Pose
 from mpsfm_core.evaluation.chained_pnp import chained_poses
@@ -24,6 +23,7 @@ from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.threads import limited
 
 OURS = "ours"
 CHAIN = "chained-pnp"
@@ -80,7 +80,7 @@ def run_method(method: str, problem: MappingProblem, options: MapperOptions) -> 
     models: list[dict[str, Pose]] = []
     error = ""
     try:
-        with threadpool_limits(1):
+        with limited(1):
             models = _models(method, problem, options)
     except Exception as raised:  # whatever a mapper raises is its result
         error = f"{type(raised).__name__}: {raised}"

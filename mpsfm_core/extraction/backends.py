@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import shutil
 import threading
 import time
@@ -17,6 +16,7 @@ from mpsfm_core.errors import ProviderRunError
 from mpsfm_core.options import Backend
 from mpsfm_core.providers import API_VERSION, Capability, Kind, ProviderContext, ProviderSpec
 from mpsfm_core.registry import Registry
+from mpsfm_core.threads import cores
 from mpsfm_core.weights import WeightStore, file_sha256, is_remote
 
 T = TypeVar("T")
@@ -177,20 +177,14 @@ def within(seconds: float | None, compute: Callable[[], T]) -> T:
 
 def worker_count(runtime: RuntimeOptions) -> int:
     """Threads that a stage runs on."""
-    return runtime.workers or min(_MAX_WORKERS, _cores())
+    return runtime.workers or min(_MAX_WORKERS, cores())
 
 
 def thread_count(runtime: RuntimeOptions) -> int:
     """Threads that one provider may use itself."""
     if runtime.workers is not None:
         return runtime.threads
-    return max(runtime.threads, _cores() // worker_count(runtime))
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):  # what a container or job scheduler allows
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return max(runtime.threads, cores() // worker_count(runtime))
 
 
 def _device(runtime: RuntimeOptions, spec: ProviderSpec) -> str:

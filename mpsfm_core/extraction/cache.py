@@ -8,11 +8,13 @@ place and moved into it when complete; one that is damaged nevertheless is compu
 from __future__ import annotations
 
 import errno
+import functools
 import hashlib
 import json
 import logging
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast, get_args, get_origin, get_type_hints
@@ -74,6 +76,11 @@ class Cache:
                 f"runtime.cache_dir"
             ) from error
 
+    def forget(self, kind: str, key: str) -> None:
+        """Take an entry away, if it is there."""
+        with suppress(OSError):
+            self._path(kind, key).unlink()
+
     def _path(self, kind: str, key: str) -> Path:
         return self.folder / kind / key[:2] / f"{key}.npz"
 
@@ -121,7 +128,7 @@ def unpack(cls: type[T], arrays: Arrays, prefix: str = "") -> T:
     """The object of class ``cls`` (a data class, or an array) that :func:`pack` took apart."""
     if not is_dataclass(cls):
         return arrays[prefix or "value"]  # type: ignore[return-value]
-    hints = get_type_hints(cls)
+    hints = _hints(cls)
     values: dict[str, Any] = {}
     for field in fields(cls):
         path = f"{prefix}/{field.name}" if prefix else field.name
@@ -141,6 +148,9 @@ def _unpack_tuple(cls: type[T], arrays: Arrays, path: str) -> tuple[T, ...]:
     names = {name.removeprefix(f"{path}/").partition("/")[0] for name in arrays if "/" in name}
     count = sum(f"{index}" in names for index in range(len(names)))
     return tuple(unpack(cls, arrays, f"{path}/{index}") for index in range(count))
+
+
+_hints = functools.cache(get_type_hints)  # takes longer than reading a small entry
 
 
 def _data_class(hint: object) -> type | None:

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from mpsfm_core.config import Config
 from mpsfm_core.errors import ConfigError, InputError, did_you_mean
@@ -33,6 +32,7 @@ from mpsfm_core.first_party import EXECUTORS
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.providers import Executor
 from mpsfm_core.registry import Registry
+from mpsfm_core.threads import limited
 
 THREADS = "threads"
 
@@ -97,7 +97,7 @@ class Step:
     config: Config
 
     def __call__(self, item: Any) -> None:
-        with threadpool_limits(thread_count(self.config.runtime), user_api="blas"):
+        with limited(thread_count(self.config.runtime)):
             _station(self).work[self.stage](item)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from mpsfm_core.data import Float64, Int64, PinholeCamera
 from mpsfm_core.extraction.options import VerificationOptions
@@ -94,7 +94,7 @@ def _chance(inliers: int, matches: int, camera: PinholeCamera, error_px: float) 
     area = camera.width * camera.height
     band = 2 * math.sqrt(2) * error_px * math.hypot(camera.width, camera.height) / area
     sample = 5
-    return float(binom.sf(inliers - sample - 1, matches - sample, min(band, 1.0)))
+    return float(bdtrc(inliers - sample - 1, matches - sample, min(band, 1.0)))
 
 
 def _dropped(reason: str, configuration: str = "") -> TwoView:

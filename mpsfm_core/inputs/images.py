@@ -40,6 +40,7 @@ from mpsfm_core.inputs.undistortion import (
     to_original,
     to_view,
 )
+from mpsfm_core.threads import allowed
 
 _log = logging.getLogger(__name__)
 
@@ -50,7 +51,7 @@ _CACHED_BYTES = 512 << 20
 _CACHED_WARPS = 2
 """A warp has 8 bytes a pixel, and neighbouring images mostly share a camera."""
 _READERS = 4
-"""Threads that read and hash files."""
+"""Threads that read and hash files, at most."""
 _MENTIONED = 5
 SUMMARY = "summary.json"
 """The file that tells a folder of results from one of photos."""
@@ -271,7 +272,7 @@ def load_images(
             raise InputError(f"{source} has {found}: a reconstruction needs two or more")
     known = _read_cameras(intrinsics, names)
     partial = _read_cameras(model, names) if known is None else None
-    with ThreadPoolExecutor(_READERS) as pool:
+    with ThreadPoolExecutor(min(_READERS, allowed())) as pool:
         files = list(pool.map(lambda name: _probe(folder / name, options), names))
     left_out = {name: file.fault for name, file in zip(names, files, strict=True) if file.fault}
     _judge(left_out, len(names), options)

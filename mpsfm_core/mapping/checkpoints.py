@@ -44,7 +44,8 @@ class Keeper:
         self._shared = (problem, events)
 
     def load(self) -> tuple[list[Run], Mapper | None]:
-        """The runs that are finished, and the mapper of the one that is not."""
+        """The runs that are finished, and the mapper of the one that is not; runs without a mapper
+        are all that there will be."""
         if self._checkpoints is None or (frozen := self._checkpoints.load()) is None:
             return [], None
         try:
@@ -56,6 +57,12 @@ class Keeper:
 
     def save(self, runs: list[Run], mapper: Mapper) -> None:
         """Keep the state if it is time."""
+        self._save(runs, mapper, mapper.group.size)
+
+    def finish(self, runs: list[Run]) -> None:
+        """Keep what came out, for who is killed in what follows."""
+        self._save(runs, None, max(run.size for run in runs))
+
+    def _save(self, runs: list[Run], mapper: Mapper | None, registered: int) -> None:
         if self._checkpoints is not None and self._checkpoints.due():
-            frozen = freeze((runs, mapper), self._shared)
-            self._checkpoints.save(frozen, mapper.group.size)
+            self._checkpoints.save(freeze((runs, mapper), self._shared), registered)

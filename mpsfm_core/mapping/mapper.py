@@ -43,13 +43,15 @@ def reconstruct(
     problem = canonical(problem)
     keeper = Keeper(checkpoints, problem, events)
     runs, unfinished = keeper.load()
-    for number in range(len(runs), options.max_runs):
+    finished_before = bool(runs) and unfinished is None
+    for number in range(len(runs), 0 if finished_before else options.max_runs):
         own = options.model_copy(update={"seed": options.seed + number})
         mapper = unfinished or Mapper(problem, own, events)
         runs.append(mapper.run(partial(keeper.save, runs, mapper)))
         unfinished = None
         if mapper.keeps_poses or settled(runs, options.enough_explained):
             break
+    keeper.finish(runs)
     best = max(runs, key=lambda run: run.of_largest)
     models = list(best.models)
     if models and options.place_unconfirmed:

@@ -16,9 +16,6 @@ from mpsfm_core.optimize.depth_integration import IntegrationOptions
 from mpsfm_core.optimize.losses import Loss
 from mpsfm_core.options import Options
 
-THREADS = 2
-"""That find poses and refine maps (ours); what comes out does not depend on it."""
-
 
 class InitializationOptions(Options):
     """How a group of images starts."""

@@ -16,7 +16,7 @@ from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.mapping.depth_noise import DepthNoise, measure_depth_noise
 from mpsfm_core.mapping.filtering import filter_points
 from mpsfm_core.mapping.keypoint_noise import measure_loss_scale
-from mpsfm_core.mapping.options import THREADS, MapperOptions
+from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.triangulation import complete_and_merge, lift_low_parallax
 from mpsfm_core.mapping.view_selection import local_bundle
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
@@ -30,6 +30,7 @@ from mpsfm_core.optimize.thinning import (
     thinning_step,
 )
 from mpsfm_core.scene.scene import Scene
+from mpsfm_core.threads import allowed
 
 LOCAL_MAX_TRACK_LENGTH = 15
 """Longer tracks stay fixed in local bundle adjustment (COLMAP, reference)."""
@@ -149,7 +150,7 @@ class Refiner:
             return
         images = [image for image in images if self.scene.maps[image].active]
         covariances = self._covariances(images)
-        with ThreadPoolExecutor(THREADS) as pool:
+        with ThreadPoolExecutor(allowed()) as pool:
             list(pool.map(lambda image: self._integrate(image, *covariances), images))
 
     def adjust(

@@ -15,12 +15,13 @@ import numpy as np
 
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.correspondences import Correspondences
-from mpsfm_core.mapping.options import THREADS, MapperOptions, RegistrationOptions
+from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
 from mpsfm_core.mapping.pose_hypotheses import Estimate, Hypotheses, Hypothesis
 from mpsfm_core.mapping.pose_support import AbsolutePose, improve_pose, rate_pose
 from mpsfm_core.mapping.refinement import Refiner
 from mpsfm_core.mapping.triangulation import triangulate_image
 from mpsfm_core.scene.scene import Scene, Snapshot
+from mpsfm_core.threads import allowed
 
 MIN_TURN_DEG = 3.0
 """Hypotheses that differ less are refined to the same pose (ours)."""
@@ -78,7 +79,7 @@ def find_poses(
     """
     poses: list[AbsolutePose] = []
     hypotheses = Hypotheses(scene, image, found, options, seed)
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(allowed()) as pool:
 
         def add(estimates: Iterator[Estimate]) -> None:
             made = pool.map(lambda estimate: estimate(), estimates)

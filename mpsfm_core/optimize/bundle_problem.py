@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from mpsfm_core.errors import DataError
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.losses import Loss
 from mpsfm_core.options import Options
+from mpsfm_core.threads import allowed
 
 RANGE_SIZE = 8000
 """Observations that are worth a thread of their own (our choice; about 2 ms a step)."""
@@ -51,7 +51,7 @@ class BundleOptions(Options):
     """Up to this many variable poses the cameras are solved for by a dense Cholesky
     factorisation, beyond by conjugate gradients (they break even between 300 and 600)."""
     threads: int | None = Field(None, ge=1)
-    """None: one per processor. The result does not depend on it."""
+    """None: as many as the run may use. The result does not depend on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,7 @@ def prepare(problem: BundleProblem, options: BundleOptions) -> Prepared:
 @contextmanager
 def workers(ranges: list[Range], threads: int | None) -> Iterator[Run]:
     """Threads, if there are several ranges and processors, for as long as the context lasts."""
-    count = min(len(ranges), threads or os.cpu_count() or 1)
+    count = min(len(ranges), threads or allowed())
     if count < 2:
 
         def run_here(function: Callable[[int, int, int], Result]) -> list[Result]:

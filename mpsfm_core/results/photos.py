@@ -29,6 +29,10 @@ class Photos:
         """The photo of a registered image."""
         return self._images[self._rows[image.name]]
 
+    def key(self, image: RegisteredImage) -> str:
+        """Names the content of its view."""
+        return self._images.pixel_key(self._rows[image.name])
+
     def view(self, name: str) -> View:
         """The undistorted view."""
         return self._images.view(self._rows[name])

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mpsfm_core.checkpoints import DenseCheckpoints
 from mpsfm_core.data import View
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
+from mpsfm_core.dense.stereo import StereoDepth
 
 OPTIONS = DenseOptions(correlation_px=20)
 
@@ -85,3 +88,49 @@ def test_an_unconfirmed_pose_is_not_used(room) -> None:
     dense, report = densify(guessed, room.views.__getitem__, OPTIONS)
     assert dense.images[1].depth is images[1].depth
     assert all("1.png" not in sources for sources in report.sources.values())
+
+
+class Dies:
+    """Keeps what two images give, and ends the run at the third."""
+
+    def __init__(self, kept: DenseCheckpoints) -> None:
+        self.kept, self.loaded, self.saved = kept, 0, 0
+
+    def load(self, name: str) -> StereoDepth | None:
+        found = self.kept.load(name)
+        self.loaded += found is not None
+        return found
+
+    def save(self, name: str, depth: StereoDepth) -> None:
+        self.saved += 1
+        if self.saved == 3:
+            raise KeyboardInterrupt
+        self.kept.save(name, depth)
+
+
+def test_a_run_goes_on_with_what_a_killed_one_found(room, tmp_path: Path) -> None:
+    def checkpoints(photos: list[str]) -> DenseCheckpoints:
+        return DenseCheckpoints(tmp_path, room.reconstruction, photos, OPTIONS)
+
+    whole, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS)
+    keys = list(room.views)
+    with pytest.raises(KeyboardInterrupt):
+        densify(
+            room.reconstruction,
+            room.views.__getitem__,
+            OPTIONS,
+            workers=1,
+            found_before=Dies(checkpoints(keys)),
+        )
+    second = Dies(checkpoints(keys))
+    again, _ = densify(
+        room.reconstruction, room.views.__getitem__, OPTIONS, workers=1, found_before=second
+    )
+    assert second.loaded == 2
+    for a, b in zip(whole.images, again.images, strict=True):
+        np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
+        np.testing.assert_array_equal(a.depth.variance, b.depth.variance)
+    assert checkpoints(keys).load(keys[0]) is not None
+    assert checkpoints([*keys[1:], "another photo"]).load(keys[0]) is None
+    checkpoints(keys).forget()
+    assert not list(tmp_path.rglob("*.npz"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -18,6 +17,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import PinholeCamera
+from mpsfm_core.testing.result_files import content
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 
 HERE = Path(__file__).parent
@@ -31,22 +31,6 @@ normals: {{use: from-depth}}
 extraction: {{integration_size: 64}}
 runtime: {{workers: 1, checkpoint_s: 0, cache_dir: {cache}}}
 """
-
-
-def content(folder: Path) -> dict[str, str]:
-    """Hash of each file; of the summary only what does not tell the time."""
-    found = {}
-    for path in sorted(folder.rglob("*")):
-        if path.name == "report.html":  # tells the time, and is made of the other files
-            found[str(path.relative_to(folder))] = ""
-        elif path.is_file():
-            data = path.read_bytes()
-            if path.name == "summary.json" and data.startswith(b"{"):
-                summary = json.loads(data)
-                parts = [summary.get(k) for k in ("status", "reconstructions", "pairs")]
-                data = json.dumps([parts, summary.get("images")]).encode()
-            found[str(path.relative_to(folder))] = hashlib.sha256(data).hexdigest()
-    return found
 
 
 @dataclass
