@@ -103,7 +103,7 @@ class Dies:
 
     def save(self, name: str, depth: StereoDepth) -> None:
         self.saved += 1
-        if self.saved == 3:
+        if self.saved >= 3:
             raise KeyboardInterrupt
         self.kept.save(name, depth)
 
