@@ -76,6 +76,9 @@ class RuntimeOptions(Options):
     checkpoint_s: float | None = Field(10.0, ge=0)
     """Seconds between checkpoints of the mapping, more where writing one takes long; a run that
     was killed goes on from the last. Null writes none, and none of the dense stage either."""
+    check_resources: bool = True
+    """A run that cannot fit into memory or onto the disk ends before a photo is decoded, and one
+    that may not fit says so; off: what it takes is told and no more."""
     offline: bool = False
     """Never download; a missing weights file is an error."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import platform
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from mpsfm_core import precompile
+from mpsfm_core import precompile, resources
 from mpsfm_core.checkpoints import DenseCheckpoints, DiskCheckpoints
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import Float64, MappingProblem, Pose, View
@@ -24,6 +24,7 @@ from mpsfm_core.dense.options import DenseOptions, MeshOptions
 from mpsfm_core.dense.sparse_depth import depth_of_points
 from mpsfm_core.dense.stage import DenseReport, densify
 from mpsfm_core.errors import ConfigError, InputError, ReconstructionError
+from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.focal import estimate_focals
 from mpsfm_core.extraction.predictions import FROM_MATCHER
 from mpsfm_core.extraction.runner import Extraction, extract
@@ -58,6 +59,7 @@ from mpsfm_core.results.writer import (
     MESH,
     SPARSE,
     Component,
+    update_summary,
     write_failure,
     write_results,
 )
@@ -145,6 +147,7 @@ def reconstruct(
             stack.enter_context(claimed(target))
         elif is_video(folder):
             raise InputError(f"{folder}: a video needs an output folder, for its frames")
+        stack.enter_context(run.watching_processes())
         matches = (database,) if database is not None else hloc or ()
         return run(
             folder,
@@ -171,7 +174,13 @@ class _Run:
         self._dense: list[dict[str, Any]] | None = None
         self._imported: ImportedMatches | None = None
         self._place: dict[str, object] | None = None
+        self._needs = resources.Needs(0, 0, 0)
+        self._started = resources.Watch()
         self._checkpoints: list[DiskCheckpoints | DenseCheckpoints] = []
+
+    def watching_processes(self) -> AbstractContextManager[None]:
+        """Measure the memory of processes that this one starts."""
+        return self._started.watching()
 
     def __call__(
         self,
@@ -201,6 +210,7 @@ class _Run:
                 model=poses,
                 without=self._output,
             )
+            self._foresee(images)
             known = {} if poses is None else _known_poses(poses, images)
             self._imported = _import_matches(matches, images)
         with stage("extraction"):
@@ -236,7 +246,40 @@ class _Run:
                 write_results(self._output, components, photos, config.results, summarize, seed)
         self._forget_checkpoints()
         self._report()
+        if self._output is not None:
+            summary["resources"] = self._resources(self._output)
+            with suppress(OSError):  # what was written before stands
+                update_summary(self._output, summary)
         return ReconstructionResult(models[0], models[1:], mapping, summary, self._output)
+
+    def _foresee(self, images: ImageSet) -> None:
+        """Say what the run will take; raises :class:`InputError` where that cannot be had."""
+        config, registry = self._provision.config, self._registry
+        files = [
+            file
+            for _, kind, backend in config.backends()
+            for file in registry.weights(kind, backend.use, backend.options)
+        ]
+        self._needs = resources.predict(
+            [image.pinhole.size for image in images],
+            config,
+            [choice.provider for choice in self._provision.choices],
+            sum(file.size or 0 for file in files),
+        )
+        self._stages.notice(f"takes about {self._needs}")
+        if config.runtime.check_resources:
+            cache = cache_folder(config.runtime.cache_dir)
+            for text in resources.shortages(self._needs, cache, self._output):
+                self._stages.notice(f"warning: {text}")
+
+    def _resources(self, output: Path | None = None) -> dict[str, Any]:
+        """What was predicted and what it was: of memory the peak so far."""
+        peaks = [record.peak_memory_mb or 0.0 for record in self._stages.report().values()]
+        measured = {
+            "memory_mb": round(max(peaks, default=0.0) + self._started.peak_mb),
+            "output_mb": None if output is None else round(resources.folder_mb(output)),
+        }
+        return {"predicted": asdict(self._needs), "measured": measured}
 
     def _mapper_checkpoints(self, problem: MappingProblem) -> DiskCheckpoints | None:
         config = self._provision.config
@@ -364,6 +407,7 @@ class _Run:
             "pairs": describe_pairs(extraction.report, mapping),
             "reconstructions": describe_reconstructions(mapping, models),
             "georeference": self._place,
+            "resources": self._resources(),
             "stages": {name: asdict(record) for name, record in self._stages.report().items()},
             "dense": self._dense,
             "mapping_runs": mapping.report.runs,

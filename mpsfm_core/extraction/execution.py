@@ -27,7 +27,7 @@ from mpsfm_core.extraction.matching import PairMatcher
 from mpsfm_core.extraction.multiview import GroupPriors
 from mpsfm_core.extraction.predictions import Predictions
 from mpsfm_core.extraction.selection import PairSelection
-from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.extraction.workbench import RUNS, Workbench
 from mpsfm_core.first_party import EXECUTORS
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.providers import Executor
@@ -77,7 +77,8 @@ class _Elsewhere:
         config = bench.config.model_copy(update={"runtime": runtime})
         self._step = Step(uuid.uuid4().hex, "", bench.images, config)
         self._executor = executor
-        bench.cache.store(_MARK, content_key(self._step.run), np.array(True))
+        bench.shared_run = self._step.run
+        bench.cache.store(RUNS, content_key(self._step.run), np.array(True))
 
     def __call__(self, stage: str, items: Sequence[Any]) -> Generator[None, None, None]:
         """Run a stage; yields after each item."""
@@ -107,7 +108,8 @@ class _Station:
     def __init__(self, step: Step) -> None:
         config = step.config
         bench = Workbench(step.images, config, Registry.discover(), Silent())
-        if bench.cache.load(_MARK, content_key(step.run), np.ndarray) is None:
+        bench.shared_run = step.run
+        if bench.cache.load(RUNS, content_key(step.run), np.ndarray) is None:
             raise InputError(
                 f"the worker on {socket.gethostname()} does not see the cache {bench.cache.folder} "
                 f"of this run: set runtime.cache_dir to a folder that all machines share"
@@ -129,7 +131,6 @@ class _Station:
             self.work["features"] = table.__getitem__
 
 
-_MARK = "run"
 _LOCK = threading.Lock()
 _STATIONS: dict[str, _Station] = {}
 

@@ -25,6 +25,9 @@ from mpsfm_core.registry import Registry
 
 _log = logging.getLogger(__name__)
 
+RUNS = "run"
+"""Kind of cache entry that the workers of one run leave for each other."""
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -47,6 +50,8 @@ class Workbench:
         self._events = events
         self.elsewhere: Callable[[str, Sequence[Any]], Generator[None, None, None]] | None = None
         """Runs a stage on the workers of an executor, where there is one."""
+        self.shared_run = ""
+        """Names the run to the workers of an executor: all know what a provider failed on."""
         self._mask_providers: list[ActiveProvider] = []
         self._masks: dict[int, tuple[UInt8, str]] = {}
 
@@ -93,16 +98,28 @@ class Workbench:
         if found is not None:
             provider.count_cached(key)
             return found
+        may_skip = self.config.runtime.on_error == "skip" and cls in NOTHING and bool(images)
         try:
+            if may_skip:
+                self._check_known_failure(key)
             value = provider.timed(key, compute, self.config.runtime.timeout_s)
         except (ProviderRunError, ProviderOutputError) as error:
-            if self.config.runtime.on_error == "fail" or cls not in NOTHING or not images:
+            if not may_skip:
                 raise
+            if self.shared_run:
+                self.cache.store(RUNS, content_key(self.shared_run, key), np.array(str(error)))
             self._note_failure(images, error)
             return cast(Result, NOTHING[cls]())
         if not uncached:
             self.cache.store(provider.kind, key, value)
         return value
+
+    def _check_known_failure(self, key: str) -> None:
+        """Raise what a provider failed with on another worker of this run: once is enough."""
+        if self.shared_run:
+            known = self.cache.load(RUNS, content_key(self.shared_run, key), np.ndarray)
+            if known is not None:
+                raise ProviderRunError(str(known))
 
     def failed(self, images: Sequence[int]) -> bool:
         """Whether a provider failed on one of the images: nothing more is asked about it."""

@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 
 FocalSource = Literal["intrinsics", "exif", "provider", "default"]
 
-_CACHED_BYTES = 512 << 20
+CACHED_BYTES = 512 << 20
 """Decoded views that are kept: the matcher asks for each image many times."""
 _CACHED_WARPS = 2
 """A warp has 8 bytes a pixel, and neighbouring images mostly share a camera."""
@@ -125,7 +125,7 @@ class ImageSet:
         self.images = tuple(images)
         self.left_out = dict(left_out or {})
         self._options = options
-        self._views: Recent[int, View] = Recent(_CACHED_BYTES, _bytes)
+        self._views: Recent[int, View] = Recent(CACHED_BYTES, _bytes)
         self._warps: Recent[str, Warp] = Recent(_CACHED_WARPS, lambda _: 1)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -30,7 +30,7 @@ import pycolmap
 
 from mpsfm_core.data import UInt8
 from mpsfm_core.dense.fusion import fuse_depth_maps
-from mpsfm_core.files import replacing
+from mpsfm_core.files import replacing, write_file
 from mpsfm_core.inputs.images import SUMMARY
 from mpsfm_core.inputs.nerfstudio import can_hold, write_transforms
 from mpsfm_core.results.colmap_model import build_model, pinhole, point_colors, write_model
@@ -138,6 +138,11 @@ def _write_dense(
         write_depth_maps(folder / DEPTH, component.reconstruction)
 
 
+def update_summary(output: Path, summary: Mapping[str, Any]) -> None:
+    """Write the summary once more, when the rest is in place; raises :class:`OSError`."""
+    write_file(output / SUMMARY, _json_text(summary))
+
+
 def write_failure(
     output: Path, photos: Photos, options: ResultOptions, summary: Mapping[str, Any]
 ) -> None:
@@ -168,4 +173,8 @@ def _write_nerfstudio(path: Path, output: Path, component: Component, photos: Ph
 
 
 def _write_json(path: Path, data: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+    path.write_text(_json_text(data), encoding="utf-8")
+
+
+def _json_text(data: Mapping[str, Any]) -> str:
+    return json.dumps(data, indent=2) + "\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import cv2
 
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.errors import ConfigError, DataError
+from mpsfm_core.errors import ConfigError, DataError, ProviderRunError
 from mpsfm_core.extraction.events import Silent
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
@@ -93,12 +94,7 @@ def check_errors(executor: Executor) -> None:
 def check_extraction(name: str, options: dict[str, Any], folder: Path) -> None:
     """An extraction gives what threads give, bit for bit; Ctrl-C ends it, and what was done stays;
     a worker that does not see the cache says so."""
-    photos = folder / "photos"
-    photos.mkdir(parents=True)
-    scene = room_scene()
-    for number, pose in enumerate(arc_poses(_COUNT, 10.0)):
-        cv2.imwrite(str(photos / f"{number}.png"), scene.render(_CAMERA, pose).rgb[..., ::-1])
-    (folder / "intrinsics.yaml").write_text(_INTRINSICS, encoding="utf-8")
+    _make_photos(folder)
     here = _extract(folder, RuntimeOptions(cache_dir=folder / "here", workers=2))
     runtime = RuntimeOptions(
         cache_dir=folder / "there", workers=2, executor=name, executor_options=options
@@ -118,6 +114,86 @@ def check_extraction(name: str, options: dict[str, Any], folder: Path) -> None:
     assert watch.done["features"] == _COUNT and watch.done["matching"] == pairs
     used = {line["kind"]: line["computed"] for line in there.report["providers"]}
     assert not used["matcher"], "this process matched itself"
+
+
+def check_failing_provider(name: str, options: dict[str, Any], folder: Path) -> None:
+    """A provider that fails on a photo, or hangs, is asked about it once, by a worker; the rule is
+    that of threads: the run ends and names it, or goes on without the photo and lists it."""
+    _make_photos(folder)
+    with _installed(folder):
+        runtime = RuntimeOptions(
+            cache_dir=folder / "cache",
+            workers=2,
+            executor=name,
+            executor_options=options,
+            timeout_s=_TIMEOUT_S,
+        )
+        try:
+            _extract(folder, runtime, depth="shaky")
+        except ProviderRunError as error:
+            assert "'shaky'" in str(error)
+        else:
+            raise AssertionError("the provider's error did not end the run")
+        for mark in folder.glob("asked-*"):
+            mark.unlink()
+        found = _extract(folder, runtime.model_copy(update={"on_error": "skip"}), depth="shaky")
+    reasons = found.report["failed"]
+    assert list(reasons) == ["1.png", "2.png"], reasons
+    assert "ZeroDivisionError" in reasons["1.png"]
+    assert f"no answer within {_TIMEOUT_S:g} s" in reasons["2.png"]
+    valid = [image.depth.valid.any() for image in found.problem.images]
+    assert valid == [True, False, False, True]
+    asked = [path.name.split("-")[1:] for path in folder.glob("asked-*")]
+    for photo in reasons:
+        processes = [process for asked_photo, process in asked if asked_photo == photo]
+        assert len(processes) == 1 and processes[0] != str(os.getpid()), (photo, processes)
+
+
+_TIMEOUT_S = 3.0
+_SHAKY = """
+import os, time
+from pathlib import Path
+import numpy as np
+from mpsfm_core import DepthPrior, ProviderSpec, hookimpl
+
+class Shaky:
+    def __init__(self, options, context): pass
+
+    def predict(self, view):
+        Path({folder!r}, f"asked-{{view.name}}-{{os.getpid()}}").touch()
+        if view.name == "1.png":
+            raise ZeroDivisionError("in the network")
+        if view.name == "2.png":
+            time.sleep(60)
+        return DepthPrior.from_arrays(np.full(view.image.shape[:2], 3.0, np.float32))
+
+@hookimpl
+def mpsfm_providers():
+    return [ProviderSpec(kind="depth", name="shaky", factory=Shaky)]
+"""
+
+
+@contextmanager
+def _installed(folder: Path) -> Iterator[None]:
+    """While this lasts, a plugin that fails is installed, here and for processes started here."""
+    site, name = folder / "site", "mpsfm_shaky"
+    about = site / f"{name}-1.0.dist-info"
+    about.mkdir(parents=True)
+    (site / f"{name}.py").write_text(_SHAKY.format(folder=str(folder)), encoding="utf-8")
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[mpsfm.plugins]\nshaky = {name}\n")
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(site), *([before] if before else [])])
+    sys.path.insert(0, str(site))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(site))
+        sys.modules.pop(name, None)
+        if before is None:
+            del os.environ["PYTHONPATH"]
+        else:
+            os.environ["PYTHONPATH"] = before
 
 
 class _Watch(Silent):
@@ -145,11 +221,22 @@ class _CtrlC(Silent):
             signal.raise_signal(signal.SIGINT)
 
 
-def _extract(folder: Path, runtime: RuntimeOptions, events: Silent | None = None) -> Extraction:
+def _make_photos(folder: Path) -> None:
+    photos = folder / "photos"
+    photos.mkdir(parents=True)
+    scene = room_scene()
+    for number, pose in enumerate(arc_poses(_COUNT, 10.0)):
+        cv2.imwrite(str(photos / f"{number}.png"), scene.render(_CAMERA, pose).rgb[..., ::-1])
+    (folder / "intrinsics.yaml").write_text(_INTRINSICS, encoding="utf-8")
+
+
+def _extract(
+    folder: Path, runtime: RuntimeOptions, events: Silent | None = None, depth: str = "flat"
+) -> Extraction:
     config = Config(
         features=Backend(use="sift"),
         matcher=Backend(use="mutual-nearest"),
-        depth=Backend(use="flat"),
+        depth=Backend(use=depth),
         normals=Backend(use="from-depth"),
         runtime=runtime,
     )

@@ -37,6 +37,10 @@ def test_extraction(tmp_path: Path) -> None:
     executors.check_extraction("dask", {"workers": 2}, tmp_path)
 
 
+def test_a_failing_provider(tmp_path: Path) -> None:
+    executors.check_failing_provider("dask", {"workers": 2}, tmp_path)
+
+
 def test_options() -> None:
     executors.check_options(DaskExecutor)
 

@@ -38,5 +38,9 @@ def test_extraction(tmp_path: Path) -> None:
     executors.check_extraction("ray", {"workers": 2}, tmp_path)
 
 
+def test_a_failing_provider(tmp_path: Path) -> None:
+    executors.check_failing_provider("ray", {"workers": 2}, tmp_path)
+
+
 def test_options() -> None:
     executors.check_options(RayExecutor)

@@ -1,0 +1,241 @@
+"""Memory and disk that a run takes: predicted before the first photo is decoded, measured after.
+
+The prediction is for photos that all end in one group, which takes most. Its constants are read off
+the peaks of resident memory of each stage (``summary.json``) and the sizes of files of runs with 5
+to 100 photos of 320 x 213 to 640 x 480 pixels, SIFT, depth of files and `compact`, 1 to 4 workers,
+CPython 3.11 on Linux; docs/robustness.md has the errors.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from mpsfm_core.config import Config
+from mpsfm_core.errors import InputError
+from mpsfm_core.extraction.backends import worker_count
+from mpsfm_core.extraction.priors import integration_grid
+from mpsfm_core.inputs.images import CACHED_BYTES
+from mpsfm_core.providers import ProviderSpec
+
+TOLERANCE = 1.3
+"""The prediction is to be off by less than this factor."""
+
+_MB = 1e6
+_PROGRAM_MB = 324.0
+"""Interpreter and libraries (255), and what the first photos bring with them."""
+_TORCH_MB = 250.0
+"""More where a provider's library is torch, once (estimated)."""
+_COMPILED_MB = 50.0
+"""Compiled kernels of mapping and what loads them."""
+_WORKER_BYTES = 350.0
+"""A pixel of the photo that a worker has in hand: SIFT's pyramid of the doubled image."""
+_WEIGHTS = 2.0
+"""Times its size a network is in memory, in each worker (estimated)."""
+_PRIOR_BYTES = 86.0
+"""A pixel of the prior maps: depth and normals with variances (26), and what mapping adds (60)."""
+_DENSE_BYTES = 45.0
+"""A pixel of the dense stage: the view (13), what was found (12) and compared, the result (9)."""
+_DENSE_WORKER_MB = 15.0
+"""Costs of all labels, of each worker."""
+_RESULT_BYTES = 52.0
+"""A pixel of the final depth maps: points of the cloud with colours."""
+
+_CACHE_KEYPOINT_BYTES = 544.0
+"""A keypoint with 128 values of 4 bytes, position and scale; photos may have fewer than allowed."""
+_CACHE_MAP_MB = 0.27
+"""Depth and normals of a photo by `compact`; larger networks leave more."""
+_CACHE_PAIR_BYTES = 6_000.0
+"""Matches and two-view geometry of a pair."""
+_DENSE_CACHE_BYTES = 12.0
+"""A pixel that the dense stage found, until the run ends."""
+_OUTPUT_BYTES = 30.0
+"""A pixel of the final depth maps: cloud (19), maps (11), and the rest beside them."""
+_USUAL_KEYPOINTS = 4096
+"""Of a photo, where the options of the features do not say it."""
+_EVERY_S = 1.0
+_GROUPS = Path("/sys/fs/cgroup")
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Megabytes: peak of memory of the process and those it starts, cache and output folder."""
+
+    memory_mb: float
+    cache_mb: float
+    output_mb: float
+
+    def __str__(self) -> str:
+        """For people."""
+        return (
+            f"{self.memory_mb:.0f} MB of memory, {self.cache_mb:.0f} MB of cache and "
+            f"{self.output_mb:.0f} MB of results, if all photos end in one group"
+        )
+
+
+def predict(
+    sizes: Sequence[tuple[int, int]],
+    config: Config,
+    providers: Sequence[ProviderSpec],
+    weights: int,
+) -> Needs:
+    """What a run will take.
+
+    ``sizes``: (width, height) of the undistorted views. ``providers``: those that were chosen;
+    ``weights``: bytes of all their networks.
+    """
+    count, workers = len(sizes), worker_count(config.runtime)
+    pixels = [width * height for width, height in sizes]
+    grids = [integration_grid(size, config.extraction.integration_size) for size in sizes]
+    final = prior = sum(width * height for width, height in grids)
+    torch = any("torch" in spec.requires for spec in providers)
+    memory = (_PROGRAM_MB + _COMPILED_MB + torch * _TORCH_MB) * _MB
+    memory += min(CACHED_BYTES, 3 * sum(pixels)) + _PRIOR_BYTES * prior
+    memory += workers * (_WORKER_BYTES * max(pixels) + _WEIGHTS * weights)
+    cache = count * (_CACHE_KEYPOINT_BYTES * _keypoints(config) + _CACHE_MAP_MB * _MB)
+    cache += _CACHE_PAIR_BYTES * _pairs(count, config)
+    if config.dense.enabled:
+        final = sum(_reduced(size, config.dense.max_size) for size in sizes)
+        memory += _DENSE_BYTES * final + workers * _DENSE_WORKER_MB * _MB
+        cache += _DENSE_CACHE_BYTES * final
+    memory += _RESULT_BYTES * final
+    return Needs(round(memory / _MB), round(cache / _MB), round(_OUTPUT_BYTES * final / _MB))
+
+
+def shortages(needs: Needs, cache: Path, output: Path | None) -> list[str]:
+    """What is short, in words; empty where the run fits.
+
+    Raises:
+        InputError: it cannot fit: more than all the memory that this machine or container has, or
+            results larger than the disk has room for, by more than the prediction may be off.
+    """
+    limit, free = memory_mb()
+    found = []
+    much = f"this run takes about {needs.memory_mb:.0f} MB of memory"
+    less = "set inputs.max_image_size or dense.max_size lower, use fewer photos"
+    if needs.memory_mb > TOLERANCE * limit:
+        raise InputError(
+            f"{much} and {limit:.0f} MB are there: {less}, or set runtime.check_resources=false"
+        )
+    if needs.memory_mb > free:
+        found.append(f"{much} and {free:.0f} MB are free: it may fail; {less}")
+    places = {"the cache": (cache, needs.cache_mb)}
+    if output is not None:
+        places["the results"] = (output, needs.output_mb)
+    for what, (folder, size) in places.items():
+        room = _room_mb(folder)
+        text = f"{what} in {folder} take about {size:.0f} MB and {room:.0f} MB are free"
+        if what == "the results" and size > TOLERANCE * room:
+            raise InputError(f"{text}: make room, or set runtime.check_resources=false")
+        if sum(mb for other, mb in places.values() if _same_disk(other, folder)) > room:
+            found.append(f"{text}: it may fail where other files go there too")
+    return found
+
+
+def memory_mb() -> tuple[float, float]:
+    """All memory that this process may use, and what is free of it: of the machine, and of the
+    control groups (containers, job schedulers) that it is in."""
+    machine = psutil.virtual_memory()
+    limits, free = [machine.total], [machine.available]
+    for folder in _control_groups():
+        with suppress(OSError, ValueError, StopIteration):
+            limit = int(_first(folder, "memory.max", "memory.limit_in_bytes"))
+            used = int(_first(folder, "memory.current", "memory.usage_in_bytes"))
+            lines = (folder / "memory.stat").read_text().splitlines()
+            files = next(int(x.split()[1]) for x in lines if x.startswith("inactive_file "))
+            limits.append(limit)
+            free.append(max(0, limit - (used - files)))  # what is cached of files is given back
+    return min(limits) / _MB, min(free) / _MB
+
+
+class Watch:
+    """Memory of the processes that this one starts; its own is in the stages' records."""
+
+    def __init__(self) -> None:
+        self.peak_mb = 0.0
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Look every second while this lasts."""
+        ended = threading.Event()
+        thread = threading.Thread(target=self._watch, args=(ended,), name="mpsfm memory")
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+    def _watch(self, ended: threading.Event) -> None:
+        own = psutil.Process()
+        while not ended.wait(_EVERY_S):
+            resident = 0
+            with suppress(psutil.Error):
+                for child in own.children(recursive=True):
+                    with suppress(psutil.Error):
+                        resident += child.memory_info().rss
+            self.peak_mb = max(self.peak_mb, resident / _MB)
+
+
+def folder_mb(folder: Path) -> float:
+    """Megabytes of the files below a folder."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / _MB
+
+
+def _control_groups() -> Iterator[Path]:
+    """Folders of the control groups of this process, as far up as they are seen here."""
+    with suppress(OSError):
+        for line in Path("/proc/self/cgroup").read_text().splitlines():
+            _, controllers, path = line.split(":", 2)
+            if controllers in ("", "memory"):
+                root = _GROUPS / "memory" if controllers else _GROUPS
+                own = root / path.lstrip("/")
+                yield own
+                yield from (parent for parent in own.parents if parent.is_relative_to(root))
+
+
+def _first(folder: Path, *names: str) -> str:
+    return next((folder / name).read_text() for name in names if (folder / name).is_file())
+
+
+def _room_mb(folder: Path) -> float:
+    return shutil.disk_usage(_existing(folder)).free / _MB
+
+
+def _same_disk(a: Path, b: Path) -> bool:
+    return _existing(a).stat().st_dev == _existing(b).stat().st_dev
+
+
+def _existing(folder: Path) -> Path:
+    """The folder, or the nearest above it that is there."""
+    folder = folder.resolve()
+    return next(path for path in (folder, *folder.parents) if path.exists())
+
+
+def _reduced(size: tuple[int, int], limit: int) -> int:
+    factor = min(1.0, limit / max(size))
+    return round(size[0] * factor) * round(size[1] * factor)
+
+
+def _keypoints(config: Config) -> int:
+    """Of a photo, at most."""
+    options = {} if config.features is None else config.features.options
+    return int(options.get("max_keypoints") or _USUAL_KEYPOINTS)
+
+
+def _pairs(count: int, config: Config) -> int:
+    """Pairs that are matched, at most."""
+    pairs, every = config.pairs, count * (count - 1) // 2
+    partners = {
+        "exhaustive": count,
+        "sequential": pairs.overlap,
+        "retrieval": pairs.top_k,
+        "auto": pairs.partners + pairs.overlap,
+    }
+    return min(every, count * partners[pairs.mode])
