@@ -27,7 +27,7 @@ from mpsfm_core.providers import ProviderSpec
 TOLERANCE = 1.3
 """The prediction is to be off by less than this factor."""
 
-_MB = 1e6
+_MB = float(1 << 20)
 _PROGRAM_MB = 324.0
 """Interpreter and libraries (255), and what the first photos bring with them."""
 _TORCH_MB = 250.0

@@ -39,7 +39,7 @@ def test_what_a_run_takes_grows_with_what_it_is_given() -> None:
     pairs = predict([SIZE] * 100, config(pairs={"mode": "sequential"}), (), 0)
     assert pairs.cache_mb < many.cache_mb
     workers = predict([SIZE] * 10, config(runtime=RuntimeOptions(workers=4)), (), 0)
-    network = predict([SIZE] * 10, config(), (), 100_000_000)
+    network = predict([SIZE] * 10, config(), (), 100 << 20)
     assert workers.memory_mb > few.memory_mb and network.memory_mb == few.memory_mb + 200
 
 
@@ -66,9 +66,9 @@ def test_a_run_that_cannot_fit_is_refused(needs: Needs, tmp_path: Path) -> None:
 
 
 def test_limits_of_a_container_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "memory.max").write_text("500000000\n")
-    (tmp_path / "memory.current").write_text("300000000\n")
-    (tmp_path / "memory.stat").write_text("anon 1\ninactive_file 100000000\n")
+    (tmp_path / "memory.max").write_text(f"{500 << 20}\n")
+    (tmp_path / "memory.current").write_text(f"{300 << 20}\n")
+    (tmp_path / "memory.stat").write_text(f"anon 1\ninactive_file {100 << 20}\n")
     monkeypatch.setattr(resources, "_control_groups", lambda: iter([tmp_path]))
     assert resources.memory_mb() == (500.0, 300.0)
     (tmp_path / "memory.max").write_text("max\n")
