@@ -16,7 +16,7 @@ NOT_PINNED = {
     *("superpoint", "disk-onnx", "lightglue-superpoint", "lightglue-disk-onnx"),
     # the newest version of a repository
     *("sky", "transformers", "superpoint-hub", "lightglue-superpoint-hub", "superglue"),
-    *("efficient-loftr", "dino"),
+    *("efficient-loftr", "dino", "depth-anything-3"),
 }
 """Providers that are still to be pinned; none is added."""
 

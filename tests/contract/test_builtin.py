@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from mpsfm_core.builtin.plugin import mpsfm_providers
 from mpsfm_core.registry import Registry
 from mpsfm_core.testing import contract_tests
@@ -14,6 +16,7 @@ test_mutual_nearest = contract_tests("matcher", "mutual-nearest", registry=BUILT
 test_depth_files = contract_tests("depth", "files", registry=BUILTIN)
 test_flat_depth = contract_tests("depth", "flat", registry=BUILTIN)
 test_depth_of_matcher = contract_tests("depth", "matcher", registry=BUILTIN)
+test_depth_of_multiview = pytest.mark.slow(contract_tests("depth", "multiview", registry=BUILTIN))
 test_normal_files = contract_tests("normals", "files", registry=BUILTIN)
 test_normals_from_depth = contract_tests("normals", "from-depth", registry=BUILTIN)
 test_mask_files = contract_tests("mask", "files", registry=BUILTIN)
@@ -26,6 +29,7 @@ def test_all_of_them_are_here() -> None:
         ("depth", "files"),
         ("depth", "flat"),
         ("depth", "matcher"),
+        ("depth", "multiview"),
         ("normals", "files"),
         ("normals", "from-depth"),
         ("mask", "files"),
