@@ -14,10 +14,10 @@ from mpsfm_core.cli import build_app
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.dense.sparse_depth import depth_of_points
 from mpsfm_core.errors import InputError
-from mpsfm_core.evaluation.cloud_accuracy import read_ply
 from mpsfm_core.geometry import project, transform
 from mpsfm_core.pipeline import densify_model
 from mpsfm_core.results.colmap_model import build_model, pinhole, write_model
+from mpsfm_core.results.ply import read_ply
 from mpsfm_core.testing.scenes import room_scene
 
 
@@ -55,7 +55,7 @@ def test_depth_is_found_from_the_range_of_the_points_alone(room, model: Path) ->
         error = np.abs(depth / truth - 1)
         certain = np.sqrt(variance) < 0.05 * depth
         assert certain.mean() > 0.4 and np.median(error[certain]) < 0.015
-    assert len(read_ply(model / "out" / "dense.ply")) > 1000
+    assert len(read_ply(model / "out" / "dense.ply")[0]) > 1000
 
 
 def test_a_model_without_points_is_told(model: Path) -> None:
