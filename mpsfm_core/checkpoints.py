@@ -15,6 +15,7 @@ import logging
 import platform
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,7 +24,7 @@ import numpy as np
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stereo import StereoDepth
-from mpsfm_core.errors import DataError
+from mpsfm_core.errors import DataError, OutputError
 from mpsfm_core.extraction.cache import Cache, cache_folder, content_key
 from mpsfm_core.files import remove_unfinished, write_file
 from mpsfm_core.mapping.options import MapperOptions
@@ -43,6 +44,7 @@ _SHARE = 0.02
 """Of the time of a run that saving may take (ours)."""
 _KEPT_S = 30 * 24 * 3600.0
 """Checkpoints that nobody came back to are taken away then (ours)."""
+_GIVEN_UP = "no checkpoints from now on: %s"
 _LIBRARIES = ("numpy", "scipy", "numba", "pycolmap", "cv2")
 _NUMERICS = ("data.py", "geometry.py", "jit.py", "mapping", "optimize", "scene", "dense")
 
@@ -71,7 +73,8 @@ class DiskCheckpoints:
 
     def forget(self) -> None:
         """Start anew next time: the run is finished, or that is wanted."""
-        self._path.unlink(missing_ok=True)
+        with suppress(OSError):
+            self._path.unlink()
 
     def load(self) -> Frozen | None:
         """As :class:`mpsfm_core.mapping.checkpoints.Checkpoints`."""
@@ -117,7 +120,7 @@ class DiskCheckpoints:
         try:
             write_file(self._path, lambda file: np.savez(file, **arrays), self._unfinished)
         except OSError as error:
-            _log.warning("%s: no checkpoints from now on: %s", self._folder, error)
+            _log.warning(_GIVEN_UP, error)
             self._failed = True
         self._last = time.monotonic()
         self._wait_s = max(self._every_s, (self._last - started) / _SHARE)
@@ -129,8 +132,9 @@ class DiskCheckpoints:
     def _clear_up(self) -> None:
         remove_unfinished(self._unfinished)
         for path in self._folder.glob("*.npz"):
-            if time.time() - path.stat().st_mtime > _KEPT_S:
-                path.unlink(missing_ok=True)
+            with suppress(OSError):
+                if time.time() - path.stat().st_mtime > _KEPT_S:
+                    path.unlink()
 
 
 class DenseCheckpoints:
@@ -151,14 +155,21 @@ class DenseCheckpoints:
             code_key(), fingerprint(reconstruction), list(photos), options.model_dump(mode="json")
         )
         self._names = [image.name for image in reconstruction.images]
+        self._failed = False
 
     def load(self, name: str) -> StereoDepth | None:
         """As :class:`mpsfm_core.dense.stage.FoundBefore`."""
         return self._cache.load("dense", self._key(name), StereoDepth)
 
     def save(self, name: str, depth: StereoDepth) -> None:
-        """As :class:`mpsfm_core.dense.stage.FoundBefore`."""
-        self._cache.store("dense", self._key(name), depth)
+        """As :class:`mpsfm_core.dense.stage.FoundBefore`; a full disk as with the mapper."""
+        if self._failed:
+            return
+        try:
+            self._cache.store("dense", self._key(name), depth)
+        except OutputError as error:
+            _log.warning(_GIVEN_UP, error)
+            self._failed = True
 
     def forget(self) -> None:
         """The run is finished."""

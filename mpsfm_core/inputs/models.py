@@ -32,9 +32,12 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     folder = model_folder(path)
     try:
         check_binary_model(folder)
-        return pycolmap.Reconstruction(str(folder))
+        model = pycolmap.Reconstruction(str(folder))
+        for image in model.images.values():
+            str(image.name)  # decoded when asked for
     except (OSError, RuntimeError, ValueError, IndexError) as error:
         raise InputError(f"{folder}: not a readable COLMAP model: {error}") from error
+    return model
 
 
 def model_folder(folder: Path) -> Path:

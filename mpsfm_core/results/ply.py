@@ -79,12 +79,13 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
     end = data.find(b"end_header", 0, _LONGEST_HEADER)
     start = data.find(b"\n", end) + 1 if end >= 0 else 0
     lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
-    words = lines[1].split() if len(lines) > 1 else []
-    if lines[:1] != ["ply"] or words[:1] != ["format"] or words[1] not in _ORDERS or not start:
-        raise InputError(f"{path}: is no PLY file")
-    vertex, count = _layout(path, lines[2:], _ORDERS[words[1]])
+    match [line.split() for line in lines[:2]]:
+        case [["ply"], ["format", encoding, *_]] if encoding in _ORDERS and start:
+            vertex, count = _layout(path, lines[2:], _ORDERS[encoding])
+        case _:
+            raise InputError(f"{path}: is no PLY file")
     body = data[start:]
-    if words[1] == "ascii":
+    if encoding == "ascii":
         vertices = _read_text(path, body, vertex, count)
     elif len(body) < count * vertex.itemsize:
         raise InputError(f"{path}: is cut off, {count} points are announced")

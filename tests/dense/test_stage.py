@@ -14,6 +14,8 @@ from mpsfm_core.data import View
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.dense.stereo import StereoDepth
+from mpsfm_core.errors import OutputError
+from mpsfm_core.extraction.cache import Cache
 
 OPTIONS = DenseOptions(correlation_px=20)
 
@@ -134,3 +136,17 @@ def test_a_run_goes_on_with_what_a_killed_one_found(room, tmp_path: Path) -> Non
     assert checkpoints([*keys[1:], "another photo"]).load(keys[0]) is None
     checkpoints(keys).forget()
     assert not list(tmp_path.rglob("*.npz"))
+
+
+def test_a_full_disk_ends_no_run(
+    room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> None:
+        raise OutputError("cannot write to the cache: the disk is full")
+
+    kept = DenseCheckpoints(tmp_path, room.reconstruction, list(room.views), OPTIONS)
+    monkeypatch.setattr(Cache, "store", full)
+    dense, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS, found_before=kept)
+    assert all(image.depth is not None for image in dense.images)
+    assert caplog.text.count("no checkpoints from now on") == 1
+    assert "the disk is full" in caplog.text

@@ -105,7 +105,14 @@ def test_ply_files_of_all_kinds(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_ply(path)[0], points)
 
 
-@pytest.mark.parametrize("content", [b"", b"ply\nformat ascii 1.0\nelement face 1\nend_header\n"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"ply\nformat\nend_header\n",
+        b"ply\nformat ascii 1.0\nelement face 1\nend_header\n",
+    ],
+)
 def test_what_is_no_cloud_is_explained(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "x.ply").write_bytes(content)
     with pytest.raises(InputError, match=r"x\.ply: (is no PLY file|its points have no x, y and z)"):

@@ -14,7 +14,7 @@ from pathlib import Path
 from mpsfm_core.errors import MpsfmError
 
 LIMIT_S = 10
-"""A file that keeps a reader busy for longer hangs it."""
+"""A file that keeps a reader busy for longer, in time of the processor, hangs it."""
 MEMORY = 1 << 30
 """Bytes that a reader may take for a file of some kilobytes, beside what the process had."""
 
@@ -99,7 +99,8 @@ def _in_process(reader: Reader, name: str, seed: bytes, numbers: range):
     _, status = os.waitpid(child, 0)
     if os.WIFSIGNALED(status):
         what = os.WTERMSIG(status)
-        return ("it hangs" if what == signal.SIGALRM else f"killed by signal {what}"), last
+        hangs = what in (signal.SIGPROF, signal.SIGALRM)
+        return ("it hangs" if hangs else f"killed by signal {what}"), last
     return "", numbers.stop
 
 
@@ -116,7 +117,8 @@ def _read_all(reader: Reader, name: str, seed: bytes, numbers: range, sender: in
             path = Path(folder) / str(number) / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(case(name, seed, number))
-            signal.alarm(LIMIT_S)
+            signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
+            signal.alarm(10 * LIMIT_S)  # one that waits for something that never comes
             try:
                 reader(path)
             except MpsfmError:
@@ -125,4 +127,5 @@ def _read_all(reader: Reader, name: str, seed: bytes, numbers: range, sender: in
                 place = traceback.extract_tb(error.__traceback__)[-1]
                 text = f"{type(error).__name__}: {error} ({place.filename}:{place.lineno})"
                 os.write(sender, f"{number} {' '.join(text.split())[:300]}\n".encode())
+            signal.setitimer(signal.ITIMER_PROF, 0)
             signal.alarm(0)

@@ -29,7 +29,7 @@ from mpsfm_core.inputs import video
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.matches import matches_from_database, matches_from_hloc
-from mpsfm_core.inputs.models import read_model, reconstruction_poses
+from mpsfm_core.inputs.models import read_model, read_poses
 from mpsfm_core.inputs.options import InputOptions, VideoOptions
 from mpsfm_core.pipeline import _depths_of_points
 from mpsfm_core.report.page import write_report
@@ -78,7 +78,7 @@ def in_model(*readers: Reader) -> dict[str, Reader]:
 
 
 def poses(folder: Path) -> None:
-    reconstruction_poses(read_model(folder))
+    read_poses(folder)
 
 
 def intrinsics(folder: Path) -> None:
@@ -99,15 +99,19 @@ def used(folder: Path) -> None:
     read_view(folder)
 
 
-def models() -> Table:
-    """Files of COLMAP models, for every use."""
+def model_files(*readers: Reader) -> Table:
+    """Files of COLMAP models, for each of some readers of a folder."""
     made: dict[str, bytes] = {}
     with tempfile.TemporaryDirectory() as folder:
         synthetic().write_binary(folder)
         synthetic().write_text(folder)
         made = {path.name: path.read_bytes() for path in Path(folder).iterdir()}
-    readers = in_model(poses, intrinsics, exported, used)
-    return {key: (made[Path(key).name], reader) for key, reader in readers.items()}
+    return {key: (made[Path(key).name], reader) for key, reader in in_model(*readers).items()}
+
+
+def models() -> Table:
+    """Files of COLMAP models, for every use."""
+    return model_files(poses, intrinsics, exported, used)
 
 
 def results() -> Table:

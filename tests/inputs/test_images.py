@@ -328,7 +328,7 @@ def test_views_are_decoded_once_and_forgotten(
     monkeypatch.setattr(
         ImageSet, "_load", lambda self, image: decoded.append(image.name) or load(self, image)
     )
-    monkeypatch.setattr(module, "_CACHED_BYTES", 2 * 60 * 80 * 3)
+    monkeypatch.setattr(module, "CACHED_BYTES", 2 * 60 * 80 * 3)
     found = load_images(folder, intrinsics)
     for index in (0, 1, 0, 1, 2, 0):
         found.view(index)
