@@ -46,7 +46,16 @@ _KEPT_S = 30 * 24 * 3600.0
 """Checkpoints that nobody came back to are taken away then (ours)."""
 _GIVEN_UP = "no checkpoints from now on: %s"
 _LIBRARIES = ("numpy", "scipy", "numba", "pycolmap", "cv2")
-_NUMERICS = ("data.py", "geometry.py", "jit.py", "mapping", "optimize", "scene", "dense")
+_NUMERICS = (
+    "data.py",
+    "geometry.py",
+    "statistics.py",
+    "jit.py",
+    "mapping",
+    "optimize",
+    "scene",
+    "dense",
+)
 
 
 class DiskCheckpoints:

@@ -14,7 +14,16 @@ PACKAGE = ROOT / "mpsfm_core"
 FRONT_DOOR = "__init__"
 """Imports the rooms when one of its functions is called, see there."""
 NUMERICS = {"optimize", "scene", "mapping", "dense"}
-BELOW_NUMERICS = {"errors", "options", "jit", "threads", "data", "geometry", *NUMERICS}
+BELOW_NUMERICS = {
+    "errors",
+    "options",
+    "jit",
+    "threads",
+    "data",
+    "geometry",
+    "statistics",
+    *NUMERICS,
+}
 
 
 def documented_rooms() -> dict[str, int]:

@@ -24,6 +24,7 @@ from scipy.stats import t as student_t
 
 from mpsfm_core.calibration.samples import Residuals
 from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.statistics import MAD_TO_STD, weighted_quantile
 
 ONE_SIGMA = 0.6827
 """Share of normal errors within one std."""
@@ -83,14 +84,6 @@ def bootstrap(residuals: Residuals, fit: Fit, count: int, rng: np.random.Generat
         found = again.finish(again.solve(start)[0])
         row[:-1], row[-1] = found.values, found.edge_scale
     return drawn
-
-
-def weighted_quantile(values: Float64, weights: Float64, share: float) -> float:
-    """The value below which this share of the weight lies."""
-    order = np.argsort(values)
-    cumulated = np.cumsum(weights[order])
-    place = int(np.searchsorted(cumulated, share * cumulated[-1]))
-    return float(values[order[min(place, len(order) - 1)]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +191,7 @@ class _Problem:
 
     def _factors_alone(self) -> Float64:
         """Log of each factor if its term were the only one, by the median error."""
-        spread = 1.4826 * np.median(np.abs(self._residuals.error))
+        spread = MAD_TO_STD * np.median(np.abs(self._residuals.error))
         values: Float64 = np.log(max(spread, 1e-9) / np.median(self._terms, axis=0))
         return values
 

@@ -8,16 +8,16 @@ import numpy as np
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
-from mpsfm_core.calibration.fit import FREEDOM, ONE_SIGMA, STD_OF_T, weighted_quantile
+from mpsfm_core.calibration.fit import FREEDOM, ONE_SIGMA, STD_OF_T
 from mpsfm_core.calibration.samples import Residuals
 from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.statistics import MAD_TO_STD, weighted_quantile
 
 CURVE_POINTS = 50
 BINS = 10
 RANGES = 5
 NORMAL_COVERAGE = (ONE_SIGMA, 0.9545, 0.9973)
 """Of normal errors, within 1, 2 and 3 standard deviations."""
-MAD_TO_STD = 1.4826
 
 
 def measure(residuals: Residuals, std: Float64) -> dict[str, Any]:

@@ -13,10 +13,11 @@ from pydantic import Field
 
 from mpsfm_core.calibration.fit import DOMINANT_SHARE, Fit, bootstrap
 from mpsfm_core.calibration.fitting import Candidate, DepthData, NormalData, std_of, winner
-from mpsfm_core.calibration.metrics import MAD_TO_STD, coverage, measure
+from mpsfm_core.calibration.metrics import coverage, measure
 from mpsfm_core.calibration.samples import Residuals, join
 from mpsfm_core.data import Float64, Int64
 from mpsfm_core.options import Options
+from mpsfm_core.statistics import MAD_TO_STD
 from mpsfm_core.uncertainty.model import Calibration
 
 FEW_IMAGES = 10

@@ -20,8 +20,8 @@ from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64
 from mpsfm_core.geometry import pixel_centers
-from mpsfm_core.mapping.statistics import MAD_TO_STD, group_medians
 from mpsfm_core.scene.scene import Scene
+from mpsfm_core.statistics import MAD_TO_STD, group_medians
 
 CELLS = 4
 """Residuals are compared in a grid of this many cells per side (ours)."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, PosedImage, SceneState
-from mpsfm_core.mapping.statistics import MAD_TO_STD
 from mpsfm_core.scene.reconstruction import MetricScale, Reconstruction, RegisteredImage
 from mpsfm_core.scene.scene import Scene
+from mpsfm_core.statistics import MAD_TO_STD
 
 MAX_METRIC_SPREAD = 0.15
 """Above this relative spread of the per-image scales the priors do not agree on a metre (ours)."""

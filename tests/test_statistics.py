@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpsfm_core.mapping.statistics import MAD_TO_STD, group_medians
+from mpsfm_core.statistics import MAD_TO_STD, group_medians
 
 
 def test_medians_of_groups() -> None:

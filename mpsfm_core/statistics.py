@@ -10,6 +10,14 @@ MAD_TO_STD = 1.4826
 """Of normal errors: from the median of their absolute values to their std."""
 
 
+def weighted_quantile(values: Float64, weights: Float64, share: float) -> float:
+    """The value below which this share of the weight lies; both (n,)."""
+    order = np.argsort(values)
+    cumulated = np.cumsum(weights[order])
+    place = int(np.searchsorted(cumulated, share * cumulated[-1]))
+    return float(values[order[min(place, len(order) - 1)]])
+
+
 def group_medians(values: Float64, groups: Int64, count: int) -> Float64:
     """(count,) median of the values (m,) of each group; NaN for those without any.
 
