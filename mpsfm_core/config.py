@@ -39,7 +39,7 @@ from mpsfm_core.providers import Kind
 from mpsfm_core.registry import Registry
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.uncertainty.file import CALIBRATIONS, read_values
-from mpsfm_core.yaml_text import line_of, parse_yaml, write_yaml
+from mpsfm_core.yaml_text import line_of, parse_assignment, parse_yaml, write_yaml
 
 FORMAT = 1
 """Of configuration files."""
@@ -185,7 +185,8 @@ def load_config(
     """
     layers = _read_chain(_find(str(name_or_path), Path()))
     # A change of provider drops the block's options, so it goes before the overrides that set them.
-    layers += [_parse_override(o) for o in sorted(overrides, key=lambda o: ".use=" not in o)]
+    last = sorted(overrides, key=lambda text: ".use=" not in text)
+    layers += [_Layer(f"--set {text}", parse_assignment(text)) for text in last]
     try:
         config = parse_settings(Config, _merge_all(layers))
         return _check(config, registry or Registry.discover(), layers, complete)
@@ -262,18 +263,6 @@ def _read_chain(path: Path, children: tuple[Path, ...] = ()) -> list[_Layer]:
     except ConfigError as error:
         raise ConfigError(f"{layer.place(('extends',))}: extends: {error}") from error
     return [*_read_chain(found, chain), layer]
-
-
-def _parse_override(text: str) -> _Layer:
-    key, equals, value = text.partition("=")
-    parts = key.strip().split(".")
-    source = f"--set {text}"
-    if not (equals and all(parts)):
-        raise ConfigError(f"{source}: must look like a.b=value")
-    data: Any = parse_yaml(value, source)
-    for part in reversed(parts):
-        data = {part: data}
-    return _Layer(source, data)
 
 
 def _merge_all(layers: Sequence[_Layer]) -> dict[str, Any]:

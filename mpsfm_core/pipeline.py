@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -17,7 +17,7 @@ import pycolmap
 from mpsfm_core import precompile, resources
 from mpsfm_core.checkpoints import DenseCheckpoints, DiskCheckpoints
 from mpsfm_core.config import Config, load_config
-from mpsfm_core.data import Float64, MappingProblem, Pose, View
+from mpsfm_core.data import DepthPrior, Float64, MappingProblem, Pose, View
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.mesh import Mesh, mesh_of_depth_maps
 from mpsfm_core.dense.options import DenseOptions, MeshOptions
@@ -37,7 +37,7 @@ from mpsfm_core.inputs.matches import (
     matches_from_database,
     matches_from_hloc,
 )
-from mpsfm_core.inputs.models import match_names, read_model, read_poses
+from mpsfm_core.inputs.models import match_names, read_model, read_poses, reconstruction_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
 from mpsfm_core.provision import Provision, provide
@@ -516,30 +516,40 @@ def _densify_model(
         raise InputError(f"{images}: has {len(matched)} of the photos of {model}, two are needed")
     photos = load_images(images, model=model, names=list(matched))
     points = {str(image.name): _depths_of_points(colmap, image) for image in colmap.images.values()}
-    registered = []
-    for index, source in enumerate(photos):
-        found = matched[source.name]
+    depths = []
+    for photo in photos:
+        found = matched[photo.name]
         file = model / DEPTH / f"{found}.npz"
-        depth = read_depth_map(file)[1] if file.is_file() else depth_of_points(points[found])
-        if depth is not None:
-            pose, ids = poses[found], np.zeros(0, np.int64)
-            registered.append(
-                RegisteredImage(index, source.name, source.pinhole, *pose, ids, depth, 1.0)
-            )
-    if not registered:
+        depths.append(read_depth_map(file)[1] if file.is_file() else depth_of_points(points[found]))
+    known = _maps_alone(photos, [poses[matched[photo.name]] for photo in photos], depths)
+    if not known.images:
         raise InputError(f"{model}: has no points, so nothing says how far the surfaces are")
-    known = Reconstruction(tuple(registered), np.zeros((0, 3)), np.zeros(0))
-    rows = {name: row for row, name in enumerate(photos.names)}
-
-    def view_of(name: str) -> View:
-        return photos.view(rows[name])
-
+    view_of = _view_of(photos)
     dense, report = densify(known, view_of, options or DenseOptions())
     with replacing(output, (SPARSE, DENSE, DEPTH)) as folder:
         write_model(folder / SPARSE, colmap)
         write_depth_maps(folder / DEPTH, dense)
         write_cloud(folder / DENSE, fuse_depth_maps(dense, view_of, ResultOptions()))
     return report
+
+
+def _maps_alone(
+    photos: ImageSet, poses: Sequence[Pose], depths: Sequence[DepthPrior | None]
+) -> Reconstruction:
+    """The photos whose depth is known, without points."""
+    none = np.zeros(0, np.int64)
+    found = enumerate(zip(photos, poses, depths, strict=True))
+    images = tuple(
+        RegisteredImage(index, photo.name, photo.pinhole, *pose, none, depth, 1.0)
+        for index, (photo, pose, depth) in found
+        if depth is not None
+    )
+    return Reconstruction(images, np.zeros((0, 3)), np.zeros(0))
+
+
+def _view_of(photos: ImageSet) -> Callable[[str], View]:
+    rows = {name: row for row, name in enumerate(photos.names)}
+    return lambda name: photos.view(rows[name])
 
 
 def _depths_of_points(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Float64:
@@ -568,24 +578,13 @@ def mesh_model(
     """
     with claimed(Path(folder)):
         source = Source.read(Path(folder), _path(photos))
-        registered = []
-        for index, (image, photo) in enumerate(
-            zip(source.registered(), source.images, strict=True)
-        ):
-            file = source.folder / DEPTH / f"{image.name}.npz"
-            if file.is_file():
-                matrix, ids = np.asarray(image.cam_from_world().matrix()), np.zeros(0, np.int64)
-                pose, depth = (matrix[:, :3], matrix[:, 3]), read_depth_map(file)[1]
-                registered.append(
-                    RegisteredImage(index, photo.name, photo.pinhole, *pose, ids, depth, 1.0)
-                )
-        if not registered:
+        poses = reconstruction_poses(source.model)
+        files = [source.folder / DEPTH / f"{name}.npz" for name in source.names]
+        depths = [read_depth_map(file)[1] if file.is_file() else None for file in files]
+        known = _maps_alone(source.images, [poses[name] for name in source.names], depths)
+        if not known.images:
             raise InputError(f"{folder}: has no depth maps; mpsfm dense makes them")
-        known = Reconstruction(tuple(registered), np.zeros((0, 3)), np.zeros(0))
-        rows = {image.name: image.index for image in registered}
-        mesh = mesh_of_depth_maps(
-            known, lambda name: source.images.view(rows[name]), options or MeshOptions()
-        )
+        mesh = mesh_of_depth_maps(known, _view_of(source.images), options or MeshOptions())
         with replacing(source.folder, MESH) as written:
             write_mesh(written, mesh, source)
     return mesh

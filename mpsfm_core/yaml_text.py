@@ -64,6 +64,19 @@ def parse_yaml(text: str, source: str) -> Any:
         raise ConfigError(f"{source}: is nested too deeply") from error
 
 
+def parse_assignment(text: str) -> dict[str, Any]:
+    """``a.b=value`` with a YAML value, as ``{"a": {"b": value}}``; raises ConfigError."""
+    key, equals, value = text.partition("=")
+    parts = key.strip().split(".")
+    source = f"--set {text}"
+    if not (equals and all(parts)):
+        raise ConfigError(f"{source}: must look like a.b=value")
+    data: Any = parse_yaml(value, source)
+    for part in reversed(parts):
+        data = {part: data}
+    return dict(data)
+
+
 def write_yaml(value: Any) -> str:
     """A value of plain types as block-style YAML that :func:`parse_yaml` reads back the same."""
     text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -30,12 +30,11 @@ def dense(
     from mpsfm_core.dense.options import DenseOptions
     from mpsfm_core.options import parse_settings
     from mpsfm_core.pipeline import densify_model
-    from mpsfm_core.yaml_text import parse_yaml
+    from mpsfm_core.yaml_text import parse_assignment
 
-    values = {}
+    values: dict[str, Any] = {}
     for text in overrides or ():
-        key, _, value = text.partition("=")
-        values[key] = parse_yaml(value, f"--set {text}")
+        values |= parse_assignment(text)
     report = densify_model(model, images, output, parse_settings(DenseOptions, values))
     if not quiet:
         shares = report.confirmed.values()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -31,12 +31,11 @@ def mesh(
     from mpsfm_core.dense.options import MeshOptions
     from mpsfm_core.options import parse_settings
     from mpsfm_core.pipeline import mesh_model
-    from mpsfm_core.yaml_text import parse_yaml
+    from mpsfm_core.yaml_text import parse_assignment
 
-    values = {}
+    values: dict[str, Any] = {}
     for text in overrides or ():
-        key, _, value = text.partition("=")
-        values[key] = parse_yaml(value, f"--set {text}")
+        values |= parse_assignment(text)
     made = mesh_model(folder, images, parse_settings(MeshOptions, values))
     if not quiet:
         typer.echo(f"{len(made.triangles)} triangles; written to {folder}/mesh.ply and mesh.glb")
