@@ -21,8 +21,8 @@ from typing import NamedTuple
 
 from threadpoolctl import threadpool_limits
 
-from mpsfm_core.evaluation.methods import peak_mib
 from mpsfm_core.mapping import mapper
+from mpsfm_core.stages import peak_memory_mb
 from mpsfm_core.testing.halls import HONEST, hall_problem
 
 MAP_WIDTH = 387
@@ -102,7 +102,7 @@ def _measured(views: int) -> dict[str, float]:
         for name, step in STEPS.items():
             if (PurePath(file).name, function) in step.functions:
                 found[name] += seconds
-    return {**found, "peak": peak_mib()}
+    return {**found, "peak": peak_memory_mb()}
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ CPython 3.11 on Linux; docs/robustness.md has the errors.
 
 from __future__ import annotations
 
+import math
 import shutil
 import threading
 from collections.abc import Iterator, Sequence
@@ -18,6 +19,7 @@ from pathlib import Path
 import psutil
 
 from mpsfm_core.config import Config
+from mpsfm_core.dense.view import dense_size
 from mpsfm_core.errors import InputError
 from mpsfm_core.extraction.backends import worker_count
 from mpsfm_core.extraction.priors import integration_grid
@@ -101,7 +103,7 @@ def predict(
     cache = count * (_CACHE_KEYPOINT_BYTES * _keypoints(config) + _CACHE_MAP_MB * _MB)
     cache += _CACHE_PAIR_BYTES * _pairs(count, config)
     if config.dense.enabled:
-        final = sum(_reduced(size, config.dense.max_size) for size in sizes)
+        final = sum(math.prod(dense_size(size, config.dense.max_size)) for size in sizes)
         memory += _DENSE_BYTES * final + workers * _DENSE_WORKER_MB * _MB
         cache += _DENSE_CACHE_BYTES * final
     memory += _RESULT_BYTES * final
@@ -216,11 +218,6 @@ def _existing(folder: Path) -> Path:
     """The folder, or the nearest above it that is there."""
     folder = folder.resolve()
     return next(path for path in (folder, *folder.parents) if path.exists())
-
-
-def _reduced(size: tuple[int, int], limit: int) -> int:
-    factor = min(1.0, limit / max(size))
-    return round(size[0] * factor) * round(size[1] * factor)
 
 
 def _keypoints(config: Config) -> int:

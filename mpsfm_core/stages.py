@@ -63,7 +63,7 @@ class Stages:
         return {**self._finished, **{name: self._record(name) for name in self._running}}
 
     def _record(self, name: str) -> StageRecord:
-        return StageRecord(time.perf_counter() - self._running[name], _peak_memory_mb())
+        return StageRecord(time.perf_counter() - self._running[name], peak_memory_mb())
 
     def notice(self, text: str) -> None:
         """Something that the user should know now, in one line."""
@@ -102,7 +102,8 @@ def _reset_peak_memory() -> None:
         (_PROC / "clear_refs").write_text("5")
 
 
-def _peak_memory_mb() -> float | None:
+def peak_memory_mb() -> float | None:
+    """Most memory that this process held, of a stage or else so far; None where nothing tells."""
     with suppress(OSError):
         for line in (_PROC / "status").read_text().splitlines():
             if line.startswith("VmHWM:"):

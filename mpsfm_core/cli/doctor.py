@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shutil
 import subprocess
@@ -15,6 +14,7 @@ import typer
 
 from mpsfm_core.cli.arguments import ConfigName, Offline, settings
 from mpsfm_core.cli.models import CacheDir
+from mpsfm_core.threads import cores
 
 if TYPE_CHECKING:
     from mpsfm_core.provision import Provision
@@ -40,7 +40,7 @@ def doctor(
     registry = Registry.discover()
     _heading("this machine")
     _line("mpsfm", f"{core_version()}, Python {platform.python_version()}, {platform.system()}")
-    _line("processor", f"{os.cpu_count()} cores{_memory()}")
+    _line("processor", f"{cores()} cores{_memory()}")
     _line("GPU", _gpu())
     folder = cache_folder(cache)
     _line("cache", f"{folder}, {size_text(cache_size(folder))} (mpsfm cache prune makes it less)")

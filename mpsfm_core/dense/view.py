@@ -12,6 +12,12 @@ from mpsfm_core.geometry import resize_map
 from mpsfm_core.scene.reconstruction import RegisteredImage
 
 
+def dense_size(size: tuple[int, int], longer_side: int) -> tuple[int, int]:
+    """(width, height) of the grid for a photo of this size."""
+    factor = min(1.0, longer_side / max(size))
+    return max(2, round(size[0] * factor)), max(2, round(size[1] * factor))
+
+
 @dataclass(frozen=True, eq=False)
 class PosedGrid:
     """Where the pixels of a photo look: ``camera`` on its grid, ``rotation`` (3, 3) and
@@ -53,8 +59,7 @@ class DenseView(PosedGrid):
     def of(cls, image: RegisteredImage, view: View, max_size: int) -> DenseView:
         """A registered image with its photo, the longer side ``max_size`` at most."""
         rows, columns = view.image.shape[:2]
-        factor = min(1.0, max_size / max(rows, columns))
-        width, height = max(2, round(columns * factor)), max(2, round(rows * factor))
+        width, height = dense_size((columns, rows), max_size)
         grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
         usable = np.ones((height, width), np.bool_)
         if view.mask is not None:

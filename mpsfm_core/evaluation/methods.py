@@ -6,7 +6,6 @@ A mapper that crashes takes its process with it, not the benchmark.
 from __future__ import annotations
 
 import multiprocessing
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -21,6 +20,7 @@ from mpsfm_core.evaluation.chained_pnp import chained_poses
 from mpsfm_core.evaluation.peers import PEERS, run_peer
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.stages import peak_memory_mb
 from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 from mpsfm_core.threads import limited
@@ -85,17 +85,7 @@ def run_method(method: str, problem: MappingProblem, options: MapperOptions) -> 
     except Exception as raised:  # whatever a mapper raises is its result
         error = f"{type(raised).__name__}: {raised}"
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
-    return Outcome(models, seconds, cpu_seconds, peak_mib(), error)
-
-
-def peak_mib() -> float:
-    """Most memory that this process held so far; 0 where the system does not tell."""
-    if sys.platform == "win32":
-        return 0.0
-    import resource  # not on Windows
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
+    return Outcome(models, seconds, cpu_seconds, peak_memory_mb() or 0.0, error)
 
 
 def _models(method: str, problem: MappingProblem, options: MapperOptions) -> list[dict[str, Pose]]:

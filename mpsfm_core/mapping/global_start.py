@@ -19,9 +19,9 @@ from scipy.sparse.linalg import splu
 
 from mpsfm_core.data import Bool, Float64, Int64, VerifiedPair
 from mpsfm_core.geometry import camera_center, rotation_angle_deg, triangulation_angle_deg
-from mpsfm_core.mapping.statistics import MAD_TO_STD, group_medians
 from mpsfm_core.mapping.triangulation import midpoints
 from mpsfm_core.scene.scene import Scene
+from mpsfm_core.statistics import MAD_TO_STD, group_medians
 
 MIN_ANGLE_DEG = 1.5
 """Between the rays of a match whose depth says how long a baseline is (as for points that are
@@ -119,9 +119,8 @@ def averaged_rotations(links: _Links, num_images: int, seed: int) -> Float64 | N
     options = pycolmap.RotationEstimatorOptions()
     options.random_seed = seed
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(
-        level, _FATAL
-    )  # it tells on stderr what it left out, and that nothing is left
+    # It tells on stderr what it left out, and that nothing is left.
+    pycolmap.logging.minloglevel = max(level, _FATAL)
     try:
         if not pycolmap.run_rotation_averaging(options, graph, reconstruction, []):
             return None
