@@ -363,6 +363,8 @@ def find_images(folder: Path, without: Path | None = None) -> list[str]:
     :data:`SUMMARY`: that holds results.
     """
     if not folder.is_dir():
+        if folder.exists():
+            raise InputError(f"{folder} is neither a folder of photos nor a video")
         raise InputError(f"images folder {folder} does not exist")
     found = []
     own = _below(without, folder)

@@ -154,6 +154,9 @@ def read_intrinsics(path: Path) -> Intrinsics:
 def _from_yaml(path: Path) -> tuple[CameraEntry, ...]:
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError as error:
+        known = "a COLMAP model, database (.db) or transforms.json"
+        raise InputError(f"{path} is no text, so neither YAML nor {known}") from error
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise InputError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, Mapping) or not data:

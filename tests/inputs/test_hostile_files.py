@@ -1,12 +1,14 @@
 """Damaged and hostile files of every kind that is read: one clear error each, that names the file.
 
-Photos themselves are in test_images.py and test_pixels.py; GLB files are written, never read.
+Photos themselves are in test_images.py and test_pixels.py. GLB files are written, never read: there
+they stand where something else is wanted.
 """
 
 from __future__ import annotations
 
 import json
 import sqlite3
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,11 +22,13 @@ from mpsfm_core.errors import InputError
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.matches import matches_from_database, matches_from_hloc
+from mpsfm_core.inputs.models import read_model
 from mpsfm_core.inputs.nerfstudio import read_transforms
 from mpsfm_core.inputs.options import InputOptions, VideoOptions
 from mpsfm_core.inputs.video import choose_frames
 from mpsfm_core.results.exports.source import Source
 from mpsfm_core.results.ply import read_ply
+from mpsfm_core.viewing import read_scene
 
 NAMES = ("0.png", "1.png")
 Damage = Callable[[Path], object]
@@ -318,3 +322,37 @@ def test_clouds(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "dense.ply"
     path.write_bytes(content)
     refused(lambda: read_ply(path), path)
+
+
+GLB_READERS: dict[str, Callable[[Path], object]] = {
+    "photos.glb": load_images,
+    "model.glb": read_model,
+    "result.glb": Source.read,
+    "scene.glb": read_scene,
+    "intrinsics.glb": read_intrinsics,
+    "intrinsics.db": read_intrinsics,
+    "transforms.json": read_transforms,
+    "cloud.ply": read_ply,
+    "video.mp4": lambda path: choose_frames(path, VideoOptions()),
+}
+
+
+def untouched(path: Path) -> None:
+    """Well-formed, but not what is wanted."""
+
+
+@pytest.mark.parametrize("damage", [untouched, emptied, cut, noise_inside])
+@pytest.mark.parametrize("name", GLB_READERS)
+def test_glb_files(tmp_path: Path, name: str, damage: Damage) -> None:
+    text = b'{"asset": {"version": "2.0"}, "meshes": [{"primitives": [{"attributes": {}}]}]}'
+    text += b" " * (-len(text) % 4)
+    path = tmp_path / name
+    path.write_bytes(
+        struct.pack("<4sII", b"glTF", 2, 28 + len(text) + 8)
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", 8, b"BIN\0")
+        + b"\xff" * 8
+    )
+    damage(path)
+    refused(lambda: GLB_READERS[name](path), path)
