@@ -15,29 +15,31 @@ from mpsfm_ray.executor import RayExecutor
 pytestmark = pytest.mark.filterwarnings("ignore")  # of the cluster's own threads at its end
 
 
-@pytest.fixture(scope="module")
-def executor() -> Iterator[RayExecutor]:
-    executor = RayExecutor({"workers": 2})
-    yield executor
-    executor.close()
+class TestOneCluster:
+    """Ray knows one cluster in a process; the tests below start their own, after this has ended."""
+
+    @pytest.fixture(scope="class")
+    def executor(self) -> Iterator[RayExecutor]:
+        executor = RayExecutor({"workers": 2})
+        yield executor
+        executor.close()
+
+    def test_items(self, executor: RayExecutor, tmp_path: Path) -> None:
+        executors.check_items(executor, tmp_path / "items")
+
+    def test_errors(self, executor: RayExecutor) -> None:
+        executors.check_errors(executor)
+
+    def test_a_lost_worker_loses_nothing(self, executor: RayExecutor, tmp_path: Path) -> None:
+        executors.check_lost_worker(executor, tmp_path / "items")
 
 
-def test_items(executor: RayExecutor, tmp_path: Path) -> None:
-    executors.check_items(executor, tmp_path / "items")
-
-
-def test_errors(executor: RayExecutor) -> None:
-    executors.check_errors(executor)
-
-
-def test_a_lost_worker_loses_nothing(executor: RayExecutor, tmp_path: Path) -> None:
-    executors.check_lost_worker(executor, tmp_path / "items")
-
-
+@pytest.mark.slow  # starts clusters
 def test_extraction(tmp_path: Path) -> None:
     executors.check_extraction("ray", {"workers": 2}, tmp_path)
 
 
+@pytest.mark.slow  # starts clusters
 def test_a_failing_provider(tmp_path: Path) -> None:
     executors.check_failing_provider("ray", {"workers": 2}, tmp_path)
 
