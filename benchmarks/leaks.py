@@ -3,20 +3,19 @@
     python -m benchmarks.leaks [--count 200]
 
 Three photos of an analytic room, all stages, results written anew each time; what providers give
-comes from the cache after the first. Prints resident memory as runs go on, and how it grows from
-the first quarter of the runs on. Writes benchmarks/results/leaks.md.
+comes from the cache after the first. Prints what the process holds as runs go on, and how that
+grows in the second half of the runs. Writes benchmarks/results/leaks.md.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
-import psutil
 
 from benchmarks._scenes import RESULTS
 from mpsfm_core.config import Config, RuntimeOptions
@@ -24,6 +23,7 @@ from mpsfm_core.data import PinholeCamera
 from mpsfm_core.options import Backend
 from mpsfm_core.pipeline import reconstruct
 from mpsfm_core.registry import Registry
+from mpsfm_core.testing.held import Held, held_after_each
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
@@ -35,19 +35,24 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200)
     count = parser.parse_args().count
     with tempfile.TemporaryDirectory() as folder:
-        resident = np.array(list(memory_of_runs(Path(folder), count)))
-    settled = np.arange(count // 4, count)
-    slope = np.polyfit(settled, resident[settled], 1)[0]
+        runs = held_after_each(reconstruction(Path(folder)), count)
+        held = np.fromiter(runs, np.dtype((float, len(Held._fields))), count)
+    later = np.arange(count // 2, count)
+    slopes = Held(*np.polyfit(later, held[later], 1)[0])
     lines = [
-        f"# Memory of {count} reconstructions in one process",
+        f"# {count} reconstructions in one process",
         "",
         f"`python -m benchmarks.leaks --count {count}`",
         "",
-        f"From run {settled[0] + 1} on memory grows by {1000 * slope:.0f} kB a run.",
+        f"In the second half memory grows by {1e3 * slopes.memory_mb:.1f} kB a run, the objects",
+        f"that Python knows by {slopes.objects:.2f}: slopes of lines through those runs.",
         "",
-        "| after run | resident MB |",
-        "| --- | --- |",
-        *(f"| {k + 1} | {resident[k]:.1f} |" for k in range(0, count, max(1, count // 10))),
+        "| after run | resident MB | objects | open files | threads |",
+        "| --- | --- | --- | --- | --- |",
+        *(
+            "| {} | {:.1f} | {:.0f} | {:.0f} | {:.0f} |".format(k + 1, *held[k])
+            for k in (0, *range(count // 10 - 1, count, count // 10))
+        ),
     ]
     text = "\n".join(lines) + "\n"
     RESULTS.mkdir(exist_ok=True)
@@ -55,8 +60,8 @@ def main() -> None:
     print(text)
 
 
-def memory_of_runs(folder: Path, count: int) -> Iterator[float]:
-    """Resident memory after each run, MB."""
+def reconstruction(folder: Path) -> Callable[[], object]:
+    """A reconstruction of photos made here, to be called again and again."""
     photos = folder / "photos"
     photos.mkdir()
     for number, pose in enumerate(arc_poses(3, 10.0)):
@@ -73,16 +78,14 @@ def memory_of_runs(folder: Path, count: int) -> Iterator[float]:
     config = config.model_copy(
         update={"extraction": config.extraction.model_copy(update={"integration_size": 64})}
     )
-    registry, process = Registry.discover(), psutil.Process()
-    for _ in range(count):
-        reconstruct(
-            photos,
-            folder / "out",
-            config,
-            intrinsics=folder / "intrinsics.yaml",
-            registry=registry,
-        )
-        yield process.memory_info().rss / 1e6
+    registry = Registry.discover()
+    return lambda: reconstruct(
+        photos,
+        folder / "out",
+        config,
+        intrinsics=folder / "intrinsics.yaml",
+        registry=registry,
+    )
 
 
 if __name__ == "__main__":
