@@ -425,8 +425,7 @@ def _download(uri: str, part: Path, expected: str | None, progress: Progress | N
         except urllib.error.HTTPError as error:
             reached = True
             if error.code not in _WORTH_A_RETRY:
-                answer = f"{error.code} {error.reason}"
-                raise WeightsError(f"{uri}: the server answers {answer}") from error
+                raise WeightsError(f"{uri}: the server answers {_in_words(error)}") from error
             failure: Exception = error
         except _CONNECTION_FAILURES as error:
             reached = reached or not isinstance(error, (urllib.error.URLError, TimeoutError))
@@ -434,10 +433,18 @@ def _download(uri: str, part: Path, expected: str | None, progress: Progress | N
         fruitless = 0 if _size(part) > before else fruitless + 1
         if fruitless >= _FRUITLESS_ATTEMPTS or not reached:
             raise WeightsError(
-                f"{uri} cannot be downloaded: {failure}. Try again (it goes on after the "
-                f"{_size(part)} bytes that are here), or name a local file"
+                f"{uri} cannot be downloaded: {_in_words(failure)}. Try again (it goes on after "
+                f"the {_size(part)} bytes that are here), or name a local file"
             ) from failure
         time.sleep(_RETRY_WAIT_S * 2**fruitless)
+
+
+def _in_words(failure: Exception) -> str:
+    """What the server answers or the system says, without the exceptions around it."""
+    if isinstance(failure, urllib.error.HTTPError):
+        return f"{failure.code} {failure.reason}"
+    cause = failure.reason if isinstance(failure, urllib.error.URLError) else failure
+    return str((isinstance(cause, OSError) and cause.strerror) or cause)
 
 
 def _open(

@@ -62,7 +62,7 @@ def doctor(
     if "none" in _gpu():
         advice.append("a GPU with CUDA makes networks and dense matching many times faster")
     _heading("what would make runs better here")
-    for text in advice or ["nothing that mpsfm knows of"]:
+    for text in dict.fromkeys(advice) or ["nothing that mpsfm knows of"]:
         typer.echo(f"  - {text}")
     if broken:
         raise typer.Exit(1)

@@ -167,34 +167,34 @@ def _scale(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
     details = summary["images"]["details"]
+    refined = {
+        name: (image["focal_length_px"], image.get("refined_focal_length_px"))
+        for name, image in details.items()
+    }
     guessed = [name for name, image in details.items() if image["focal_length_from"] == "default"]
     if guessed:
+        before, after = refined[next((n for n in guessed if refined[n][1]), guessed[0])]
+        became = f"It was refined, from {before:.0f} to {after:.0f} px, but" if after else "But"
         yield Finding(
             "warning",
             f"The focal length of {_count(len(guessed), 'photo')} was guessed",
-            "Neither EXIF nor --intrinsics nor a network tells it. It was refined where the views "
-            "tell it, but a wrong one bends everything.",
+            f"Neither EXIF nor --intrinsics nor a network tells it. {became} a wrong one bends "
+            "everything.",
             "Give it with --intrinsics, or use photos as they come from the camera, with EXIF.",
             tuple(guessed),
         )
     far = [
         name
-        for name, image in details.items()
-        if abs(image.get("refined_focal_length_px", image["focal_length_px"]))
-        and abs(
-            image.get("refined_focal_length_px", image["focal_length_px"])
-            / image["focal_length_px"]
-            - 1
-        )
-        > _REFINED_FAR
+        for name, (before, after) in refined.items()
+        if name not in guessed and after and abs(after / before - 1) > _REFINED_FAR
     ]
     if far:
-        image = details[far[0]]
+        before, after = refined[far[0]]
         yield Finding(
             "note",
             "The focal length changed much",
-            f"From {image['focal_length_px']:.0f} ({image['focal_length_from']}) to "
-            f"{image['refined_focal_length_px']:.0f} px. The photos may be cropped or zoomed.",
+            f"From {before:.0f} ({details[far[0]]['focal_length_from']}) to {after:.0f} px. The "
+            "photos may be cropped or zoomed.",
             "If you know the true one, give it with --intrinsics.",
             tuple(far),
         )

@@ -121,3 +121,16 @@ def test_a_photo_that_hangs_on_another_is_told() -> None:
     said["pairs"]["all"].pop()
     (found,) = findings(said)
     assert set(found.images) == {"b", "c"}
+
+
+def test_focal_lengths_are_told_of_once() -> None:
+    said = summary()
+    for name, origin in (("a", "default"), ("b", "exif")):
+        said["images"]["details"][name] |= {
+            "focal_length_from": origin,
+            "refined_focal_length_px": 400.0,
+        }
+    guess, change = findings(said)
+    assert (guess.images, change.images) == (("a",), ("b",))
+    assert "refined, from 500 to 400 px, but a wrong one" in guess.text
+    assert change.text.startswith("From 500 (exif) to 400 px.")
