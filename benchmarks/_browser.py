@@ -26,8 +26,8 @@ def picture_of(browser: Any) -> bytes:
 
 
 @contextmanager
-def headless(width: int = 1440, height: int = 1000) -> Iterator[Any]:
-    """Selenium's driver of a window of this size. Ends the script where there is no browser."""
+def headless(width: int = 1280, height: int = 800) -> Iterator[Any]:
+    """Selenium's driver of a page of this size. Ends the script where there is no browser."""
     try:
         from selenium import webdriver
     except ImportError as error:
@@ -37,13 +37,15 @@ def headless(width: int = 1440, height: int = 1000) -> Iterator[Any]:
         raise SystemExit("needs chromium and chromedriver (Debian: chromium chromium-driver)")
     options = webdriver.ChromeOptions()
     options.binary_location = chromium
-    for argument in (*_ARGUMENTS, f"--window-size={width},{height}"):
+    for argument in _ARGUMENTS:
         options.add_argument(argument)
     options.page_load_strategy = "none"  # who wants to see something waits for it
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
     browser.command_executor.client_config.timeout = 600  # seconds; drawn without a GPU
     browser.set_script_timeout(600)
+    screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     try:
         yield browser
     finally:

@@ -14,6 +14,7 @@ import os
 import pty
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -158,13 +159,17 @@ def shoot_viewer(browser: Any, folder: Path) -> None:
     )
     try:
         assert process.stdout is not None
-        address = next(line for line in process.stdout if "http" in line).split()[0]
-        browser.get(address)
-        wait_for(browser, "document.querySelector('canvas') !== null")
+        address = next(filter(None, (re.search(r"http://\S+", line) for line in process.stdout)))
+        browser.get(address[0])
+        wait_for(browser, "location.protocol === 'http:' && document.querySelector('canvas')")
         time.sleep(20)  # the scene comes through a socket
+        # it warns of browsers that draw without a GPU
+        close = "document.querySelectorAll('.mantine-Notification-closeButton')"
+        browser.execute_script(f"{close}.forEach((button) => button.click())")
+        time.sleep(2)
         shoot(browser, "viewer.jpg")
     finally:
-        process.terminate()
+        process.send_signal(signal.SIGINT)
         process.wait()
 
 
@@ -186,7 +191,8 @@ def main() -> None:
             said = on_terminal("demo", "--offline", "--output", str(out))
             draw_terminal(said.replace(str(out), "out"), shown, PICTURES / "terminal.svg")
         if not (failed / "report.html").is_file():
-            on_terminal("reconstruct", str(photos), "--offline", "-o", str(failed), code=3)
+            ours = ("--offline", "--set", "depth.use=compact")
+            on_terminal("reconstruct", str(photos), *ours, "-o", str(failed), code=3)
         draw_maps(out)
         with headless() as browser:
             browser.get((failed / "report.html").resolve().as_uri())

@@ -69,6 +69,13 @@ def test_python_asks_for_what_there_is(page: Path) -> None:
                 assert hasattr(mpsfm_core, node.attr), node.attr
 
 
+def test_every_picture_is_shown() -> None:
+    pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    for picture in (ROOT / "docs" / "pictures").iterdir():
+        assert f"pictures/{picture.name}" in pages, picture.name
+        assert picture.stat().st_size < 200_000, picture.name
+
+
 def test_the_first_pages_have_commands() -> None:
     assert len(commands_of(ROOT / "docs" / "first-run.md")) >= 3
     assert len(commands_of(ROOT / "README.md")) >= 3

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from mpsfm_core.report.reasons import NOTHING_TO_HOLD_ON, explain, pair_kind
+from mpsfm_core.report.reasons import NO_MATCH, NOTHING_TO_HOLD_ON, explain, pair_kind
 
 Level = Literal["bad", "warning", "note"]
 _ORDER: tuple[Level, ...] = ("bad", "warning", "note")
@@ -103,12 +103,16 @@ def _missing(summary: Mapping[str, Any]) -> Iterator[Finding]:
     failed = summary["status"] != "success"
     if failed:  # of course
         groups.pop(explain(NOTHING_TO_HOLD_ON).kind, None)
+        if not summary["pairs"]["verified"]:
+            groups.pop(explain(NO_MATCH).kind, None)
     for kind, members in sorted(groups.items(), key=lambda item: -len(item[1])):
         names = tuple(name for name, _ in members)
         first = members[0][1]
+        alike = all(explained.plain == first.plain for _, explained in members)
+        plain = first.plain if alike else f"{names[0]}, for one: {first.plain}"
         title = f"{_count(len(names), 'photo')} missing: {kind}"
         level: Level = "note" if failed else "warning"
-        yield Finding(level, title, first.plain, "" if failed else first.remedy, names)
+        yield Finding(level, title, plain, "" if failed else first.remedy, names)
 
 
 def _unconfirmed(summary: Mapping[str, Any]) -> Iterator[Finding]:
@@ -174,11 +178,11 @@ def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
     guessed = [name for name, image in details.items() if image["focal_length_from"] == "default"]
     if guessed:
         before, after = refined[next((n for n in guessed if refined[n][1]), guessed[0])]
-        became = f"It was refined, from {before:.0f} to {after:.0f} px, but" if after else "But"
+        became = f"It was refined, from {before:.0f} to {after:.0f} px, but a" if after else "A"
         yield Finding(
             "warning",
             f"The focal length of {_count(len(guessed), 'photo')} was guessed",
-            f"Neither EXIF nor --intrinsics nor a network tells it. {became} a wrong one bends "
+            f"Neither EXIF nor --intrinsics nor a network tells it. {became} wrong one bends "
             "everything.",
             "Give it with --intrinsics, or use photos as they come from the camera, with EXIF.",
             tuple(guessed),

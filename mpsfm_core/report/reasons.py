@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+NO_MATCH = "no verified match with another image"
 NOTHING_TO_HOLD_ON = "nothing that it matches could be registered"
 
 _MORE_OVERLAP = (
@@ -30,27 +31,27 @@ class Explanation:
 
 _IMAGES: tuple[tuple[str, str, str, str], ...] = (
     (
-        r"no verified match with another image",
-        "shows nothing that another photo shows",
-        "None of its matches with any other photo is geometrically possible.",
+        NO_MATCH,
+        "nothing in common with another photo",
+        "No match with any other photo is geometrically possible.",
         _MORE_OVERLAP + " A blurred or very dark photo matches nothing: leave it out.",
     ),
     (
         NOTHING_TO_HOLD_ON,
-        "matches only photos that are missing too",
-        "It matches other photos, but none of them has a place in the reconstruction.",
+        "in common only with photos that are missing too",
+        "There are matches with other photos, but none of those has a place in the reconstruction.",
         "Add a photo that overlaps both with these and with the registered ones.",
     ),
     (
         r"its depth is valid nowhere",
-        "has no depth",
-        "The depth provider gives no valid depth for it.",
+        "no depth",
+        "The depth provider gives no valid depth.",
         "Look at the mask and at the files or the network of the depth provider.",
     ),
     (
         r"(?P<have>\d+) matches have a 3D point, (?P<need>\d+) are needed",
-        "shares too little with the reconstructed part",
-        "Only {have} of its matches are points of the reconstruction; {need} are needed.",
+        "too little in common with the reconstructed part",
+        "Only {have} matches are points of the reconstruction; {need} are needed.",
         _MORE_OVERLAP,
     ),
     (
@@ -58,33 +59,33 @@ _IMAGES: tuple[tuple[str, str, str, str], ...] = (
         r"|(?P<share>[\d.]+%) of the matches support its pose, not .*"
         r"|neither PnP nor an essential matrix gives a pose|nothing gives a pose",
         "matches that do not agree",
-        "Its matches do not agree on one place where the camera could have stood.",
+        "The matches do not agree on one place where the camera could have stood.",
         "Look at its matches below. If they lie on moving or repeated things, add a photo from "
         "nearby; if they look right, give the true focal length (--intrinsics).",
     ),
     (
         r"too few points are left after refinement|lost its points .*",
-        "did not hold",
-        "It had a place, but too few of its points fitted once everything was refined.",
+        "a place that did not hold",
+        "There was a place, but too few points fitted once everything was refined.",
         _MORE_OVERLAP,
     ),
     (
         r"(at the end )?(?P<share>[\d.]+%) of the pixels contradict (the depth of (?P<other>.+)"
         r"|another view's)",
-        "contradicts another photo",
-        "Where its matches put it, {share} of what it sees contradicts what another photo sees.",
+        "in contradiction to another photo",
+        "Where the matches put it, {share} of what the photo sees contradicts what another sees.",
         _LOOK_ALIKE,
     ),
     (
         r"(?P<count>\d+) other images contradict its depth",
-        "contradicts other photos",
-        "{count} other photos contradict what it sees where its matches put it.",
+        "in contradiction to other photos",
+        "{count} other photos contradict what the photo sees where its matches put it.",
         _LOOK_ALIKE,
     ),
     (
         r"held to the rest only by an image that was dropped at the end",
-        "hung on a photo that was dropped",
-        "Its only link to the others was a photo that was dropped in the end.",
+        "held only by a photo that was dropped",
+        "The only link to the others was a photo that was dropped in the end.",
         _MORE_OVERLAP,
     ),
     (
@@ -96,7 +97,7 @@ _IMAGES: tuple[tuple[str, str, str, str], ...] = (
     (
         r"not connected to the others; in components/(?P<number>\d+)",
         "in a reconstruction of its own",
-        "Its group was reconstructed, but nothing links it to the others (components/{number}).",
+        "The group was reconstructed, but nothing links it to the others (components/{number}).",
         "Add photos that overlap with both groups.",
     ),
     (
@@ -107,8 +108,8 @@ _IMAGES: tuple[tuple[str, str, str, str], ...] = (
     ),
     (
         r"has no known pose, and known poses are fixed",
-        "has no known pose",
-        "Poses were given and kept fixed, and it has none.",
+        "no known pose",
+        "Poses were given and kept fixed, and there is none for this photo.",
         "Leave out --set mapping.known_poses=fixed, or give its pose.",
     ),
 )
@@ -128,7 +129,7 @@ def explain(reason: str) -> Explanation:
         if found:
             values = {key: value for key, value in found.groupdict().items() if value}
             return Explanation(kind, plain.format(**values), remedy)
-    return Explanation("is missing", reason[:1].upper() + reason[1:] + ".", _MORE_OVERLAP)
+    return Explanation("another reason", reason[:1].upper() + reason[1:] + ".", _MORE_OVERLAP)
 
 
 def pair_kind(reason: str) -> str:

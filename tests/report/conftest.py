@@ -70,10 +70,12 @@ def browser() -> Iterator[Any]:
     options.binary_location = chromium
     arguments = ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars")
     software_3d = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-    for argument in (*arguments, *software_3d, "--window-size=1440,1000"):
+    for argument in (*arguments, *software_3d):
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     opened = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    screen = {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     yield opened
     opened.quit()
 

@@ -65,6 +65,12 @@ COLORED = """(() => {
 })()"""
 
 
+LOWEST_ADVICE = """Math.max(...[...document.querySelectorAll('.finding:not(.note) .do')].map(
+  (advice) => advice.getBoundingClientRect().bottom))"""
+SCREEN = 800
+"""The height of the page, without scrolling."""
+
+
 def test_it_renders_and_asks_nobody(opened: Open, finished: Path) -> None:
     browser = opened(finished)
     wait_for(browser, "window.report !== undefined")
@@ -77,6 +83,17 @@ def test_it_renders_and_asks_nobody(opened: Open, finished: Path) -> None:
         if not (url == page or url.startswith(("data:", "blob:")))
     }
     assert foreign == set()
+
+
+def test_what_is_missing_and_what_to_do_is_on_the_first_screen(
+    opened: Open, finished: Path
+) -> None:
+    browser = opened(finished)
+    assert wait_for(browser, "document.getElementById('badge').innerText").lower() == "partial"
+    assert "1 photo missing: nothing in common with another photo" in browser.execute_script(
+        "return document.querySelector('.finding.warning h3').innerText"
+    )
+    assert browser.execute_script(f"return {LOWEST_ADVICE}") < SCREEN
 
 
 def test_hostile_names_are_text(opened: Open, finished: Path) -> None:
@@ -142,8 +159,7 @@ def test_maps_matches_and_table(opened: Open, finished: Path) -> None:
 def test_a_failed_run_says_what_to_do_on_the_first_screen(opened: Open, failed: Path) -> None:
     browser = opened(failed)
     assert wait_for(browser, "document.getElementById('badge').innerText").lower() == "failed"
-    advice = "document.querySelector('.finding.bad .do').getBoundingClientRect().bottom"
-    assert browser.execute_script(f"return {advice} < window.innerHeight")
+    assert browser.execute_script(f"return {LOWEST_ADVICE}") < SCREEN
     assert "No two photos" in browser.execute_script(
         "return document.querySelector('.finding.bad h3').innerText"
     )

@@ -130,7 +130,11 @@ class ViserViewer:
 
     def _cloud(self, name: str, cloud: Cloud) -> None:
         handle = self.server.scene.add_point_cloud(
-            name, cloud.xyz.astype(np.float32), cloud.rgb, point_size=0.005 * self._unit
+            name,
+            cloud.xyz.astype(np.float32),
+            cloud.rgb,
+            point_size=0.005 * self._unit,
+            point_shading="flat",
         )
         self.clouds.append(handle)
 
