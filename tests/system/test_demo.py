@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
-import sys
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -51,35 +46,6 @@ def test_with_the_priors_of_the_scene_the_poses_are_right(mpsfm, tmp_path: Path)
     assert report["trajectory"]["ate_median"] < 0.05
     # The priors' scales spread by 4 %; their consensus is the metre of the model.
     assert report["trajectory"]["scale"] == pytest.approx(1, abs=0.08)
-
-
-@pytest.mark.slow
-def test_it_runs_from_a_wheel_somewhere_else(tmp_path: Path) -> None:
-    """The wheel has the configurations and the sample photos, and no scripts of the scene."""
-    source, installed = tmp_path / "source", tmp_path / "installed"
-    for name in ("mpsfm_core", "configs", "examples/sample_scene"):
-        shutil.copytree(ROOT / name, source / name)
-    for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE", "mpsfm_pytest.py"):
-        shutil.copy(ROOT / name, source)
-    wheel = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation"]
-    options = {"check": True, "cwd": tmp_path, "capture_output": True, "text": True}
-    subprocess.run([*wheel, "--wheel-dir", str(tmp_path), str(source)], **options)
-    (built,) = tmp_path.glob("*.whl")
-    with zipfile.ZipFile(built) as archive:
-        archive.extractall(installed)
-        assert not [name for name in archive.namelist() if "make_scene" in name]
-    shutil.rmtree(source)
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(installed),
-        "MPSFM_CACHE": str(tmp_path / "cache"),
-        "OMP_NUM_THREADS": "1",
-    }
-    code = "import mpsfm_core.cli as cli; print(cli.__file__); cli.main()"
-    command = [sys.executable, "-c", code, "demo", "--offline", "--output", "out"]
-    ended = subprocess.run(command, env=environment, **options)
-    assert ended.stdout.startswith(str(installed))
-    assert "8 of 8 images" in ended.stdout and "pose AUC" in ended.stdout
 
 
 def test_a_scene_of_the_same_layout_can_be_given(mpsfm, tmp_path: Path) -> None:
