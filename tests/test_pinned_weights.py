@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 
@@ -40,3 +41,9 @@ def test_what_is_downloaded_is_pinned() -> None:
     if not any(line.distribution == "mpsfm-kornia" for line in registry.status()):
         pytest.skip("needs the first-party plugins")
     assert found <= NOT_PINNED
+
+
+def test_what_is_not_pinned_is_told() -> None:
+    told = (Path(__file__).parents[1] / "SECURITY.md").read_text(encoding="utf-8")
+    assert [name for name in sorted(NOT_PINNED) if f"`{name}`" not in told] == []
+    assert f"for these {len(NOT_PINNED)} providers" in " ".join(told.split())

@@ -110,8 +110,8 @@ def model_files(*readers: Reader) -> Table:
 
 
 def models() -> Table:
-    """Files of COLMAP models, for every use."""
-    return model_files(poses, intrinsics, exported, used)
+    """Files of COLMAP models, for every use beside poses and intrinsics."""
+    return model_files(exported, used)
 
 
 def results() -> Table:
