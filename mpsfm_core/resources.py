@@ -1,9 +1,9 @@
 """Memory and disk that a run takes: predicted before the first photo is decoded, measured after.
 
-The prediction is for photos that all end in one group, which takes most. Its constants are read off
-the peaks of resident memory of each stage (``summary.json``) and the sizes of files of runs with 5
-to 100 photos of 320 x 213 to 640 x 480 pixels, SIFT, depth of files and `compact`, 1 to 4 workers,
-CPython 3.11 on Linux; docs/robustness.md has the errors.
+The prediction is for photos that all end in one group, which takes most memory; in several, each
+has a cloud of its own, which takes more disk. Its terms are what the code keeps a pixel, where that
+can be said, else read off the peaks of resident memory of each stage (``summary.json``): of runs
+with 5, 24 and 60 rendered photos, CPython 3.11 on Linux. docs/robustness.md has the errors.
 """
 
 from __future__ import annotations
@@ -22,43 +22,57 @@ from mpsfm_core.config import Config
 from mpsfm_core.dense.view import dense_size
 from mpsfm_core.errors import InputError
 from mpsfm_core.extraction.backends import worker_count
+from mpsfm_core.extraction.features import CACHED_BYTES as CACHED_FEATURES
 from mpsfm_core.extraction.priors import integration_grid
-from mpsfm_core.inputs.images import CACHED_BYTES
+from mpsfm_core.inputs.images import CACHED_BYTES as CACHED_VIEWS
 from mpsfm_core.providers import ProviderSpec
 
 TOLERANCE = 1.3
 """The prediction is to be off by less than this factor."""
 
 _MB = float(1 << 20)
-_PROGRAM_MB = 324.0
-"""Interpreter and libraries (255), and what the first photos bring with them."""
+_PROGRAM_MB = 265.0
+"""Interpreter and libraries (232), what the first photos bring with them (25), the report (8)."""
 _TORCH_MB = 250.0
 """More where a provider's library is torch, once (estimated)."""
-_COMPILED_MB = 50.0
+_COMPILED_MB = 54.0
 """Compiled kernels of mapping and what loads them."""
 _WORKER_BYTES = 350.0
 """A pixel of the photo that a worker has in hand: SIFT's pyramid of the doubled image."""
 _WEIGHTS = 2.0
 """Times its size a network is in memory, in each worker (estimated)."""
-_PRIOR_BYTES = 86.0
-"""A pixel of the prior maps: depth and normals with variances (26), and what mapping adds (60)."""
-_DENSE_BYTES = 45.0
-"""A pixel of the dense stage: the view (13), what was found (12) and compared, the result (9)."""
-_DENSE_WORKER_MB = 15.0
-"""Costs of all labels, of each worker."""
-_RESULT_BYTES = 52.0
-"""A pixel of the final depth maps: points of the cloud with colours."""
+_PRIOR_BYTES = 106.0
+"""A pixel of the prior maps: depth and normals with variances (26), and what mapping adds (80)."""
+_DENSE_BYTES = 12.0
+"""A pixel of the dense stage: the final map (9), and what was found (14) as far as it does not fit
+into what earlier stages left free."""
+_DENSE_WORKER_BYTES = 320.0
+"""A pixel of the photo that a worker matches: 11 labels, each of a byte from 5 views and of 6
+arrays of 4 bytes."""
+_RESULT_BYTES = 4.6
+"""A pixel of the final depth maps: whether it is certain (1); number and votes of those that become
+points (9 for 0.4)."""
+_POINT_BYTES = 120.0
+"""A point of the cloud (44), once more in parts (44), and as it is written (32)."""
+_POINTS = 0.4
+"""Of the pixels become points (0.27 to 0.46 were seen), as long as they may."""
 
-_CACHE_KEYPOINT_BYTES = 544.0
-"""A keypoint with 128 values of 4 bytes, position and scale; photos may have fewer than allowed."""
+_KEYPOINT_BYTES = 544.0
+"""A keypoint with 128 values of 4 bytes, position and scale, in memory and in the cache."""
+_KEYPOINT_PIXELS = 60.0
+"""Pixels of a photo for each keypoint, at least: SIFT found one in 62 to 325 on photos of four
+scenes, 320 to 1280 wide."""
 _CACHE_MAP_MB = 0.27
 """Depth and normals of a photo by `compact`; larger networks leave more."""
 _CACHE_PAIR_BYTES = 6_000.0
 """Matches and two-view geometry of a pair."""
 _DENSE_CACHE_BYTES = 12.0
 """A pixel that the dense stage found, until the run ends."""
-_OUTPUT_BYTES = 30.0
-"""A pixel of the final depth maps: cloud (19), maps (11), and the rest beside them."""
+_WRITTEN_POINT_BYTES = 32.0
+_WRITTEN_BYTES = 7.3
+"""A pixel of the final depth maps, compressed."""
+_PAGE_MB, _PAGE_PHOTO_MB = 2.0, 0.22
+"""The report and what it shows, once and for each photo; the model is little beside it."""
 _USUAL_KEYPOINTS = 4096
 """Of a photo, where the options of the features do not say it."""
 _EVERY_S = 1.0
@@ -97,17 +111,23 @@ def predict(
     grids = [integration_grid(size, config.extraction.integration_size) for size in sizes]
     final = prior = sum(width * height for width, height in grids)
     torch = any("torch" in spec.requires for spec in providers)
+    most = _keypoints(config)
+    features = _KEYPOINT_BYTES * sum(min(most, size / _KEYPOINT_PIXELS) for size in pixels)
     memory = (_PROGRAM_MB + _COMPILED_MB + torch * _TORCH_MB) * _MB
-    memory += min(CACHED_BYTES, 3 * sum(pixels)) + _PRIOR_BYTES * prior
-    memory += workers * (_WORKER_BYTES * max(pixels) + _WEIGHTS * weights)
-    cache = count * (_CACHE_KEYPOINT_BYTES * _keypoints(config) + _CACHE_MAP_MB * _MB)
-    cache += _CACHE_PAIR_BYTES * _pairs(count, config)
+    memory += min(CACHED_VIEWS, 3 * sum(pixels)) + min(CACHED_FEATURES, features)
+    memory += _PRIOR_BYTES * prior + workers * (_WORKER_BYTES * max(pixels) + _WEIGHTS * weights)
+    cache = features + _CACHE_MAP_MB * _MB * count + _CACHE_PAIR_BYTES * _pairs(count, config)
     if config.dense.enabled:
-        final = sum(math.prod(dense_size(size, config.dense.max_size)) for size in sizes)
-        memory += _DENSE_BYTES * final + workers * _DENSE_WORKER_MB * _MB
+        dense = [math.prod(dense_size(size, config.dense.max_size)) for size in sizes]
+        final = sum(dense)
+        memory += _DENSE_BYTES * final + workers * _DENSE_WORKER_BYTES * max(dense)
         cache += _DENSE_CACHE_BYTES * final
-    memory += _RESULT_BYTES * final
-    return Needs(round(memory / _MB), round(cache / _MB), round(_OUTPUT_BYTES * final / _MB))
+    results = config.results
+    points = results.dense_cloud * min(results.dense_max_points, _POINTS * final)
+    memory += _RESULT_BYTES * final + _POINT_BYTES * points
+    output = _WRITTEN_POINT_BYTES * points + results.depth_maps * _WRITTEN_BYTES * final
+    output += results.report * (_PAGE_MB + _PAGE_PHOTO_MB * count) * _MB
+    return Needs(round(memory / _MB), round(cache / _MB), round(output / _MB))
 
 
 def shortages(needs: Needs, cache: Path, output: Path | None) -> list[str]:

@@ -31,11 +31,13 @@ def config(**changes: object) -> Config:
 
 def test_what_a_run_takes_grows_with_what_it_is_given() -> None:
     few, many = (predict([SIZE] * count, config(), (), 0) for count in (10, 100))
-    assert many.memory_mb > few.memory_mb + 90 * 20 and many.cache_mb > 9 * few.cache_mb
+    assert many.memory_mb > few.memory_mb + 90 * 15 and many.cache_mb > 9 * few.cache_mb
     large = predict([(1280, 960)] * 10, config(), (), 0)
     assert large.memory_mb > few.memory_mb
     sparse = predict([SIZE] * 100, config(dense={"enabled": False}), (), 0)
     assert sparse.memory_mb < many.memory_mb and sparse.output_mb < many.output_mb
+    maps = predict([SIZE] * 100, config(results={"dense_cloud": False}), (), 0)
+    assert maps.memory_mb < many.memory_mb and maps.output_mb < many.output_mb
     pairs = predict([SIZE] * 100, config(pairs={"mode": "sequential"}), (), 0)
     assert pairs.cache_mb < many.cache_mb
     workers = predict([SIZE] * 10, config(runtime=RuntimeOptions(workers=4)), (), 0)

@@ -14,7 +14,7 @@ from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.inputs.recent import Recent
 from mpsfm_core.options import Backend
 
-_CACHED_BYTES = 512 << 20
+CACHED_BYTES = 512 << 20
 """Features that are kept while pairs are matched; 8192 SIFT features have 4 MB."""
 
 
@@ -24,7 +24,7 @@ class FeatureTable:
     def __init__(self, bench: Workbench, backend: Backend) -> None:
         self._bench = bench
         self._provider = bench.provider("features", backend)
-        self._recent: Recent[int, Features] = Recent(_CACHED_BYTES, lambda f: f.descriptors.nbytes)
+        self._recent: Recent[int, Features] = Recent(CACHED_BYTES, lambda f: f.descriptors.nbytes)
 
     def extract(self) -> list[Features]:
         """Run the stage; returns features without descriptors, to keep memory small."""

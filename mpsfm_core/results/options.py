@@ -21,7 +21,7 @@ class ResultOptions(Options):
     dense_cloud: bool = True
     """Write ``dense.ply``."""
     dense_max_points: int = Field(2_000_000, ge=1)
-    """Size limit of ``dense.ply`` (15 bytes a point: 30 MB); random pixels are left out above."""
+    """Size limit of ``dense.ply`` (32 bytes a point: 64 MB); random pixels are left out above."""
     dense_max_relative_std: float = Field(0.1, gt=0)
     """Pixels whose depth has a larger relative std are left out of ``dense.ply``. Twice the
     relative std of the weaker networks of the paper's appendix C, so it takes the worst pixels.

@@ -90,7 +90,7 @@ def hall_problem(
     ``wrong_matches``: share of the matches of each pair that join keypoints at random.
     """
     rng = np.random.default_rng(seed)
-    poses, scene = _hall(views, rng)
+    poses, scene = hall(views, rng)
     eyes = np.array([camera_center(pose[:, :3], pose[:, 3]) for pose in poses])
     parts = [_in_sight(scene, pose) for pose in poses]
     numbers, pixels = _keypoints(parts, poses, eyes, points_per_view, rng)
@@ -116,7 +116,7 @@ def hall_problem(
     return Hall(MappingProblem(tuple(images), tuple(pairs)), truth)
 
 
-def _hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], AnalyticScene]:
+def hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], AnalyticScene]:
     """Views on a square grid, and a hall with boxes between them."""
     side = int(np.ceil(np.sqrt(views)))
     row, column = np.divmod(np.arange(views), side)
