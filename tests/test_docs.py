@@ -7,10 +7,12 @@ import importlib
 import importlib.util
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import pytest
 import typer.main
 
@@ -79,6 +81,34 @@ def test_every_picture_is_shown() -> None:
 def test_the_first_pages_have_commands() -> None:
     assert len(commands_of(ROOT / "docs" / "first-run.md")) >= 3
     assert len(commands_of(ROOT / "README.md")) >= 3
+
+
+@pytest.mark.slow
+def test_first_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of the first run and of two how-tos, in their order, but the demo, which has its own
+    test. Three photos of the sample scene are the photos, and the video."""
+    monkeypatch.setenv("MPSFM_OFFLINE", "1")
+    monkeypatch.setenv("MPSFM_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "photos").mkdir()
+    video = cv2.VideoWriter(
+        str(tmp_path / "room.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, (640, 480)
+    )
+    for number in range(3):
+        photo = ROOT / "examples" / "sample_scene" / "images" / f"view_{number}.jpg"
+        shutil.copy(photo, tmp_path / "photos")
+        video.write(cv2.imread(str(photo)))
+    video.release()
+    further = re.compile(r"mpsfm (export|mesh) out/")
+    commands = commands_of(ROOT / "docs" / "first-run.md")
+    commands += filter(further.match, commands_of(ROOT / "docs" / "how-to.md"))
+    run = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+    for line in commands:
+        if not line.startswith("mpsfm demo"):
+            arguments = shlex.split(line, comments=True)[1:]
+            ended = subprocess.run([*run, *arguments], cwd=tmp_path, capture_output=True, text=True)
+            assert ended.returncode == 0, f"{line}\n{ended.stderr[-2000:]}"
+    assert {path.name for path in (tmp_path / "out" / "exports").iterdir()} >= {"gsplat", "rerun"}
+    assert (tmp_path / "out" / "mesh.glb").is_file()
 
 
 def test_the_site_builds_and_asks_no_other_server(tmp_path: Path) -> None:

@@ -70,7 +70,7 @@
       byId("findings").append(
         el("div", { class: `finding ${finding.level}` }, el("h3", {}, finding.title), el("p", {}, finding.text),
           finding.remedy && el("p", { class: "do" }, el("b", {}, "What to do: "), finding.remedy),
-          finding.images.length ? names : null),
+          finding.images.length > 0 && finding.images.length < photos.length ? names : null),
       );
     }
   }
