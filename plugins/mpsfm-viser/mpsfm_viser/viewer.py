@@ -73,6 +73,12 @@ class ViserViewer:
         if not self._shown:
             self._state.content = f"{stage} ..."
 
+    @hookimpl
+    def mpsfm_stage_progress(self, stage: str, done: int, total: int) -> None:
+        """Say how far it is."""
+        if not self._shown:
+            self._state.content = f"{stage}: {done} of {total}"
+
     def show(self, scene: SceneState, cloud: Cloud | None = None) -> None:
         """Replace what is shown; ``cloud`` is shown instead of the depth maps."""
         with self._lock, self.server.atomic():

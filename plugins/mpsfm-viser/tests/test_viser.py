@@ -76,6 +76,8 @@ def test_the_final_cloud_takes_the_place_of_the_depth_maps(viewer: ViserViewer) 
 def test_it_listens_to_a_run(viewer: ViserViewer) -> None:
     registry = Registry()
     registry.register(viewer, name="viewer")
+    registry.call_hook("mpsfm_stage_progress", stage="matching", done=3, total=28)
+    assert viewer._state.content == "matching: 3 of 28"
     registry.call_hook("mpsfm_scene_changed", scene=lambda: scene(2))
     assert len(viewer.frustums) == 2
     registry.call_hook("mpsfm_scene_changed", scene=lambda: scene(3))
