@@ -48,7 +48,7 @@ _DENSE_BYTES = 12.0
 into what earlier stages left free."""
 _DENSE_WORKER_BYTES = 320.0
 """A pixel of the photo that a worker matches: 11 labels, each of a byte from 5 views and of 6
-arrays of 4 bytes."""
+arrays of 4 bytes. On the coarse grid it may be 700, in what earlier stages left free."""
 _RESULT_BYTES = 4.6
 """A pixel of the final depth maps: whether it is certain (1); number and votes of those that become
 points (9 for 0.4)."""
