@@ -97,7 +97,8 @@ _IMAGES: tuple[tuple[str, str, str, str], ...] = (
     (
         r"not connected to the others; in components/(?P<number>\d+)",
         "in a reconstruction of its own",
-        "The group was reconstructed, but nothing links it to the others (components/{number}).",
+        "The group was reconstructed (components/{number}), but what it matches in the others does "
+        "not suffice to join them.",
         "Add photos that overlap with both groups.",
     ),
     (

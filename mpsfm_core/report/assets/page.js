@@ -269,6 +269,16 @@
   // ---------------------------------------------------------------- matches
   const MOST_DRAWN = 1500;
 
+  // Names of the photos without extension and, where they are long, without what all begin with.
+  function shortNames(most) {
+    const bare = photos.map((photo) => photo.name.replace(/\.[^.]*$/, ""));
+    let shared = 0;
+    if (bare.some((name) => name.length > most))
+      while (bare.every((name) => shared < name.length && name[shared] === bare[0][shared])) shared++;
+    while (shared > 0 && /\d/.test(bare[0][shared - 1])) shared--; // numbers stay whole
+    return bare.map((name) => name.slice(shared)).map((name) => (name.length > most ? `…${name.slice(1 - most)}` : name));
+  }
+
   function graph() {
     const svg = byId("graph");
     const size = 500;
@@ -281,7 +291,7 @@
     };
     const around = photos.map((_, row) => {
       const angle = (2 * Math.PI * row) / photos.length - Math.PI / 2;
-      return [size / 2 + 0.38 * size * Math.cos(angle), size / 2 + 0.38 * size * Math.sin(angle), angle];
+      return [size / 2 + 0.37 * size * Math.cos(angle), size / 2 + 0.37 * size * Math.sin(angle), angle];
     });
     const edges = pairs.filter((pair) => pair[3] > 0).sort((x, y) => y[3] - x[3]).slice(0, MOST_DRAWN);
     const most = Math.max(1, ...edges.map((edge) => edge[3]));
@@ -294,6 +304,7 @@
       return [line, a, b];
     });
     const radius = Math.max(2.5, Math.min(9, 180 / photos.length));
+    const labels = shortNames(9);
     const dots = photos.map((photo, row) => {
       const group = draw("g", {}, svg);
       group.addEventListener("click", () => select(row, true));
@@ -305,8 +316,7 @@
         const turn = (angle * 180) / Math.PI + (left ? 180 : 0);
         const [tx, ty] = [x + (radius + 4) * Math.cos(angle), y + (radius + 4) * Math.sin(angle)];
         const text = draw("text", { x: tx, y: ty, "text-anchor": left ? "end" : "start", "dominant-baseline": "middle", transform: `rotate(${turn} ${tx} ${ty})` }, group);
-        const bare = photo.name.replace(/\.[^.]*$/, "");
-        text.textContent = bare.length > 9 ? `…${bare.slice(-8)}` : bare;
+        text.textContent = labels[row];
       }
       return dot;
     });
@@ -400,7 +410,7 @@
     if (focals.size > 12) lines.push(`and ${focals.size - 12} further focal lengths`);
     data.reconstructions.forEach((best, index) => {
       const metric = best.metric_scale;
-      const unit = metric === null ? "the unit is unknown: no depth is metric" : metric.trusted ? `in metres, by ${scaleDetail(metric)}` : `one unit is about ${number(metric.metres_per_unit, 3)} m, by ${scaleDetail(metric)}; not trusted`;
+      const unit = metric === null ? "the unit is unknown: no depth is metric" : metric.trusted ? `in metres, ${scaleDetail(metric)}` : `one unit is about ${number(metric.metres_per_unit, 3)} m, ${scaleDetail(metric)}; not trusted`;
       lines.push(`${index ? `Reconstruction components/${index}` : "Reconstruction"}: ${plural(best.images, "photo")}, ${plural(best.points, "point")}, ${unit}`);
     });
     byId("cameras").append(...lines.map((text) => el("li", {}, text)));
