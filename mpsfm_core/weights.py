@@ -202,7 +202,7 @@ class WeightStore:
             state = "is damaged in" if path.is_file() else "is not in"
             raise WeightsError(
                 f"{uri} {state} the cache {self.cache_dir} and downloads are switched off "
-                f"(--offline, runtime.offline or ${' or $'.join(OFFLINE_VARIABLES)}): run 'mpsfm "
+                f"(--offline, runtime.offline or ${' or $'.join(OFFLINE_VARIABLES)}). Run 'mpsfm "
                 f"models fetch {uri}' with network, or name a local file instead"
             )
         part = path.with_name(path.name + ".part")

@@ -97,10 +97,11 @@ def test_the_worst_comes_first() -> None:
     said["images"]["details"]["a"]["focal_length_from"] = "default"
     said["images"]["registered"].remove("c")
     said["images"]["unregistered"]["c"] = "its depth is valid nowhere"
-    said["providers"][0]["passed_over"] = {"better": "https://host/a/file.onnx is gone. Look."}
+    gone = "https://host/a/file.onnx is gone. Run 'mpsfm models fetch https://host/a/file.onnx'"
+    said["providers"][0]["passed_over"] = {"better": gone}
     found = findings(said)
     assert [finding.level for finding in found] == ["warning", "warning", "note"]
-    assert "better: file.onnx is gone." in found[-1].text
+    assert found[-1].text.endswith("better: file.onnx is gone.")
     assert verdict(said).text == "2 of 3 photos have their place, 1 not."
 
 
