@@ -18,7 +18,7 @@ else:
     tomllib = pytest.importorskip("tomli")
 
 PLUGINS = sorted(path.parent for path in Path(__file__).parent.glob("*/pyproject.toml"))
-DISTRIBUTIONS = {"cv2": "opencv-python-headless", "rerun": "rerun-sdk"}
+DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "rerun": "rerun-sdk"}
 """Of imports that are called otherwise."""
 WITH_THE_CORE = {"mpsfm_core", "pydantic"}
 """Options are pydantic models."""

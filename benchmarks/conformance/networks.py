@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core import DepthPrior, NormalPrior, View
+from mpsfm_core import DepthPrior, NormalPrior, PairMatches
 from mpsfm_core.data import Bool
 from mpsfm_core.geometry import resize_map
 
@@ -22,32 +22,35 @@ Differences = dict[str, float]
 class Network:
     """A network under comparison.
 
-    ``repository``, ``commit``: the authors' code. ``script``: in ``authors/``. ``libraries``:
-    further checkouts (folder -> repository and commit) and packages that it needs. ``provider``:
-    ours, as kind, name and options for a model file. ``ask``: calls it. ``compare``: the largest
-    differences from the authors' arrays. ``tolerance``: of each of them, see the README.
+    ``export``: what ``mpsfm models export`` knows it as, with the authors' repository and the
+    commit. ``script``: in ``authors/``. ``size``, ``described``: which of its sizes, for the
+    export and for people. ``libraries``: further checkouts that it needs, folder -> repository and
+    commit; ``packages``: what ``pip install --no-deps`` gets. ``provider``: ours, as kind, name and
+    options for a model file. ``ask``: calls it with ``views`` photos. ``compare``: the largest
+    differences from the authors' arrays.
     """
 
-    name: str
-    repository: str
-    commit: str
+    export: str
     script: str
     size: str
+    described: str
     provider: Callable[[Path], tuple[Any, str, dict[str, Any]]]
-    ask: Callable[[Any, View], Any]
+    ask: Callable[..., Any]
     compare: Callable[[Any, Arrays], Differences]
     libraries: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     packages: tuple[str, ...] = ()
-    photos: int = 3
+    views: int = 1
 
 
 def relative(ours: NDArray[Any], theirs: NDArray[Any], where: Bool) -> float:
-    """Largest relative difference."""
-    return float(np.abs(ours[where] / theirs[where] - 1).max())
+    """Largest relative difference, NaN of nothing."""
+    return float(np.abs(ours[where] / theirs[where] - 1).max()) if where.any() else np.nan
 
 
 def angle_deg(ours: NDArray[Any], theirs: NDArray[Any], where: Bool) -> float:
-    """Largest angle between unit vectors, in degrees."""
+    """Largest angle between unit vectors, in degrees; NaN of none."""
+    if not where.any():
+        return np.nan
     a, b = ours[where].astype(np.float64), theirs[where].astype(np.float64)
     b = b / np.linalg.norm(b, axis=-1, keepdims=True)
     return float(np.degrees(2 * np.arcsin(np.linalg.norm(a - b, axis=-1) / 2)).max())
@@ -76,6 +79,39 @@ def _dsine(answer: NormalPrior, theirs: Arrays) -> Differences:
     }
 
 
+def _mast3r(answer: PairMatches, theirs: Arrays) -> Differences:
+    """Depth and std where the authors' crop is; matches as pixels of their crops."""
+    assert answer.dense is not None and answer.depth is not None
+    found: Differences = {"depth": np.nan, "std": np.nan, "pixels behind": 0.0}
+    cells = []
+    positions = answer.dense.points_a, answer.dense.points_b
+    priors = answer.depth.depth_a, answer.depth.depth_b
+    for side, ours, xy in zip("ab", priors, positions, strict=True):
+        z, std = theirs[f"z_{side}"], 1 / theirs[f"confidence_{side}"]
+        top, left = ((o - t) // 2 for o, t in zip(ours.shape, z.shape, strict=True))
+        crop = slice(top, top + z.shape[0]), slice(left, left + z.shape[1])
+        assert ours.variance is not None
+        seen = ours.valid[crop]
+        found["depth"] = np.fmax(found["depth"], relative(ours.depth[crop], z, seen))
+        found["std"] = np.fmax(found["std"], relative(np.sqrt(ours.variance[crop]), std, seen))
+        behind = float((seen != (z > 0)).mean())
+        found["pixels behind"] = max(found["pixels behind"], behind)
+        scale = np.array(ours.shape[::-1]) / theirs[f"size_{side}"]
+        cells.append(np.rint(xy * scale - (left, top) - 0.5).astype(int))
+    matches = np.concatenate([theirs["matches_a"], theirs["matches_b"]], axis=1)
+    expected = set(map(tuple, matches.tolist()))
+    pairs = np.concatenate(cells, axis=1)
+    got = set(map(tuple, pairs.tolist()))
+    found["matches of one side only"] = len(got ^ expected) / len(expected)
+    (xa, ya, xb, yb), scores = pairs.T, []
+    for a, b in (("11", "21"), ("12", "22")):
+        of_both = theirs[f"certainty_{a}"][ya, xa] * theirs[f"certainty_{b}"][yb, xb]
+        scores.append(np.sqrt(of_both) / (1 + np.sqrt(of_both)))
+    nearest = np.abs(np.array(scores) / answer.dense.scores - 1).min(axis=0)
+    found["scores"] = float(nearest.max())
+    return found
+
+
 def _metric3d(answer: tuple[DepthPrior, NormalPrior], theirs: Arrays) -> Differences:
     from mpsfm_onnx.decode import expected_angle
 
@@ -88,7 +124,7 @@ def _metric3d(answer: tuple[DepthPrior, NormalPrior], theirs: Arrays) -> Differe
     certain = depth.valid & (std > 1e-3 * expected["depth"])
     return {
         "depth": relative(depth.depth, expected["depth"], depth.valid),
-        "std of depth": relative(np.sqrt(depth.variance), std, certain) if certain.any() else 0.0,
+        "std of depth": relative(np.sqrt(depth.variance), std, certain),
         "normals, deg": angle_deg(normals.normals, expected["normal"], normals.valid),
         "std of normals": relative(np.sqrt(normals.variance), angle, normals.valid),
         "rows or columns": float(max(abs(np.subtract(theirs["depth"].shape, depth.shape)))),
@@ -97,10 +133,9 @@ def _metric3d(answer: tuple[DepthPrior, NormalPrior], theirs: Arrays) -> Differe
 
 NETWORKS = (
     Network(
-        "moge-2",
-        "microsoft/MoGe",
-        "07444410f1e33f402353b99d6ccd26bd31e469e8",
+        "moge",
         "moge_2.py",
+        "",
         "ViT-S/14, 1800 tokens",
         lambda file: ("depth", "moge-2-small", {"weights": str(file)}),
         lambda provider, view: provider.predict_joint(view),
@@ -115,25 +150,37 @@ NETWORKS = (
     ),
     Network(
         "dsine",
-        "baegwangbin/DSINE",
-        "ef0c2afa32b4dd19cb8ca4567c652802cd92591c",
         "dsine_kappa.py",
+        "b0",
         "EfficientNet-B0, 1280 features",
         lambda file: ("normals", "dsine", {"model": str(file)}),
         lambda provider, view: provider.predict(view),
         _dsine,
-        packages=("geffnet", "timm"),
+        packages=("geffnet",),
     ),
     Network(
-        "metric3d-v2",
-        "YvanYin/Metric3D",
-        "eb5b6fac0dc155e4e52f576e304fbf11655ff339",
+        "mast3r",
+        "mast3r_pairs.py",
+        "tiny",
+        "2 encoder blocks, 12 + 12 decoder blocks of width 128, its heads",
+        lambda file: ("matcher", "mast3r", {"model": str(file), "size": 256}),
+        lambda provider, a, b: provider.match(a, b),
+        _mast3r,
+        libraries={
+            "mast3r/dust3r": ("naver/dust3r", "3cc8c88c413bb9e34c41db0e0eef99c2ee010b12"),
+            "mast3r/dust3r/croco": ("naver/croco", "d7de0705845239092414480bd829228723bf20de"),
+        },
+        packages=("einops", "matplotlib", "roma", "tqdm", "trimesh"),
+        views=2,
+    ),
+    Network(
+        "metric3d",
         "metric3d_v2.py",
-        "ViT-S/14 with 4 registers, 4 refinements",
+        "small",
+        "ViT-S/14 with 4 registers, 4 refinements, 616 x 1064",
         lambda file: ("depth", "metric3d-v2-small", {"weights": str(file), "confidence": True}),
         lambda provider, view: provider.predict_joint(view),
         _metric3d,
-        packages=("mmengine", "timm"),
-        photos=1,
+        packages=("mmengine", "addict", "yapf", "termcolor"),
     ),
 )

@@ -7,8 +7,9 @@ A script is run as a program with the checkouts on its search path::
     if __name__ == "__main__":
         job = Job.given()
         model = TheirNetwork()
-        model.load_state_dict(job.checkpoint()["model"])
-        job.export(model, {"image": torch.rand(1, 3, 96, 128)}, ["normal"])
+        if job.weights:
+            job.load(model, job.checkpoint()["model"])
+        job.export(model, [{"image": torch.rand(1, 3, 96, 128)}], ["normal"])
 
 Imports torch: for such scripts only.
 """
@@ -18,16 +19,20 @@ from __future__ import annotations
 import json
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
+from torch.onnx.utils import register_custom_op_symbolic
 from torch.overrides import TorchFunctionMode
 
 OPSET = 17
+
+Given: TypeAlias = Mapping[str, torch.Tensor]
+"""Inputs of a network by name, in its order."""
 
 
 @dataclass(frozen=True)
@@ -61,39 +66,65 @@ class Job:
         with torch.serialization.safe_globals(list(allowed)):
             return torch.load(self.weights, map_location="cpu", weights_only=True)
 
+    def load(self, model: torch.nn.Module, state: Mapping[str, torch.Tensor]) -> None:
+        """Weights into the network, which has to find all of its own among them."""
+        missing = model.load_state_dict(state, strict=False).missing_keys
+        if missing:
+            raise SystemExit(f"the checkpoint lacks {missing[0]} and {len(missing) - 1} more")
+
     def export(
         self,
         model: torch.nn.Module,
-        example: Mapping[str, torch.Tensor],
+        given: Sequence[Given],
         outputs: Sequence[str],
         dynamic: Mapping[str, Mapping[int, str]] | None = None,
-        further: Sequence[Mapping[str, torch.Tensor]] = (),
+        said: Sequence[Sequence[torch.Tensor]] = (),
     ) -> None:
-        """Write the network, and what it says of the example and of ``further`` inputs.
+        """Write the network, traced on the first of the ``given`` inputs, and its answers to all.
 
-        ``dynamic``: of each tensor the axes that may have other lengths, with a name; then
-        ``further`` should have such.
+        ``dynamic``: of each tensor the axes that may have other lengths, with a name; then the
+        given ones should have such. ``said``: the answers of the authors' own network, where
+        ``model`` is another form of it.
         """
-        model = model.eval()
-        with torch.inference_mode():
-            answers = [_answer(model, given) for given in (example, *further)]
+        said = said or answers(model, given)
+        register_custom_op_symbolic("aten::expm1", _expm1, OPSET)
+        before = set(self.output.parent.iterdir())
         with MaskedWrites():
             torch.onnx.export(
                 model,
-                tuple(tensor.clone() for tensor in example.values()),
+                tuple(tensor.clone() for tensor in given[0].values()),
                 str(self.output),
-                input_names=list(example),
+                input_names=list(given[0]),
                 output_names=list(outputs),
                 dynamic_axes=dynamic,
                 opset_version=OPSET,
                 dynamo=False,
             )
+        if beside := set(self.output.parent.iterdir()) - before - {self.output}:
+            gather_weights(self.output, beside)
         arrays: dict[str, Any] = {}
-        for number, (given, found) in enumerate(zip((example, *further), answers, strict=True)):
-            arrays |= {f"{number}/in/{name}": tensor.numpy() for name, tensor in given.items()}
+        for number, (tensors, found) in enumerate(zip(given, said, strict=True)):
+            arrays |= {f"{number}/in/{name}": tensor.numpy() for name, tensor in tensors.items()}
             named = zip(outputs, found, strict=True)
             arrays |= {f"{number}/out/{name}": tensor.numpy() for name, tensor in named}
         np.savez(self.output.with_suffix(".npz"), **arrays)
+
+
+def gather_weights(output: Path, beside: Collection[Path]) -> None:
+    """Of a network beyond 2 GB, whose weights the exporter lays ``beside`` it one by one: into one
+    file of the network's name with ``.data``."""
+    import onnx
+
+    onnx.save(onnx.load(output), output, save_as_external_data=True, location=f"{output.name}.data")
+    for path in beside:
+        path.unlink()
+
+
+def answers(model: torch.nn.Module, given: Sequence[Given]) -> list[tuple[torch.Tensor, ...]]:
+    """What a network says of several inputs."""
+    model = model.eval()
+    with torch.inference_mode():
+        return [_answer(model, tensors) for tensors in given]
 
 
 class MaskedWrites(TorchFunctionMode):
@@ -131,7 +162,13 @@ class MaskedWrites(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
-def _answer(model: torch.nn.Module, given: Mapping[str, torch.Tensor]) -> tuple[Any, ...]:
+def _expm1(graph: Any, x: Any) -> Any:
+    """``exp(x) - 1``, which ONNX lacks, as ``2 sinh(x / 2) exp(x / 2)``: as exact near 0."""
+    half = graph.op("Mul", x, graph.op("Constant", value_t=torch.tensor(0.5)))
+    return graph.op("Add", *2 * (graph.op("Mul", graph.op("Sinh", half), graph.op("Exp", half)),))
+
+
+def _answer(model: torch.nn.Module, given: Given) -> tuple[torch.Tensor, ...]:
     found = model(*(tensor.clone() for tensor in given.values()))
     if isinstance(found, Mapping):  # the exporter takes the values, in their order
         found = tuple(found.values())

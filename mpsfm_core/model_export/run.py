@@ -65,8 +65,15 @@ def export_model(
     target = (output or exports_folder() / f"{name}.onnx").expanduser().resolve()
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".export-", dir=target.parent) as scratch:
-        made = Path(scratch) / "network.onnx"
-        _run(name, recipe, code, weights, made, size, python)
+        made = Path(scratch) / target.name  # a file of large weights is known by its name in it
+        script = importlib.util.find_spec(recipe.script)
+        if script is None or script.origin is None:
+            raise ProviderError(f"the plugin of {name} has no script {recipe.script!r}")
+        try:
+            run_script(Path(script.origin), code, made, weights=weights, size=size, python=python)
+        except ProviderError as error:
+            needs = f" (it needs {', '.join(recipe.packages)})" if recipe.packages else ""
+            raise ProviderError(f"the authors' code of {name} fails: {error}{needs}") from None
         differences = compared(made)
         worst = max(differences.values())
         if worst > TOLERANCE:
@@ -88,8 +95,8 @@ def export_model(
             "largest_differences": differences,
             "made": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         }
-        for part in sorted(Path(scratch).glob("network.onnx*")):  # large weights lie beside
-            shutil.move(part, target.with_name(part.name.replace("network.onnx", target.name)))
+        for part in sorted(Path(scratch).glob(f"{target.name}*")):  # large weights lie beside
+            shutil.move(part, target.with_name(part.name))
     text = json.dumps(manifest, indent=1) + "\n"
     write_file(target.with_suffix(".json"), text)
     if checkpoint != RANDOM and target.parent != exports_folder().resolve():
@@ -118,8 +125,9 @@ def compared(made: Path) -> dict[str, float]:
 
 def relative_difference(found: Any, expected: Any) -> float:
     """What 99.9 % of the values of an array are off by from another of its shape, in terms of their
-    size, or of the typical one where they are smaller; infinite where the shapes differ."""
-    if found.shape != expected.shape:
+    size, or of the typical one where they are smaller; infinite where the shapes differ or a value
+    is no number."""
+    if found.shape != expected.shape or not np.isfinite([found, expected]).all():
         return float("inf")
     if not found.size:
         return 0.0
@@ -128,34 +136,34 @@ def relative_difference(found: Any, expected: Any) -> float:
     return float(np.quantile(np.abs(found.astype(np.float64) - expected) / size, _QUANTILE))
 
 
-def _run(
-    name: str,
-    recipe: ModelExport,
+def run_script(
+    script: Path,
     code: Sequence[Path],
-    weights: Path | None,
-    made: Path,
-    size: str,
-    python: Path | None,
+    output: Path,
+    *,
+    weights: Path | None = None,
+    size: str = "",
+    python: Path | None = None,
 ) -> None:
-    """Run the plugin's script with the checkouts on its search path."""
-    spec = importlib.util.find_spec(recipe.script)
-    if spec is None or spec.origin is None:
-        raise ProviderError(f"the plugin of {name} has no script {recipe.script!r}")
-    job = {"weights": weights and str(weights.resolve()), "output": str(made), "size": size}
+    """Run a script that makes ``output`` with the checkouts on its search path, see
+    :class:`mpsfm_core.model_export.authors.Job`.
+
+    Raises:
+        ProviderError: it fails; the message is its last line.
+    """
+    job = {"weights": weights and str(weights.resolve()), "output": str(output), "size": size}
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join([*(str(folder.resolve()) for folder in code), *_ours()]),
         "PYTHONDONTWRITEBYTECODE": "1",
         "XFORMERS_DISABLED": "1",
     }
-    command = [str(python or sys.executable), spec.origin, json.dumps(job)]
+    command = [str(python or sys.executable), str(script.resolve()), json.dumps(job)]
     done = subprocess.run(
         command, cwd=code[0], env=environment, capture_output=True, text=True, check=False
     )
-    if done.returncode or not made.is_file():
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        needs = f" (it needs {', '.join(recipe.packages)})" if recipe.packages else ""
-        raise ProviderError(f"the authors' code of {name} fails: {last}{needs}")
+    if done.returncode or not output.is_file():
+        raise ProviderError((done.stderr.strip().splitlines() or ["no message"])[-1])
 
 
 def _ours() -> list[str]:

@@ -45,7 +45,7 @@ if job.weights:
 axes = {{1: "height", 2: "width"}}
 found = {{2: "height", 3: "width"}}
 one, other = ({{"image": torch.rand(1, rows, 4)}} for rows in (3, 5))
-job.export(net, one, ["axes"], {{"image": axes, "axes": found}}, [other])
+job.export(net, [one, other], ["axes"], {{"image": axes, "axes": found}})
 """
 
 
@@ -121,6 +121,45 @@ class shifted(torch.nn.Module):
     assert not list((tmp_path / "exports").iterdir())
 
 
+def test_weights_that_lie_beside_a_network_become_one_file_that_moves_with_it(
+    tmp_path: Path,
+) -> None:
+    onnx = pytest.importorskip("onnx")
+    import onnxruntime
+
+    from mpsfm_core.model_export.authors import gather_weights
+
+    text = """<ir_version: 8, opset_import: ["" : 17]> net (float[1000] x) => (float[1000] y) {
+        z = Add (x, one)
+        y = Mul (z, two)
+    }"""
+    model = onnx.parser.parse_model(text)
+    for name, value in (("one", 1.0), ("two", 2.0)):
+        weights = np.full(1000, value, np.float32)
+        model.graph.initializer.append(onnx.numpy_helper.from_array(weights, name))
+    made = tmp_path / "net.onnx"
+    onnx.save(model, made, save_as_external_data=True, all_tensors_to_one_file=False)
+    gather_weights(made, set(tmp_path.iterdir()) - {made})
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for path in (made, tmp_path / "net.onnx.data"):
+        path.rename(moved / path.name)
+    assert [path.name for path in tmp_path.iterdir()] == ["elsewhere"]
+    session = onnxruntime.InferenceSession(str(moved / "net.onnx"))
+    (found,) = session.run(None, {"x": np.zeros(1000, np.float32)})
+    np.testing.assert_array_equal(found, 2.0)
+
+
+@pytest.mark.slow
+def test_what_onnx_has_no_word_for(
+    code: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    net = code / "their_net.py"
+    net.write_text(net.read_text().replace("image * self.gain", "torch.expm1(image * 1e-5)"))
+    found = export_model("net", recipe(tmp_path, monkeypatch), [code], run.RANDOM)
+    assert found["largest_differences"]["axes"] < 1e-6
+
+
 @pytest.mark.slow
 def test_a_checkpoint_with_code_in_it_is_refused(
     code: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -144,6 +183,7 @@ def test_what_is_not_there(code: Path, tmp_path: Path, monkeypatch: pytest.Monke
         (np.ones((2, 2)), np.ones((2, 3)), np.inf),
         (np.array([1.01, 100.0]), np.array([1.0, 100.0]), pytest.approx(0.01 / 50.5, rel=0.01)),
         (np.zeros(0), np.zeros(0), 0.0),
+        (np.full(3, np.nan), np.full(3, np.nan), np.inf),
     ],
 )
 def test_relative_difference(found: np.ndarray, expected: np.ndarray, difference: float) -> None:

@@ -12,7 +12,7 @@ from models.dsine import v02_kappa
 
 from mpsfm_core.model_export.authors import Job
 
-_ENCODERS = {"": 5, "b0": 0, "b5": 5}
+ENCODERS = {"": 5, "b0": 0, "b5": 5}
 _SIDES = ((96, 128), (160, 96))
 
 
@@ -68,19 +68,17 @@ def export(job: Job, model: Last) -> None:
         image = torch.randn(1, 3, height, width)
         examples.append({"image": image, "intrins": intrinsics[None]})
     axes = {2: "height", 3: "width"}
-    job.export(model, examples[0], ["normal"], {"image": axes, "normal": axes}, examples[1:])
+    job.export(model, examples, ["normal"], {"image": axes, "normal": axes})
 
 
 def main() -> None:
     """Export the network of the checkpoint."""
     job = Job.given()
-    model = network(_ENCODERS[job.size])
+    model = network(ENCODERS[job.size])
     if job.weights is not None:
         state = job.checkpoint()["model"]
         state = {name.removeprefix("module."): tensor for name, tensor in state.items()}
-        missing = model.model.load_state_dict(state, strict=False).missing_keys
-        if missing:
-            raise SystemExit(f"the checkpoint lacks {missing[0]} and {len(missing) - 1} more")
+        job.load(model.model, state)
     export(job, model)
 
 

@@ -75,6 +75,7 @@ class PairNetwork:
             scale=1 / 255,
             mean=(0.5, 0.5, 0.5),
             std=(0.5, 0.5, 0.5),
+            interpolation="lanczos",
             size=SideSize(mode="longest", side=options.size, multiple_of=_PATCH, fit="crop"),
         )
 

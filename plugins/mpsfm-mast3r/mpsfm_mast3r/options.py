@@ -10,8 +10,8 @@ from mpsfm_core import Options
 class Mast3rOptions(Options):
     """The network."""
 
-    model: str
-    """Path or URI of the ONNX file (the README says how it is made)."""
+    model: str = "export:mast3r"
+    """Path or URI of the ONNX file; by default what ``mpsfm models export mast3r`` made."""
     sha256: str | None = None
     """Expected hash of ``model``."""
     size: int = Field(512, ge=16)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from mpsfm_core import ProviderSpec, hookimpl
+from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
 from mpsfm_core.options import Options
-from mpsfm_core.providers import Capability, file_named_by
+from mpsfm_core.providers import Capability, ModelExport, file_named_by
 from mpsfm_mast3r.options import DenseOptions, SparseOptions
+
+_LICENSE = "CC-BY-NC-SA-4.0"
 
 
 @hookimpl
@@ -15,6 +17,20 @@ def mpsfm_providers() -> list[ProviderSpec]:
         _spec("mast3r", "dense", DenseOptions, "MASt3R: dense matches and depth of both views"),
         _spec("mast3r-sparse", "sparse", SparseOptions, "MASt3R at keypoints of any detector"),
     ]
+
+
+@hookimpl
+def mpsfm_exports() -> dict[str, ModelExport]:
+    """From the authors' code and checkpoint."""
+    return {
+        "mast3r": ModelExport(
+            script="mpsfm_mast3r.export",
+            repository="naver/mast3r",
+            commit="f5209afc300cec36239a7ac992263f36847bbba0",
+            license=_LICENSE,
+            packages=("einops", "huggingface-hub"),
+        )
+    }
 
 
 def _spec(name: str, how: Capability, options: type[Options], summary: str) -> ProviderSpec:
@@ -28,7 +44,7 @@ def _spec(name: str, how: Capability, options: type[Options], summary: str) -> P
         requires=("onnxruntime",),
         install_hint="pip install mpsfm-mast3r",
         code_license="Apache-2.0",
-        weights_license="CC-BY-NC-SA-4.0",
-        weights=file_named_by("model"),
+        weights_license=_LICENSE,
+        weights=file_named_by("model", WeightsFile("export:mast3r", license=_LICENSE)),
         contract=f"mpsfm_mast3r.contract:{how}",
     )

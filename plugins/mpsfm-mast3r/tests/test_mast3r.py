@@ -76,7 +76,7 @@ def scattered():
     chosen = colours[distinct[:12]]
     views, centres = [], []
     for name in ("a.png", "b.png"):
-        image = np.full((SIZE[1], SIZE[0], 3), 1, dtype=np.uint8)
+        image = np.full((SIZE[1], SIZE[0], 3), 40, dtype=np.uint8)
         places = rng.permutation(np.mgrid[0:4, 0:3].reshape(2, -1).T) * 20
         for colour, (x, y) in zip(chosen, places, strict=True):
             image[y + 5 : y + 15, x + 5 : x + 15] = colour
@@ -113,7 +113,7 @@ class TestDense:
     def test_positions_lie_at_pixel_centres_of_the_cropped_view(self, model, context):
         """100 x 61 becomes 64 x 39, of which the network sees 64 x 32 from row 3 on."""
         rng = np.random.default_rng(0)
-        image = rng.integers(1, 255, (61, 100, 3), dtype=np.uint8)
+        image = rng.integers(30, 225, (61, 100, 3), dtype=np.uint8)
         view = view_of(image)
         found = DenseMatcher(DenseOptions(**model, subsample=1), context).match(view, view).dense
         np.testing.assert_array_equal(found.points_a, found.points_b)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel
 
 from mpsfm_core import ProviderSpec, hookimpl
-from mpsfm_core.providers import Kind
+from mpsfm_core.providers import Kind, ModelExport
 from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
 from mpsfm_metric3d_onnx.options import SIZES, WEIGHTS_LICENSE, Metric3dOptions, Size
 
@@ -16,6 +16,20 @@ _NORMALS = NormalCalibration(std_scale=1.0, std_floor_deg=1.0)
 def mpsfm_providers() -> list[ProviderSpec]:
     """Depth, which gives normals in the same pass, and normals alone, of every size."""
     return [_spec(kind, size) for kind in ("depth", "normals") for size in SIZES]
+
+
+@hookimpl
+def mpsfm_exports() -> dict[str, ModelExport]:
+    """From the authors' code and checkpoint, with confidence, which the public exports lack."""
+    return {
+        "metric3d": ModelExport(
+            script="mpsfm_metric3d_onnx.export",
+            repository="YvanYin/Metric3D",
+            commit="eb5b6fac0dc155e4e52f576e304fbf11655ff339",
+            license="none named by the authors (code BSD-2-Clause)",
+            packages=("mmengine",),
+        )
+    }
 
 
 @hookimpl

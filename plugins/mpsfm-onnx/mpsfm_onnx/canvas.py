@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from mpsfm_core import PinholeCamera
 from mpsfm_core.data import Float32, Float64, UInt8
@@ -35,7 +36,12 @@ class Canvas:
         if isinstance(rule, FixedSize):
             size = (rule.width, rule.height)
             scale = min(s / v for s, v in zip(size, view, strict=True))
-            image = size if rule.fit == "stretch" else _scaled(view, scale)
+            if rule.fit == "stretch":
+                image = size
+            elif rule.rounding == "down":
+                image = max(1, int(view[0] * scale)), max(1, int(view[1] * scale))
+            else:
+                image = _scaled(view, scale)
         else:
             scale = rule.side / (max(view) if rule.mode == "longest" else min(view))
             if not rule.enlarge:
@@ -120,8 +126,13 @@ def _scaled(size: tuple[int, int], scale: float, step: int = 1) -> tuple[int, in
 
 
 def _resize(image: UInt8, size: tuple[int, int], interpolation: str) -> UInt8:
+    shrinks = size[0] <= image.shape[1] and size[1] <= image.shape[0]
+    if interpolation in ("smooth-cubic", "lanczos"):
+        lanczos = interpolation == "lanczos" and size[0] < image.shape[1]
+        mode = Image.Resampling.LANCZOS if lanczos else Image.Resampling.BICUBIC
+        smoothed: UInt8 = np.asarray(Image.fromarray(image).resize(size, mode))
+        return smoothed
     if interpolation == "area":
-        shrinks = size[0] <= image.shape[1] and size[1] <= image.shape[0]
         mode = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     else:
         mode = _INTERPOLATION[interpolation]

@@ -32,6 +32,8 @@ class FixedSize(Options):
     height: int = Field(gt=0)
     fit: Literal["stretch", "pad"] = "stretch"
     """``stretch`` changes the aspect ratio; ``pad`` keeps it and puts the image in the middle."""
+    rounding: Literal["nearest", "down"] = "nearest"
+    """Of the sides of an image that keeps its aspect ratio."""
 
 
 class SideSize(Options):
@@ -71,8 +73,10 @@ class ImageInput(Options):
     """Both in the order of ``channels``."""
     pad_value: Triple = (0.0, 0.0, 0.0)
     """RGB in 0..255, before normalisation."""
-    interpolation: Literal["linear", "area", "cubic"] = "area"
-    """``area`` averages when shrinking and is linear when enlarging."""
+    interpolation: Literal["linear", "area", "cubic", "smooth-cubic", "lanczos"] = "area"
+    """``area`` averages when shrinking and is linear when enlarging. ``linear`` and ``cubic`` take
+    the nearest pixels alone, as OpenCV does; ``smooth-cubic`` and ``lanczos`` average when
+    shrinking, as Pillow does, and are cubic when enlarging."""
     size: Annotated[FixedSize | SideSize, Field(discriminator="mode")]
     intrinsics: IntrinsicsInput | None = None
     """For networks that are told the camera."""

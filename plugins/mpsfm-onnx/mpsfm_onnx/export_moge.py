@@ -13,7 +13,7 @@ from mpsfm_core.model_export.authors import Job
 _DIMS = [384, 64, 32, 16, 8]
 _NONE = {"res_block_in_norm": "none", "res_block_hidden_norm": "none"}
 _STEPS = ["conv_transpose", "conv_transpose", "conv_transpose", "bilinear"]
-_TOKENS = 1800
+TOKENS = 1800
 _SIDES = ((140, 196), (182, 126))
 
 
@@ -56,10 +56,10 @@ def small_with_normals() -> dict[str, Any]:
 def export(job: Job, model: torch.nn.Module) -> None:
     """Images of any size, and how many tokens they are made to."""
     model.onnx_compatible_mode = True
-    tokens = torch.tensor(_TOKENS)
+    tokens = torch.tensor(TOKENS)
     given = [{"image": torch.rand(1, 3, *size), "num_tokens": tokens} for size in _SIDES]
     outputs = ["points", "normal", "mask", "scale"]
-    job.export(model, given[0], outputs, {"image": {2: "height", 3: "width"}}, given[1:])
+    job.export(model, given, outputs, {"image": {2: "height", 3: "width"}})
 
 
 def main() -> None:
@@ -70,7 +70,7 @@ def main() -> None:
         return
     stored = job.checkpoint()
     model = MoGeModel(**stored["model_config"])
-    model.load_state_dict(stored["model"], strict=False)
+    job.load(model, {**dict(model.named_buffers()), **stored["model"]})
     export(job, model)
 
 

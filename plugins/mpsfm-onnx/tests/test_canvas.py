@@ -124,3 +124,21 @@ def test_the_camera_follows_the_image():
     canvas = Canvas.plan(FixedSize(mode="fixed", width=40, height=30, fit="pad"), (20, 10))
     camera = canvas.camera(PinholeCamera(20, 10, 15.0, 16.0, 9.0, 4.0))
     assert camera == PinholeCamera(40, 30, 30.0, 32.0, 18.0, 8.0 + 5)
+
+
+@pytest.mark.parametrize(("rounding", "width"), [("nearest", 819), ("down", 818)])
+def test_sides_are_rounded_as_the_networks_authors_do(rounding, width):
+    """517 x 389 in 616 rows is 818.7 pixels wide."""
+    size = FixedSize(mode="fixed", width=1064, height=616, fit="pad", rounding=rounding)
+    assert Canvas.plan(size, (517, 389)).image == (width, 616)
+
+
+@pytest.mark.parametrize("interpolation", ["smooth-cubic", "lanczos"])
+def test_stripes_of_a_pixel_average_out_where_an_image_shrinks(interpolation):
+    image = np.zeros((32, 96, 3), dtype=np.uint8)
+    image[:, ::3] = 240
+    rule = ImageInput(
+        size=FixedSize(mode="fixed", width=32, height=32), interpolation=interpolation
+    )
+    painted = Canvas.plan(rule.size, (96, 32)).paint(image, rule)
+    np.testing.assert_allclose(painted[..., 4:-4], 80, atol=8)

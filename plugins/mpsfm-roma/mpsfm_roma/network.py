@@ -60,7 +60,7 @@ class WarpNetwork:
             scale=1 / 255,
             mean=(0.485, 0.456, 0.406),
             std=(0.229, 0.224, 0.225),
-            interpolation="cubic",
+            interpolation="smooth-cubic",
             size=FixedSize(mode="fixed", width=options.width, height=options.height),
         )
 

@@ -1,0 +1,97 @@
+"""The chain of ``paper-mast3r`` with the real architectures on random weights, from end to end.
+
+    python -m benchmarks.paper_chain PHOTOS [--mast3r DIR --dsine DIR] [--work DIR]
+
+What ``mpsfm models export ... --checkpoint random`` and ``mpsfm reconstruct`` do to a folder of
+photos: SuperPoint's keypoints (of transformers), MASt3R's matches and depth (ViT-L), DSINE's
+normals with a mirrored pass (EfficientNet-B5), mapper. Random weights match nothing, so exit code
+3 with a report is what to expect. Prints time and peak memory of the networks and of the run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import psutil
+
+_MPSFM = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("photos", type=Path)
+    parser.add_argument("--mast3r", type=Path, nargs="*", help="Checkouts for its export.")
+    parser.add_argument("--dsine", type=Path, nargs="*", help="Checkouts for its export.")
+    parser.add_argument("--work", type=Path, help="Keeps the files of the networks.")
+    parser.add_argument("--set", dest="settings", nargs="*", default=[], help="KEY=VALUE.")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="mpsfm-chain-") as scratch:
+        work = arguments.work or Path(scratch)
+        work.mkdir(parents=True, exist_ok=True)
+        for name, code in (("mast3r", arguments.mast3r), ("dsine", arguments.dsine)):
+            file = work / f"{name}.onnx"
+            if code and not file.exists():
+                folders = [word for folder in code for word in ("--code", str(folder))]
+                export = ["models", "export", name, *folders, "--checkpoint", "random"]
+                _measured([*export, "--output", str(file)], f"export of {name}")
+        detector = _random_superpoint(work / "superpoint")
+        output = Path(scratch, "output")
+        settings = [
+            "pairs.mode=exhaustive",
+            "retrieval.use=appearance",
+            "features.use=superpoint-hub",
+            f"features.options.model={detector}",
+            f"matcher.options.model={work / 'mast3r.onnx'}",
+            f"normals.options.model={work / 'dsine.onnx'}",
+            "masks=[]",
+            *arguments.settings,
+        ]
+        words = [word for setting in settings for word in ("--set", setting)]
+        run = ["reconstruct", str(arguments.photos), "--config", "paper-mast3r", *words]
+        _measured([*run, "--output", str(output)], "reconstruction", allowed=(0, 3))
+        print(json.dumps(json.loads((output / "summary.json").read_text()), indent=1)[:20000])
+
+
+def _random_superpoint(folder: Path) -> Path:
+    import torch
+    from transformers import (
+        SuperPointConfig,
+        SuperPointForKeypointDetection,
+        SuperPointImageProcessorPil,
+    )
+
+    torch.manual_seed(0)
+    SuperPointForKeypointDetection(SuperPointConfig()).save_pretrained(folder)
+    SuperPointImageProcessorPil().save_pretrained(folder)
+    return folder
+
+
+def _measured(command: list[str], what: str, allowed: tuple[int, ...] = (0,)) -> None:
+    """Run a command of ours; time and largest memory of its processes together."""
+    start, peak = time.perf_counter(), 0
+    running = subprocess.Popen([*_MPSFM, *command])
+    process = psutil.Process(running.pid)
+    while running.poll() is None:
+        total = 0
+        for member in (process, *process.children(recursive=True)):
+            try:
+                total += member.memory_info().rss
+            except psutil.Error:
+                continue
+        peak = max(peak, total)
+        time.sleep(0.5)
+    took = time.perf_counter() - start
+    print(f"{what}: {took:.0f} s, {peak / 2**30:.1f} GiB, exit code {running.returncode}")
+    if running.returncode not in allowed:
+        raise SystemExit(f"{what} failed")
+
+
+if __name__ == "__main__":
+    main()

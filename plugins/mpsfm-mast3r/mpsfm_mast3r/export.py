@@ -1,0 +1,138 @@
+"""MASt3R as ONNX, by its authors' code; run as a program, see :mod:`mpsfm_core.model_export`."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from argparse import Namespace
+from typing import Any
+
+import torch
+
+from mpsfm_core.model_export.authors import Job, answers
+
+sys.modules["models.curope"] = None  # type: ignore[assignment]  # the rotations of torch instead
+
+from mast3r.model import AsymmetricMASt3R  # noqa: E402
+from models.pos_embed import RoPE2D  # noqa: E402
+
+_INFINITE = "1e999"
+_PUBLISHED = """AsymmetricMASt3R(
+    pos_embed='RoPE100', patch_embed_cls='ManyAR_PatchEmbed', img_size=(512, 512),
+    head_type='catmlp+dpt', output_mode='pts3d+desc24', depth_mode=('exp', -inf, inf),
+    conf_mode=('exp', 1, inf), enc_embed_dim=1024, enc_depth=24, enc_num_heads=16,
+    dec_embed_dim=768, dec_depth=12, dec_num_heads=12, two_confs=True,
+    desc_conf_mode=('exp', 0, inf))"""
+"""What the published checkpoint says of itself: the authors' README, training of
+MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric."""
+_NARROW = {
+    "enc_embed_dim": 128,
+    "enc_depth": 2,
+    "enc_num_heads": 2,
+    "dec_embed_dim": 128,
+    "dec_num_heads": 2,
+}
+"""Of size ``tiny``, to try things: the same classes and heads, which want 12 decoder blocks."""
+_POSITIONS = 256
+"""Patches along a side that the file has rotations for: photos of up to 4096 pixels."""
+_SIDES = (((96, 128), (128, 64)), ((64, 160), (64, 160)))
+_KEYS = ("pts3d", "conf", "desc", "desc_conf")
+_OUTPUTS = [f"{key}_{side}" for side in (1, 2) for key in _KEYS]
+
+
+class TwoViews(torch.nn.Module):
+    """As the authors' scripts ask the network about two photos."""
+
+    def __init__(self, model: AsymmetricMASt3R) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, img1: torch.Tensor, img2: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        views = [
+            {"img": image, "true_shape": torch.tensor([image.shape[-2:]]), "instance": [str(n)]}
+            for n, image in enumerate((img1, img2))
+        ]
+        one, two = self.model(*views)
+        two["pts3d"] = two["pts3d_in_other_view"]
+        return tuple(view[key] for view in (one, two) for key in _KEYS)
+
+
+class AnySize(torch.nn.Module):
+    """The same for photos of any size in steps of a patch: each encoded by itself, sizes and
+    positions computed from what is given."""
+
+    def __init__(self, model: AsymmetricMASt3R) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, img1: torch.Tensor, img2: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        model, images = self.model, (img1, img2)
+        (feat1, pos1), (feat2, pos2) = (self._encoded(image) for image in images)
+        heads = model.downstream_head1, model.downstream_head2
+        sides = zip(images, heads, model._decoder(feat1, pos1, feat2, pos2), strict=True)
+        found = [head(tokens, image.shape[-2:]) for image, head, tokens in sides]
+        return tuple(view[key] for view in found for key in _KEYS)
+
+    def _encoded(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        patches = self.model.patch_embed.proj(image)
+        rows, columns = (torch.arange(side) for side in patches.shape[-2:])
+        grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij"), dim=-1)
+        positions = grid.reshape(1, -1, 2)
+        tokens = patches.flatten(2).transpose(1, 2)
+        for block in self.model.enc_blocks:
+            tokens = block(tokens, positions)
+        return self.model.enc_norm(tokens), positions
+
+
+def arguments(said: str) -> dict[str, Any]:
+    """Of the constructor call that a checkpoint holds as text, which is read and not run."""
+    call = ast.parse(said.replace("inf", _INFINITE), mode="eval").body
+    if not (isinstance(call, ast.Call) and ast.unparse(call.func) == AsymmetricMASt3R.__name__):
+        raise SystemExit(f"the checkpoint is of another network: {said}")
+    given = {str(word.arg): ast.literal_eval(word.value) for word in call.keywords}
+    return {**given, "patch_embed_cls": "PatchEmbedDust3R", "landscape_only": False}
+
+
+def network(size: str) -> AsymmetricMASt3R:
+    """As published or ``tiny``, with random weights that see points in front of the camera."""
+    narrowed = {"": {}, "tiny": _NARROW}[size]
+    model = AsymmetricMASt3R(**(arguments(_PUBLISHED) | narrowed)).eval()
+    for head in (model.downstream_head1, model.downstream_head2):
+        head.dpt.head[-1].bias.data[2] += 1.0
+    return model
+
+
+def export(job: Job, model: AsymmetricMASt3R) -> None:
+    """Two photos, each of any size in steps of 16."""
+    given = [
+        {f"img{n}": torch.rand(1, 3, *sides) * 2 - 1 for n, sides in enumerate(pair, start=1)}
+        for pair in _SIDES
+    ]
+    axes = {f"img{n}": {2: f"height{n}", 3: f"width{n}"} for n in (1, 2)}
+    axes |= {name: {1: f"height{name[-1]}", 2: f"width{name[-1]}"} for name in _OUTPUTS}
+    rotations = RoPE2D.get_cos_sin
+
+    def all_rotations(self: RoPE2D, dimensions: int, count: int, *of: Any) -> Any:
+        return rotations(self, dimensions, _POSITIONS, *of)
+
+    said = answers(TwoViews(model), given)
+    RoPE2D.get_cos_sin = all_rotations
+    job.export(AnySize(model), given, _OUTPUTS, axes, said)
+
+
+def main() -> None:
+    """Export the network of the checkpoint, which says its own architecture."""
+    job = Job.given()
+    if job.weights is None:
+        export(job, network(job.size))
+        return
+    stored = job.checkpoint(Namespace)
+    if "model" not in stored:  # of the Hub: weights alone
+        stored = {"model": stored, "args": Namespace(model=_PUBLISHED)}
+    model = AsymmetricMASt3R(**arguments(stored["args"].model))
+    job.load(model, stored["model"])
+    export(job, model.eval())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""Metric3D v2 as ONNX with all that it says, by its authors' code; run as a program, see
+:mod:`mpsfm_core.model_export`."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+from typing import Any
+
+import torch
+
+from mpsfm_core.model_export.authors import Job
+
+for _name in ("mmcv", "mmcv.utils", "timm", "timm.models", "timm.models.layers"):
+    sys.modules[_name] = ModuleType(_name)  # of what follows nothing is called here
+sys.modules["timm.models.registry"] = ModuleType("timm.models.registry")
+sys.modules["mmcv.utils"].__dict__["collect_env"] = dict
+sys.modules["timm.models.layers"].__dict__.update(trunc_normal_=None, DropPath=None)
+sys.modules["timm.models.registry"].__dict__["register_model"] = lambda made: made
+
+import hubconf  # noqa: E402
+from mono.model.decode_heads.RAFTDepthNormalDPTDecoder5 import (  # noqa: E402
+    ConvLoRA,
+    ConvTransposeLoRA,
+    LoRALinear,
+    RAFTDepthNormalDPT5,
+)
+
+SIZE = 616, 1064
+"""Rows and columns that the authors give the network; the file has no others."""
+_MEAN, _STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
+_MODELS = {
+    "": hubconf.metric3d_vit_small,
+    "small": hubconf.metric3d_vit_small,
+    "large": hubconf.metric3d_vit_large,
+    "giant2": hubconf.metric3d_vit_giant2,
+}
+
+
+_LEFT = {
+    ConvLoRA: torch.nn.Conv2d,
+    ConvTransposeLoRA: torch.nn.ConvTranspose2d,
+    LoRALinear: torch.nn.Linear,
+}
+"""These leave their weights as memory is found, for a checkpoint to fill."""
+
+
+class Named(torch.nn.Module):
+    """As the authors' metric3d_onnx_export.py, with all outputs, named as in public exports."""
+
+    def __init__(self, model: torch.nn.Module) -> None:
+        super().__init__()
+        self.model = model
+        self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1))
+        self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1))
+
+    def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        normalised = (image - self.mean) / self.std
+        depth, confidence, found = self.model.inference({"input": normalised})
+        normal = found["prediction_normal"]
+        return depth, normal[:, :3], normal[:, 3], confidence
+
+
+def network(size: str) -> Named:
+    """The authors' network on the CPU, which their code has no place for."""
+    linspace, grid = torch.linspace, RAFTDepthNormalDPT5.create_mesh_grid
+
+    def here(*values: Any, device: Any = None, **options: Any) -> torch.Tensor:
+        return linspace(*values, **options)
+
+    def mesh(self: Any, *sides: int, device: Any = None, **options: Any) -> Any:
+        return grid(self, *sides, device="cpu", **options)
+
+    torch.linspace, RAFTDepthNormalDPT5.create_mesh_grid = here, mesh
+    model = _MODELS[size](pretrain=False)
+    for module in model.modules():
+        for theirs, of_torch in _LEFT.items():
+            if isinstance(module, theirs):
+                of_torch.reset_parameters(module)
+    return Named(model).eval()
+
+
+def export(job: Job, model: Named) -> None:
+    """Images of the one size, 0 to 255."""
+    given = [{"pixel_values": torch.rand(1, 3, *SIZE) * 255} for _ in range(2)]
+    outputs = ["predicted_depth", "predicted_normal", "normal_confidence", "confidence"]
+    job.export(model, given, outputs)
+
+
+def main() -> None:
+    """Export the network of the checkpoint."""
+    job = Job.given()
+    model = network(job.size)
+    if job.weights is not None:
+        job.load(model.model, job.checkpoint()["model_state_dict"])
+    export(job, model)
+
+
+if __name__ == "__main__":
+    main()
