@@ -35,7 +35,7 @@ NOISE = 4.0
 """Std of grey values (of 255)."""
 POLL_S = 0.05
 CONFIG = """
-features: {{use: sift, options: {{max_keypoints: 1024}}}}
+features: {{use: sift, options: {{max_keypoints: 2048}}}}
 matcher: {{use: mutual-nearest}}
 depth: {{use: compact}}
 normals: {{use: as-depth}}

@@ -117,6 +117,8 @@ class DiskCheckpoints:
 
         A disk that is full ends no run: it goes on without checkpoints, and says so.
         """
+        if self._failed:
+            return
         started = time.monotonic()
         header = {
             "code": code_key(),

@@ -16,11 +16,13 @@ from typing import NamedTuple
 import numba
 
 from mpsfm_core.data import PinholeCamera, View
+from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.mapping import mapper
 from mpsfm_core.optimize.bundle_kernels import step_points
 from mpsfm_core.optimize.depth_integration import DepthIntegrator
+from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 
@@ -67,7 +69,8 @@ def compile_kernels(end: str) -> None:
         image.name: View(image.name, scene.render(_CAMERA, pose).rgb, _CAMERA)
         for image, pose in zip(problem.images, poses, strict=True)
     }
-    densify(mapping.reconstructions[0], views.__getitem__, DenseOptions())
+    dense, _ = densify(mapping.reconstructions[0], views.__getitem__, DenseOptions())
+    fuse_depth_maps(dense, views.__getitem__, ResultOptions())
 
 
 def _stamp() -> Path | None:

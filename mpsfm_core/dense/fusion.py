@@ -1,7 +1,10 @@
 """One point cloud from the depth maps of all images, every surface once."""
 
+# mypy: allow-untyped-decorators
+
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -9,16 +12,8 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.dense.source_views import choose_sources
-from mpsfm_core.geometry import (
-    camera_center,
-    inside,
-    pixel_centers,
-    project,
-    resize_map,
-    sample_nearest,
-    transform,
-    unproject,
-)
+from mpsfm_core.geometry import camera_center, pixel_centers, resize_map, unproject
+from mpsfm_core.jit import kernel
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
 
@@ -27,8 +22,6 @@ _NEIGHBORS = 8
 _WORSE = 1.5
 """Pixels of so many times the median std stay in any case: a network that promises little still
 gives a cloud (ours)."""
-
-
 _SAME = 0.02
 """Relative distance up to which points that agree are one, whatever their std (ours)."""
 _MUCH_SURER = 0.5
@@ -165,26 +158,60 @@ def _votes(
     ``others``: images, which of their pixels may become points, and whether they come first among
     equally certain ones.
     """
-    votes = np.zeros(len(points), dtype=np.int64)
+    votes = np.zeros(len(points), np.int64)
     views = np.ones(len(points), np.uint8)
     theirs = np.zeros(len(points), np.bool_)
     for other, usable, first in others:
         height, width = other.depth.shape
-        local = transform(other.rotation, other.translation, points)
-        xy = project(other.camera.resized(width, height), local)
-        seen = np.flatnonzero(inside(xy, (width, height)))
-        seen = seen[sample_nearest(other.depth.valid, xy[seen])]
-        ahead = sample_nearest(other.depth.depth, xy[seen]) - local[seen, 2]
-        other_variance = sample_nearest(_variance(other), xy[seen])
-        std = np.sqrt(variance[seen] + other_variance)
-        agrees = np.abs(ahead) <= sigmas * std
-        votes[seen] += agrees.astype(np.int64) - (ahead > sigmas * std)
-        views[seen[agrees]] += 1
-        surer = other_variance <= variance[seen] if first else other_variance < variance[seen]
-        same = np.abs(ahead) <= _SAME * local[seen, 2]
-        same |= other_variance <= _MUCH_SURER**2 * variance[seen]
-        theirs[seen[agrees & surer & same & sample_nearest(usable, xy[seen])]] = True
+        camera = other.camera.resized(width, height)
+        turned, shift = camera.matrix @ other.rotation, camera.matrix @ other.translation
+        map_ = (other.depth.depth, other.depth.valid, _variance(other), usable)
+        _vote(points, variance, turned, shift, *map_, first, sigmas, votes, views, theirs)
     return _Verdict(votes >= 0, theirs, views)
+
+
+@kernel()
+def _vote(
+    points: Float64,
+    variance: Float64,
+    turned: Float64,
+    shift: Float64,
+    depth: Float32,
+    valid: Bool,
+    depth_variance: Float32,
+    usable: Bool,
+    first: bool,
+    sigmas: float,
+    votes: Int64,
+    views: UInt8,
+    theirs: Bool,
+) -> None:
+    """Add what one image says to ``votes``, ``views`` and ``theirs``; a point is there at the
+    homogeneous pixel ``turned @ point + shift``."""
+    height, width = depth.shape
+    for k in range(len(points)):
+        u, v, z = shift
+        for axis in range(3):
+            u += turned[0, axis] * points[k, axis]
+            v += turned[1, axis] * points[k, axis]
+            z += turned[2, axis] * points[k, axis]
+        if z <= 0 or u < 0 or v < 0 or u > width * z or v > height * z:
+            continue
+        row, column = min(int(v / z), height - 1), min(int(u / z), width - 1)
+        if not valid[row, column]:
+            continue
+        ahead, other_variance = depth[row, column] - z, depth_variance[row, column]
+        limit = sigmas * math.sqrt(variance[k] + other_variance)
+        if ahead > limit:
+            votes[k] -= 1
+        if abs(ahead) > limit:
+            continue
+        votes[k] += 1
+        views[k] += 1
+        surer = other_variance < variance[k] or (first and other_variance == variance[k])
+        same = abs(ahead) <= _SAME * z or other_variance <= _MUCH_SURER**2 * variance[k]
+        if surer and same and usable[row, column]:
+            theirs[k] = True
 
 
 def _normals(image: RegisteredImage) -> Float32:

@@ -1,22 +1,18 @@
 """Which views a photo is matched with: those that see the same surface at a good angle."""
 
+# mypy: allow-untyped-decorators
+
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import Float32, Float64, PinholeCamera
-from mpsfm_core.geometry import (
-    camera_center,
-    inside,
-    project,
-    sample_nearest,
-    transform,
-    triangulation_angle_deg,
-    unproject,
-)
+from mpsfm_core.data import Float64, Int64
+from mpsfm_core.geometry import camera_center, pixel_centers, sample_nearest, unproject
+from mpsfm_core.jit import kernel
 from mpsfm_core.scene.reconstruction import RegisteredImage
 
 _ROWS = 16
@@ -30,15 +26,21 @@ _HIDDEN_STDS = 1.5
 """A point so far behind what a view sees is hidden there, in std of depth (ours)."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Sampled:
-    camera: PinholeCamera
-    rotation: Float64
-    translation: Float64
-    center: Float64
-    points: Float64
-    log_depth: Float32
-    log_std: float
+class _Sampled(NamedTuple):
+    """What is looked at of m views: a grid of pixels of each, of ``columns`` (m,) columns.
+
+    ``params`` (m, 4): fx, fy, cx, cy of the grids. ``log_depth`` (m, rows, most columns),
+    ``log_std`` (m,). ``points``: of each view its own (n, 3), world.
+    """
+
+    params: Float64
+    columns: Int64
+    rotations: Float64
+    translations: Float64
+    centers: Float64
+    log_depth: Float64
+    log_std: Float64
+    points: list[Float64]
 
 
 def choose_sources(images: Sequence[RegisteredImage], limit: int) -> list[list[int]]:
@@ -46,36 +48,48 @@ def choose_sources(images: Sequence[RegisteredImage], limit: int) -> list[list[i
 
     Taken one after the other: each by what it adds where others see little.
     """
-    sampled = [_sample(image) for image in images]
-    return [_sources(sampled, row, limit) for row in range(len(sampled))]
+    if not images:
+        return []
+    views = _sample(images)
+    return [_sources(views, row, limit) for row in range(len(images))]
 
 
-def _sample(image: RegisteredImage) -> _Sampled:
-    rows, columns = _ROWS, max(2, round(_ROWS * image.camera.width / image.camera.height))
-    camera = image.camera.resized(columns, rows)
-    y, x = np.mgrid[0:rows, 0:columns] + 0.5
-    xy = np.stack([x.ravel(), y.ravel()], axis=1)
-    on_map = xy * (np.array(image.depth.shape[::-1]) / (columns, rows))
-    depth = sample_nearest(image.depth.depth, on_map).astype(np.float64)
-    valid = sample_nearest(image.depth.valid, on_map)
-    depth = np.where(valid, depth, np.median(depth[valid]) if valid.any() else 1.0)
-    variance = image.depth.variance
-    assert variance is not None  # of a refined map always
-    spread = np.sqrt(sample_nearest(variance, on_map)) / depth
-    center = camera_center(image.rotation, image.translation)
-    points = unproject(camera, xy, depth) @ image.rotation + center
-    log_depth = np.log(depth).astype(np.float32).reshape(rows, columns)
-    log_std = float(np.median(spread[valid])) if valid.any() else 1.0
-    return _Sampled(camera, image.rotation, image.translation, center, points, log_depth, log_std)
+def _sample(images: Sequence[RegisteredImage]) -> _Sampled:
+    ratios = [image.camera.width / image.camera.height for image in images]
+    columns = np.array([max(2, round(_ROWS * ratio)) for ratio in ratios])
+    cameras = [
+        image.camera.resized(int(width), _ROWS)
+        for image, width in zip(images, columns, strict=True)
+    ]
+    rotations = np.stack([image.rotation for image in images])
+    translations = np.stack([image.translation for image in images])
+    centers = camera_center(rotations, translations)
+    log_depth = np.zeros((len(images), _ROWS, columns.max()))
+    log_std = np.ones(len(images))
+    points = []
+    for row, (image, camera) in enumerate(zip(images, cameras, strict=True)):
+        xy = pixel_centers(camera.width, camera.height).reshape(-1, 2)
+        on_map = xy * (np.array(image.depth.shape[::-1]) / camera.size)
+        depth = sample_nearest(image.depth.depth, on_map).astype(np.float64)
+        valid = sample_nearest(image.depth.valid, on_map)
+        depth = np.where(valid, depth, np.median(depth[valid]) if valid.any() else 1.0)
+        variance = image.depth.variance
+        assert variance is not None  # of a refined map always
+        if valid.any():
+            spread = np.sqrt(sample_nearest(variance, on_map)) / depth
+            log_std[row] = np.median(spread[valid])
+        log_depth[row, :, : camera.width] = np.log(depth).reshape(_ROWS, -1)
+        points.append(unproject(camera, xy, depth) @ image.rotation + centers[row])
+    params = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras])
+    return _Sampled(params, columns, rotations, translations, centers, log_depth, log_std, points)
 
 
-def _sources(views: Sequence[_Sampled], row: int, limit: int) -> list[int]:
-    own = views[row]
-    gains = np.stack([_gain(own, view) for view in views])
-    gains[row] = 0
+def _sources(views: _Sampled, row: int, limit: int) -> list[int]:
+    gains = np.zeros((len(views.points), len(views.points[row])))
+    _gains(row, views.points[row], *views[:-1], gains)
     chosen: list[int] = []
     have = np.zeros(gains.shape[1])
-    for _ in range(min(limit, len(views) - 1)):
+    for _ in range(min(limit, len(gains) - 1)):
         added = (gains / (1 + have)).mean(axis=1)
         added[chosen] = 0
         best = int(added.argmax())
@@ -86,19 +100,50 @@ def _sources(views: Sequence[_Sampled], row: int, limit: int) -> list[int]:
     return chosen
 
 
-def _gain(own: _Sampled, other: _Sampled) -> Float64:
-    """What another view says about each sampled pixel, 0 to 1."""
-    local = transform(other.rotation, other.translation, own.points)
-    xy = project(other.camera, local)
-    seen = inside(xy, other.camera.size)
-    ahead = np.log(np.maximum(local[:, 2], 1e-12)) - sample_nearest(
-        other.log_depth, np.nan_to_num(xy)
-    )
-    seen &= ahead < _HIDDEN_STDS * max(own.log_std, other.log_std)
-    angle = triangulation_angle_deg(own.center, other.center, own.points)
-    ours, theirs = own.points - own.center, own.points - other.center
-    seen &= (ours * theirs).sum(axis=1) > 0
-    lengths = np.linalg.norm(ours, axis=1) / np.maximum(np.linalg.norm(theirs, axis=1), 1e-12)
-    wide = np.exp(-(np.maximum(angle - _WIDE_DEG, 0) ** 2) / (2 * _WIDE_DEG**2))
-    gain = np.minimum(angle / _ENOUGH_DEG, 1) * wide * np.minimum(lengths, 1 / lengths)
-    return np.where(seen, gain, 0.0)
+@kernel()
+def _gains(
+    own: int,
+    points: Float64,
+    params: Float64,
+    columns: Int64,
+    rotations: Float64,
+    translations: Float64,
+    centers: Float64,
+    log_depth: Float64,
+    log_std: Float64,
+    gains: Float64,
+) -> None:
+    """What each other view says about each of our points, 0 to 1: (m, n)."""
+    rows = log_depth.shape[1]
+    for other in range(len(params)):
+        if other == own:
+            continue
+        fx, fy, cx, cy = params[other]
+        rotation, translation = rotations[other], translations[other]
+        hidden = _HIDDEN_STDS * max(log_std[own], log_std[other])
+        for k in range(len(points)):
+            point = points[k]
+            x, y, z = translation
+            for axis in range(3):
+                x += rotation[0, axis] * point[axis]
+                y += rotation[1, axis] * point[axis]
+                z += rotation[2, axis] * point[axis]
+            if z <= 0:
+                continue
+            u, v = fx * x / z + cx, fy * y / z + cy
+            if u < 0 or v < 0 or u > columns[other] or v > rows:
+                continue
+            column, row = min(int(u), columns[other] - 1), min(int(v), rows - 1)
+            if math.log(z) - log_depth[other, row, column] >= hidden:
+                continue
+            ours, theirs, cosine = 0.0, 0.0, 0.0
+            for axis in range(3):
+                a, b = point[axis] - centers[own, axis], point[axis] - centers[other, axis]
+                ours, theirs, cosine = ours + a * a, theirs + b * b, cosine + a * b
+            if cosine <= 0:
+                continue
+            lengths = math.sqrt(ours * theirs)
+            angle = math.degrees(math.acos(min(cosine / lengths, 1.0)))
+            wide = max(angle - _WIDE_DEG, 0.0) / _WIDE_DEG
+            nearer = math.sqrt(min(ours, theirs) / max(ours, theirs))
+            gains[other, k] = min(angle / _ENOUGH_DEG, 1.0) * math.exp(-(wide**2) / 2) * nearer

@@ -57,12 +57,11 @@ class Keeper:
 
     def save(self, runs: list[Run], mapper: Mapper) -> None:
         """Keep the state if it is time."""
-        self._save(runs, mapper, mapper.group.size)
+        if self._checkpoints is not None and self._checkpoints.due():
+            self._checkpoints.save(freeze((runs, mapper), self._shared), mapper.group.size)
 
     def finish(self, runs: list[Run]) -> None:
         """Keep what came out, for who is killed in what follows."""
-        self._save(runs, None, max(run.size for run in runs))
-
-    def _save(self, runs: list[Run], mapper: Mapper | None, registered: int) -> None:
-        if self._checkpoints is not None and self._checkpoints.due():
-            self._checkpoints.save(freeze((runs, mapper), self._shared), registered)
+        if self._checkpoints is not None:
+            registered = max(run.size for run in runs)
+            self._checkpoints.save(freeze((runs, None), self._shared), registered)
