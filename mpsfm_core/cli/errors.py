@@ -7,6 +7,7 @@ reconstruction was possible, 130 interrupted.
 from __future__ import annotations
 
 import errno
+import signal
 from typing import Any, NoReturn
 
 import typer
@@ -30,6 +31,12 @@ class GuardedGroup(TyperGroup):
             if _is_control_flow(error) or ctx.params.get("debug"):
                 raise
             fail(*_explain(error))
+
+
+def heed_termination() -> None:
+    """SIGTERM ends a command as Ctrl-C does. For after the import of pycolmap, which has a stack
+    trace of its own printed."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def fail(message: str, exit_code: int) -> NoReturn:

@@ -92,12 +92,14 @@ def run(
     ``viewer``: name of a viewer that shows the run as it goes on. ``further``: keyword arguments
     of :func:`mpsfm_core.pipeline.reconstruct`.
     """
+    from mpsfm_core.cli.errors import heed_termination
     from mpsfm_core.cli.progress import showing_progress
     from mpsfm_core.cli.view import showing_run
     from mpsfm_core.errors import ReconstructionError
     from mpsfm_core.pipeline import reconstruct
     from mpsfm_core.registry import Registry
 
+    heed_termination()
     registry = Registry.discover()
     with showing_run(registry, viewer, images, output):
         try:

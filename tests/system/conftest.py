@@ -148,13 +148,14 @@ def mpsfm(environment: Mapping[str, str]) -> Mpsfm:
 
 @pytest.fixture(scope="session")
 def interrupted(environment: Mapping[str, str]) -> Mpsfm:
-    """Runs ``mpsfm ARGUMENTS`` and presses Ctrl-C when a line on stderr starts with ``after``."""
+    """Runs ``mpsfm ARGUMENTS`` and presses Ctrl-C when a line on stderr starts with ``after``;
+    ``by``: another signal."""
 
     def heed_interrupts() -> None:
         # A shell lets what it starts in the background ignore Ctrl-C, these tests with it.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-    def run(*arguments: object, after: str) -> Ended:
+    def run(*arguments: object, after: str, by: int = signal.SIGINT) -> Ended:
         process = subprocess.Popen(
             [*COMMAND, *map(str, arguments)],
             env=environment,
@@ -170,7 +171,7 @@ def interrupted(environment: Mapping[str, str]) -> Mpsfm:
             lines.append(line)
             if line.startswith(after):
                 # The whole foreground group gets Ctrl-C, workers included.
-                os.killpg(process.pid, signal.SIGINT)
+                os.killpg(process.pid, by)
                 break
         out, rest = process.communicate(timeout=120)
         return Ended(process.returncode, out, "".join(lines) + rest)

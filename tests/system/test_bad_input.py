@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -165,9 +166,19 @@ def test_a_full_disk(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
     check(ended, 1, str(output), "the disk is full", "earlier results are unchanged")
 
 
-@pytest.mark.parametrize("stage", ["inputs", "extraction", "mapping"])
-def test_ctrl_c(photo_scene, interrupted, output: Path, stage: str, cache: Path) -> None:
-    ended = interrupted(*photo_scene.arguments, "--output", output, after=stage)
+@pytest.mark.parametrize(
+    ("stage", "by"),
+    [
+        ("inputs", signal.SIGINT),
+        ("extraction", signal.SIGINT),
+        ("mapping", signal.SIGINT),
+        ("extraction", signal.SIGTERM),
+    ],
+)
+def test_ctrl_c(
+    photo_scene, interrupted, output: Path, stage: str, by: signal.Signals, cache: Path
+) -> None:
+    ended = interrupted(*photo_scene.arguments, "--output", output, after=stage, by=by)
     check(ended, 130, "interrupted")
 
 
