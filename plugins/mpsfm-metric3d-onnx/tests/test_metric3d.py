@@ -48,7 +48,7 @@ def test_canonical_camera_padding_and_normals(model, context):
     # 616 / 480 rows limit the size: 821 x 616 of 1064 x 616, of which only the image remains
     assert depth.shape == normals.shape == (616, 821)
     assert depth.valid.all() and depth.metric and depth.variance is None
-    focal = (700 * 821 / 640 + 720 * 616 / 480) / 2
+    focal = (700 + 720) / 2 * 616 / 480
     np.testing.assert_allclose(depth.depth, 90 * focal / 1000, rtol=1e-5)
     np.testing.assert_allclose(normals.normals[300, 400], [0.6, 0.0, -0.8], rtol=1e-5)
     np.testing.assert_allclose(normals.variance, expected_angle(np.array(20.0)) ** 2, rtol=1e-5)

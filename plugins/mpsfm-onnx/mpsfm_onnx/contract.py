@@ -179,5 +179,5 @@ def _canonical_unit(description: Description) -> float:
     if rule is None or rule.canonical_focal is None:
         return 1.0
     image = Canvas.plan(description.input.size, camera.size).image
-    resized = camera.resized(*image)
-    return rule.canonical_focal / ((resized.fx + resized.fy) / 2)
+    scale = max(width / full for width, full in zip(image, camera.size, strict=True))
+    return rule.canonical_focal / ((camera.fx + camera.fy) / 2 * scale)

@@ -160,7 +160,9 @@ def _factor(rule: DepthOutput, answer: Answer, camera: PinholeCamera) -> float:
     for the network's own scale."""
     resized, factor = camera.resized(*answer.canvas.image), 1.0
     if rule.canonical_focal is not None:
-        factor *= (resized.fx + resized.fy) / 2 / rule.canonical_focal
+        sides = zip(answer.canvas.image, camera.size, strict=True)
+        scale = max(resized_side / side for resized_side, side in sides)  # one of them is exact
+        factor *= (camera.fx + camera.fy) / 2 * scale / rule.canonical_focal
     if rule.assumed_focal is not None:
         factor *= resized.fx / answer.numbers[rule.assumed_focal]
     if rule.multiplier is not None:
