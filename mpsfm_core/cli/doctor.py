@@ -14,7 +14,6 @@ import typer
 
 from mpsfm_core.cli.arguments import ConfigName, Offline, settings
 from mpsfm_core.cli.models import CacheDir
-from mpsfm_core.threads import cores
 
 if TYPE_CHECKING:
     from mpsfm_core.provision import Provision
@@ -36,6 +35,7 @@ def doctor(
     from mpsfm_core.extraction.cache import cache_folder
     from mpsfm_core.provision import look_up
     from mpsfm_core.registry import Registry, core_version
+    from mpsfm_core.threads import cores
 
     registry = Registry.discover()
     _heading("this machine")
