@@ -1,4 +1,4 @@
-"""Where benchmarks find scenes and leave results, and how they tell what is done."""
+"""Where benchmarks find scenes and leave results, how they run commands and tell what is done."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from mpsfm_core.evaluation.records import Record
 from mpsfm_core.yaml_text import write_yaml
 
 RESULTS = Path(__file__).parent / "results"
+MPSFM = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+"""The command ``mpsfm`` of this environment; its arguments follow."""
 
 
 def shared_folder() -> Path:

@@ -13,14 +13,13 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import psutil
 
-_MPSFM = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+from benchmarks._scenes import MPSFM
 
 
 def main() -> None:
@@ -78,7 +77,7 @@ def _random_superpoint(folder: Path) -> Path:
 def _measured(command: list[str], what: str, allowed: tuple[int, ...] = (0,)) -> None:
     """Run a command of ours; time and largest memory of its processes together."""
     start, peak = time.perf_counter(), 0
-    running = subprocess.Popen([*_MPSFM, *command])
+    running = subprocess.Popen([*MPSFM, *command])
     process = psutil.Process(running.pid)
     while running.poll() is None:
         total = 0

@@ -16,7 +16,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -28,6 +27,7 @@ from rich.console import Console
 from rich.text import Text
 
 from benchmarks._browser import headless, picture_of
+from benchmarks._scenes import MPSFM
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = ROOT / "docs" / "pictures"
@@ -37,7 +37,6 @@ _APART = ("view_0.jpg", "view_4.jpg")
 """They look at opposite walls."""
 _COLUMNS = 118
 _MAPS = ("photo", "prior", "refined", "std", "normals")
-_MPSFM = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
 
 
 def on_terminal(*arguments: str, code: int = 0) -> str:
@@ -45,7 +44,7 @@ def on_terminal(*arguments: str, code: int = 0) -> str:
     ours, theirs = pty.openpty()
     environment = {**os.environ, "COLUMNS": str(_COLUMNS), "TERM": "xterm-256color"}
     process = subprocess.Popen(
-        [*_MPSFM, *arguments], stdin=theirs, stdout=theirs, stderr=theirs, env=environment
+        [*MPSFM, *arguments], stdin=theirs, stdout=theirs, stderr=theirs, env=environment
     )
     os.close(theirs)
     said = b""
@@ -155,7 +154,7 @@ def shoot_viewer(browser: Any, folder: Path) -> None:
     """``mpsfm view`` as people see it."""
     environment = {**os.environ, "MPSFM_VIEWER_PORT": "18790", "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(
-        [*_MPSFM, "view", str(folder)], stdout=subprocess.PIPE, text=True, env=environment
+        [*MPSFM, "view", str(folder)], stdout=subprocess.PIPE, text=True, env=environment
     )
     try:
         assert process.stdout is not None

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks._scenes import MPSFM
 from mpsfm_core.data import Float64, PinholeCamera
 from mpsfm_core.testing.halls import hall
 from mpsfm_core.testing.scenes import AnalyticScene, arc_poses, room_scene
@@ -36,7 +36,6 @@ pairs: {{mode: sequential, overlap: 4, quadratic: true}}
 extraction: {{integration_size: {grid}}}
 runtime: {{workers: {workers}, cache_dir: {folder}/cache}}
 """
-COMMAND = [sys.executable, "-c", "from mpsfm_core.cli import main; main()", "reconstruct"]
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,7 @@ def run(case: Case, folder: Path) -> dict:
     output = folder / "out"
     arguments = [str(folder / "images"), "--output", str(output), "--quiet"]
     arguments += [text for name, path in options.items() for text in (f"--{name}", path)]
-    subprocess.run([*COMMAND, *arguments], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([*MPSFM, "reconstruct", *arguments], check=True, stdout=subprocess.DEVNULL)
     return json.loads((output / "summary.json").read_text(encoding="utf-8"))
 
 

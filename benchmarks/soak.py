@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 import yaml
 
-from benchmarks._scenes import RESULTS, shared_folder
+from benchmarks._scenes import MPSFM, RESULTS, shared_folder
 from mpsfm_core.testing.result_files import content
 
 SCENE = "hololens_room"
@@ -43,7 +43,6 @@ pairs: {{mode: sequential, overlap: 4, quadratic: true}}
 extraction: {{integration_size: 160}}
 runtime: {{workers: {workers}, cache_dir: {cache}}}
 """
-COMMAND = [sys.executable, "-c", "from mpsfm_core.cli import main; main()", "reconstruct"]
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,8 @@ def run(folder: Path, name: str, limits: list[float], workers: int) -> list[Life
     cache.mkdir(parents=True)
     config = folder / name / "config.yaml"
     config.write_text(CONFIG.format(workers=workers, cache=cache))
-    command = [*COMMAND, str(folder / "images"), "--output", str(output), "--config", str(config)]
+    command = [*MPSFM, "reconstruct", str(folder / "images"), "--output", str(output)]
+    command += ["--config", str(config)]
     command += ["--intrinsics", str(folder / "intrinsics.yaml")]
     lives: list[Life] = []
     for number in range(len(limits) + 1):

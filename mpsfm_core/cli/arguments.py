@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import typer
 
@@ -31,3 +31,13 @@ ViewerName: TypeAlias = Annotated[
 def settings(overrides: list[str] | None, offline: bool) -> list[str]:
     """The settings that the options ``--set`` and ``--offline`` mean."""
     return [*(overrides or ()), *(["runtime.offline=true"] if offline else [])]
+
+
+def assigned(overrides: list[str] | None) -> dict[str, Any]:
+    """The values that ``--set`` gives to the settings of one command; raises ConfigError."""
+    from mpsfm_core.yaml_text import parse_assignment
+
+    values: dict[str, Any] = {}
+    for text in overrides or ():
+        values |= parse_assignment(text)
+    return values

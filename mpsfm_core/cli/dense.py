@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Quiet
+from mpsfm_core.cli.arguments import Quiet, assigned
 
 
 def dense(
@@ -30,12 +30,8 @@ def dense(
     from mpsfm_core.dense.options import DenseOptions
     from mpsfm_core.options import parse_settings
     from mpsfm_core.pipeline import densify_model
-    from mpsfm_core.yaml_text import parse_assignment
 
-    values: dict[str, Any] = {}
-    for text in overrides or ():
-        values |= parse_assignment(text)
-    report = densify_model(model, images, output, parse_settings(DenseOptions, values))
+    report = densify_model(model, images, output, parse_settings(DenseOptions, assigned(overrides)))
     if not quiet:
         shares = report.confirmed.values()
         typer.echo(

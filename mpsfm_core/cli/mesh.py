@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Quiet
+from mpsfm_core.cli.arguments import Quiet, assigned
 
 
 def mesh(
@@ -31,11 +31,7 @@ def mesh(
     from mpsfm_core.dense.options import MeshOptions
     from mpsfm_core.options import parse_settings
     from mpsfm_core.pipeline import mesh_model
-    from mpsfm_core.yaml_text import parse_assignment
 
-    values: dict[str, Any] = {}
-    for text in overrides or ():
-        values |= parse_assignment(text)
-    made = mesh_model(folder, images, parse_settings(MeshOptions, values))
+    made = mesh_model(folder, images, parse_settings(MeshOptions, assigned(overrides)))
     if not quiet:
         typer.echo(f"{len(made.triangles)} triangles; written to {folder}/mesh.ply and mesh.glb")
