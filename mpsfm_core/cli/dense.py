@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mpsfm_core.cli.arguments import Quiet, assigned
+from mpsfm_core.cli.errors import heed_termination
 
 
 def dense(
@@ -31,6 +32,7 @@ def dense(
     from mpsfm_core.options import parse_settings
     from mpsfm_core.pipeline import densify_model
 
+    heed_termination()
     report = densify_model(model, images, output, parse_settings(DenseOptions, assigned(overrides)))
     if not quiet:
         shares = report.confirmed.values()

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mpsfm_core.cli.arguments import Quiet, assigned
+from mpsfm_core.cli.errors import heed_termination
 
 
 def mesh(
@@ -32,6 +33,7 @@ def mesh(
     from mpsfm_core.options import parse_settings
     from mpsfm_core.pipeline import mesh_model
 
+    heed_termination()
     made = mesh_model(folder, images, parse_settings(MeshOptions, assigned(overrides)))
     if not quiet:
         typer.echo(f"{len(made.triangles)} triangles; written to {folder}/mesh.ply and mesh.glb")

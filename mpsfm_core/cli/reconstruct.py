@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mpsfm_core.cli.arguments import ConfigName, Offline, Overrides, Quiet, ViewerName, settings
+from mpsfm_core.cli.errors import heed_termination
 
 if TYPE_CHECKING:
     from mpsfm_core.pipeline import ReconstructionResult
@@ -92,7 +93,6 @@ def run(
     ``viewer``: name of a viewer that shows the run as it goes on. ``further``: keyword arguments
     of :func:`mpsfm_core.pipeline.reconstruct`.
     """
-    from mpsfm_core.cli.errors import heed_termination
     from mpsfm_core.cli.progress import showing_progress
     from mpsfm_core.cli.view import showing_run
     from mpsfm_core.errors import ReconstructionError
