@@ -8,6 +8,7 @@ import os
 import platform
 import sys
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ class Service:
         self._registry: Registry | None = None
         self._provider: Any = None
         self._threads: int | None = None
+        self._limit, self._limited_with = ExitStack(), 0
 
     def serve(self) -> None:
         """Greet, and answer until the main process is gone."""
@@ -53,8 +55,8 @@ class Service:
     def _answer(self, request: Mapping[str, Any]) -> Any:
         what = request["do"]
         if what == "call":
-            with limited(self._threads):
-                return getattr(self._provider, request["method"])(*request["arguments"])
+            self._limit_threads()
+            return getattr(self._provider, request["method"])(*request["arguments"])
         registry = self._registry or Registry.discover(environments=False)
         self._registry = registry
         if what == "describe":
@@ -81,6 +83,13 @@ class Service:
         if what == "calibration":
             return registry.calibration(kind, Backend(use=name, options=values))
         raise ProviderError(f"nobody here can {what!r}")
+
+    def _limit_threads(self) -> None:
+        """To be done again, which takes a millisecond, when libraries may have come since."""
+        if self._limited_with != len(sys.modules):
+            self._limit.close()
+            self._limit.enter_context(limited(self._threads))
+            self._limited_with = len(sys.modules)
 
     def _resolve(self, uri: str, sha256: str | None) -> Path:
         """The main process finds and fetches weights for all."""
@@ -151,7 +160,7 @@ def main() -> None:
     os.dup2(nothing, 0)
     folder = Path(sys.argv[1])
     try:
-        Service(Channel(reader, writer, folder, "worker", "main", copy=False)).serve()
+        Service(Channel(reader, writer, folder, "worker", "main")).serve()
     except Closed:
         return
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from mpsfm_core import data
+from mpsfm_core.data import UInt8
 from mpsfm_core.errors import DataError
 from mpsfm_core.providers import WeightsFile
 from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
@@ -90,7 +91,7 @@ class Packed:
         return [array.dtype.str, list(array.shape), start]
 
 
-def unpack(text: bytes, block: memoryview, copy: bool) -> Any:
+def unpack(text: bytes, block: UInt8, copy: bool) -> Any:
     """The value again. Its arrays are read-only views of the block, or copies if so asked.
 
     Data types are put together without the checks of their values: the other side's constructors
@@ -98,39 +99,47 @@ def unpack(text: bytes, block: memoryview, copy: bool) -> Any:
     lives. Raises :class:`~mpsfm_core.errors.DataError` for what is no value of a type above.
     """
 
-    def array(description: list[Any]) -> NDArray[Any]:
+    try:
+        return _Unpacking(block, copy).build(json.loads(text))
+    except (ValueError, KeyError, TypeError, AttributeError, MemoryError, RecursionError) as error:
+        raise DataError("value", f"does not follow the protocol: {error}") from error
+
+
+class _Unpacking:
+    """Of one message. It is gone with it, and arrays alone keep the block."""
+
+    def __init__(self, block: UInt8, copy: bool) -> None:
+        self._block, self._copy = block, copy
+
+    def build(self, plain: Any) -> Any:
+        if not isinstance(plain, dict):
+            return plain
+        if "type" in plain:
+            values = {key: self.build(entry) for key, entry in plain["fields"].items()}
+            return _put_together(_TYPES[plain["type"]], values)
+        ((kind_of, content),) = plain.items()
+        if kind_of == "array":
+            return self._array(content)
+        if kind_of == "path":
+            return Path(content)
+        if kind_of == "dict":
+            return {key: self.build(entry) for key, entry in content.items()}
+        if kind_of in ("list", "tuple"):
+            entries = [self.build(entry) for entry in content]
+            return tuple(entries) if kind_of == "tuple" else entries
+        raise DataError("value", f"unknown content {kind_of!r}")
+
+    def _array(self, description: list[Any]) -> NDArray[Any]:
         dtype, shape, start = np.dtype(description[0]), tuple(description[1]), description[2]
         count = int(np.prod(shape, dtype=np.int64))
         if not count:
             return np.empty(shape, dtype)
-        view: NDArray[Any] = np.frombuffer(block, dtype, count, start).reshape(shape)
-        if copy:
+        end = start + count * dtype.itemsize
+        view: NDArray[Any] = self._block[start:end].view(dtype).reshape(shape)
+        if self._copy:
             view = np.array(view)
         view.flags.writeable = False
         return view
-
-    def build(plain: Any) -> Any:
-        if not isinstance(plain, dict):
-            return plain
-        if "type" in plain:
-            values = {key: build(entry) for key, entry in plain["fields"].items()}
-            return _put_together(_TYPES[plain["type"]], values)
-        ((kind_of, content),) = plain.items()
-        if kind_of == "array":
-            return array(content)
-        if kind_of == "path":
-            return Path(content)
-        if kind_of == "dict":
-            return {key: build(entry) for key, entry in content.items()}
-        if kind_of in ("list", "tuple"):
-            entries = [build(entry) for entry in content]
-            return tuple(entries) if kind_of == "tuple" else entries
-        raise DataError("value", f"unknown content {kind_of!r}")
-
-    try:
-        return build(json.loads(text))
-    except (ValueError, KeyError, TypeError, AttributeError, MemoryError, RecursionError) as error:
-        raise DataError("value", f"does not follow the protocol: {error}") from error
 
 
 def _put_together(kind: type, values: dict[str, Any]) -> Any:

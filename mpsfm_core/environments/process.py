@@ -19,7 +19,7 @@ from mpsfm_core.errors import DataError, MpsfmError, ProviderError
 from mpsfm_core.options import SettingProblem, SettingsError
 from mpsfm_core.providers import API_VERSION
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Of the messages; both sides must have the same."""
 
 _MODULE = "mpsfm_core.worker"
@@ -27,6 +27,9 @@ _START_S = 120.0
 """For the process to begin and import the core, on a cold network disk."""
 _NEEDED_BYTES = 256 << 20
 """Room in memory for the messages of a worker; else they go through the temporary folder."""
+_LENT = 2
+"""Answers that are looked into at once: one more is asked for while one is put away. They hold
+their memory as long as the worker lives."""
 _ENDING_S = 5.0
 _OURS: Mapping[str, type[MpsfmError]] = MappingProxyType(
     {
@@ -64,7 +67,7 @@ class Worker:
             )
         assert self._process.stdin is not None and self._process.stdout is not None
         self._channel = Channel(
-            self._process.stdout, self._process.stdin, folder, "main", "worker", copy=True
+            self._process.stdout, self._process.stdin, folder, "main", "worker", lent=_LENT
         )
         self._lock = threading.Lock()
         self._end = weakref.finalize(self, _end, self._process, self._folder)

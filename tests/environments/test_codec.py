@@ -15,9 +15,9 @@ from mpsfm_core.uncertainty.model import DepthCalibration
 
 def there_and_back(value, copy=True):
     packed = Packed(value)
-    block = bytearray(packed.size)
+    block = np.zeros(packed.size, dtype=np.uint8)
     packed.write(memoryview(block))
-    return unpack(packed.text, memoryview(block), copy)
+    return unpack(packed.text, block, copy)
 
 
 def test_values_come_back():
@@ -60,4 +60,4 @@ def test_no_objects(value):
 )
 def test_nothing_but_the_protocol(text):
     with pytest.raises(DataError):
-        unpack(text, memoryview(bytes(64)), copy=True)
+        unpack(text, np.zeros(64, dtype=np.uint8), copy=True)
