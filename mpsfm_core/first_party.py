@@ -48,6 +48,11 @@ FIRST_PARTY: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "mpsfm-depth-anything-3": ("multiview/depth-anything-3",),
         "mpsfm-mast3r": ("matcher/mast3r", "matcher/mast3r-sparse"),
         "mpsfm-roma": ("matcher/roma", "matcher/roma-sparse"),
+        "mpsfm-vismatch": tuple(
+            f"matcher/vismatch{network}{how}"
+            for network in ("", "-roma", "-mast3r")
+            for how in ("", "-sparse")
+        ),
         "mpsfm-retrieval": ("retrieval/appearance", "retrieval/global-onnx"),
         "mpsfm-sky": ("mask/sky", "mask/sky-simple"),
     }

@@ -22,7 +22,7 @@ DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "rerun": "rer
 """Of imports that are called otherwise."""
 WITH_THE_CORE = {"mpsfm_core", "pydantic"}
 """Options are pydantic models."""
-WITHOUT_THEIR_DEPENDENCIES = {"depth_anything_3"}
+WITHOUT_THEIR_DEPENDENCIES = {"depth_anything_3", "vismatch"}
 """They ask for packages that fit beside nothing; a specification says how to get them."""
 FOR_TESTS_ONLY = ("contract.py", "stand_in.py")
 BESIDE_THE_AUTHORS_CODE = ("export.py", "export_moge.py")

@@ -6,6 +6,9 @@ matches of both passes are better than those of one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import ClassVar
+
 import numpy as np
 
 from mpsfm_core import (
@@ -21,8 +24,8 @@ from mpsfm_core.data import Float32, Int64
 from mpsfm_core.geometry import inside
 from mpsfm_core.providers import required_features
 from mpsfm_mast3r.neighbours import mutual, reciprocal
-from mpsfm_mast3r.network import PairNetwork, Seen
-from mpsfm_mast3r.options import DenseOptions, SparseOptions
+from mpsfm_mast3r.network import OnnxPairNetwork, PairNetwork, Seen
+from mpsfm_mast3r.options import DenseSearch, SparseSearch
 
 _STD_NETWORK_PX = 0.5
 """Localisation noise of dense matches in network pixels (reference)."""
@@ -31,8 +34,10 @@ _STD_NETWORK_PX = 0.5
 class DenseMatcher:
     """Reciprocal nearest neighbours of the descriptors of all pixels."""
 
-    def __init__(self, options: DenseOptions, context: ProviderContext) -> None:
-        self._network = PairNetwork(options, context)
+    network: ClassVar[Callable[..., PairNetwork]] = OnnxPairNetwork
+
+    def __init__(self, options: DenseSearch, context: ProviderContext) -> None:
+        self._network = self.network(options, context)
         self._subsample = options.subsample
 
     def match(
@@ -71,8 +76,10 @@ class DenseMatcher:
 class SparseMatcher:
     """Mutual nearest neighbours among the descriptors at given keypoints."""
 
-    def __init__(self, options: SparseOptions, context: ProviderContext) -> None:
-        self._network = PairNetwork(options, context)
+    network: ClassVar[Callable[..., PairNetwork]] = OnnxPairNetwork
+
+    def __init__(self, options: SparseSearch, context: ProviderContext) -> None:
+        self._network = self.network(options, context)
         self._min_similarity = options.min_similarity
 
     def match(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpsfm_onnx.canvas import Canvas
@@ -15,6 +18,7 @@ from mpsfm_core.data import Float32, Float64, Int64
 from mpsfm_mast3r.options import Mast3rOptions
 
 _PATCH = 16
+Tensors = Sequence[NDArray[Any]]
 _TENSORS = ("pts3d", "conf", "desc", "desc_conf")
 
 
@@ -59,25 +63,25 @@ class Seen:
         return max(v / i for v, i in zip(self.view.camera.size, self.canvas.image, strict=True))
 
 
-class PairNetwork:
-    """MASt3R as an ONNX model.
+class PairNetwork(ABC):
+    """MASt3R, whatever runs it: one answer to two images.
 
-    Inputs ``img1``, ``img2`` (1, 3, h, w), RGB in [-1, 1]; outputs ``pts3d_1`` (1, h, w, 3),
-    ``conf_1`` (1, h, w), ``desc_1`` (1, h, w, d), ``desc_conf_1`` (1, h, w), and the same of the
-    second view; all points are in the frame of the first.
+    ``size``: longer side of the images.
     """
 
-    def __init__(self, options: Mast3rOptions, context: ProviderContext) -> None:
-        self._model = Model(context.resolve_weights(options.model, options.sha256), context)
-        self._outputs = [f"{name}_{side}" for side in (1, 2) for name in _TENSORS]
-        self._model.require(("img1", "img2"), self._outputs, "MASt3R")
+    def __init__(self, size: int) -> None:
         self._rule = ImageInput(
             scale=1 / 255,
             mean=(0.5, 0.5, 0.5),
             std=(0.5, 0.5, 0.5),
             interpolation="lanczos",
-            size=SideSize(mode="longest", side=options.size, multiple_of=_PATCH, fit="crop"),
+            size=SideSize(mode="longest", side=size, multiple_of=_PATCH, fit="crop"),
         )
+
+    @abstractmethod
+    def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
+        """Of images (1, 3, h, w), RGB in [-1, 1]: points (h, w, 3) in the frame of the first,
+        certainty (h, w), descriptors (h, w, d) and their certainty (h, w), of either."""
 
     def both(self, view_a: View, view_b: View) -> tuple[tuple[Seen, Seen], tuple[Seen, Seen]]:
         """``(a, b)`` of the pass with a as first view, and of the pass with b as first view."""
@@ -87,17 +91,36 @@ class PairNetwork:
     def _run(self, first: View, second: View) -> tuple[Seen, Seen]:
         views = (first, second)
         canvases = [Canvas.plan(self._rule.size, view.camera.size) for view in views]
-        feed = {
-            f"img{side}": canvas.paint(view.image, self._rule)
-            for side, (canvas, view) in enumerate(zip(canvases, views, strict=True), start=1)
-        }
-        tensors = [tensor[0] for tensor in self._model.run(feed, self._outputs)]
-        seen = zip(views, canvases, (tensors[:4], tensors[4:]), strict=True)
+        images = (
+            canvas.paint(view.image, self._rule)
+            for canvas, view in zip(canvases, views, strict=True)
+        )
+        seen = zip(views, canvases, self.answer(*images), strict=True)
         one, two = (_seen(view, canvas, parts) for view, canvas, parts in seen)
         return one, two
 
 
-def _seen(view: View, canvas: Canvas, tensors: list[NDArray[np.float32]]) -> Seen:
+class OnnxPairNetwork(PairNetwork):
+    """MASt3R as an ONNX model.
+
+    Inputs ``img1``, ``img2``; outputs ``pts3d_1`` (1, h, w, 3), ``conf_1`` (1, h, w), ``desc_1``
+    (1, h, w, d), ``desc_conf_1`` (1, h, w), and the same of the second view.
+    """
+
+    def __init__(self, options: Mast3rOptions, context: ProviderContext) -> None:
+        super().__init__(options.size)
+        self._model = Model(context.resolve_weights(options.model, options.sha256), context)
+        self._outputs = [f"{name}_{side}" for side in (1, 2) for name in _TENSORS]
+        self._model.require(("img1", "img2"), self._outputs, "MASt3R")
+
+    def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
+        """See :class:`PairNetwork`."""
+        feed = {"img1": first, "img2": second}
+        tensors = [tensor[0] for tensor in self._model.run(feed, self._outputs)]
+        return tensors[:4], tensors[4:]
+
+
+def _seen(view: View, canvas: Canvas, tensors: Tensors) -> Seen:
     points, certainty, descriptors, match_certainty = (t.astype(np.float32) for t in tensors)
     flat = descriptors.reshape(-1, descriptors.shape[-1])
     return Seen(view, canvas, points, certainty, flat, match_certainty.reshape(-1))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import ClassVar
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -15,15 +18,17 @@ from mpsfm_core import (
 )
 from mpsfm_core.data import Float32, Float64, Int64
 from mpsfm_core.providers import required_features
-from mpsfm_roma.network import Warp, WarpNetwork
-from mpsfm_roma.options import DenseOptions, SparseOptions
+from mpsfm_roma.network import OnnxWarpNetwork, Warp, WarpNetwork
+from mpsfm_roma.options import DenseSearch, SparseSearch
 
 
 class DenseMatcher:
     """The certain parts of the warp, thinned out."""
 
-    def __init__(self, options: DenseOptions, context: ProviderContext) -> None:
-        self._network = WarpNetwork(options, context)
+    network: ClassVar[Callable[..., WarpNetwork]] = OnnxWarpNetwork
+
+    def __init__(self, options: DenseSearch, context: ProviderContext) -> None:
+        self._network = self.network(options, context)
         self._cell, self._min_certainty = options.cell, options.min_certainty
 
     def match(
@@ -54,8 +59,10 @@ class DenseMatcher:
 class SparseMatcher:
     """Keypoints that the warp sends near to each other."""
 
-    def __init__(self, options: SparseOptions, context: ProviderContext) -> None:
-        self._network = WarpNetwork(options, context)
+    network: ClassVar[Callable[..., WarpNetwork]] = OnnxWarpNetwork
+
+    def __init__(self, options: SparseSearch, context: ProviderContext) -> None:
+        self._network = self.network(options, context)
         self._snap_px, self._min_certainty = options.snap_px, options.min_certainty
 
     def match(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.description import FixedSize, ImageInput
 from mpsfm_onnx.model import Model
+from numpy.typing import NDArray
 
 from mpsfm_core import ProviderContext, View
 from mpsfm_core.data import Bool, Float32, Float64, Int64
@@ -43,13 +46,31 @@ class Warp:
         return np.stack([x, y], axis=-1), certainty
 
 
-class WarpNetwork:
+class WarpNetwork(ABC):
+    """RoMa, whatever runs it."""
+
+    @abstractmethod
+    def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
+        """As of RoMa's ``match``: the warp (h, w, 4), positions ``x_a, y_a, x_b, y_b`` in [-1, 1]
+        of which the first two are a grid; its certainty (h, w); and whether it is symmetric: the
+        warp of the second view is to the right of the first one's, with the last two as the
+        grid."""
+
+    def warps(self, view_a: View, view_b: View) -> tuple[Warp, Warp | None]:
+        """The warp from a to b and, from a symmetric model, the one from b to a."""
+        warp, certainty, symmetric = self.answer(view_a, view_b)
+        half = warp.shape[1] // 2 if symmetric else warp.shape[1]
+        there = _warp(view_a, view_b, warp[:, :half, 2:], certainty[:, :half])
+        if not symmetric:
+            return there, None
+        return there, _warp(view_b, view_a, warp[:, half:, :2], certainty[:, half:])
+
+
+class OnnxWarpNetwork(WarpNetwork):
     """RoMa as an ONNX model.
 
-    Inputs: two images (1, 3, height, width), normalised as for ImageNet. Outputs as of RoMa's
-    ``match``: the warp (h, w, 4) or (1, h, w, 4), positions ``x_a, y_a, x_b, y_b`` in [-1, 1] of
-    which the first two are a grid; and its certainty (h, w). A symmetric model gives the warp of
-    the second view to the right of the first one's, with the last two as the grid.
+    Inputs: two images (1, 3, height, width), normalised as for ImageNet. Outputs, with or without
+    a batch dimension: the warp and its certainty.
     """
 
     def __init__(self, options: RomaOptions, context: ProviderContext) -> None:
@@ -64,23 +85,17 @@ class WarpNetwork:
             size=FixedSize(mode="fixed", width=options.width, height=options.height),
         )
 
-    def warps(self, view_a: View, view_b: View) -> tuple[Warp, Warp | None]:
-        """The warp from a to b and, from a symmetric model, the one from b to a."""
-        views = (view_a, view_b)
+    def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
+        """See :class:`WarpNetwork`."""
         images = (
-            Canvas.plan(self._rule.size, v.camera.size).paint(v.image, self._rule) for v in views
+            Canvas.plan(self._rule.size, v.camera.size).paint(v.image, self._rule)
+            for v in (view_a, view_b)
         )
         feed = dict(zip(self._inputs, images, strict=True))
         warp, certainty = (np.squeeze(t) for t in self._model.run(feed, self._outputs))
         size = self._rule.size
         assert isinstance(size, FixedSize)
-        width = warp.shape[1]
-        symmetric = width * size.height == 2 * warp.shape[0] * size.width
-        half = width // 2 if symmetric else width
-        there = _warp(view_a, view_b, warp[:, :half, 2:], certainty[:, :half])
-        if not symmetric:
-            return there, None
-        return there, _warp(view_b, view_a, warp[:, half:, :2], certainty[:, half:])
+        return warp, certainty, warp.shape[1] * size.height == 2 * warp.shape[0] * size.width
 
 
 def _warp(view: View, other: View, target: Float32, certainty: Float32) -> Warp:

@@ -24,7 +24,7 @@ class RomaOptions(Options):
     """Names of the tensors of the warp and of its certainty."""
 
 
-class DenseOptions(RomaOptions):
+class DenseSearch(Options):
     """Matches of free positions."""
 
     cell: int = Field(4, ge=1)
@@ -34,10 +34,18 @@ class DenseOptions(RomaOptions):
     """Less certain matches are not given (RoMa's own threshold)."""
 
 
-class SparseOptions(RomaOptions):
+class SparseSearch(Options):
     """Matches of given keypoints."""
 
     snap_px: float = Field(2.0, gt=0)
     """Farthest that a keypoint may be from where the warp sends another one (reference)."""
     min_certainty: float = Field(0.05, ge=0, lt=1)
     """Smallest certainty of the warp at a keypoint (RoMa's own threshold)."""
+
+
+class DenseOptions(RomaOptions, DenseSearch):
+    """Of ``roma``."""
+
+
+class SparseOptions(RomaOptions, SparseSearch):
+    """Of ``roma-sparse``."""

@@ -1,0 +1,1 @@
+"""The matchers of vismatch, a collection of matching networks in torch."""

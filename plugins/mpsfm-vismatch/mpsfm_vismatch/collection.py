@@ -1,0 +1,37 @@
+"""A network of the collection by name."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from mpsfm_core import ProviderContext
+from mpsfm_core.errors import ConfigError, did_you_mean
+from mpsfm_core.torch_runtime import use_threads
+
+
+def load(name: str, context: ProviderContext, max_keypoints: int = 2048) -> Any:
+    """The matcher of a name, or of a class as ``package.module:Class``, on the context's device.
+
+    The collection gets weights by itself and keeps them where its sources do (the Hub's cache,
+    torch's). Raises :class:`~mpsfm_core.errors.ConfigError` for what it does not know.
+    """
+    use_threads(context)
+    if ":" in name:
+        module, _, attribute = name.partition(":")
+        make = getattr(importlib.import_module(module), attribute)
+        return make(device=context.device, max_num_keypoints=max_keypoints)
+    import vismatch
+
+    if name not in vismatch.available_models:
+        hint = did_you_mean(name, vismatch.available_models)
+        raise ConfigError(f"vismatch {vismatch.__version__} knows no {name!r}{hint}")
+    return vismatch.get_matcher(name, device=context.device, max_num_keypoints=max_keypoints)
+
+
+def part(matcher: Any, name: str, *attributes: str) -> Any:
+    """The inner network, which matchers of the collection call this or that."""
+    for attribute in attributes:
+        if hasattr(matcher, attribute):
+            return getattr(matcher, attribute)
+    raise ConfigError(f"{name!r} has none of {', '.join(attributes)}: it is of another kind")

@@ -1,0 +1,46 @@
+"""How the contract kit tests the matchers without weights."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+from mpsfm_core.testing import Setup
+
+_REAL = "sift-nn"
+_STAND_IN = "mpsfm_vismatch.stand_in"
+_SMALL = {"network": f"{_STAND_IN}:Matching", "resize": 96}
+"""So that comparing all pixels is quick."""
+
+
+def vismatch(folder: Path) -> Setup:
+    """The collection's own matcher without weights; a stand-in where it is not installed."""
+    return Setup(options={"network": _REAL} if find_spec("vismatch") else _SMALL, knows="seen")
+
+
+def vismatch_sparse(folder: Path) -> Setup:
+    """The same, at keypoints of any detector."""
+    options = {"network": _REAL} if find_spec("vismatch") else _SMALL
+    return Setup(options={**options, "snap_px": 3.0}, knows="seen")
+
+
+def vismatch_roma(folder: Path) -> Setup:
+    """Symmetric, with every position of a coarse grid."""
+    options = {"network": f"{_STAND_IN}:Warping", "cell": 1, "min_certainty": 0.5}
+    return Setup(options=options, knows="seen")
+
+
+def vismatch_roma_sparse(folder: Path) -> Setup:
+    """The coarse grid needs a wider reach than RoMa's sub-pixel warp."""
+    options = {"network": f"{_STAND_IN}:Warping", "snap_px": 3.0, "min_certainty": 0.5}
+    return Setup(options=options, knows="seen")
+
+
+def vismatch_mast3r(folder: Path) -> Setup:
+    """Small, so that comparing all pixels is quick."""
+    return Setup(options={"network": f"{_STAND_IN}:Pointing", "size": 128}, knows="seen")
+
+
+def vismatch_mast3r_sparse(folder: Path) -> Setup:
+    """The same at the keypoints of any detector."""
+    return Setup(options={"network": f"{_STAND_IN}:Pointing", "size": 128}, knows="seen")

@@ -1,0 +1,121 @@
+"""Any network of the collection: the positions that it matches, or keypoints that are near them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from mpsfm_core import (
+    DenseMatches,
+    Features,
+    PairMatches,
+    ProviderContext,
+    SparseMatches,
+    View,
+)
+from mpsfm_core.data import Float32, Float64
+from mpsfm_core.geometry import inside, resize_map, scale_pixels
+from mpsfm_core.providers import required_features
+from mpsfm_core.torch_runtime import inference
+from mpsfm_vismatch.collection import load
+from mpsfm_vismatch.options import CollectionOptions, SnapOptions
+
+_STD_DETECTED_PX, _STD_DENSE_PX = 1.0, 0.5
+"""Localisation noise in pixels of the image that was shown (reference)."""
+_OF_CORNERS = ("roma", "redimatch", "gim-dkm", "loftr", "xoftr", "aspanformer", "matchformer")
+_OF_CORNERS += ("topicfm", "edm", "matchanything", "dedode", "steerers", "loma")
+"""Parts of the names of networks whose positions are parts of an image's width and height, or
+that were trained on such: as COLMAP's. All others count from the centre of the first pixel."""
+_OF_OPENCV = ("sift", "doghardnet-lightglue")
+"""OpenCV's SIFT doubles the image so that its positions are a quarter of a pixel less."""
+
+
+class DenseMatcher:
+    """All that the network matches, each as certain as it says; 1 where it does not say."""
+
+    def __init__(self, options: CollectionOptions, context: ProviderContext) -> None:
+        self._matcher = load(options.network, context, options.max_keypoints)
+        self._matcher.skip_ransac = True  # or it looks for a homography
+        self._resize, self._seed = options.resize, context.seed
+        self._first = _first_pixel(options.network)
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """Matches of free positions."""
+        return PairMatches(dense=self._matched(view_a, view_b))
+
+    def _matched(self, *views: View) -> DenseMatches:
+        images = [self._shown(view) for view in views]
+        np.random.seed(self._seed)  # some draw from a warp, with either of these
+        torch.manual_seed(self._seed)
+        with inference():
+            found = self._matcher(*images)
+        points = [
+            self._in_view(view, image, found[f"matched_kpts{side}"])
+            for side, (view, image) in enumerate(zip(views, images, strict=True))
+        ]
+        scores = found["matched_confidences"]
+        if scores is None:
+            scores = np.ones(len(points[0]))
+        keep = inside(points[0], views[0].camera.size) & inside(points[1], views[1].camera.size)
+        pixel = max(v.camera.width / i.shape[2] for v, i in zip(views, images, strict=True))
+        std_px = _STD_DETECTED_PX if len(found["all_kpts0"]) else _STD_DENSE_PX
+        certain: Float32 = np.clip(scores, 0, 1).astype(np.float32)
+        return DenseMatches(
+            points[0][keep], points[1][keep], certain[keep], max(1.0, std_px * pixel)
+        )
+
+    def _shown(self, view: View) -> torch.Tensor:
+        """(3, h, w) float32, RGB in [0, 1]."""
+        scale = min(1.0, (self._resize or np.inf) / max(view.camera.size))
+        width, height = (max(1, round(side * scale)) for side in view.camera.size)
+        image = resize_map(view.image, width, height) / np.float32(255)
+        return torch.from_numpy(image).permute(2, 0, 1).contiguous()
+
+    def _in_view(self, view: View, image: torch.Tensor, xy: Float64) -> Float64:
+        shown = np.asarray(xy, dtype=np.float64).reshape(-1, 2) + self._first
+        return scale_pixels(shown, (image.shape[2], image.shape[1]), view.camera.size)
+
+
+def _first_pixel(network: str) -> float:
+    """What the centre of the first pixel is in COLMAP's count, less what it is in the network's."""
+    if any(part in network for part in _OF_OPENCV):
+        return 0.25
+    of_corners = any(part in network for part in _OF_CORNERS)
+    return 0.0 if of_corners and not network.startswith("xfeat") else 0.5  # xfeat-steerers
+
+
+class SparseMatcher(DenseMatcher):
+    """Keypoints that are near to both positions of a match."""
+
+    def __init__(self, options: SnapOptions, context: ProviderContext) -> None:
+        super().__init__(options, context)
+        self._snap_px = options.snap_px
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """The most certain ones first, each keypoint once."""
+        given = required_features("vismatch-sparse matches keypoints", features_a, features_b)
+        found = self._matched(view_a, view_b)
+        nearest = np.empty((len(found), 2), dtype=np.int64)
+        near = np.ones(len(found), dtype=np.bool_)
+        for side, (features, xy) in enumerate(
+            zip(given, (found.points_a, found.points_b), strict=True)
+        ):
+            if not len(features):
+                near[:] = False
+                continue
+            distance, nearest[:, side] = cKDTree(features.keypoints).query(xy)
+            near &= distance <= self._snap_px
+        return PairMatches(sparse=SparseMatches.best_first(nearest[near], found.scores[near]))

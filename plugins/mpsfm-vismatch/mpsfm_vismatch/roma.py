@@ -1,0 +1,53 @@
+"""RoMa's authors' network in the place of an ONNX file."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import mpsfm_roma.matcher as roma
+import numpy as np
+from mpsfm_roma.network import WarpNetwork
+from numpy.typing import NDArray
+from PIL import Image
+
+from mpsfm_core import ProviderContext, View
+from mpsfm_core.torch_runtime import inference
+from mpsfm_vismatch.collection import load, part
+from mpsfm_vismatch.options import RomaNetwork
+
+
+class TorchWarpNetwork(WarpNetwork):
+    """Its own ``match``, with its own resizing and both its passes.
+
+    The images go through files, since it opens them a second time at the size of its second pass.
+    """
+
+    def __init__(self, options: RomaNetwork, context: ProviderContext) -> None:
+        matcher = load(options.network, context)
+        self._network = part(matcher, options.network, "roma_model", "matcher", "model")
+        self._device = context.device
+
+    def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
+        """See :class:`~mpsfm_roma.network.WarpNetwork`."""
+        with tempfile.TemporaryDirectory(prefix="mpsfm-") as folder, inference():
+            paths = []
+            for side, view in zip("ab", (view_a, view_b), strict=True):
+                paths.append(str(Path(folder, f"{side}.png")))
+                Image.fromarray(view.image).save(paths[-1], compress_level=0)
+            warp, certainty = self._network.match(*paths, device=self._device)
+        arrays = (np.squeeze(t.float().cpu().numpy()) for t in (warp, certainty))
+        return *arrays, bool(self._network.symmetric)
+
+
+class DenseMatcher(roma.DenseMatcher):
+    """See :class:`mpsfm_roma.matcher.DenseMatcher`."""
+
+    network = TorchWarpNetwork
+
+
+class SparseMatcher(roma.SparseMatcher):
+    """See :class:`mpsfm_roma.matcher.SparseMatcher`."""
+
+    network = TorchWarpNetwork

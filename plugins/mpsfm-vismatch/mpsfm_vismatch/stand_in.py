@@ -1,0 +1,114 @@
+"""Small matchers with the interface of the collection's, and no weights: they match by the pixels
+around each pixel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch.nn.functional import normalize, unfold
+
+_SIDE, _REACH = 5, 3
+_STEP = 3
+"""Of the positions that :class:`Matching` looks for: odd, as they would all be rounded to one side
+in an image of half the size."""
+_GRID = (42, 56)
+"""Rows and columns of the warp."""
+_FLAT = 0.05
+"""Contrast of what is as much noise as it is texture."""
+
+
+def _described(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Unit descriptors (h * w, d) of an image (1, 3, h, w), less long in flat regions, and the
+    contrast (h * w,)."""
+    around = unfold(image, _SIDE, dilation=_REACH, padding=_SIDE // 2 * _REACH)[0].T
+    around = around - around.mean(dim=1, keepdim=True)
+    contrast = around.norm(dim=1) + _FLAT
+    return around / contrast[:, None], contrast
+
+
+class Warping:
+    """As RoMa's matcher; it is its own network."""
+
+    symmetric = True
+
+    def __init__(self, device: str = "cpu", max_num_keypoints: int = 2048) -> None:
+        self.roma_model = self
+
+    def match(self, path_a: str, path_b: str, device: str) -> tuple[torch.Tensor, torch.Tensor]:
+        """Warp and certainty of a coarse grid, both ways."""
+        height, width = _GRID
+        a, b = (_described(_opened(path, (width, height)))[0] for path in (path_a, path_b))
+        similarity = a @ b.T
+        x, y = (torch.linspace(-1 + 1 / n, 1 - 1 / n, n) for n in (width, height))
+        grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
+        there, back = similarity.max(dim=1), similarity.max(dim=0)
+        maps = [
+            torch.cat(pair, dim=1).reshape(height, width, 4)
+            for pair in ((grid, grid[there.indices]), (grid[back.indices], grid))
+        ]
+        sure = [found.values.clamp(0, 1).reshape(height, width) ** 2 for found in (there, back)]
+        return torch.cat(maps, dim=1), torch.cat(sure, dim=1)
+
+
+class Pointing:
+    """As MASt3R's matcher; points are its colours, moved away from the camera."""
+
+    def __init__(self, device: str = "cpu", max_num_keypoints: int = 2048) -> None:
+        self.model = torch.nn.Module()
+        self.model.forward = self.forward  # type: ignore[method-assign]
+
+    def forward(self, *views: dict[str, Any]) -> list[dict[str, torch.Tensor]]:
+        """Of both views."""
+        answers = []
+        for view, name in zip(views, ("pts3d", "pts3d_in_other_view"), strict=True):
+            image = view["img"]
+            shape = (1, *image.shape[2:])
+            described, contrast = _described(image)
+            answers.append(
+                {
+                    name: image.permute(0, 2, 3, 1) + 2,
+                    "conf": contrast.reshape(shape) + 1,
+                    "desc": normalize(described, dim=1).reshape(*shape, -1),
+                    "desc_conf": contrast.reshape(shape),
+                }
+            )
+        return answers
+
+
+class Matching:
+    """As any matcher: mutual neighbours of a grid of positions, which it gives as counted from the
+    centre of the first pixel."""
+
+    def __init__(self, device: str = "cpu", max_num_keypoints: int = 2048) -> None:
+        self._most = max_num_keypoints
+
+    def __call__(self, image_a: torch.Tensor, image_b: torch.Tensor) -> dict[str, Any]:
+        """The collection's dictionary."""
+        a, b = (_described(image[None])[0] for image in (image_a, image_b))
+        width = image_a.shape[2]
+        columns, rows = torch.meshgrid(
+            torch.arange(0, width, _STEP), torch.arange(0, image_a.shape[1], _STEP), indexing="xy"
+        )
+        cells = (rows * width + columns).reshape(-1)
+        similarity, there = (a[cells] @ b.T).max(dim=1)
+        back = (b[there] @ a.T).argmax(dim=1)
+        kept = torch.nonzero(back == cells)[: self._most, 0]
+        cells, there = cells[kept], there[kept]
+        return {
+            "all_kpts0": np.empty((0, 2)),
+            "matched_kpts0": _positions(cells, width),
+            "matched_kpts1": _positions(there, image_b.shape[2]),
+            "matched_confidences": similarity[kept].numpy(),
+        }
+
+
+def _positions(cells: torch.Tensor, width: int) -> np.ndarray[Any, Any]:
+    return torch.stack([cells % width, cells // width], dim=1).double().numpy()
+
+
+def _opened(path: str, size: tuple[int, int]) -> torch.Tensor:
+    image = Image.open(path).resize(size, Image.Resampling.BICUBIC)
+    return torch.from_numpy(np.array(image)).permute(2, 0, 1)[None] / 127.5 - 1

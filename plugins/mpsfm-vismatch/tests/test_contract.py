@@ -1,0 +1,24 @@
+"""The contract: on stand-ins with the collection's interface, on the collection where it is."""
+
+from dataclasses import replace
+
+import pytest
+
+pytest.importorskip("torch")
+
+from mpsfm_vismatch.plugin import mpsfm_providers
+
+from mpsfm_core.builtin import plugin as builtin
+from mpsfm_core.registry import Registry
+from mpsfm_core.testing import contract_tests
+
+registry = Registry()
+registry.register(builtin)
+registry.add(*(replace(spec, requires=("torch",)) for spec in mpsfm_providers()))
+
+test_dense = contract_tests("matcher", "vismatch", registry=registry)
+test_sparse = contract_tests("matcher", "vismatch-sparse", registry=registry)
+test_roma = contract_tests("matcher", "vismatch-roma", registry=registry)
+test_roma_sparse = contract_tests("matcher", "vismatch-roma-sparse", registry=registry)
+test_mast3r = contract_tests("matcher", "vismatch-mast3r", registry=registry)
+test_mast3r_sparse = contract_tests("matcher", "vismatch-mast3r-sparse", registry=registry)
