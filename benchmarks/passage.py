@@ -2,7 +2,7 @@
 
 A provider that only returns what it holds, asked through a worker process: CPU time of both
 processes for a view of a megapixel and a depth map of a megapixel, without and with its variance.
-The best of some rounds. How an answer is validated is not in it: that is the same for all providers.
+The best of some rounds. How an answer is validated is not in it: that is so for all providers.
 """
 
 from __future__ import annotations

@@ -14,11 +14,11 @@ from mpsfm_core.environments.channel import Channel
 @pytest.fixture
 def ends(tmp_path):
     """One that asks, whose answers are lent, and one that answers."""
-    there, back = os.pipe(), os.pipe()
+    there, back, modes = os.pipe(), os.pipe(), ("rb", "wb")
     with ExitStack() as stack:
-        (ask_out, answer_in), (answer_out, ask_in) = (
-            (stack.enter_context(os.fdopen(write, "wb")), stack.enter_context(os.fdopen(read, "rb")))
-            for read, write in (there, back)
+        (answer_in, ask_out), (ask_in, answer_out) = (
+            [stack.enter_context(os.fdopen(end, mode)) for end, mode in zip(p, modes, strict=True)]
+            for p in (there, back)
         )
         asking = Channel(ask_in, ask_out, tmp_path, "a", "b", lent=2)
         yield asking, Channel(answer_in, answer_out, tmp_path, "b", "a")

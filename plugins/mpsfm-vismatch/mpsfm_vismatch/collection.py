@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from mpsfm_core import ProviderContext
@@ -27,6 +28,17 @@ def load(name: str, context: ProviderContext, max_keypoints: int = 2048) -> Any:
         hint = did_you_mean(name, vismatch.available_models)
         raise ConfigError(f"vismatch {vismatch.__version__} knows no {name!r}{hint}")
     return vismatch.get_matcher(name, device=context.device, max_num_keypoints=max_keypoints)
+
+
+def at_home(matcher: Any) -> AbstractContextManager[Any]:
+    """While this lasts, the code of a matcher of the collection finds what it imports."""
+    home = type(matcher).__module__
+    if not home.startswith("vismatch."):
+        return nullcontext()
+    from vismatch.import_sandbox import ImportSandbox
+
+    sandbox: AbstractContextManager[Any] = ImportSandbox.get(home)
+    return sandbox
 
 
 def part(matcher: Any, name: str, *attributes: str) -> Any:
