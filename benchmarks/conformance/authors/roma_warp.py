@@ -1,0 +1,24 @@
+"""RoMa's warp by its authors' code: ``python roma_warp.py CHECKOUT PHOTO PHOTO OUTPUT``.
+
+Run where torchvision is. The matches are as their ``to_pixel_coordinates`` gives them.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import torch
+from mpsfm_vismatch.seeded_roma import network
+from PIL import Image
+
+checkout, first, second, output = sys.argv[1:]
+sys.path.insert(0, checkout)
+from romatch import roma_outdoor  # noqa: E402
+
+model = network(roma_outdoor)
+with torch.inference_mode():
+    warp, certainty = model.match(first, second, device="cpu")
+    sizes = [Image.open(path).size[::-1] for path in (first, second)]
+    a, b = model.to_pixel_coordinates(warp.reshape(-1, 4), *sizes[0], *sizes[1])
+np.savez(output, a=a, b=b, certainty=np.squeeze(certainty))  # newer code has a batch dimension

@@ -1,0 +1,52 @@
+"""RoMa's own architecture with seeded random weights: to compare what runs it, without weights."""
+
+from __future__ import annotations
+
+import inspect
+import zlib
+from collections.abc import Callable
+from typing import Any
+from unittest.mock import patch
+
+import torch
+
+from mpsfm_vismatch.collection import at_home
+
+COARSE, FINE = 560, 280
+"""Sides of the images of either pass; the published ones are 560 and 864. With another one than 560
+in the first pass versions of the authors' code disagree about the reach of its refinement."""
+
+
+def network(roma_outdoor: Callable[..., Any], device: str = "cpu") -> Any:
+    """What the authors' function makes, of whatever version of their code: each tensor is drawn by
+    its own name."""
+    options = {"coarse_res": COARSE, "upsample_res": FINE, "use_custom_corr": False}
+    known = inspect.signature(roma_outdoor).parameters
+    with patch.object(torch.nn.Module, "load_state_dict"):  # there is nothing to load
+        made = roma_outdoor(
+            device=device,
+            weights={},
+            dinov2_weights={},
+            **{name: value for name, value in options.items() if name in known},
+        )
+    state = made.state_dict()
+    state |= {f"dinov2.{n}": t for n, t in made.encoder.dinov2_vitl14[0].state_dict().items()}
+    for name, tensor in state.items():
+        if tensor.is_floating_point() and not name.endswith("running_var"):
+            generator = torch.Generator().manual_seed(zlib.crc32(name.encode()))
+            drawn = torch.randn(tensor.shape, generator=generator)
+            size = tensor.shape[1:].numel() if tensor.ndim > 1 else 400
+            tensor.copy_(drawn / size**0.5 + (tensor.ndim == 1 and name.endswith("weight")))
+    return made.eval()
+
+
+class Matcher:
+    """As the collection's, whose copy of the authors' code it runs, at home where that is."""
+
+    __module__ = "vismatch.im_models.roma"
+
+    def __init__(self, device: str = "cpu", max_num_keypoints: int = 2048) -> None:
+        from vismatch.im_models.roma import roma_outdoor
+
+        with at_home(self):
+            self.roma_model = network(roma_outdoor, device)
