@@ -66,6 +66,7 @@ from mpsfm_core.results.writer import (
 from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
 from mpsfm_core.stages import Stages
 from mpsfm_core.threads import allowed, limited
+from mpsfm_core.weights import WeightStore
 
 PathLike = str | Path
 
@@ -255,16 +256,17 @@ class _Run:
     def _foresee(self, images: ImageSet) -> None:
         """Say what the run will take; raises :class:`InputError` where that cannot be had."""
         config, registry = self._provision.config, self._registry
-        files = [
-            file
+        store = WeightStore(config.runtime.cache_dir, offline=True)
+        networks = {  # one that gives two things at once is there once
+            (backend.use, file.uri): resources.network_bytes(file, store)
             for _, kind, backend in config.backends()
             for file in registry.weights(kind, backend.use, backend.options)
-        ]
+        }
         self._needs = resources.predict(
             [image.pinhole.size for image in images],
             config,
             [choice.provider for choice in self._provision.choices],
-            sum(file.size or 0 for file in files),
+            list(networks.values()),
         )
         self._stages.notice(f"takes about {self._needs}")
         if config.runtime.check_resources:

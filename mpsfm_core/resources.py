@@ -14,6 +14,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 
 import psutil
@@ -25,7 +26,8 @@ from mpsfm_core.extraction.backends import worker_count
 from mpsfm_core.extraction.features import CACHED_BYTES as CACHED_FEATURES
 from mpsfm_core.extraction.priors import integration_grid
 from mpsfm_core.inputs.images import CACHED_BYTES as CACHED_VIEWS
-from mpsfm_core.providers import ProviderSpec
+from mpsfm_core.providers import ProviderSpec, WeightsFile
+from mpsfm_core.weights import WeightStore
 
 TOLERANCE = 1.3
 """The prediction is to be off by less than this factor."""
@@ -40,7 +42,11 @@ _COMPILED_MB = 54.0
 _WORKER_BYTES = 350.0
 """A pixel of the photo that a worker has in hand: SIFT's pyramid of the doubled image."""
 _WEIGHTS = 2.0
-"""Times its size a network is in memory, in each worker (estimated)."""
+"""Times the size of its file a network is in memory, in each worker: in ONNX Runtime 1.7 (MoGe-2
+ViT-S, 98 MB) and 1.8 (DSINE, 339 MB). While it is loaded it may be more, 4.3 for DSINE."""
+_WORKING, _MOST_WORKING_MB = 3.0, 320.0
+"""Times that size what it computes with, and how much at most: 317 MB for MoGe-2 with 1800 tokens
+and for DSINE at 1024 x 683, which is 3.2 and 0.9 times their size."""
 _PRIOR_BYTES = 106.0
 """A pixel of the prior maps: depth and normals with variances (26), and what mapping adds (80)."""
 _DENSE_BYTES = 12.0
@@ -99,12 +105,12 @@ def predict(
     sizes: Sequence[tuple[int, int]],
     config: Config,
     providers: Sequence[ProviderSpec],
-    weights: int,
+    networks: Sequence[int],
 ) -> Needs:
     """What a run will take.
 
     ``sizes``: (width, height) of the undistorted views. ``providers``: those that were chosen;
-    ``weights``: bytes of all their networks.
+    ``networks``: bytes of each network's file, see :func:`network_bytes`.
     """
     count, workers = len(sizes), worker_count(config.runtime)
     pixels = [width * height for width, height in sizes]
@@ -115,7 +121,9 @@ def predict(
     features = _KEYPOINT_BYTES * sum(min(most, size / _KEYPOINT_PIXELS) for size in pixels)
     memory = (_PROGRAM_MB + _COMPILED_MB + torch * _TORCH_MB) * _MB
     memory += min(CACHED_VIEWS, 3 * sum(pixels)) + min(CACHED_FEATURES, features)
-    memory += _PRIOR_BYTES * prior + workers * (_WORKER_BYTES * max(pixels) + _WEIGHTS * weights)
+    memory += _PRIOR_BYTES * prior + workers * _WORKER_BYTES * max(pixels)
+    for size in networks:
+        memory += workers * (_WEIGHTS * size + min(_WORKING * size, _MOST_WORKING_MB * _MB))
     cache = features + _CACHE_MAP_MB * _MB * count + _CACHE_PAIR_BYTES * _pairs(count, config)
     if config.dense.enabled:
         dense = [math.prod(dense_size(size, config.dense.max_size)) for size in sizes]
@@ -128,6 +136,15 @@ def predict(
     output = _WRITTEN_POINT_BYTES * points + results.depth_maps * _WRITTEN_BYTES * final
     output += results.report * (_PAGE_MB + _PAGE_PHOTO_MB * count) * _MB
     return Needs(round(memory / _MB), round(cache / _MB), round(output / _MB))
+
+
+def network_bytes(file: WeightsFile, store: WeightStore) -> int:
+    """Of a network's file, with what lies beside it where it is in parts; as its publisher says
+    where it is not on this machine, 0 where nobody says it."""
+    path = store.locate(file.uri)
+    if path is None:
+        return file.size or 0
+    return sum(part.stat().st_size for part in path.parent.glob(f"{escape(path.name)}*"))
 
 
 def shortages(needs: Needs, cache: Path, output: Path | None) -> list[str]:

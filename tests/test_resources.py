@@ -13,7 +13,9 @@ from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.errors import InputError
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.options import Backend
+from mpsfm_core.providers import WeightsFile
 from mpsfm_core.resources import Needs, predict, shortages
+from mpsfm_core.weights import WeightStore
 
 SIZE = (640, 480)
 
@@ -30,19 +32,31 @@ def config(**changes: object) -> Config:
 
 
 def test_what_a_run_takes_grows_with_what_it_is_given() -> None:
-    few, many = (predict([SIZE] * count, config(), (), 0) for count in (10, 100))
+    few, many = (predict([SIZE] * count, config(), (), ()) for count in (10, 100))
     assert many.memory_mb > few.memory_mb + 90 * 15 and many.cache_mb > 9 * few.cache_mb
-    large = predict([(1280, 960)] * 10, config(), (), 0)
+    large = predict([(1280, 960)] * 10, config(), (), ())
     assert large.memory_mb > few.memory_mb
-    sparse = predict([SIZE] * 100, config(dense={"enabled": False}), (), 0)
+    sparse = predict([SIZE] * 100, config(dense={"enabled": False}), (), ())
     assert sparse.memory_mb < many.memory_mb and sparse.output_mb < many.output_mb
-    maps = predict([SIZE] * 100, config(results={"dense_cloud": False}), (), 0)
+    maps = predict([SIZE] * 100, config(results={"dense_cloud": False}), (), ())
     assert maps.memory_mb < many.memory_mb and maps.output_mb < many.output_mb
-    pairs = predict([SIZE] * 100, config(pairs={"mode": "sequential"}), (), 0)
+    pairs = predict([SIZE] * 100, config(pairs={"mode": "sequential"}), (), ())
     assert pairs.cache_mb < many.cache_mb
-    workers = predict([SIZE] * 10, config(runtime=RuntimeOptions(workers=4)), (), 0)
-    network = predict([SIZE] * 10, config(), (), 100 << 20)
-    assert workers.memory_mb > few.memory_mb and network.memory_mb == few.memory_mb + 200
+    workers = predict([SIZE] * 10, config(runtime=RuntimeOptions(workers=4)), (), ())
+    network = predict([SIZE] * 10, config(), (), [200 << 20])
+    assert workers.memory_mb > few.memory_mb and network.memory_mb == few.memory_mb + 720
+
+
+def test_the_size_of_a_network_is_that_of_its_files(tmp_path: Path) -> None:
+    store = WeightStore(tmp_path / "cache", offline=True)
+    path = tmp_path / "large.onnx"
+    path.write_bytes(bytes(10))
+    assert resources.network_bytes(WeightsFile(str(path), size=1), store) == 10
+    path.with_name("large.onnx.data").write_bytes(bytes(2000))
+    assert resources.network_bytes(WeightsFile(str(path)), store) == 2010
+    absent = WeightsFile("https://example.com/a.onnx", size=300)
+    assert resources.network_bytes(absent, store) == 300
+    assert resources.network_bytes(WeightsFile("https://example.com/b.onnx"), store) == 0
 
 
 @pytest.fixture
