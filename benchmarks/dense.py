@@ -27,7 +27,7 @@ import pycolmap
 
 from benchmarks._scenes import shared_folder
 from benchmarks.accuracy import FASTDEPTH, PRIORS
-from mpsfm_core.data import DepthPrior, Float64, MappingProblem, NormalPrior, Pose
+from mpsfm_core.data import Bool, DepthPrior, Float64, MappingProblem, NormalPrior, Pose
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
@@ -43,6 +43,7 @@ from mpsfm_core.geometry import (
     project,
     rays,
     sample_bilinear,
+    sample_nearest,
     scale_pixels,
     transform,
     triangulation_angle_deg,
@@ -61,8 +62,6 @@ NEAR = 0.1
 """Relative error of depth that counts as near."""
 WAYS = ("mapper", "dense")
 """Maps as the mapper refined them, and after the dense stage."""
-CERTAIN = 0.02
-"""Relative std up to which depth counts as measured in the photos."""
 POINT_NEAR = 0.01
 """The same at true points."""
 ANGLE, ERROR_PX = 3.0, 1.0
@@ -169,16 +168,17 @@ def measured(
     for way in WAYS:
         found = []
         for item in mapped:
-            model, seconds = item.reconstruction, 0.0
+            model, seconds, seen = item.reconstruction, 0.0, {}
             if way == "dense":
                 started = time.process_time()
-                model, _ = densify(model, view_of(photos), DenseOptions(), workers=1)
+                model, report = densify(model, view_of(photos), DenseOptions(), workers=1)
+                seen = report.measured
                 seconds = (time.process_time() - started) / len(model.images)
-            maps = {image.name: image.depth for image in model.images}
             cloud, *_ = fuse_depth_maps(model, view_of(photos), ResultOptions())
-            errors = set_errors(scene, problem, model, maps, cloud)
+            errors = set_errors(scene, problem, model, seen, cloud)
             found.append({**errors, "cpu_s_photo": seconds})
-        rows.append({"case": name, "maps": way, **_means(found)})
+        usable = [each for each in found if len(each) > 1]
+        rows.append({"case": name, "maps": way, "sets": len(usable), **_means(usable)})
     return rows
 
 
@@ -192,13 +192,15 @@ def set_errors(
     scene: SceneFolder,
     problem: MappingProblem | None,
     reconstruction: Reconstruction,
-    maps: Mapping[str, DepthPrior],
+    seen: Mapping[str, Bool],
     cloud: Float64,
 ) -> dict[str, float]:
     """Errors of the depth maps and of the cloud (n, 3) of one set; empty if it has no scale.
 
-    ``problem``: what was mapped, where matches tell the true depth.
+    ``problem``: what was mapped, where matches tell the true depth. ``seen``: by image, (h, w), of
+    its map, pixels that were measured in the photos.
     """
+    maps = {image.name: image.depth for image in reconstruction.images}
     errors = trajectory_errors(reconstruction.poses, scene.truth)
     if errors is None:
         return {}
@@ -207,10 +209,10 @@ def set_errors(
         assert problem is not None
         return points_near(problem, scene.truth, maps, aligned.scale)
     found = [
-        map_errors(depth, aligned.scale, read_depth(depth_file(scene.depth, name)))
+        map_errors(depth, aligned.scale, read_depth(depth_file(scene.depth, name)), seen.get(name))
         for name, depth in maps.items()
     ]
-    result = {key: float(np.nanmean([each[key] for each in found])) for key in found[0]}
+    result = _means(found)
     accuracy = cloud_accuracy(aligned.apply(cloud), scan_of(scene, tuple(maps)), TOLERANCES)
     for tolerance in map(str, TOLERANCES):
         centimetres = round(100 * float(tolerance))
@@ -220,8 +222,11 @@ def set_errors(
     return result
 
 
-def map_errors(depth: DepthPrior, scale: float, truth: Float64) -> dict[str, float]:
-    """AbsRel, the share that is near, and the share within the stated std, of one map."""
+def map_errors(
+    depth: DepthPrior, scale: float, truth: Float64, seen: Bool | None
+) -> dict[str, float]:
+    """AbsRel and the share that is near of one map; of pixels that were ``seen`` and of the rest
+    the share within the stated std, and the part that the rest has in the AbsRel."""
     assert depth.variance is not None  # of a refined map always
     known = truth > 0
     height, width = truth.shape
@@ -233,13 +238,16 @@ def map_errors(depth: DepthPrior, scale: float, truth: Float64) -> dict[str, flo
     true = truth[known][ok]
     error = np.abs(scale * found[ok] - true)
     std = np.sqrt(np.maximum(variance[ok], 0))
-    within, certain = error <= scale * std, std <= CERTAIN * found[ok]
+    within, relative = error <= scale * std, error / true
+    own = np.zeros(grid, np.bool_) if seen is None else seen
+    measured = sample_nearest(own, xy)[ok]
     return {
-        "abs_rel": float((error / true).mean()),
+        "abs_rel": float(relative.mean()),
         "near": float((error <= NEAR * true).mean()),
-        "certain": float(certain.mean()),
-        "within_std_certain": float(within[certain].mean()) if certain.any() else np.nan,
-        "within_std_rest": float(within[~certain].mean()) if not certain.all() else np.nan,
+        "measured": float(measured.mean()),
+        "abs_rel_of_rest": float(relative[~measured].sum() / len(relative)),
+        "within_std_measured": float(within[measured].mean()) if measured.any() else np.nan,
+        "within_std_rest": float(within[~measured].mean()) if not measured.all() else np.nan,
     }
 
 
@@ -301,9 +309,9 @@ def points_near(
 
 
 def _means(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    usable = [each for each in found if len(each) > 1]
-    means = {key: float(np.nanmean([each[key] for each in usable])) for key in usable[0]}
-    return {"sets": len(usable), **means}
+    """Of each key, over those that have a value."""
+    values = {key: [each[key] for each in found if np.isfinite(each[key])] for key in found[0]}
+    return {key: float(np.mean(known)) if known else np.nan for key, known in values.items()}
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -23,6 +23,7 @@ from mpsfm_core.dense.mesh import Mesh, mesh_of_depth_maps
 from mpsfm_core.dense.options import DenseOptions, MeshOptions
 from mpsfm_core.dense.sparse_depth import depth_of_points
 from mpsfm_core.dense.stage import DenseReport, densify
+from mpsfm_core.disk_arrays import DiskArrays
 from mpsfm_core.errors import ConfigError, InputError, ReconstructionError
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.focal import estimate_focals
@@ -323,6 +324,7 @@ class _Run:
         if not config.dense.enabled:
             return mapping, None
         parts, reports = [], []
+        disk = DiskArrays(cache_folder(config.runtime.cache_dir))
         with self._stages.stage("dense"):
             for part in mapping.reconstructions:
                 dense, report = densify(
@@ -332,9 +334,10 @@ class _Run:
                     None,
                     partial(self._stages.stage_progress, "dense"),
                     self._dense_checkpoints(part, photos),
+                    disk.keep,
                 )
                 parts.append(dense)
-                reports.append(asdict(report))
+                reports.append(report.describe())
         return replace(mapping, reconstructions=tuple(parts)), reports
 
     def _georeference(self, images: ImageSet, mapping: MappingResult) -> MappingResult:
@@ -527,7 +530,8 @@ def _densify_model(
     if not known.images:
         raise InputError(f"{model}: has no points, so nothing says how far the surfaces are")
     view_of = _view_of(photos)
-    dense, report = densify(known, view_of, options or DenseOptions())
+    disk = DiskArrays(cache_folder())
+    dense, report = densify(known, view_of, options or DenseOptions(), keep=disk.keep)
     with replacing(output, (SPARSE, DENSE, DEPTH)) as folder:
         write_model(folder / SPARSE, colmap)
         write_depth_maps(folder / DEPTH, dense)

@@ -21,6 +21,7 @@ import psutil
 
 from mpsfm_core.config import Config
 from mpsfm_core.dense.view import dense_size
+from mpsfm_core.disk_arrays import IN_MEMORY
 from mpsfm_core.errors import InputError
 from mpsfm_core.extraction.backends import worker_count
 from mpsfm_core.extraction.features import CACHED_BYTES as CACHED_FEATURES
@@ -50,8 +51,10 @@ and for DSINE at 1024 x 683, which is 3.2 and 0.9 times their size."""
 _PRIOR_BYTES = 106.0
 """A pixel of the prior maps: depth and normals with variances (26), and what mapping adds (80)."""
 _DENSE_BYTES = 12.0
-"""A pixel of the dense stage: the final map (9), and what was found (14) as far as it does not fit
+"""A pixel of the dense stage: the final map (9), and what was found (11) as far as it does not fit
 into what earlier stages left free."""
+_DENSE_KEPT_BYTES = 20.0
+"""Both, all of it, for what is on disk where it is too much."""
 _DENSE_WORKER_BYTES = 320.0
 """A pixel of the photo that a worker matches: 11 labels, each of a byte from 5 views and of 6
 arrays of 4 bytes. On the coarse grid it may be 700, in what earlier stages left free."""
@@ -128,8 +131,9 @@ def predict(
     if config.dense.enabled:
         dense = [math.prod(dense_size(size, config.dense.max_size)) for size in sizes]
         final = sum(dense)
-        memory += _DENSE_BYTES * final + workers * _DENSE_WORKER_BYTES * max(dense)
-        cache += _DENSE_CACHE_BYTES * final
+        memory += min(_DENSE_BYTES * final, IN_MEMORY)
+        memory += workers * _DENSE_WORKER_BYTES * max(dense)
+        cache += _DENSE_CACHE_BYTES * final + max(0.0, _DENSE_KEPT_BYTES * final - IN_MEMORY)
     results = config.results
     points = results.dense_cloud * min(results.dense_max_points, _POINTS * final)
     memory += _RESULT_BYTES * final + _POINT_BYTES * points

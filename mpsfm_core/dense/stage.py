@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, View
 from mpsfm_core.dense.consistency import Agreement, compare_depth, splat_depth
@@ -21,6 +22,7 @@ from mpsfm_core.geometry import resize_map
 from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.threads import allowed
 
+_T = TypeVar("_T", bound=np.generic)
 _MAX_COST = 0.9
 """Of depth that counts as measured: black photos agree on everything (ours)."""
 _NOISE_FACTOR = 1.25
@@ -38,11 +40,28 @@ _SEEN_FACTOR = 3.0
 
 @dataclass(frozen=True)
 class DenseReport:
-    """For people and the summary: ``sources``: image name -> the views it was matched with;
-    ``confirmed``: image name -> share of its pixels whose depth other views confirm."""
+    """``sources``: image name -> the views it was matched with; ``confirmed``: image name -> share
+    of its pixels whose depth other views confirm; ``measured``: image name -> (h, w) bool, where
+    the photos say something about depth, and not the map before alone."""
 
     sources: dict[str, list[str]]
     confirmed: dict[str, float]
+    measured: dict[str, Bool]
+
+    def describe(self) -> dict[str, Any]:
+        """For the summary."""
+        return {"sources": self.sources, "confirmed": self.confirmed}
+
+
+class Keep(Protocol):
+    """Gives an array of the same values that is held instead, in memory or elsewhere."""
+
+    def __call__(self, array: NDArray[_T]) -> NDArray[_T]: ...
+
+
+def in_memory(array: NDArray[_T]) -> NDArray[_T]:
+    """The array itself."""
+    return array
 
 
 class FoundBefore(Protocol):
@@ -62,12 +81,14 @@ def densify(
     workers: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     found_before: FoundBefore | None = None,
+    keep: Keep = in_memory,
 ) -> tuple[Reconstruction, DenseReport]:
     """The reconstruction with depth that was measured in the photos where that is possible.
 
     ``view_of``: undistorted view by name. ``workers``: images at once, None for as many as the run
     may use; what comes out does not depend on it. ``progress``: is told how many images of how many
     are matched. ``found_before``: has what a run that was killed found, and keeps what this finds.
+    ``keep``: holds maps, those of the result too; called from several threads.
     Images that no other one overlaps keep their maps, and so do those without confirmed pose.
     """
     posed = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
@@ -85,7 +106,7 @@ def densify(
                 found_before.save(name, stereo)
         # where the photo may be used and says anything
         supported = view.usable & (stereo.cost < _MAX_COST)
-        return _Found(view.grid, stereo.log_depth, stereo.parallax, supported)
+        return _Found(view.grid, keep(stereo.log_depth), stereo.parallax, keep(supported))
 
     rows = [row for row, others in enumerate(sources) if others]
     found: dict[int, _Found] = {}
@@ -93,18 +114,20 @@ def densify(
         for row, own in zip(rows, pool.map(matched, rows), strict=True):
             found[row] = own
             progress(len(found), len(rows))
-    agreed = {row: _compared(row, found, sources[row], options) for row in found}
-    maps = list(reconstruction.images)
+    agreed = {row: _compared(row, found, sources[row], options, keep) for row in found}
+    maps, which = list(reconstruction.images), {}
     for row in found:
-        view = views[row]
+        view, name = views[row], images[row].name
         known = Observed(view.log_depth, view.log_std)
         measured = with_known(_measured(row, view, found, agreed, near[row], options), known)
+        which[name] = keep(measured.known)
         joined = posterior(known, measured, options.correlation_px)
-        maps[posed[row]] = _with_depth(images[row], view, joined)
+        maps[posed[row]] = _with_depth(images[row], view, joined, keep)
     names = [image.name for image in images]
     report = DenseReport(
         {names[row]: [names[other] for other in others] for row, others in enumerate(sources)},
         {name: _share(agreed.get(row)) for row, name in enumerate(names)},
+        which,
     )
     return replace(reconstruction, images=tuple(maps)), report
 
@@ -148,7 +171,11 @@ class _Found(NamedTuple):
 
 
 def _compared(
-    row: int, found: Mapping[int, _Found], sources: Sequence[int], options: DenseOptions
+    row: int,
+    found: Mapping[int, _Found],
+    sources: Sequence[int],
+    options: DenseOptions,
+    keep: Keep,
 ) -> Agreement:
     """A map beside those of its sources."""
     own = found[row]
@@ -157,7 +184,9 @@ def _compared(
         for other in sources
         if other in found
     )
-    return compare_depth(own.grid, own.log_depth, own.log_std(options), others)
+    agreement = compare_depth(own.grid, own.log_depth, own.log_std(options), others)
+    maps = keep(agreement.confirmed), keep(agreement.mean_change)
+    return Agreement(*maps, agreement.noise)
 
 
 def _measured(
@@ -187,8 +216,12 @@ def _measured(
     )
 
 
-def _with_depth(image: RegisteredImage, view: DenseView, joined: Observed) -> RegisteredImage:
+def _with_depth(
+    image: RegisteredImage, view: DenseView, joined: Observed, keep: Keep
+) -> RegisteredImage:
     depth = np.exp(joined.log_depth)
     variance = (joined.log_std * depth) ** 2
     prior = DepthPrior.from_arrays(depth, variance, view.usable, metric=image.depth.metric)
-    return replace(image, depth=prior)
+    assert prior.variance is not None
+    maps = keep(prior.depth), keep(prior.variance), keep(prior.valid)
+    return replace(image, depth=DepthPrior(*maps, metric=prior.metric))

@@ -14,6 +14,7 @@ from mpsfm_core.data import View
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.dense.stereo import StereoDepth
+from mpsfm_core.disk_arrays import DiskArrays
 from mpsfm_core.errors import OutputError
 from mpsfm_core.extraction.cache import Cache
 
@@ -54,6 +55,16 @@ def test_threads_do_not_change_the_result(room) -> None:
     two, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS, workers=2)
     for a, b in zip(one.images, two.images, strict=True):
         np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
+
+
+def test_maps_may_lie_on_disk(room, tmp_path: Path) -> None:
+    there, report = densify(room.reconstruction, room.views.__getitem__, OPTIONS)
+    keep = DiskArrays(tmp_path, in_memory=0).keep
+    here, same = densify(room.reconstruction, room.views.__getitem__, OPTIONS, keep=keep)
+    for a, b in zip(there.images, here.images, strict=True):
+        np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
+        np.testing.assert_array_equal(a.depth.variance, b.depth.variance)
+        np.testing.assert_array_equal(report.measured[a.name], same.measured[a.name])
 
 
 def test_exposure_may_change_from_photo_to_photo(room) -> None:
