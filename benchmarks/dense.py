@@ -18,7 +18,7 @@ import pickle
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from benchmarks.accuracy import FASTDEPTH, PRIORS
 from mpsfm_core.data import Bool, DepthPrior, Float64, MappingProblem, NormalPrior, Pose
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
+from mpsfm_core.dense.sparse_depth import depth_of_points
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.benchmark import PairsOfSets, problem_of_sets
@@ -60,8 +61,9 @@ TOLERANCES = (0.02, 0.05)
 """Metres, of the clouds."""
 NEAR = 0.1
 """Relative error of depth that counts as near."""
-WAYS = ("mapper", "dense")
-"""Maps as the mapper refined them, and after the dense stage."""
+WAYS = ("mapper", "dense", "without prior")
+"""Maps as the mapper refined them, after the dense stage, and after one that knew no more than the
+range of the points that an image sees."""
 POINT_NEAR = 0.01
 """The same at true points."""
 ANGLE, ERROR_PX = 3.0, 1.0
@@ -169,7 +171,9 @@ def measured(
         found = []
         for item in mapped:
             model, seconds, seen = item.reconstruction, 0.0, {}
-            if way == "dense":
+            if way == "without prior":
+                model = without_prior(model)
+            if way != "mapper":
                 started = time.process_time()
                 model, report = densify(model, view_of(photos), DenseOptions(), workers=1)
                 seen = report.measured
@@ -180,6 +184,17 @@ def measured(
         usable = [each for each in found if len(each) > 1]
         rows.append({"case": name, "maps": way, "sets": len(usable), **_means(usable)})
     return rows
+
+
+def without_prior(model: Reconstruction) -> Reconstruction:
+    """With one depth an image, from its points; images without points are left out."""
+    images = []
+    for image in model.images:
+        points = model.points[image.point_ids[image.point_ids >= 0]]
+        depth = depth_of_points(transform(image.rotation, image.translation, points)[:, 2])
+        if depth is not None:
+            images.append(replace(image, depth=depth))
+    return replace(model, images=tuple(images))
 
 
 def view_of(photos: ImageSet) -> Any:
