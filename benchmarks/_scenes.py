@@ -11,7 +11,7 @@ from mpsfm_core.evaluation.records import Record
 from mpsfm_core.yaml_text import write_yaml
 
 RESULTS = Path(__file__).parent / "results"
-MPSFM = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+MPSFM = [sys.executable, "-m", "mpsfm_core"]
 """The command ``mpsfm`` of this environment; its arguments follow."""
 
 

@@ -101,7 +101,7 @@ def test_first_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     further = re.compile(r"mpsfm (export|mesh) out/")
     commands = commands_of(ROOT / "docs" / "first-run.md")
     commands += filter(further.match, commands_of(ROOT / "docs" / "how-to.md"))
-    run = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+    run = [sys.executable, "-m", "mpsfm_core"]
     for line in commands:
         if not line.startswith("mpsfm demo"):
             arguments = shlex.split(line, comments=True)[1:]

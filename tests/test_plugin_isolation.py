@@ -100,7 +100,7 @@ def environment(install_plugin: InstallPlugin, monkeypatch: pytest.MonkeyPatch) 
 
 
 def mpsfm(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from mpsfm_core.cli import main; main()", *arguments]
+    command = [sys.executable, "-m", "mpsfm_core", *arguments]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
 
 

@@ -121,7 +121,7 @@ def new(
 
 def _elsewhere(name: str, arguments: list[str]) -> int:
     """Check in another process, which a crashing provider may end; returns the exit code."""
-    command = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+    command = [sys.executable, "-m", "mpsfm_core"]
     environment = {**same_path(), _CHECKING: "1"}
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(

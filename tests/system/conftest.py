@@ -20,7 +20,7 @@ from mpsfm_core.testing.scenes import arc_poses, room_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 CAMERA = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
-COMMAND = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+COMMAND = [sys.executable, "-m", "mpsfm_core"]
 
 CONFIG = """
 features:

@@ -75,7 +75,7 @@ def test_it_is_trained_as_said(installed: Mapping[str, str], tmp_path: Path) -> 
 @pytest.mark.slow
 def test_it_reconstructs_by_its_name(installed: Mapping[str, str], tmp_path: Path) -> None:
     """The last step of the tutorial, with its result: AUC 67, 93 and 98 %, 0.5 cm."""
-    mpsfm = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+    mpsfm = [sys.executable, "-m", "mpsfm_core"]
     cameras = ("--intrinsics", SCENE / "intrinsics.yaml", "--config", EXAMPLE / "config.yaml")
     cache = ("--set", f"runtime.cache_dir={tmp_path / 'cache'}", "--set", "runtime.workers=1")
     output = tmp_path / "out"

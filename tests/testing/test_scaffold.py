@@ -115,7 +115,7 @@ def test_installed_it_is_checked_by_name_and_by_its_own_tests(tmp_path: Path) ->
     folder = tmp_path / "brand-new-depth"
     run([sys.executable, "-m", "pip", *install, "--target", site, folder], tmp_path)
     path = os.pathsep.join(map(str, (site, ROOT, *sys.path)))
-    mpsfm_command = [sys.executable, "-c", "from mpsfm_core.cli import main; main()"]
+    mpsfm_command = [sys.executable, "-m", "mpsfm_core"]
     checked = run([*mpsfm_command, "plugins", "check", "brand-new-depth"], tmp_path, path)
     assert "pass  depth/brand-new-depth: light-import" in checked
     assert "fail" not in checked

@@ -1,0 +1,5 @@
+"""``python -m mpsfm_core``: the command ``mpsfm`` of this environment."""
+
+from mpsfm_core.cli import main
+
+main()
