@@ -160,6 +160,7 @@ def create_environment(
             _run(command, environment.label)
         made.refresh()
         made.close()
+        _name_place(made.python.parent, made.folder, environment.folder)
         made.folder.rename(environment.folder)
     return environment, environment.describe()
 
@@ -183,6 +184,16 @@ def _commands(
         [python or sys.executable, "-m", "venv", venv],
         [inside, "-m", "pip", "install", "--disable-pip-version-check", *packages],
     ]
+
+
+def _name_place(scripts: Path, before: Path, after: Path) -> None:
+    """Scripts of an environment name its interpreter: at the place where it is going to be."""
+    old, new = os.fsencode(before), os.fsencode(after)
+    for path in scripts.iterdir():
+        if path.is_file() and not path.is_symlink():
+            content = path.read_bytes()
+            if old in content and b"\0" not in content:  # launchers on Windows are programs
+                path.write_bytes(content.replace(old, new))
 
 
 def _core() -> list[str]:

@@ -165,6 +165,7 @@ def test_it_is_there_as_a_whole_or_not_at_all(monkeypatch, tmp_path):
         python = Path(command[0])
         python.parent.mkdir(parents=True, exist_ok=True)
         python.touch()
+        python.with_name("pip").write_text(f"#!{python}\nimport pip\n")
         seen.append([environment.name for environment in store.all_environments()])
 
     monkeypatch.setattr(store, "_commands", lambda e, packages, python: [[str(e.python)]])
@@ -174,6 +175,8 @@ def test_it_is_there_as_a_whole_or_not_at_all(monkeypatch, tmp_path):
     assert (seen, found) == ([[]], [])
     assert [e.name for e in store.all_environments()] == ["new"] and environment.python.exists()
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
+    script = environment.python.with_name("pip").read_text()
+    assert script.splitlines()[0] == f"#!{environment.python}"
 
 
 @pytest.mark.slow
