@@ -14,6 +14,9 @@ from mpsfm_core.errors import InputError
 TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 """In the scan's unit (ETH3D, metres)."""
 
+_SAMPLE = 1000
+"""Points whose distances tell a median that is beyond all tolerances."""
+
 
 def cloud_accuracy(
     points: Float64, scan: Float64, tolerances: Sequence[float] = TOLERANCES
@@ -30,8 +33,8 @@ def cloud_accuracy(
     if not len(points) or not len(scan):
         raise InputError("a point cloud is empty, there is nothing to compare")
     points, scan = (thinned(cloud, min(tolerances) / 2) for cloud in (points, scan))
-    to_scan = cKDTree(scan).query(points)[0]
-    to_points = cKDTree(points).query(scan)[0]
+    to_scan, median_to_scan = _distances(points, scan, max(tolerances))
+    to_points, median_to_points = _distances(scan, points, max(tolerances))
     accuracy = {str(t): float((to_scan <= t).mean()) for t in tolerances}
     completeness = {str(t): float((to_points <= t).mean()) for t in tolerances}
     return {
@@ -40,9 +43,25 @@ def cloud_accuracy(
         "accuracy": accuracy,
         "completeness": completeness,
         "f1": {t: _harmonic(accuracy[t], completeness[t]) for t in accuracy},
-        "median_distance_to_scan": float(np.median(to_scan)),
-        "median_distance_to_points": float(np.median(to_points)),
+        "median_distance_to_scan": median_to_scan,
+        "median_distance_to_points": median_to_points,
     }
+
+
+def _distances(points: Float64, others: Float64, limit: float) -> tuple[Float64, float]:
+    """To the nearest of others (n,), infinite beyond the limit, and the median.
+
+    If the median is beyond the limit it is that of a sample: in the middle of a room all of it is
+    about equally far, so that finding the very nearest takes a walk through all points.
+    """
+    tree = cKDTree(others)
+    found: Float64 = tree.query(points, distance_upper_bound=np.nextafter(limit, np.inf))[0]
+    sample = found
+    if np.isinf(np.median(found)):
+        count = min(len(points), _SAMPLE)
+        chosen = np.random.default_rng(0).choice(len(points), count, replace=False)
+        sample = tree.query(points[chosen])[0]
+    return found, float(np.median(sample))
 
 
 def thinned(points: Float64, size: float) -> Float64:
