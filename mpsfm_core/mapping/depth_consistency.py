@@ -24,6 +24,10 @@ are none, the std of the whole stands and so does the contradiction. This tells 
 priors: an image that stands in the twin of its room has points only on what both rooms share, where
 depth is right; what differs has none to excuse it.
 
+What fills the picture of a near view may fall into few pixels of a far one, whose refined map is
+least sure of what is small. Images that hold already go on clear evidence only: there it counts as
+these few pixels. A newcomer, which is tried again, is held to all.
+
 An image is held against all views that it overlaps with, not only those it shares points with:
 those that led an image to a wrong place look alike there, others tell.
 """
@@ -101,7 +105,7 @@ class DepthCheck:
         for image in map(int, images):
             for other in overlapping_views(scene, image, self._options.num_views):
                 if not shares[image, other]:
-                    share = self.between(image, other, std_factor)
+                    share = self.between(image, other, std_factor, once=True)
                     shares[image, other] = shares[other, image] = share
         removed = []
         while (shares > limit).any():
@@ -111,15 +115,18 @@ class DepthCheck:
             shares[worst] = shares[:, worst] = 0
         return removed
 
-    def between(self, a: int, b: int, std_factor: float = 1.0) -> float:
-        """Share of pixels of two views at which one sees empty space and the other a surface."""
+    def between(self, a: int, b: int, std_factor: float = 1.0, *, once: bool = False) -> float:
+        """Share of pixels of two views at which one sees empty space and the other a surface.
+
+        ``once``: those that fall into one pixel of the other view together count as one.
+        """
         scene, options, total = self._scene, self._options, 0.0
         for source, target in ((a, b), (b, a)):
             rotation = scene.rotations[target] @ scene.rotations[source].T
             translation = scene.translations[target] - rotation @ scene.translations[source]
             one, two = self._grid(source, std_factor), self._grid(target, std_factor)
             total += unexplained_share(
-                one, two, rotation, translation, options.max_deviation, options.min_gap
+                one, two, rotation, translation, options.max_deviation, options.min_gap, once
             )
         return total
 
@@ -226,6 +233,7 @@ def unexplained_share(
     translation: Float64,
     limit: float,
     min_gap: float,
+    once: bool,
 ) -> float:
     """Share of the pixels of one view that lie before what another sees, whatever errors of depth
     are likely.
@@ -233,10 +241,12 @@ def unexplained_share(
     Args:
         source, target: maps of the two. rotation, translation: ``target_from_source``. limit:
             errors in terms of their std, of both maps together, up to which they are likely.
-        min_gap: share of the seen depth up to which before it is not in front of it.
+        min_gap: share of the seen depth up to which before it is not in front of it. once: those
+            that fall into one pixel of the other view together count as one.
     """
     rows, columns = target.depth.shape
-    r, t, count, visited = rotation, translation, 0, 0
+    r, t, total, visited = rotation, translation, 0.0, 0
+    zoom = target.params[0] / source.params[0]
     for row in range(SAMPLING // 2, source.depth.shape[0], SAMPLING):
         y = (row + 0.5 - source.params[3]) / source.params[1]
         for column in range(SAMPLING // 2, source.depth.shape[1], SAMPLING):
@@ -270,5 +280,8 @@ def unexplained_share(
                 explained = error * error + other * other <= limit * limit
                 if explained:
                     break
-            count += not explained
-    return count / max(visited, 1)
+            if not explained:
+                depth = source.depth[row, column]
+                pixels = (zoom * depth / (depth * along + t[2])) ** 2
+                total += min(1.0, pixels) if once else 1.0
+    return total / max(visited, 1)

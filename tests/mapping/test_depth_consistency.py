@@ -82,6 +82,17 @@ def test_a_surface_in_seen_empty_space_is_a_violation_and_one_behind_is_not() ->
     assert check.share == pytest.approx(box)
 
 
+def test_what_a_far_view_sees_in_few_pixels_counts_as_few() -> None:
+    """What fills one picture is small for a view ten metres behind, which sees past it."""
+    behind = np.eye(3, 4)
+    behind[2, 3] = 10.0
+    scene = posed_scene([wall(1.0), wall(20.0)], [HERE, behind], SMALL)
+    check = DepthCheck(scene, OPTIONS)
+    assert check.between(0, 1) == 1
+    assert check.between(0, 1, once=True) == pytest.approx(1 / 11**2)
+    assert not check.conflicting_images([0, 1], OPTIONS.max_violations)
+
+
 def test_an_occluded_surface_is_no_violation() -> None:
     """What the second view sees beside a box lies behind the box for the first."""
     rooms = twin_rooms()
