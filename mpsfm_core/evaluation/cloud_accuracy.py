@@ -67,8 +67,11 @@ def _distances(points: Float64, others: Float64, limit: float) -> tuple[Float64,
 def thinned(points: Float64, size: float) -> Float64:
     """The first point of each cube of a grid of this size."""
     cells: Int64 = np.floor(points / size).astype(np.int64)
-    _, first = np.unique(cells, axis=0, return_index=True)
-    return points[np.sort(first)]
+    order = np.lexsort(cells.T)
+    ordered = cells[order]
+    first = np.ones(len(points), np.bool_)
+    first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    return points[np.sort(order[first])]
 
 
 def _harmonic(a: float, b: float) -> float:
