@@ -81,7 +81,7 @@ def test_accuracy_and_completeness_of_a_plane() -> None:
 def test_a_cloud_that_is_nowhere_near_has_a_median_distance_all_the_same() -> None:
     rng = np.random.default_rng(0)
     scan = rng.random((5000, 3)) * [1, 1, 0]
-    found = cloud_accuracy(scan + [0, 0, 3], scan, (0.01, 0.02))
+    found = cloud_accuracy(scan + np.array([0, 0, 3]), scan, (0.01, 0.02))
     assert found["median_distance_to_scan"] == pytest.approx(3, abs=0.01)
     assert found["median_distance_to_points"] == pytest.approx(3, abs=0.01)
     assert found["f1"] == {"0.01": 0, "0.02": 0}
