@@ -25,7 +25,7 @@ WITH_THE_CORE = {"mpsfm_core", "pydantic"}
 WITHOUT_THEIR_DEPENDENCIES = {"depth_anything_3", "vismatch"}
 """They ask for packages that fit beside nothing; a specification says how to get them."""
 FOR_TESTS_ONLY = ("contract.py", "stand_in.py")
-BESIDE_THE_AUTHORS_CODE = ("export.py", "export_moge.py")
+BESIDE_THE_AUTHORS_CODE = ("export.py", "export_moge.py", "export_unidepth.py")
 """Run where the authors' code is installed, with what it needs."""
 HEAVY = {"viser", "rerun", "torch", "transformers", "onnxruntime", "kornia", "cv2", "scipy", "onnx"}
 

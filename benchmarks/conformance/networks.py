@@ -131,6 +131,16 @@ def _metric3d(answer: tuple[DepthPrior, NormalPrior], theirs: Arrays) -> Differe
     }
 
 
+def _unidepth(answer: DepthPrior, theirs: Arrays) -> Differences:
+    std = np.log(theirs["confidence"])
+    certain = answer.valid & (std > 1e-2 * theirs["depth"])
+    assert answer.variance is not None
+    return {
+        "depth": relative(answer.depth, theirs["depth"], answer.valid),
+        "std": relative(np.sqrt(answer.variance), std, certain),
+    }
+
+
 NETWORKS = (
     Network(
         "moge",
@@ -182,5 +192,15 @@ NETWORKS = (
         lambda provider, view: provider.predict_joint(view),
         _metric3d,
         packages=("mmengine", "addict", "yapf", "termcolor"),
+    ),
+    Network(
+        "unidepth",
+        "unidepth_v2.py",
+        "small",
+        "ViT-S/14, 462 x 630",
+        lambda file: ("depth", "onnx", {"description": "unidepth-v2", "model": str(file)}),
+        lambda provider, view: provider.predict(view),
+        _unidepth,
+        packages=("einops", "huggingface_hub", "scipy", "tqdm"),
     ),
 )

@@ -106,7 +106,7 @@ def fetch(
 
 @app.command()
 def export(
-    name: Annotated[str, typer.Argument(help="dsine, mast3r, roma, metric3d, moge.")],
+    name: Annotated[str, typer.Argument(help="dsine, mast3r, metric3d, moge, unidepth.")],
     code: Annotated[
         list[Path],
         typer.Option(

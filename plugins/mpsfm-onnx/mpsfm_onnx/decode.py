@@ -71,7 +71,7 @@ def _network_depth(
     """Depth (h, w) in the network's unit; NaN or infinite where it has no meaning."""
     height, width = value.shape[:2]
     xy = rays(camera.resized(width, height), pixel_centers(width, height))[..., :2]
-    quantity = value[..., 0].astype(np.float64) * rule.scale + rule.shift
+    quantity = value[..., rule.channel].astype(np.float64) * rule.scale + rule.shift
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         if rule.output == "log-depth":
             return np.asarray(np.exp(quantity))
@@ -125,6 +125,8 @@ def _depth_std(depth: Float64, tensor: Float64, rule: ConfidenceOutput) -> Float
         std = depth * (1 - np.clip(tensor, 0, 1))
     elif rule.output == "std":
         std = tensor
+    elif rule.output == "exp-std":
+        std = np.log(np.maximum(tensor, 1))
     else:
         std = np.sqrt(np.maximum(tensor, 0))
     return np.maximum(std, _SMALLEST_RELATIVE_STD * depth)

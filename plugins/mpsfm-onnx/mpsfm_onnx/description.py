@@ -25,7 +25,7 @@ Sign = Literal[-1, 1]
 
 
 class FixedSize(Options):
-    """A canvas of one size."""
+    """A canvas of one size. A model whose file fixes another one has that."""
 
     mode: Literal["fixed"]
     width: int = Field(gt=0)
@@ -80,6 +80,9 @@ class ImageInput(Options):
     size: Annotated[FixedSize | SideSize, Field(discriminator="mode")]
     intrinsics: IntrinsicsInput | None = None
     """For networks that are told the camera."""
+    rays: str | None = None
+    """For those that are told it by the tensor of unit rays (1, 3, h, w) through the centres of
+    the input's pixels."""
     constants: dict[str, float] = Field(default_factory=dict)
     """Further inputs that always have one value."""
 
@@ -93,6 +96,8 @@ class DepthOutput(Options):
     ``ray-length``: ``v`` is the distance to the camera. ``points``: three channels x, y, z whose z
     lacks a shift, which the known camera tells. Pixels where ``v <= 0`` are invalid, except for
     log-depth."""
+    channel: int = Field(0, ge=0)
+    """Of the tensor, for all but ``points``."""
     scale: float = 1.0
     shift: float = 0.0
     """Turn the network's unit into metres (or 1/m), or an affine disparity into a positive one."""
@@ -115,9 +120,10 @@ class ConfidenceOutput(Options):
     """The tensor that the network's own uncertainty of depth comes from."""
 
     name: str
-    output: Literal["confidence", "std", "variance"]
-    """``confidence`` c in [0, 1]: std = depth * (1 - c) (Metric3D). ``std`` and ``variance``: in
-    the unit of the depth tensor, before the canonical correction."""
+    output: Literal["confidence", "std", "variance", "exp-std"]
+    """``confidence`` c in [0, 1]: std = depth * (1 - c) (Metric3D). ``std``, ``variance`` and
+    ``exp-std``, whose logarithm is the std: in the unit of the depth tensor, before the canonical
+    correction."""
 
 
 class MaskOutput(Options):

@@ -29,7 +29,8 @@ _DTYPES: Mapping[str, type[np.generic]] = {
 class Model:
     """An inference session: on the GPU if the context says so and onnxruntime can, else the CPU.
 
-    ``inputs``, ``outputs``: names of the tensors, in the model's order.
+    ``inputs``, ``outputs``: names of the tensors, in the model's order. ``shapes``: of the inputs;
+    an axis of any length is no number.
 
     Raises:
         WeightsError: the file is no ONNX model.
@@ -41,6 +42,7 @@ class Model:
         inputs = self._session.get_inputs()
         self._dtypes = {tensor.name: _DTYPES.get(tensor.type) for tensor in inputs}
         self.inputs = tuple(self._dtypes)
+        self.shapes = {tensor.name: tuple(tensor.shape) for tensor in inputs}
         self.outputs = tuple(tensor.name for tensor in self._session.get_outputs())
 
     def require(self, inputs: Iterable[str], outputs: Iterable[str], what: str) -> None:

@@ -8,9 +8,10 @@ import numpy as np
 
 from mpsfm_core import PinholeCamera, ProviderContext, View
 from mpsfm_core.data import Float32, Float64
+from mpsfm_core.geometry import pixel_centers, rays
 from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.decode import planes
-from mpsfm_onnx.description import Description, IntrinsicsInput
+from mpsfm_onnx.description import Description, FixedSize, ImageInput, IntrinsicsInput, SideSize
 from mpsfm_onnx.model import Model
 
 
@@ -50,16 +51,21 @@ class Network:
         inputs = {self._image, *rule.constants}
         if rule.intrinsics is not None:
             inputs.add(rule.intrinsics.name)
+        if rule.rays is not None:
+            inputs.add(rule.rays)
         self._outputs = sorted(description.outputs.names())
         self._model.require(inputs, self._outputs, f"description {description.name!r}")
+        self._size = _own_size(rule, self._model.shapes[self._image])
 
     def run(self, view: View) -> Answer:
         """Run the network on a view."""
         rule, outputs = self.description.input, self.description.outputs
-        canvas = Canvas.plan(rule.size, view.camera.size)
+        canvas = Canvas.plan(self._size, view.camera.size)
         feed = {self._image: canvas.paint(view.image, rule), **rule.constants}
         if rule.intrinsics is not None:
             feed[rule.intrinsics.name] = _matrix(canvas.camera(view.camera), rule.intrinsics)
+        if rule.rays is not None:
+            feed[rule.rays] = _unit_rays(canvas.camera(view.camera))
         results = zip(self._outputs, self._model.run(feed, self._outputs), strict=True)
         maps, numbers = {}, {}
         for name, tensor in results:
@@ -68,6 +74,21 @@ class Network:
             else:
                 maps[name] = canvas.cut(planes(tensor, outputs.layout))
         return Answer(maps, numbers, canvas)
+
+
+def _own_size(rule: ImageInput, shape: tuple[object, ...]) -> FixedSize | SideSize:
+    """The rule of a description, with the size that the input of a model has if it is fixed."""
+    height, width = shape[2:4] if rule.layout == "NCHW" else shape[1:3]
+    if isinstance(rule.size, FixedSize) and isinstance(height, int) and isinstance(width, int):
+        return rule.size.model_copy(update={"width": width, "height": height})
+    return rule.size
+
+
+def _unit_rays(camera: PinholeCamera) -> Float64:
+    """Directions (1, 3, h, w) through the centres of a camera's pixels."""
+    through = rays(camera, pixel_centers(*camera.size))
+    unit: Float64 = through / np.linalg.norm(through, axis=-1, keepdims=True)
+    return unit.transpose(2, 0, 1)[np.newaxis]
 
 
 def _matrix(camera: PinholeCamera, rule: IntrinsicsInput) -> Float64:

@@ -54,7 +54,14 @@ def mpsfm_exports() -> dict[str, ModelExport]:
             commit="07444410f1e33f402353b99d6ccd26bd31e469e8",
             license="MIT",
             packages=("github.com/EasternJournalist/utils3d", "moderngl"),
-        )
+        ),
+        "unidepth": ModelExport(
+            script="mpsfm_onnx.export_unidepth",
+            repository="lpiccinelli-eth/UniDepth",
+            commit="8d8cfe4c7ee15297099983607febf0d4f32eb3d6",
+            license="CC-BY-NC-4.0",
+            packages=("einops", "huggingface_hub", "scipy"),
+        ),
     }
 
 

@@ -14,7 +14,7 @@ from mpsfm_onnx.options import OnnxOptions
 from mpsfm_onnx.providers import OnnxDepth, OnnxJoint, OnnxNormals
 
 from mpsfm_core.errors import ConfigError, WeightsError
-from mpsfm_core.geometry import pixel_centers, resize_map, unproject
+from mpsfm_core.geometry import pixel_centers, rays, resize_map, unproject
 from mpsfm_core.options import Backend
 from mpsfm_core.registry import Registry
 from mpsfm_core.uncertainty.model import DepthCalibration
@@ -211,10 +211,6 @@ SHIPPED_STAND_INS = {
         "(float[b,3,h,w] pixel_values) => (float[b,h,w] predicted_depth, float[b] focallength_px)",
         "predicted_depth = Squeeze (meaning, axis) focallength_px = Identity (guess)",
     ),
-    "unidepth-v2": (
-        "(float[b,3,h,w] image, float[b,3,3] K) => (float[b,1,h,w] depth)",
-        "depth = Identity (meaning)",
-    ),
 }
 """Interfaces as documented, with red (0 to 1) as depth."""
 
@@ -236,12 +232,37 @@ def test_shipped_interfaces(name, write_onnx, make_view, context):
     view = make_view(640, 480, colour=(102, 5, 6), focal=(500.0, 510.0))
     prior = OnnxDepth(OnnxOptions(description=name, model=str(model)), context).predict(view)
     factor = 500 * (1536 / 640) / 700 if name == "depth-pro" else 1.0
-    assert prior.shape == {
-        "depth-pro": (1536, 1536),
-        "unidepth-v2": (462, 616),
-    }.get(name, (518, 686))
+    assert prior.shape == ((1536, 1536) if name == "depth-pro" else (518, 686))
     np.testing.assert_allclose(prior.depth[prior.valid], 0.4 * factor, rtol=1e-3)
     assert prior.valid.all() and prior.metric == (name != "depth-anything-v2-small")
+
+
+def test_unidepth_interface(write_onnx, make_view, context):
+    """As the authors' export has it, of a size of its own: 0.4 is red, of points 4 m away on the
+    rays that the network is told, with an error of 1 m."""
+    red = "r = Gather <axis = 1> (rgbs, first) a = Mul (r, std) b = Add (a, mean) c = Mul (b, ten)"
+    model = write_onnx(
+        f"""uni (float[b,3,28,42] rgbs, float[b,3,28,42] rays) => (
+            float[b,3,28,42] pts_3d, float[b,1,28,42] confidence, float[b,3,3] intrinsics) {{
+            {red} pts_3d = Mul (c, rays) d = Mul (c, none) confidence = Add (d, e)
+            intrinsics = Identity (guess)
+        }}""",
+        first=FIRST,
+        std=np.float32(0.229),
+        mean=np.float32(0.485),
+        ten=np.float32(10),
+        none=np.float32(0),
+        e=np.float32(np.e),
+        guess=np.eye(3, dtype=np.float32)[None],
+    )
+    view = make_view(60, 56, colour=(102, 5, 6), focal=(50.0, 51.0))
+    options = OnnxOptions(description="unidepth-v2", model=str(model))
+    prior = OnnxDepth(options, context).predict(view)
+    assert prior.shape == (28, 30) and prior.metric and prior.valid.all()
+    through = rays(view.camera.resized(30, 28), pixel_centers(30, 28))
+    expected = 4 / np.linalg.norm(through, axis=-1)
+    np.testing.assert_allclose(prior.depth, expected, rtol=1e-5)
+    np.testing.assert_allclose(prior.variance, 1, rtol=1e-5)
 
 
 def test_moge_interface(write_onnx, make_view, context):

@@ -1,0 +1,79 @@
+"""UniDepth V2 as ONNX, told the camera, by its authors' code; run as a program, see
+:mod:`mpsfm_core.model_export`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+
+from mpsfm_core.model_export.authors import Job
+
+
+def _unused(name: str, **has: Any) -> None:
+    """A module that their code imports and of which nothing else is called here."""
+    module = sys.modules[name] = ModuleType(name)
+    module.__dict__.update(has)
+
+
+_LAYERS = dict.fromkeys(
+    ("AvgPool2dSame", "GlobalResponseNormMlp", "LayerNorm", "LayerNorm2d", "Mlp", "create_conv2d")
+)
+_LAYERS |= dict.fromkeys(("DropPath", "get_act_layer", "make_divisible", "to_ntuple"))
+for _name in ("timm", "timm.models", "torchvision", "torchvision.transforms"):
+    _unused(_name)
+_unused("timm.layers", trunc_normal_=torch.nn.init.trunc_normal_, **_LAYERS)
+_unused("timm.models.layers", **vars(sys.modules["timm.layers"]))
+_unused("torchvision.transforms.functional")
+_unused("torchvision.transforms.v2")
+_unused("torchvision.transforms.v2.functional")
+_unused("unidepth.utils.visualization", colorize=None, image_grid=None, log_train_artifacts=None)
+
+from unidepth.models.unidepthv2.export import UniDepthV2ONNXcam  # noqa: E402
+from unidepth.utils.camera import Pinhole  # noqa: E402
+
+SIZE = 462, 630
+"""Rows and columns: the default of the authors' export; the file has no others."""
+_MODELS = {"": "l", "small": "s", "base": "b", "large": "l"}
+
+
+def network(size: str) -> UniDepthV2ONNXcam:
+    """The authors' network as their export has it."""
+    name = f"config_v2_vit{_MODELS[size]}14.json"
+    config = json.loads(Path("configs", name).read_text(encoding="utf-8"))
+    config["training"]["export"] = True
+    return UniDepthV2ONNXcam(config).eval()
+
+
+def export(job: Job, model: UniDepthV2ONNXcam) -> None:
+    """Images of the one size, and the unit rays that their pixels see."""
+    given = []
+    for focal in (400.0, 700.0):
+        matrix = torch.tensor([[focal, 0, SIZE[1] / 2], [0, focal, SIZE[0] / 2], [0, 0, 1]])
+        rays = Pinhole(K=matrix[None]).get_rays((1, *SIZE))
+        given.append({"rgbs": torch.randn(1, 3, *SIZE), "rays": rays})
+    torch.linspace = _linspace
+    job.export(model, given, ["pts_3d", "confidence", "intrinsics"])
+
+
+def _linspace(start: float, end: float, steps: int, **_: Any) -> torch.Tensor:
+    """A constant, where the exporter makes float64 of it and all that follows."""
+    return torch.tensor(np.linspace(start, end, steps), dtype=torch.float32)
+
+
+def main() -> None:
+    """Export the network of the checkpoint."""
+    job = Job.given()
+    model = network(job.size)
+    if job.weights is not None:
+        job.load(model, {**dict(model.named_buffers()), **job.checkpoint()})
+    export(job, model)
+
+
+if __name__ == "__main__":
+    main()
