@@ -1,0 +1,140 @@
+"""From photos to poses: ``mpsfm reconstruct`` beside COLMAP's own SIFT pipeline.
+
+    python -m benchmarks.end_to_end [--scenes fountain ...] [--output FILE]
+
+COLMAP: SIFT, all pairs, incremental mapper, as ``colmap automatic_reconstructor`` would do it, each
+step with as many threads as it takes by itself. Ours: whole commands, with an empty cache, compiled
+kernels and true intrinsics on both sides; without the dense stage and the report, which COLMAP's
+steps have no part of. Both poses are compared with the truth, pose AUC in percent, convention
+`paper`. Time is of the clock, of one run on a machine with nothing else to do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Mapping
+from pathlib import Path
+
+import pycolmap
+
+from benchmarks._scenes import MPSFM, percent, shared_folder
+from mpsfm_core.data import Pose
+from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
+from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
+from mpsfm_core.extraction.cache import CACHE_VARIABLE
+from mpsfm_core.inputs.images import load_images
+from mpsfm_core.inputs.models import read_poses, reconstruction_poses
+
+SCENES = ("fountain", "rendered_kitchen", "hololens_room")
+SIFT = ("--set", "features.use=sift", "--set", "matcher.use=mutual-nearest")
+OURS: Mapping[str, tuple[str, ...]] = {
+    "`fast-cpu`": ("--config", "fast-cpu"),
+    "`fast-cpu` with SIFT and mutual nearest neighbours": ("--config", "fast-cpu", *SIFT),
+}
+_ALONE = ("dense.enabled=false", "results.dense_cloud=false", "results.report=false")
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--scenes", nargs="+", default=["fountain"], choices=SCENES)
+    parser.add_argument("--output", type=Path, help="also write the table to this file")
+    parser.add_argument("--colmap", nargs=2, metavar=("SCENE", "DIR"), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.colmap:
+        colmap(read_scene(Path(arguments.colmap[0])), Path(arguments.colmap[1]))
+        return
+    lines = [
+        "| scene | method | registered | AUC@1/5/20 | s | / COLMAP |",
+        "| --- | --- | ---: | ---: | ---: | ---: |",
+    ]
+    for name in arguments.scenes:
+        lines += compared(read_scene(shared_folder() / "data" / name))
+        print("\n".join(lines), file=sys.stderr)
+    text = "\n".join(lines) + "\n"
+    print(text, end="")
+    if arguments.output:
+        arguments.output.write_text(text, encoding="utf-8")
+
+
+def compared(scene: SceneFolder) -> list[str]:
+    """Rows of the table."""
+    folder = scene.images.parent
+    rows, reference = [], 0.0
+    with tempfile.TemporaryDirectory() as work:
+        own = [sys.executable, "-m", "benchmarks.end_to_end", "--colmap", str(folder)]
+        target = Path(work, "colmap")
+        seconds = reference = timed([*own, str(target)], {})
+        rows.append(row(scene, "COLMAP", read_poses(target), seconds, reference))
+        for number, (label, options) in enumerate(OURS.items()):
+            target = Path(work, str(number))
+            command = [*MPSFM, "reconstruct", str(scene.images), "-o", str(target), "--quiet"]
+            command += ["--intrinsics", str(scene.intrinsics), *options]
+            for setting in _ALONE:
+                command += ["--set", setting]
+            seconds = timed(command, {CACHE_VARIABLE: str(Path(work, f"cache-{number}"))})
+            poses = read_poses(target / "sparse")
+            rows.append(row(scene, label, poses, seconds, reference))
+    return rows
+
+
+def timed(command: list[str], environment: Mapping[str, str]) -> float:
+    """Seconds of the clock that a command takes."""
+    started = time.perf_counter()
+    subprocess.run(command, check=True, env={**os.environ, **environment}, stdout=sys.stderr)
+    return time.perf_counter() - started
+
+
+def row(
+    scene: SceneFolder, label: str, poses: Mapping[str, Pose], seconds: float, reference: float
+) -> str:
+    """One line of the table."""
+    convention = CONVENTIONS["paper"]
+    area = pose_auc(pose_errors_deg(poses, scene.truth, convention), convention)
+    registered = f"{len(poses)} of {len(scene.truth)}"
+    name = scene.images.parent.name
+    return (
+        f"| {name} | {label} | {registered} | {percent(area)} | {seconds:.1f} | "
+        f"{seconds / reference:.2f}x |"
+    )
+
+
+def colmap(scene: SceneFolder, output: Path) -> None:
+    """COLMAP's largest model of a scene."""
+    photos = load_images(scene.images, scene.intrinsics)
+    output.mkdir(parents=True)
+    database = output / "database.db"
+    cameras = defaultdict(list)
+    for photo in photos:
+        camera = photo.pinhole
+        cameras[camera.fx, camera.fy, camera.cx, camera.cy].append(photo.name)
+    for values, names in cameras.items():
+        pycolmap.extract_features(
+            database,
+            scene.images,
+            image_names=names,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=pycolmap.ImageReaderOptions(
+                camera_model="PINHOLE", camera_params=",".join(map(str, values))
+            ),
+            extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False),
+        )
+    pycolmap.match_exhaustive(
+        database, matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False)
+    )
+    options = pycolmap.IncrementalPipelineOptions()
+    options.ba_refine_focal_length = False
+    options.ba_refine_extra_params = False
+    models = pycolmap.incremental_mapping(database, scene.images, output, options)
+    largest = max(models.values(), key=lambda model: len(reconstruction_poses(model)))
+    largest.write(output)
+
+
+if __name__ == "__main__":
+    main()
