@@ -64,15 +64,15 @@ class DenseView(PosedGrid):
         usable = np.ones((height, width), np.bool_)
         if view.mask is not None:
             usable = resize_map(view.mask, width, height, linear=False) > 0
-        log_depth, log_std = _known(image.depth)
+        log_depth, log_std = _on_grid(*_known(image.depth), width, height)
         return cls(
             image.camera.resized(width, height),
             image.rotation,
             image.translation,
             resize_map(grey, width, height) / np.float32(255),
             usable,
-            resize_map(log_depth, width, height),
-            resize_map(log_std, width, height),
+            log_depth,
+            log_std,
         )
 
     def reduced(self, factor: int) -> DenseView:
@@ -94,6 +94,20 @@ class DenseView(PosedGrid):
     def grid(self) -> PosedGrid:
         """Without the photo and what is known of its depth."""
         return PosedGrid(self.camera, self.rotation, self.translation)
+
+
+def _on_grid(
+    log_depth: Float32, log_std: Float32, width: int, height: int
+) -> tuple[Float32, Float32]:
+    """Both maps on a grid of another size.
+
+    What lies between two samples of different surfaces is on neither: where the mean is further
+    from the nearest sample than that may be off, the sample counts.
+    """
+    smooth, smooth_std = (resize_map(each, width, height) for each in (log_depth, log_std))
+    nearest, std = (resize_map(each, width, height, linear=False) for each in (log_depth, log_std))
+    between = np.abs(smooth - nearest) > std
+    return np.where(between, nearest, smooth), np.where(between, std, smooth_std)
 
 
 UNKNOWN_LOG_STD = 1.0

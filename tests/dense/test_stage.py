@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from mpsfm_core.checkpoints import DenseCheckpoints
-from mpsfm_core.data import View
+from mpsfm_core.data import DepthPrior, View
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.dense.stereo import StereoDepth
+from mpsfm_core.dense.view import DenseView
 from mpsfm_core.disk_arrays import DiskArrays
 from mpsfm_core.errors import OutputError
 from mpsfm_core.extraction.cache import Cache
@@ -161,3 +162,16 @@ def test_a_full_disk_ends_no_run(
     assert all(image.depth is not None for image in dense.images)
     assert caplog.text.count("no checkpoints from now on") == 1
     assert "the disk is full" in caplog.text
+
+
+def test_no_depth_between_two_surfaces_is_made_up(room) -> None:
+    """A map of a quarter of the photo's size, with a step that its std cannot explain."""
+    image, size = room.reconstruction.images[0], 16
+    depth = np.where(np.arange(size) < size // 2, 2.0, 4.0) * np.ones((size, 1))
+    known = DepthPrior.from_arrays(depth, (0.01 * depth) ** 2)
+    view = DenseView.of(replace(image, depth=known), room.views[image.name], OPTIONS.max_size)
+    assert view.log_depth.shape[1] >= 2 * size
+    np.testing.assert_allclose(np.unique(np.exp(view.log_depth)), [2, 4], rtol=1e-6)
+    unsure = replace(image, depth=DepthPrior.from_arrays(depth, depth**2))
+    view = DenseView.of(unsure, room.views[image.name], OPTIONS.max_size)
+    assert len(np.unique(view.log_depth)) > 2
