@@ -1,41 +1,43 @@
-"""``python -m benchmarks.conformance [NETWORK ...] [--checkouts DIR]``.
+"""``python -m benchmarks.conformance [NETWORK ...] [--checkouts DIR] [--environment NAME]``.
 
 DIR (by default ``$MPSFM_CHECKOUTS``) has a checkout of each network's repository in a folder of the
 export's name, at the commit that its plugin names, and of the libraries that it needs beside it.
 What is not there is skipped, with the commands that get it. The packages that the authors' code
 needs are looked for in this environment and in ``DIR/packages`` (``pip install --target``).
+RoMa and NetVLAD run in the environment NAME (``vismatch``; as ``mpsfm env create`` makes it, with
+mpsfm-vismatch, vismatch and onnx).
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-import cv2
 import numpy as np
 
-from benchmarks.conformance.networks import NETWORKS, Network
-from mpsfm_core import PinholeCamera, ProviderContext, View
-from mpsfm_core.errors import ProviderError
+from benchmarks.conformance.netvlad import APART
+from benchmarks.conformance.networks import HOSTED, NETWORKS, Hosted, Network
+from benchmarks.conformance.shared import AUTHORS, photos
+from mpsfm_core import ProviderContext, View
+from mpsfm_core.environments.store import find_environment
+from mpsfm_core.errors import MpsfmError, ProviderError
 from mpsfm_core.model_export.run import compared, run_script
-from mpsfm_core.providers import ModelExport
 from mpsfm_core.registry import Registry
 from mpsfm_core.weights import WeightStore
 
-_SAMPLES = Path(__file__).parents[2] / "examples" / "sample_scene" / "images"
-_AUTHORS = Path(__file__).parent / "authors"
-_CAMERAS = ((640, 480, 620.0), (333, 500, 410.0), (517, 389, 900.0))
-"""Width, height and focal length of the photos: landscape, portrait, and odd sizes."""
-_HOLDS = {"normals, deg": 0.06}
+Compared: TypeAlias = Callable[[Path], dict[str, float]]
+"""The largest differences, for the folder of the checkouts."""
+_HOLDS = {"normals, deg": 0.06, "positions, px": 1e-2, APART: np.inf}
 _TOLERANCE = 1e-3
-"""Relative; of angles the same in radians. Both sides compute in float32, by other kernels."""
+"""Relative; of angles the same in radians. Both sides compute in float32, by other kernels. RoMa's
+positions are on photos 640 pixels wide: 2e-5 of a view."""
 
 
 def main() -> int:
@@ -43,29 +45,38 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("networks", nargs="*")
     parser.add_argument("--checkouts", type=Path, default=os.environ.get("MPSFM_CHECKOUTS"))
+    parser.add_argument("--environment", default="vismatch")
     arguments = parser.parse_args()
     exports = {
         n: e for found in Registry.discover().call_hook("mpsfm_exports") for n, e in found.items()
     }
+    rows: list[tuple[str, str, str, str, Mapping[str, tuple[str, str]], Compared]] = []
+    for network in NETWORKS:
+        recipe, name = exports[network.export], network.export
+        compare = partial(_through_file, network)
+        code = recipe.repository, recipe.commit
+        rows.append((name, *code, network.described, network.libraries, compare))
+    for hosted in HOSTED:
+        compare = partial(_in_environment, hosted, arguments.environment)
+        code = hosted.repository, hosted.commit
+        rows.append((hosted.name, *code, hosted.described, {}, compare))
     differing = 0
     print("| network | commit | size | largest differences |\n|---|---|---|---|", flush=True)
-    for network in NETWORKS:
-        if arguments.networks and network.export not in arguments.networks:
+    for name, repository, commit, described, libraries, compare in rows:
+        if arguments.networks and name not in arguments.networks:
             continue
-        recipe = exports[network.export]
-        missing = _missing(network, recipe, arguments.checkouts)
-        found = missing or _compared(network, arguments.checkouts)
+        wanted = {name: (repository, commit), **libraries}
+        found = _missing(wanted, arguments.checkouts) or _told(compare, arguments.checkouts)
         differing += "DIFFERS" in found
-        code = f"{recipe.repository}@{recipe.commit[:10]}"
-        print(f"| {network.export} | {code} | {network.described} | {found} |", flush=True)
+        print(f"| {name} | {repository}@{commit[:10]} | {described} | {found} |", flush=True)
     return differing
 
 
-def _missing(network: Network, recipe: ModelExport, checkouts: Path | None) -> str:
-    """Why it cannot be compared here, or an empty text."""
+def _missing(wanted: Mapping[str, tuple[str, str]], checkouts: Path | None) -> str:
+    """Why it cannot be compared here, or an empty text. ``wanted``: repository and commit of each
+    folder."""
     if checkouts is None:
         return "skipped: no --checkouts"
-    wanted = {network.export: (recipe.repository, recipe.commit), **network.libraries}
     for folder, (repository, commit) in wanted.items():
         place = checkouts / folder
         if not (place / ".git").exists():
@@ -78,36 +89,31 @@ def _missing(network: Network, recipe: ModelExport, checkouts: Path | None) -> s
     return ""
 
 
-def _compared(network: Network, checkouts: Path) -> str:
-    with tempfile.TemporaryDirectory(prefix="mpsfm-conformance-") as name:
-        made = Path(name) / "network.onnx"
-        views = _photos(made.parent)
-        code = [checkouts / f for f in (network.export, *network.libraries, "packages")]
-        try:
-            run_script(_AUTHORS / network.script, code, made, size=network.size)
-        except ProviderError as error:
-            needs = f" (needs {', '.join(network.packages)})" if network.packages else ""
-            return f"skipped: the authors' code fails: {error}{needs}"
-        differences = {"file": max(compared(made).values()), **_differences(network, made, views)}
+def _told(compare: Compared, checkouts: Path) -> str:
+    try:
+        differences = compare(checkouts)
+    except MpsfmError as error:
+        return f"skipped: {error}"
     text = ", ".join(f"{name} {value:.1e}" for name, value in differences.items())
     differs = [n for n, value in differences.items() if not value <= _HOLDS.get(n, _TOLERANCE)]
     return f"DIFFERS in {', '.join(differs)}: {text}" if differs else text
 
 
-def _photos(folder: Path) -> list[View]:
-    """Photos of the sample scene, written for the authors' script."""
-    views, entries = [], []
-    for index, (path, (width, height, focal)) in enumerate(
-        zip(sorted(_SAMPLES.glob("*.jpg")), _CAMERAS, strict=False)
-    ):
-        image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
-        resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        camera = PinholeCamera(width, height, focal, focal, width / 2, height / 2)
-        np.save(folder / f"photo_{index}.npy", resized)
-        views.append(View(path.name, resized, camera))
-        entries.append({"file": f"photo_{index}.npy", "camera": vars(camera)})
-    (folder / "photos.json").write_text(json.dumps(entries), encoding="utf-8")
-    return views
+def _in_environment(hosted: Hosted, environment: str, checkouts: Path) -> dict[str, float]:
+    return hosted.compare(find_environment(environment), checkouts / hosted.name)
+
+
+def _through_file(network: Network, checkouts: Path) -> dict[str, float]:
+    with tempfile.TemporaryDirectory(prefix="mpsfm-conformance-") as name:
+        made = Path(name) / "network.onnx"
+        views = photos(made.parent)
+        code = [checkouts / f for f in (network.export, *network.libraries, "packages")]
+        try:
+            run_script(AUTHORS / network.script, code, made, size=network.size)
+        except ProviderError as error:
+            needs = f" (needs {', '.join(network.packages)})" if network.packages else ""
+            raise ProviderError(f"the authors' code fails: {error}{needs}") from None
+        return {"file": max(compared(made).values()), **_differences(network, made, views)}
 
 
 def _differences(network: Network, made: Path, views: Sequence[View]) -> dict[str, float]:

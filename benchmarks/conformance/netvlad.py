@@ -1,58 +1,42 @@
-"""NetVLAD against hloc's, which the reference uses.
-
-    python -m benchmarks.conformance.netvlad PYTHON CHECKOUT
-
-PYTHON: an interpreter with torch, torchvision, onnx and OpenCV; CHECKOUT: of
-cvg/Hierarchical-Localization. Their code exports itself with random weights, and ``global-onnx``
-runs the file.
-"""
+"""NetVLAD against hloc's, which the reference uses: their code exports itself with random weights,
+and ``global-onnx`` runs the file."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from benchmarks.conformance.__main__ import _AUTHORS, _SAMPLES, _TOLERANCE
-from mpsfm_core import PinholeCamera, ProviderContext, View
+from benchmarks.conformance.shared import photos, run_authors
+from mpsfm_core import ProviderContext
+from mpsfm_core.environments.store import Environment
 from mpsfm_core.registry import Registry
 
-_SIZES = ((640, 480), (333, 500), (1601, 1203), (900, 1300))
+_CAMERAS = ((640, 480, 500.0), (333, 500, 500.0), (1601, 1203, 500.0), (900, 1300, 500.0))
+_LARGEST = 1024
+"""Longer side in pixels that hloc shrinks photos to."""
+APART = "(two photos)"
+"""How far the descriptors of two photos are apart, beside which the others are to be seen."""
 
 
-def main() -> int:
-    """Compare, print, return whether it differs."""
-    python, checkout = sys.argv[1:]
+def compare(environment: Environment, checkout: Path) -> dict[str, float]:
+    """Largest distances of unit descriptors, of photos as they are and of those that are shrunk."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        views = []
-        for index, (path, size) in enumerate(
-            zip(sorted(_SAMPLES.glob("*.jpg")), _SIZES, strict=False)
-        ):
-            image = cv2.resize(cv2.imread(str(path)), size, interpolation=cv2.INTER_CUBIC)
-            cv2.imwrite(str(folder / f"{index}.png"), image)
-            camera = PinholeCamera(*size, 500.0, 500.0, size[0] / 2, size[1] / 2)
-            views.append(View(f"{index}.png", image[..., ::-1].copy(), camera))
+        views = photos(folder, _CAMERAS, cv2.INTER_CUBIC)
         model = folder / "netvlad.onnx"
-        files = [str(folder / view.name) for view in views]
-        script = [str(_AUTHORS / "netvlad.py"), checkout, str(model), *files]
-        subprocess.run([python, *script], check=True)
+        files = [folder / f"photo_{index}.png" for index in range(len(views))]
+        run_authors(environment, "netvlad.py", checkout, model, *files)
         options = {"model": str(model), "network": "netvlad"}
         context = ProviderContext(resolve_weights=lambda uri, sha256: Path(uri))
         provider = Registry.discover().create("retrieval", "global-onnx", options, context)
+        found = {"as they are": 0.0, "shrunk": 0.0}
         with np.load(model.with_suffix(".npz")) as theirs:
-            ours = {view.name[:-4]: provider.describe(view) for view in views}
-            off = {key: float(np.linalg.norm(ours[key] - theirs[key])) for key in ours}
-            apart = float(np.linalg.norm(theirs["0"] - theirs["1"]))
-    for view in views:
-        print(f"{view.camera.size}: unit descriptors are {off[view.name[:-4]]:.1e} apart")
-    print(f"those of two photos: {apart:.1e}")
-    return int(max(off.values()) > _TOLERANCE)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            for index, view in enumerate(views):
+                off = np.linalg.norm(provider.describe(view) - theirs[f"photo_{index}"])
+                key = "shrunk" if max(view.camera.size) > _LARGEST else "as they are"
+                found[key] = max(found[key], float(off))
+            found[APART] = float(np.linalg.norm(theirs["photo_0"] - theirs["photo_1"]))
+    return found

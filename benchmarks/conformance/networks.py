@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.conformance import netvlad, roma
 from mpsfm_core import DepthPrior, NormalPrior, PairMatches
 from mpsfm_core.data import Bool
+from mpsfm_core.environments.store import Environment
 from mpsfm_core.geometry import resize_map
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -40,6 +42,21 @@ class Network:
     libraries: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     packages: tuple[str, ...] = ()
     views: int = 1
+
+
+@dataclass(frozen=True)
+class Hosted:
+    """A network whose authors' code needs an environment of its own: torchvision in it.
+
+    ``repository``, ``commit``: of the authors' code; ``described``: which of its sizes.
+    ``compare``: the largest differences, for an environment and a checkout.
+    """
+
+    name: str
+    repository: str
+    commit: str
+    described: str
+    compare: Callable[[Environment, Path], Differences]
 
 
 def relative(ours: NDArray[Any], theirs: NDArray[Any], where: Bool) -> float:
@@ -202,5 +219,22 @@ NETWORKS = (
         lambda provider, view: provider.predict(view),
         _unidepth,
         packages=("einops", "huggingface_hub", "scipy", "tqdm"),
+    ),
+)
+
+HOSTED = (
+    Hosted(
+        "roma",
+        "Parskatt/RoMa",
+        "a1494f87ab85485ad8a92a981876ca837e2334e4",
+        "DINOv2 ViT-L/14, VGG19, 560 and 280 pixels",
+        roma.compare,
+    ),
+    Hosted(
+        "netvlad",
+        "cvg/Hierarchical-Localization",
+        "c13273bd0ecc2917a35910fd843712a1c6243193",
+        "VGG16, 64 centres, no whitening",
+        netvlad.compare,
     ),
 )
