@@ -248,7 +248,8 @@ class ModelExport:
 
     ``script``: module of the plugin that does it, run as a program and never imported.
     ``repository``: ``OWNER/NAME`` on GitHub; ``commit``: the one that it was tested with.
-    ``license``: of the authors' weights. ``packages``: what their code needs besides torch.
+    ``license``: of the authors' weights. ``packages``: what their code needs besides
+    torch and onnx.
     """
 
     script: str

@@ -72,8 +72,10 @@ def export_model(
         try:
             run_script(Path(script.origin), code, made, weights=weights, size=size, python=python)
         except ProviderError as error:
-            needs = f" (it needs {', '.join(recipe.packages)})" if recipe.packages else ""
-            raise ProviderError(f"the authors' code of {name} fails: {error}{needs}") from None
+            needs = ", ".join(("torch", "onnx", *recipe.packages))
+            raise ProviderError(
+                f"the authors' code of {name} fails: {error} (it needs {needs})"
+            ) from None
         differences = compared(made)
         worst = max(differences.values())
         if worst > TOLERANCE:
