@@ -32,11 +32,8 @@ from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.models import read_poses, reconstruction_poses
 
 SCENES = ("fountain", "rendered_kitchen", "hololens_room")
-SIFT = ("--set", "features.use=sift", "--set", "matcher.use=mutual-nearest")
-OURS: Mapping[str, tuple[str, ...]] = {
-    "`fast-cpu`": ("--config", "fast-cpu"),
-    "`fast-cpu` with SIFT and mutual nearest neighbours": ("--config", "fast-cpu", *SIFT),
-}
+OURS = ("sift", "fast-cpu")
+"""Configurations."""
 _ALONE = ("dense.enabled=false", "results.dense_cloud=false", "results.report=false")
 
 
@@ -72,15 +69,15 @@ def compared(scene: SceneFolder) -> list[str]:
         target = Path(work, "colmap")
         seconds = reference = timed([*own, str(target)], {})
         rows.append(row(scene, "COLMAP", read_poses(target), seconds, reference))
-        for number, (label, options) in enumerate(OURS.items()):
-            target = Path(work, str(number))
+        for config in OURS:
+            target = Path(work, config)
             command = [*MPSFM, "reconstruct", str(scene.images), "-o", str(target), "--quiet"]
-            command += ["--intrinsics", str(scene.intrinsics), *options]
+            command += ["--intrinsics", str(scene.intrinsics), "--config", config]
             for setting in _ALONE:
                 command += ["--set", setting]
-            seconds = timed(command, {CACHE_VARIABLE: str(Path(work, f"cache-{number}"))})
+            seconds = timed(command, {CACHE_VARIABLE: str(Path(work, f"cache-{config}"))})
             poses = read_poses(target / "sparse")
-            rows.append(row(scene, label, poses, seconds, reference))
+            rows.append(row(scene, f"`{config}`", poses, seconds, reference))
     return rows
 
 
