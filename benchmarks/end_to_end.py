@@ -24,6 +24,7 @@ from pathlib import Path
 import pycolmap
 
 from benchmarks._scenes import MPSFM, percent, shared_folder
+from benchmarks._sift import extract, match
 from mpsfm_core.data import Pose
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
@@ -63,12 +64,12 @@ def main() -> None:
 def compared(scene: SceneFolder) -> list[str]:
     """Rows of the table."""
     folder = scene.images.parent
-    rows, reference = [], 0.0
+    rows = []
     with tempfile.TemporaryDirectory() as work:
         own = [sys.executable, "-m", "benchmarks.end_to_end", "--colmap", str(folder)]
         target = Path(work, "colmap")
-        seconds = reference = timed([*own, str(target)], {})
-        rows.append(row(scene, "COLMAP", read_poses(target), seconds, reference))
+        reference = timed([*own, str(target)], {})
+        rows.append(row(scene, "COLMAP", read_poses(target), reference, reference))
         for config in OURS:
             target = Path(work, config)
             command = [*MPSFM, "reconstruct", str(scene.images), "-o", str(target), "--quiet"]
@@ -112,19 +113,8 @@ def colmap(scene: SceneFolder, output: Path) -> None:
         camera = photo.pinhole
         cameras[camera.fx, camera.fy, camera.cx, camera.cy].append(photo.name)
     for values, names in cameras.items():
-        pycolmap.extract_features(
-            database,
-            scene.images,
-            image_names=names,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=pycolmap.ImageReaderOptions(
-                camera_model="PINHOLE", camera_params=",".join(map(str, values))
-            ),
-            extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False),
-        )
-    pycolmap.match_exhaustive(
-        database, matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False)
-    )
+        extract(database, scene.images, "PINHOLE", values, names)
+    match(database)
     options = pycolmap.IncrementalPipelineOptions()
     options.ba_refine_focal_length = False
     options.ba_refine_extra_params = False

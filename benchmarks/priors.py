@@ -26,6 +26,7 @@ import numpy as np
 import pycolmap
 
 from benchmarks._scenes import RESULTS, shared_folder
+from benchmarks._sift import extract, match
 from mpsfm_core.calibration.calibrate import Photos, compare
 from mpsfm_core.calibration.fitting import DepthData, std_of
 from mpsfm_core.calibration.metrics import sensitivity_curve
@@ -176,19 +177,8 @@ def _triangulated(folder: Path, work: Path) -> Path:
         pycolmap.set_random_seed(0)
         truth = pycolmap.Reconstruction(folder / "gt")
         camera = next(iter(truth.cameras.values()))
-        reader = pycolmap.ImageReaderOptions(
-            camera_model=camera.model.name, camera_params=",".join(map(str, camera.params))
-        )
-        pycolmap.extract_features(
-            database,
-            folder / "images",
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=reader,
-            extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=2),
-        )
-        pycolmap.match_exhaustive(
-            database, matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False)
-        )
+        extract(database, folder / "images", camera.model.name, camera.params)
+        match(database)
         known = _as_in_database(truth, database)
         pycolmap.triangulate_points(known, database, folder / "images", model)
     return model

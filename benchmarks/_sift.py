@@ -1,0 +1,31 @@
+"""COLMAP's SIFT and exhaustive matching, as its own pipeline does them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pycolmap
+
+
+def extract(
+    database: Path, images: Path, model: str, params: Sequence[float], names: Sequence[str] = ()
+) -> None:
+    """Features of images of one known camera; ``names``: of all by default."""
+    pycolmap.extract_features(
+        database,
+        images,
+        image_names=list(names),
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=pycolmap.ImageReaderOptions(
+            camera_model=model, camera_params=",".join(map(str, params))
+        ),
+        extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False),
+    )
+
+
+def match(database: Path) -> None:
+    """All pairs."""
+    pycolmap.match_exhaustive(
+        database, matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False)
+    )
