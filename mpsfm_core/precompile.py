@@ -1,4 +1,4 @@
-"""Compiles the kernels of mapping before they are needed.
+"""Compiles the kernels of matching and mapping before they are needed.
 
 A run that finds them not compiled starts this beside its extraction and waits for it before it
 maps; ``python -m mpsfm_core.precompile`` does it at installation. Two processes map a tiny scene,
@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numba
+import numpy as np
 
+from mpsfm_core.builtin.mutual_nearest import mutual_nearest
 from mpsfm_core.data import PinholeCamera, View
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
@@ -27,7 +29,7 @@ from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 
 _ENDS = ("bundles", "depth")
-_ROOMS = ("optimize", "scene", "mapping", "dense")
+_ROOMS = ("builtin", "optimize", "scene", "mapping", "dense")
 _CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
@@ -71,6 +73,7 @@ def compile_kernels(end: str) -> None:
     }
     dense, _ = densify(mapping.reconstructions[0], views.__getitem__, DenseOptions())
     fuse_depth_maps(dense, views.__getitem__, ResultOptions())
+    mutual_nearest(*np.ones((2, 1, 1), np.float32))
 
 
 def _stamp() -> Path | None:

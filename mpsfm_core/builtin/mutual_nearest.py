@@ -48,7 +48,7 @@ class MutualNearest:
             raise ProviderError(
                 f"descriptors of {view_a.name!r} and {view_b.name!r} differ in dimension"
             )
-        pairs, nearest, ratio = _mutual(a, b)
+        pairs, nearest, ratio = mutual_nearest(a, b)
         keep = ratio <= (1.0 if self._options.ratio is None else self._options.ratio)
         if self._options.max_distance is not None:
             keep &= nearest <= self._options.max_distance
@@ -56,7 +56,7 @@ class MutualNearest:
         return PairMatches(sparse=SparseMatches(pairs[keep], scores[keep]))
 
 
-def _mutual(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
+def mutual_nearest(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
     """Mutual nearest neighbours (m, 2), their distances (m,), and the larger of the ratios to the
     second nearest in both directions (m,)."""
     if not (len(a) and len(b)):
