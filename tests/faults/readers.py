@@ -264,8 +264,8 @@ def weights() -> Table:
     torch.save({"model": tensors}, pickled)
     said = {"features": Features(np.ones((4, 2)), np.ones((4, 8), np.float32)), "path": Path("a")}
     packed = Packed(said)
-    block = memoryview(bytearray(packed.size))
-    packed.write(block)
+    block = np.zeros(packed.size, np.uint8)
+    packed.write(memoryview(block))
     return {
         "a.pt": (pickled.getvalue(), load_torch_state),
         "a.safetensors": (save_safetensors(tensors), load_torch_state),
