@@ -45,7 +45,7 @@ def main() -> None:
     errors: dict[tuple[str, str], list[Float64]] = {}
     sizes: dict[tuple[str, str], list[float]] = {}
     for prior in DEGRADED:
-        problem, options = problem_of_sets(
+        prepared = problem_of_sets(
             scene,
             sets,
             prior,
@@ -54,9 +54,10 @@ def main() -> None:
             arguments.output / "bounds",
             registry,
         )
+        options = prepared.config.mapper_options()
         for item in sets:
             truth = {name: scene.truth[name] for name in item.images}
-            plain = problem.subset(list(item.images))
+            plain = prepared.problem.subset(list(item.images))
             for start, run in (("by itself", plain), ("at the truth", _posed(plain, truth))):
                 models = reconstruct(run, options).reconstructions
                 found = models[0].poses if models else {}

@@ -34,10 +34,11 @@ from mpsfm_core.dense.sparse_depth import depth_of_points
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.benchmark import PairsOfSets, problem_of_sets
-from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy
+from mpsfm_core.evaluation.dense_geometry import dense_accuracy
 from mpsfm_core.evaluation.prior_quality import read_depth
+from mpsfm_core.evaluation.report import CLOUD
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
-from mpsfm_core.evaluation.true_surface import depth_file, surface_of_depth
+from mpsfm_core.evaluation.true_surface import depth_file
 from mpsfm_core.geometry import (
     camera_center,
     pixel_centers,
@@ -155,10 +156,10 @@ def problem_of_case(
     registry, only = Registry.discover(), PairsOfSets()
     only.allow(sets)
     registry.register(only, name="pairs of sets")
-    problem, options = problem_of_sets(
+    prepared = problem_of_sets(
         scene, sets, case.prior, str(config), ("runtime.workers=1",), output / name, registry
     )
-    return problem, options, sets
+    return prepared.problem, prepared.config.mapper_options(), sets
 
 
 def measured(
@@ -179,7 +180,7 @@ def measured(
                 seen = report.measured
                 seconds = (time.process_time() - started) / len(model.images)
             cloud, *_ = fuse_depth_maps(model, view_of(photos), ResultOptions())
-            errors = set_errors(scene, problem, model, seen, cloud)
+            errors = set_errors(scene, photos, problem, model, seen, cloud)
             found.append({**errors, "cpu_s_photo": seconds})
         usable = [each for each in found if len(each) > 1]
         rows.append({"case": name, "maps": way, "sets": len(usable), **_means(usable)})
@@ -205,6 +206,7 @@ def view_of(photos: ImageSet) -> Any:
 
 def set_errors(
     scene: SceneFolder,
+    photos: ImageSet,
     problem: MappingProblem | None,
     reconstruction: Reconstruction,
     seen: Mapping[str, Bool],
@@ -219,28 +221,30 @@ def set_errors(
     errors = trajectory_errors(reconstruction.poses, scene.truth)
     if errors is None:
         return {}
-    aligned = errors.truth_from_estimate
+    scale = errors.truth_from_estimate.scale
     if scene.depth is None:
         assert problem is not None
-        return points_near(problem, scene.truth, maps, aligned.scale)
+        return points_near(problem, scene.truth, maps, scale)
     found = [
-        map_errors(depth, aligned.scale, read_depth(depth_file(scene.depth, name)), seen.get(name))
+        map_errors(depth, scale, read_depth(depth_file(scene.depth, name)), seen.get(name))
         for name, depth in maps.items()
     ]
-    result = _means(found)
-    accuracy = cloud_accuracy(aligned.apply(cloud), scan_of(scene, tuple(maps)), TOLERANCES)
+    cameras = {photo.name: photo.pinhole for photo in photos}
+    accuracy = dense_accuracy(reconstruction, cloud, scene, cameras, TOLERANCES)
+    assert accuracy is not None  # it has a scale and true depth
+    result = {"abs_rel": accuracy["depth"]["abs_rel"], **_means(found)}
     for tolerance in map(str, TOLERANCES):
         centimetres = round(100 * float(tolerance))
-        for key in ("accuracy", "completeness", "f1"):
-            result[f"{key}_{centimetres}cm"] = accuracy[key][tolerance]
-    result["points"] = accuracy["points"]
+        for key in CLOUD:
+            result[f"{key}_{centimetres}cm"] = accuracy["cloud"][key][tolerance]
+    result["points"] = accuracy["cloud"]["points"]
     return result
 
 
 def map_errors(
     depth: DepthPrior, scale: float, truth: Float64, seen: Bool | None
 ) -> dict[str, float]:
-    """AbsRel and the share that is near of one map; of pixels that were ``seen`` and of the rest
+    """The share that is near of one map; of pixels that were ``seen`` and of the rest
     the share within the stated std, and the part that the rest has in the AbsRel."""
     assert depth.variance is not None  # of a refined map always
     known = truth > 0
@@ -257,21 +261,12 @@ def map_errors(
     own = np.zeros(grid, np.bool_) if seen is None else seen
     measured = sample_nearest(own, xy)[ok]
     return {
-        "abs_rel": float(relative.mean()),
         "near": float((error <= NEAR * true).mean()),
         "measured": float(measured.mean()),
         "abs_rel_of_rest": float(relative[~measured].sum() / len(relative)),
         "within_std_measured": float(within[measured].mean()) if measured.any() else np.nan,
         "within_std_rest": float(within[~measured].mean()) if not measured.all() else np.nan,
     }
-
-
-def scan_of(scene: SceneFolder, names: Sequence[str]) -> Float64:
-    """World points of all true depth maps of the images."""
-    assert scene.depth is not None
-    photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
-    cameras = {photo.name: photo.pinhole for photo in photos}
-    return surface_of_depth(scene.depth, names, cameras, scene.truth, min(TOLERANCES) / 2)
 
 
 def triangulated(problem: MappingProblem, truth: Mapping[str, Pose]) -> dict[str, Float64]:

@@ -50,6 +50,14 @@ def benchmark(
             "transforms.json. May be repeated.",
         ),
     ] = None,
+    distance: Annotated[
+        list[float] | None,
+        typer.Option(
+            metavar="D",
+            min=1e-6,
+            help="Metres, of dense columns; may be repeated. Default: 1 to 50 cm.",
+        ),
+    ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Sets mapped at the same time.")] = 1,
     overrides: Overrides = None,
     compare: Annotated[
@@ -65,6 +73,7 @@ def benchmark(
 
     A SCENE is a folder with images/, gt/, and maybe intrinsics.yaml, gt_depth/ and testsets.yaml.
     Writes DIR/report.md, .json and .html. What DIR has already is not computed again.
+    With gt_depth/ and --set dense.enabled=true also what depth maps and clouds are worth.
     """
     from mpsfm_core.errors import InputError
 
@@ -75,6 +84,7 @@ def benchmark(
         raise InputError("benchmark needs scene folders and --output DIR, or --compare A B")
     from mpsfm_core.cli.progress import showing_progress
     from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
+    from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES
     from mpsfm_core.evaluation.methods import OTHERS
     from mpsfm_core.evaluation.report import make_rows, markdown, write_report
     from mpsfm_core.registry import Registry
@@ -88,6 +98,7 @@ def benchmark(
         tuple(overrides or ()),
         workers,
         dict(_named(text) for text in results or ()),
+        tuple(sorted(set(distance or TOLERANCES))),
     )
     registry = Registry.discover()
     with showing_progress(registry, quiet):

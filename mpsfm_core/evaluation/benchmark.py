@@ -11,12 +11,15 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
 import pycolmap
 
-from mpsfm_core.config import load_config
+from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES
+from mpsfm_core.evaluation.dense_geometry import DenseTask
 from mpsfm_core.evaluation.methods import (
     OTHERS,
     OURS,
@@ -32,8 +35,7 @@ from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_
 from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.runner import extract
 from mpsfm_core.files import write_file
-from mpsfm_core.inputs.images import load_images
-from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.providers import hookimpl
 from mpsfm_core.provision import provide
 from mpsfm_core.registry import Registry, core_version
@@ -52,7 +54,8 @@ class Plan:
     each. ``peers``: of :data:`~mpsfm_core.evaluation.methods.OTHERS`. ``overrides``: settings
     ``KEY=VALUE`` of all configurations. ``workers``: sets that are mapped at the same time.
     ``results``: label -> folder of models that another program made
-    (:mod:`~mpsfm_core.evaluation.results_of_others`).
+    (:mod:`~mpsfm_core.evaluation.results_of_others`). ``distances``: metres, at which clouds are
+    judged where a configuration has the dense stage and a scene true depth.
     """
 
     scenes: tuple[Path, ...]
@@ -63,6 +66,7 @@ class Plan:
     overrides: tuple[str, ...] = ()
     workers: int = 1
     results: Mapping[str, Path] = field(default_factory=dict)
+    distances: tuple[float, ...] = TOLERANCES
 
 
 def run_benchmark(
@@ -118,6 +122,15 @@ class PairsOfSets:
         return [(a, b) for a, b in pairs if (min(a, b), max(a, b)) in self._allowed]
 
 
+class PreparedSets(NamedTuple):
+    """``problem``: verified matches and priors of all ``images`` of some sets. ``config``: as it
+    was resolved for them."""
+
+    problem: MappingProblem
+    images: ImageSet
+    config: Config
+
+
 def problem_of_sets(
     scene: SceneFolder,
     sets: Sequence[EvaluationSet],
@@ -126,8 +139,8 @@ def problem_of_sets(
     overrides: Sequence[str],
     work: Path,
     registry: Registry,
-) -> tuple[MappingProblem, MapperOptions]:
-    """Verified matches and priors of all images of the sets, and the configuration's mapper.
+) -> PreparedSets:
+    """Photos of the sets, verified and with priors, and the configuration.
 
     ``prior``: a quality of :mod:`~mpsfm_core.evaluation.prior_quality`. ``work``: a folder for the
     depth of that quality.
@@ -142,7 +155,7 @@ def problem_of_sets(
     inputs = loaded.inputs.model_copy(update={"strict": True})  # a set is compared as a whole
     images = load_images(scene.images, scene.intrinsics, listed, inputs)
     extraction = extract(images, loaded, registry, stages)
-    return extraction.problem, loaded.mapper_options()
+    return PreparedSets(extraction.problem, images, loaded)
 
 
 class _SceneRuns:
@@ -168,7 +181,7 @@ class _SceneRuns:
     def __call__(self) -> Iterator[tuple[Record, bool]]:
         """Records and whether they were there already."""
         for number, prior in enumerate(self._plan.priors):
-            problem, options = problem_of_sets(
+            prepared = problem_of_sets(
                 self._scene,
                 self._sets,
                 prior,
@@ -182,11 +195,12 @@ class _SceneRuns:
                 for method in (OURS, *self._plan.peers)
                 if method in USING_PRIORS or number == 0
             }
+            options, dense = prepared.config.mapper_options(), self._dense(prepared)
             places: dict[Task, tuple[EvaluationSet, str]] = {}
             for item in self._sets:
-                subset = problem.subset(list(item.images))
+                subset = prepared.problem.subset(list(item.images))
                 for label, method in methods.items():
-                    task = Task(label, method, subset, options)
+                    task = Task(label, method, subset, options, dense if method == OURS else None)
                     key = _key(task)
                     known = self._known(item, label, key)
                     if known is not None:
@@ -197,6 +211,13 @@ class _SceneRuns:
                 record = self._record(*places[task], task, outcome)
                 write_record(self._output, record)
                 yield record, False
+
+    def _dense(self, prepared: PreparedSets) -> DenseTask | None:
+        config = prepared.config
+        if not config.dense.enabled or self._scene.depth is None:
+            return None
+        settings = config.dense, config.results, self._scene, self._plan.distances
+        return DenseTask(prepared.images, *settings)
 
     def _known(self, item: EvaluationSet, label: str, key: str) -> Record | None:
         path = self._output / record_file(self._scene.name, self._config_name, item.name, label)
@@ -223,6 +244,7 @@ class _SceneRuns:
             outcome.cpu_seconds,
             outcome.error,
             outcome.models[1:],
+            outcome.dense,
         )
 
 
@@ -242,6 +264,9 @@ def _key(task: Task) -> str:
     parts: list[object] = [task.method, core_version(), pycolmap.__version__]
     if task.method == OURS:
         parts.append(task.options.model_dump(mode="json"))
+    if task.dense is not None:
+        settings = (task.dense.dense, task.dense.results)
+        parts += [[each.model_dump(mode="json") for each in settings], task.dense.distances]
     if task.method in USING_PRIORS:
         parts += [digest(image) for image in task.problem.images]
     else:

@@ -34,12 +34,12 @@ class DepthAccuracy:
 
 
 def depth_accuracy(
-    depth: Float32, valid: Bool, truth: Float32, *, median_scaled: bool
+    depth: Float32, valid: Bool, truth: Float32, *, scale: float | None
 ) -> DepthAccuracy | None:
     """Compare a map (h, w) with the truth (H, W), 0 where unknown, on the truth's pixels.
 
-    ``median_scaled``: after the scale that makes the median of ``truth / depth`` one; else raw,
-    in one unit. None when no pixel can be compared.
+    ``scale``: the map is multiplied with it; None for the one that makes the median of
+    ``truth / depth`` one. Returns None when no pixel can be compared.
     """
     known = truth > 0
     height, width = truth.shape
@@ -49,7 +49,8 @@ def depth_accuracy(
     if not ok.any():
         return None
     predicted, true = found[ok], truth[known][ok].astype(np.float64)
-    scale = float(np.median(true / predicted)) if median_scaled else 1.0
+    if scale is None:
+        scale = float(np.median(true / predicted))
     predicted = scale * predicted
     ratio = np.maximum(predicted / true, true / predicted)
     return DepthAccuracy(

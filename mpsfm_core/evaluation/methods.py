@@ -12,14 +12,17 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from typing import Any
 
 import pycolmap
 
 from mpsfm_core.data import MappingProblem, PinholeCamera, Pose
 from mpsfm_core.evaluation.chained_pnp import chained_poses
+from mpsfm_core.evaluation.dense_geometry import DenseTask
 from mpsfm_core.evaluation.peers import PEERS, run_peer
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.scene.reconstruction import Reconstruction
 from mpsfm_core.stages import peak_memory_mb
 from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
@@ -41,7 +44,8 @@ class Outcome:
     ``models``: poses by image name, of the largest model first. ``seconds``: wall clock;
     ``cpu_seconds``: of the process, which other jobs on the machine do not stretch.
     ``peak_mib``: most memory that the process held, its problem and earlier tasks included; 0
-    where the system does not tell. ``error``: why it failed, empty if it did not.
+    where the system does not tell. ``error``: why it failed, empty if it did not. ``dense``: what
+    :meth:`DenseTask.measure` says of the largest model; its time is not in the seconds.
     """
 
     models: Sequence[dict[str, Pose]] = ()
@@ -49,16 +53,19 @@ class Outcome:
     cpu_seconds: float = 0.0
     peak_mib: float = 0.0
     error: str = ""
+    dense: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One run: ``method`` is :data:`OURS`, :data:`CHAIN` or the name of a peer."""
+    """One run: ``method`` is :data:`OURS`, :data:`CHAIN` or the name of a peer. ``dense``: how the
+    depth of ours is measured and compared, None where it is not."""
 
     label: str
     method: str
     problem: MappingProblem
     options: MapperOptions
+    dense: DenseTask | None = None
 
 
 def run_tasks(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, Outcome]]:
@@ -74,26 +81,31 @@ def run_tasks(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, Outco
         lanes.close()
 
 
-def run_method(method: str, problem: MappingProblem, options: MapperOptions) -> Outcome:
-    """Run a method here and now; what it raises becomes the outcome's error."""
+def run_method(task: Task) -> Outcome:
+    """Run a task here and now; what it raises becomes the outcome's error."""
     started, cpu_started = time.perf_counter(), time.process_time()
     models: list[dict[str, Pose]] = []
-    error = ""
+    found: Sequence[Reconstruction] = ()
+    dense, error = None, ""
     try:
         with limited(1):
-            models = _models(method, problem, options)
+            if task.method == CHAIN:
+                models = chained_poses(task.problem, task.options.seed)
+            elif task.method != OURS:
+                models = run_peer(task.method, task.problem)
+            else:
+                found = mapper.reconstruct(task.problem, task.options).reconstructions
+                models = [model.poses for model in found]
     except Exception as raised:  # whatever a mapper raises is its result
         error = f"{type(raised).__name__}: {raised}"
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
-    return Outcome(models, seconds, cpu_seconds, peak_memory_mb() or 0.0, error)
-
-
-def _models(method: str, problem: MappingProblem, options: MapperOptions) -> list[dict[str, Pose]]:
-    if method == CHAIN:
-        return chained_poses(problem, options.seed)
-    if method != OURS:
-        return run_peer(method, problem)
-    return [model.poses for model in mapper.reconstruct(problem, options).reconstructions]
+    if task.dense is not None and found:
+        try:
+            with limited(1):
+                dense = task.dense.measure(found[0], task.problem)
+        except Exception as raised:  # the poses stand
+            error = f"dense: {type(raised).__name__}: {raised}"
+    return Outcome(models, seconds, cpu_seconds, peak_memory_mb() or 0.0, error, dense)
 
 
 class _Lanes:
@@ -108,7 +120,7 @@ class _Lanes:
         """Run a task in the process of the calling thread."""
         process = getattr(self._local, "process", None) or self._start()
         try:
-            return process.submit(run_method, task.method, task.problem, task.options).result()
+            return process.submit(run_method, task).result()
         except BrokenProcessPool:
             self._start()
             return Outcome(error="its process died")
@@ -134,4 +146,4 @@ def _prepare() -> None:
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     camera = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
     problem = mapping_problem(room_scene(), camera, arc_poses(3, 8.0))
-    run_method(OURS, problem, MapperOptions())
+    run_method(Task(OURS, OURS, problem, MapperOptions()))

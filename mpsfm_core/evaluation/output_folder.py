@@ -10,7 +10,7 @@ from mpsfm_core.data import Float64, Pose
 from mpsfm_core.errors import InputError
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES, cloud_accuracy
-from mpsfm_core.evaluation.depth_accuracy import depth_accuracy, mean_accuracy
+from mpsfm_core.evaluation.depth_accuracy import DepthAccuracy, depth_accuracy, mean_accuracy
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.true_surface import depth_file, surface_of_depth
 from mpsfm_core.inputs.models import read_model, reconstruction_poses
@@ -25,7 +25,8 @@ def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
     Returns the means over images, ``raw`` (only for results in metres meaningful) and
     ``median_scaled``. Raises :class:`InputError` when no map has a true one.
     """
-    found: dict[bool, list[Any]] = {True: [], False: []}
+    scales = {"raw": 1.0, "median_scaled": None}
+    found: dict[str, list[DepthAccuracy]] = {name: [] for name in scales}
     for path in sorted((output / "depth").rglob("*.npz")):
         file = depth_file(truth, path.relative_to(output / "depth").with_suffix("").as_posix())
         if not file.is_file():
@@ -35,13 +36,13 @@ def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
             raise InputError(f"{path}: is no depth map of a run")
         depth, valid = arrays["depth"], arrays["valid"]
         true = read_depth(file)
-        for scaled in found:
-            accuracy = depth_accuracy(depth, valid, true, median_scaled=scaled)
+        for name, scale in scales.items():
+            accuracy = depth_accuracy(depth, valid, true, scale=scale)
             if accuracy is not None:
-                found[scaled].append(accuracy)
-    if not found[True]:
+                found[name].append(accuracy)
+    if not found["raw"]:
         raise InputError(f"{output / 'depth'}: no depth map has a true one in {truth}")
-    return {"raw": mean_accuracy(found[False]), "median_scaled": mean_accuracy(found[True])}
+    return {name: mean_accuracy(each) for name, each in found.items()}
 
 
 def evaluate_cloud(

@@ -32,7 +32,9 @@ class Record:
     ``label``: the method, ours with its prior. ``key``: names all it depends on. ``estimated``,
     ``truth``: ``cam_from_world`` by image name; images that only ``truth`` has are unregistered.
     ``estimated`` is the largest model, ``others`` are further ones. ``pairs``: number of verified
-    pairs. ``error``: why it failed, empty if it did not.
+    pairs. ``error``: why it failed, empty if it did not. ``dense``: what
+    :func:`~mpsfm_core.evaluation.dense_geometry.dense_accuracy` says, None where that was not
+    asked or cannot be told.
     """
 
     scene: str
@@ -48,6 +50,7 @@ class Record:
     cpu_seconds: float
     error: str = ""
     others: Sequence[Mapping[str, Pose]] = ()
+    dense: Mapping[str, Any] | None = None
 
     def errors_deg(self, convention: PoseConvention) -> Float64:
         """Errors of all pairs, see :func:`~mpsfm_core.evaluation.pose_auc.pose_errors_deg`."""

@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,10 +25,18 @@ from mpsfm_core.formats import VERSION
 FORMAT = 1
 """Of ``report.json``."""
 ALL_SCENES = "all scenes"
+CLOUD = ("accuracy", "completeness", "f1")
+"""What a dense column says of a cloud at a distance."""
 _COLORS = ("#1b6ca8", "#d1495b", "#2e8b57", "#e08e0b", "#7b4fa3", "#5c5c5c", "#17a2b8", "#a0522d")
 _PLOT = (440, 260)
 _RANGE_DEG = 20
 
+
+_DENSE_NOTE = (
+    "Dense geometry: AbsRel of the depth maps in the scale of the cameras; accuracy / "
+    "completeness / F1 of the cloud at each distance, percent, as ETH3D defines them, with true "
+    "depth as the scan."
+)
 
 Group = tuple[str, str, str, str]
 """Scene, configuration, bucket and method."""
@@ -39,6 +48,9 @@ class Row:
 
     ``auc``: threshold in degrees -> percent, errors of all sets pooled. ``registered``: share of
     the images. ``cpu_seconds``, ``seconds``: mean of a set. ``failed``: sets on which it raised.
+    ``dense``: None where no set was measured and compared with true depth, else means over
+    ``sets`` of them: ``abs_rel`` of the depth maps, and of the cloud ``accuracy``,
+    ``completeness`` and ``f1``, each distance in metres -> share.
     """
 
     scene: str
@@ -52,6 +64,7 @@ class Row:
     seconds: float
     cpu_seconds: float
     failed: int
+    dense: Mapping[str, Any] | None = None
 
     @property
     def place(self) -> Group:
@@ -94,20 +107,32 @@ def make_rows(
                 seconds=float(np.mean([record.seconds for record in group])),
                 cpu_seconds=float(np.mean([record.cpu_seconds for record in group])),
                 failed=sum(bool(record.error) for record in group),
+                dense=_mean_dense([record.dense for record in group if record.dense]),
             )
         )
     return rows
 
 
+def _mean_dense(sets: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    if not sets:
+        return None
+    means: dict[str, Any] = {"sets": len(sets)}
+    means["abs_rel"] = float(np.mean([each["depth"]["abs_rel"] for each in sets]))
+    for key in CLOUD:
+        distances = sets[0]["cloud"][key]
+        means[key] = {d: float(np.mean([s["cloud"][key][d] for s in sets])) for d in distances}
+    return means
+
+
 def markdown(rows: Sequence[Row], convention: PoseConvention = CONVENTIONS["paper"]) -> str:
     """A table for each scene and configuration, the convention in words above it."""
     parts = [f"Pose AUC in percent, convention `{convention.name}`: {convention.description}."]
-    header = ["bucket", "sets", "method", *(f"AUC@{t}°" for t in THRESHOLDS_DEG)]
-    header += ["registered", "CPU s / set", "failed"]
+    if any(row.dense for row in rows):
+        parts.append(_DENSE_NOTE)
     for scene, config in dict.fromkeys((row.scene, row.config) for row in rows):
         parts.append(f"### {scene}, configuration `{config}`")
-        lines = [header, ["---"] * 3 + ["---:"] * (len(header) - 3)]
-        lines += [_cells(row) for row in rows if (row.scene, row.config) == (scene, config)]
+        head, *cells = _lines([row for row in rows if (row.scene, row.config) == (scene, config)])
+        lines = [head, ["---"] * 3 + ["---:"] * (len(head) - 3), *cells]
         parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
     return "\n\n".join(parts) + "\n"
 
@@ -139,10 +164,31 @@ def write_report(output: Path, records: Sequence[Record]) -> None:
     write_file(output / "report.html", _page(rows, records, convention))
 
 
+def _lines(rows: Sequence[Row]) -> list[list[str]]:
+    """Head and cells of a table; dense columns where a row has them, one a distance."""
+    head = ["bucket", "sets", "method", *(f"AUC@{t}°" for t in THRESHOLDS_DEG)]
+    head += ["registered", "CPU s / set", "failed"]
+    dense = [row.dense for row in rows if row.dense]
+    distances = list(dict.fromkeys(d for each in dense for d in each["f1"]))
+    if dense:
+        head += ["AbsRel", *(f"{d} m" for d in distances)]
+    return [head, *(_cells(row) + (_dense_cells(row, distances) if dense else []) for row in rows)]
+
+
 def _cells(row: Row) -> list[str]:
     areas = [f"{row.auc[t]:.1f}" for t in THRESHOLDS_DEG]
     rest = [f"{row.registered:.0%}", f"{row.cpu_seconds:.2f}", str(row.failed or "")]
     return [row.bucket, str(row.sets), row.method, *areas, *rest]
+
+
+def _dense_cells(row: Row, distances: Sequence[str]) -> list[str]:
+    if row.dense is None:
+        return [""] * (1 + len(distances))
+    means = row.dense
+    shares = [
+        " / ".join(f"{100 * means[key].get(d, np.nan):.0f}" for key in CLOUD) for d in distances
+    ]
+    return [f"{means['abs_rel']:.3f}", *shares]
 
 
 def _page(rows: Sequence[Row], records: Sequence[Record], convention: PoseConvention) -> str:
@@ -154,6 +200,8 @@ def _page(rows: Sequence[Row], records: Sequence[Record], convention: PoseConven
         f"<p>Pose AUC in percent, convention {html.escape(convention.name)}: "
         f"{html.escape(convention.description)}.</p>",
     ]
+    if any(row.dense for row in rows):
+        parts.append(f"<p>{html.escape(_DENSE_NOTE)}</p>")
     groups = grouped(records)
     for place in dict.fromkeys((row.scene, row.config, row.bucket) for row in rows):
         here = [row for row in rows if (row.scene, row.config, row.bucket) == place]
@@ -170,9 +218,9 @@ def _page(rows: Sequence[Row], records: Sequence[Record], convention: PoseConven
 
 
 def _table(rows: Sequence[Row]) -> str:
-    head = ["method", *(f"AUC@{t}°" for t in THRESHOLDS_DEG), "registered", "CPU s / set", "failed"]
-    lines = ["".join(f"<th>{cell}</th>" for cell in head)]
-    lines += ["".join(f"<td>{html.escape(c)}</td>" for c in _cells(row)[2:]) for row in rows]
+    head, *cells = _lines(rows)
+    lines = ["".join(f"<th>{cell}</th>" for cell in head[2:])]
+    lines += ["".join(f"<td>{html.escape(c)}</td>" for c in line[2:]) for line in cells]
     return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
 
 

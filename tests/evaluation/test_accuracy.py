@@ -24,7 +24,7 @@ VALID = np.ones(TRUTH.shape, dtype=np.bool_)
 
 def test_depth_errors_computed_by_hand() -> None:
     depth = np.array([[1, 3, 4, 9]], dtype=np.float32).repeat(3, axis=0)
-    found = depth_accuracy(depth, VALID, TRUTH, median_scaled=False)
+    found = depth_accuracy(depth, VALID, TRUTH, scale=1.0)
     assert found is not None
     assert found.abs_rel == pytest.approx((0.5 + 0.5 + 0) / 3)
     assert found.rmse_log == pytest.approx(np.sqrt((np.log(2) ** 2 + np.log(1.5) ** 2) / 3))
@@ -35,8 +35,8 @@ def test_depth_errors_computed_by_hand() -> None:
 
 def test_median_scaling_takes_out_the_scale() -> None:
     depth = np.where(TRUTH > 0, 0.25 * TRUTH, 1).astype(np.float32)
-    raw = depth_accuracy(depth, VALID, TRUTH, median_scaled=False)
-    scaled = depth_accuracy(depth, VALID, TRUTH, median_scaled=True)
+    raw = depth_accuracy(depth, VALID, TRUTH, scale=1.0)
+    scaled = depth_accuracy(depth, VALID, TRUTH, scale=None)
     assert raw is not None and scaled is not None
     assert raw.abs_rel == pytest.approx(0.75) and raw.delta3 == 0
     assert scaled.scale == pytest.approx(4) and scaled.abs_rel == pytest.approx(0, abs=1e-6)
@@ -47,17 +47,17 @@ def test_median_scaling_takes_out_the_scale() -> None:
 def test_only_pixels_known_to_both_count() -> None:
     valid = VALID.copy()
     valid[:, 0] = False
-    found = depth_accuracy(TRUTH + np.float32(0), valid, TRUTH, median_scaled=False)
+    found = depth_accuracy(TRUTH + np.float32(0), valid, TRUTH, scale=1.0)
     assert found is not None
     assert found.coverage == pytest.approx(2 / 3) and found.abs_rel == 0
-    assert depth_accuracy(TRUTH, ~VALID, TRUTH, median_scaled=True) is None
+    assert depth_accuracy(TRUTH, ~VALID, TRUTH, scale=None) is None
 
 
 def test_a_map_on_a_smaller_grid_is_interpolated() -> None:
     rows, columns = np.mgrid[0:40, 0:80] + 0.5
     truth = (2 + columns / 80 + rows / 40).astype(np.float32)
     small = truth.reshape(20, 2, 40, 2).mean(axis=(1, 3))
-    found = depth_accuracy(small, np.ones(small.shape, np.bool_), truth, median_scaled=False)
+    found = depth_accuracy(small, np.ones(small.shape, np.bool_), truth, scale=1.0)
     assert found is not None and found.abs_rel < 1e-3
 
 

@@ -17,6 +17,7 @@ from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
 from mpsfm_core.evaluation.methods import Task, run_method, run_tasks
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.records import read_record, read_records
+from mpsfm_core.evaluation.report import CLOUD
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
@@ -61,6 +62,7 @@ def output(
 
 def arguments(scene: Path, config: Path, folder: Path) -> list[str]:
     settings = f"--config {config} --prior sensor,degraded --sets all --peers colmap -o {folder}"
+    settings += " --distance 0.02 --distance 0.1"
     return ["benchmark", str(scene), *settings.split()]
 
 
@@ -78,6 +80,27 @@ def test_the_report_has_all_methods_and_names_its_convention(output) -> None:
     assert "convention `paper`: ordered pairs" in out
     assert "| all | 1 | ours-sensor |" in out
     assert "ordered pairs" in (folder / "report.html").read_text()
+
+
+def test_dense_columns_are_of_ours_where_there_is_true_depth(output) -> None:
+    folder, out, _ = output
+    report = json.loads((folder / "report.json").read_text())["conventions"]["paper"]
+    rows = {row["method"]: row["dense"] for row in report["rows"]}
+    assert rows["colmap"] is None
+    exact, degraded = rows["ours-sensor"], rows["ours-degraded"]
+    assert exact["sets"] == 1 and exact["abs_rel"] < degraded["abs_rel"] < 0.05
+    assert exact["accuracy"]["0.1"] > 0.9 and exact["completeness"]["0.1"] > 0.9
+    for found in (exact, degraded):
+        assert found["f1"].keys() == found["accuracy"].keys() == {"0.02", "0.1"}
+        assert found["f1"]["0.02"] < found["f1"]["0.1"]
+    lines = {line.split(" | ")[2]: line for line in out.splitlines() if line.startswith("| ")}
+    assert lines["method"].endswith("| failed | AbsRel | 0.02 m | 0.1 m |")
+    shares = " / ".join(f"{100 * exact[key]['0.1']:.0f}" for key in CLOUD)
+    assert lines["ours-sensor"].endswith(f"| {shares} |")
+    assert f"| {exact['abs_rel']:.3f} |" in lines["ours-sensor"]
+    assert lines["colmap"].endswith("|  |  |  |  |")
+    page = (folder / "report.html").read_text()
+    assert "<th>AbsRel</th><th>0.02 m</th>" in page and f"<td>{shares}</td>" in page
 
 
 def test_the_recall_curves_are_labelled_and_those_of_the_errors(output) -> None:
@@ -185,7 +208,7 @@ def test_what_a_method_raises_is_its_outcome(monkeypatch: pytest.MonkeyPatch) ->
 
     task = small_task("colmap")
     monkeypatch.setattr(methods, "run_peer", fails)
-    outcome = run_method(task.method, task.problem, task.options)
+    outcome = run_method(task)
     assert outcome.error == "RuntimeError: no memory" and not outcome.models
 
 

@@ -1,0 +1,82 @@
+"""Depth maps and a cloud beside true depth, in the scale of the cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import DepthPrior, Float64
+from mpsfm_core.evaluation.dense_geometry import dense_accuracy
+from mpsfm_core.evaluation.prior_quality import read_depth
+from mpsfm_core.evaluation.records import Record
+from mpsfm_core.evaluation.report import make_rows
+from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
+from mpsfm_core.evaluation.true_surface import surface_of_depth
+from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
+from tests.evaluation.conftest import CAMERA, NAMES
+
+CAMERAS = dict.fromkeys(NAMES, CAMERA)
+SCALE = 0.25
+"""World units are four metres."""
+NO_POINTS = np.zeros(0, np.int64)
+
+
+@pytest.fixture(scope="module")
+def scene(scene_folder: Path) -> SceneFolder:
+    return read_scene(scene_folder)
+
+
+def model(scene: SceneFolder, factor: float = 1.0, images: int = len(NAMES)) -> Reconstruction:
+    """The truth in other units, its depth off by a factor."""
+    assert scene.depth is not None
+    registered = []
+    for index, name in enumerate(NAMES[:images]):
+        rotation, translation = scene.truth[name]
+        depth = read_depth(scene.depth / name) * np.float32(factor * SCALE)
+        maps = DepthPrior.from_arrays(depth, (0.01 * depth) ** 2, depth > 0)
+        pose = rotation, SCALE * translation
+        registered.append(RegisteredImage(index, name, CAMERA, *pose, NO_POINTS, maps, SCALE))
+    return Reconstruction(tuple(registered), np.zeros((0, 3)), np.zeros(0))
+
+
+def cloud_of(scene: SceneFolder) -> Float64:
+    assert scene.depth is not None
+    return SCALE * surface_of_depth(scene.depth, NAMES, CAMERAS, scene.truth, 0.01)
+
+
+def test_what_is_right_but_for_the_unit_is_right(scene: SceneFolder) -> None:
+    found = dense_accuracy(model(scene), cloud_of(scene), scene, CAMERAS, (0.02, 0.05))
+    assert found is not None
+    assert found["depth"]["abs_rel"] < 1e-4 and found["depth"]["images"] == len(NAMES)
+    assert found["depth"]["scale"] == pytest.approx(1 / SCALE)
+    assert found["cloud"]["f1"] == {"0.02": 1.0, "0.05": 1.0}
+
+
+def test_depth_off_by_a_tenth_is_not_scaled_away(scene: SceneFolder) -> None:
+    found = dense_accuracy(model(scene, 1.1), cloud_of(scene), scene, CAMERAS, (0.02,))
+    assert found is not None and found["depth"]["abs_rel"] == pytest.approx(0.1, abs=1e-3)
+
+
+def test_without_true_depth_or_scale_there_is_nothing_to_say(scene: SceneFolder, tmp_path) -> None:
+    cloud = cloud_of(scene)
+    (tmp_path / "gt_depth").mkdir()
+    for other in (replace(scene, path=tmp_path / "nowhere"), replace(scene, path=tmp_path)):
+        assert dense_accuracy(model(scene), cloud, other, CAMERAS, (0.02,)) is None
+    assert dense_accuracy(model(scene, images=2), cloud, scene, CAMERAS, (0.02,)) is None
+
+
+def test_a_row_has_the_mean_of_the_sets_that_were_compared(scene: SceneFolder) -> None:
+    found = dense_accuracy(model(scene), cloud_of(scene), scene, CAMERAS, (0.02,))
+    other = dense_accuracy(model(scene, 1.1), cloud_of(scene)[:1], scene, CAMERAS, (0.02,))
+    records = [
+        Record("room", "sift", "all", f"all-0{k}", "ours", "", {}, scene.truth, 0, 1, 1, dense=each)
+        for k, each in enumerate((found, other, None))
+    ]
+    (row,) = make_rows(records)
+    assert row.sets == 3 and row.dense is not None and row.dense["sets"] == 2
+    assert row.dense["abs_rel"] == pytest.approx(0.05, abs=1e-3)
+    assert row.dense["completeness"]["0.02"] == pytest.approx(0.5, abs=0.01)
+    assert make_rows(records[2:])[0].dense is None
