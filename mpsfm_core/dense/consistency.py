@@ -6,10 +6,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Float32, Float64, UInt8
+from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.dense.view import PosedGrid
 from mpsfm_core.jit import kernel
 
@@ -35,21 +36,33 @@ class Agreement:
     noise: float
 
 
-def compare_depth(
-    grid: PosedGrid,
-    log_depth: Float32,
-    log_std: Float32,
-    others: Iterable[tuple[PosedGrid, Float32, Float32]],
-) -> Agreement:
-    """Compare a map with those of other views, each with its log depth and its std."""
-    agree = np.zeros(log_depth.shape, np.uint8)
-    change = np.zeros(log_depth.shape, np.float32)
-    total = 0.0
-    for other, depth, std in others:
-        turned, shift = other.pixels_from(grid)
-        total += _compare(log_depth, log_std, turned, shift, depth, std, agree, change)
-    noise = math.sqrt(total / 2 / max(1, int(agree.sum(dtype=np.int64))))
-    return Agreement(agree > 0, (change / (1 + agree)).astype(np.float32), noise)
+class PosedDepth(NamedTuple):
+    """A map of a view: log depth and its std, (h, w)."""
+
+    grid: PosedGrid
+    log_depth: Float32
+    log_std: Float32
+
+
+def depth_differences(own: PosedDepth, other: PosedDepth) -> Float32:
+    """From our log depth (h, w) to that of another view at the same points, NaN where they do not
+    agree or it does not see the point."""
+    differences = np.full(own.log_depth.shape, np.nan, np.float32)
+    turned, shift = other.grid.pixels_from(own.grid)
+    _compare(*own[1:], turned, shift, *other[1:], differences)
+    return differences
+
+
+def agreement_of(shape: tuple[int, int], differences: Iterable[Float32]) -> Agreement:
+    """What :func:`depth_differences` of other views say together of a map (h, w)."""
+    views, change, total = np.zeros(shape, np.float32), np.zeros(shape, np.float32), 0.0
+    for each in differences:
+        agree = np.isfinite(each)
+        views += agree
+        change[agree] += each[agree]
+        total += float(np.sum(each[agree] ** 2, dtype=np.float64))
+    noise = math.sqrt(total / 2 / max(1.0, float(views.sum(dtype=np.float64))))
+    return Agreement(views > 0, change / (1 + views), noise)
 
 
 def splat_depth(grid: PosedGrid, others: Iterable[tuple[PosedGrid, Float32, Bool]]) -> Float32:
@@ -70,12 +83,10 @@ def _compare(
     shift: Float64,
     other: Float32,
     other_std: Float32,
-    agree: UInt8,
-    change: Float32,
-) -> float:
+    differences: Float32,
+) -> None:
     height, width = log_depth.shape
     rows, columns = other.shape
-    total = 0.0
     for i in range(height):
         for j in range(width):
             x, y = j + 0.5, i + 0.5
@@ -92,10 +103,7 @@ def _compare(
             tolerance = min(max(_STDS * math.sqrt(variance), _MIN_TOLERANCE), _MAX_TOLERANCE)
             difference = other[r, c] - math.log(w)
             if abs(difference) <= tolerance:
-                agree[i, j] += 1
-                change[i, j] += difference
-                total += difference**2
-    return total
+                differences[i, j] = difference
 
 
 @kernel()

@@ -24,13 +24,13 @@ _VARIANCE_REDUCTION = 2
 _EDGE = 0.03
 """Step of log depth between neighbours of the field's grid that halves their coupling (ours)."""
 _ITERATIONS, _TOLERANCE = 30, 1e-3
-_ONE_SIGMA = 0.683
+ONE_SIGMA = 0.683
 """Share within one std of a normal distribution."""
 _LEAST_LEFT = 0.5
 """Of a distance between known and measured depth, what the known one has of it at least: the std of
 the measured one is not told to better than an eighth. With true depth as the prior 69 % of the
 pixels of rendered_kitchen are then within their std, 88 % with all of the distance (ours)."""
-_MIN_STD = 1e-4
+MIN_STD = 1e-4
 """Of log depth that is known: no sensor is better."""
 
 
@@ -56,9 +56,9 @@ def with_known(measured: Observed, known: Observed) -> Observed:
     if not which.any():
         return measured
     distance = np.abs(measured.log_depth - known.log_depth)[which]
-    both, own = np.quantile(distance, _ONE_SIGMA), np.median(measured.log_std[which])
+    both, own = np.quantile(distance, ONE_SIGMA), np.median(measured.log_std[which])
     left = max(float(both**2 - own**2), float(_LEAST_LEFT * both) ** 2)
-    std = np.float32(max(left**0.5, _MIN_STD))
+    std = np.float32(max(left**0.5, MIN_STD))
     ours, theirs = measured.log_std**-2.0, std**-2.0
     total = ours + theirs
     mean = (ours * measured.log_depth + theirs * known.log_depth) / total

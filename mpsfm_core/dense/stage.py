@@ -12,12 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, View
-from mpsfm_core.dense.consistency import Agreement, compare_depth, splat_depth
+from mpsfm_core.dense.consistency import (
+    Agreement,
+    PosedDepth,
+    agreement_of,
+    depth_differences,
+    splat_depth,
+)
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.posterior import Observed, posterior, with_known
+from mpsfm_core.dense.scale_errors import Ties, scale_stds, ties_of_photo
 from mpsfm_core.dense.source_views import choose_sources
 from mpsfm_core.dense.stereo import StereoDepth, match_depth
-from mpsfm_core.dense.view import DenseView, PosedGrid
+from mpsfm_core.dense.view import DenseView, PosedGrid, known_depth
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.threads import allowed
@@ -114,7 +121,11 @@ def densify(
         for row, own in zip(rows, pool.map(matched, rows), strict=True):
             found[row] = own
             progress(len(found), len(rows))
-    agreed = {row: _compared(row, found, sources[row], options, keep) for row in found}
+    agreed, ties = {}, {}
+    for row in found:
+        depth = images[row].depth
+        agreed[row], ties[row] = _compared(row, found, depth, sources[row], options, keep)
+    scale_std = scale_stds(ties)
     maps, which = list(reconstruction.images), {}
     for row in found:
         view, name = views[row], images[row].name
@@ -122,7 +133,7 @@ def densify(
         measured = with_known(_measured(row, view, found, agreed, near[row], options), known)
         which[name] = keep(measured.known)
         joined = posterior(known, measured, options.correlation_px)
-        maps[posed[row]] = _with_depth(images[row], view, joined, keep)
+        maps[posed[row]] = _with_depth(images[row], view, joined, scale_std[row], keep)
     names = [image.name for image in images]
     report = DenseReport(
         {names[row]: [names[other] for other in others] for row, others in enumerate(sources)},
@@ -169,24 +180,31 @@ class _Found(NamedTuple):
         parallax = resize_map(self.parallax, *self.grid.camera.size)
         return (options.match_std_px / parallax).astype(np.float32)
 
+    def posed_depth(self, options: DenseOptions) -> PosedDepth:
+        """What was found."""
+        return PosedDepth(self.grid, self.log_depth, self.log_std(options))
+
 
 def _compared(
     row: int,
     found: Mapping[int, _Found],
+    depth: DepthPrior,
     sources: Sequence[int],
     options: DenseOptions,
     keep: Keep,
-) -> Agreement:
-    """A map beside those of its sources."""
-    own = found[row]
-    others = (
-        (found[other].grid, found[other].log_depth, found[other].log_std(options))
+) -> tuple[Agreement, Ties]:
+    """A map beside those of its sources, and beside the ``depth`` that was known."""
+    own = found[row].posed_depth(options)
+    differences = {
+        other: depth_differences(own, found[other].posed_depth(options))
         for other in sources
         if other in found
-    )
-    agreement = compare_depth(own.grid, own.log_depth, own.log_std(options), others)
+    }
+    agreement = agreement_of(own.log_depth.shape, differences.values())
     maps = keep(agreement.confirmed), keep(agreement.mean_change)
-    return Agreement(*maps, agreement.noise)
+    change = own.log_depth - known_depth(depth, *own.grid.camera.size)[0]
+    ties = ties_of_photo(differences, found[row].supported, change, options.correlation_px)
+    return Agreement(*maps, agreement.noise), ties
 
 
 def _measured(
@@ -217,10 +235,10 @@ def _measured(
 
 
 def _with_depth(
-    image: RegisteredImage, view: DenseView, joined: Observed, keep: Keep
+    image: RegisteredImage, view: DenseView, joined: Observed, scale_std: float, keep: Keep
 ) -> RegisteredImage:
     depth = np.exp(joined.log_depth)
-    variance = (joined.log_std * depth) ** 2
+    variance = (joined.log_std**2 + np.float32(scale_std**2)) * depth**2
     prior = DepthPrior.from_arrays(depth, variance, view.usable, metric=image.depth.metric)
     assert prior.variance is not None
     maps = keep(prior.depth), keep(prior.variance), keep(prior.valid)

@@ -64,7 +64,7 @@ class DenseView(PosedGrid):
         usable = np.ones((height, width), np.bool_)
         if view.mask is not None:
             usable = resize_map(view.mask, width, height, linear=False) > 0
-        log_depth, log_std = _on_grid(*_known(image.depth), width, height)
+        log_depth, log_std = known_depth(image.depth, width, height)
         return cls(
             image.camera.resized(width, height),
             image.rotation,
@@ -96,14 +96,13 @@ class DenseView(PosedGrid):
         return PosedGrid(self.camera, self.rotation, self.translation)
 
 
-def _on_grid(
-    log_depth: Float32, log_std: Float32, width: int, height: int
-) -> tuple[Float32, Float32]:
-    """Both maps on a grid of another size.
+def known_depth(depth: DepthPrior, width: int, height: int) -> tuple[Float32, Float32]:
+    """:attr:`DenseView.log_depth` and its std of a refined map, on a grid of this size.
 
     What lies between two samples of different surfaces is on neither: where the mean is further
     from the nearest sample than that may be off, the sample counts.
     """
+    log_depth, log_std = _known(depth)
     smooth, smooth_std = (resize_map(each, width, height) for each in (log_depth, log_std))
     nearest, std = (resize_map(each, width, height, linear=False) for each in (log_depth, log_std))
     between = np.abs(smooth - nearest) > std
