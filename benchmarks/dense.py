@@ -176,7 +176,13 @@ def measured(
                 model = without_prior(model)
             if way != "mapper":
                 started = time.process_time()
-                model, report = densify(model, view_of(photos), DenseOptions(), workers=1)
+                model, report = densify(
+                    model,
+                    view_of(photos),
+                    DenseOptions(),
+                    workers=1,
+                    was_mapped=way != "without prior",
+                )
                 seen = report.measured
                 seconds = (time.process_time() - started) / len(model.images)
             cloud, *_ = fuse_depth_maps(model, view_of(photos), ResultOptions())

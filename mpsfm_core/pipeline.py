@@ -521,17 +521,20 @@ def _densify_model(
         raise InputError(f"{images}: has {len(matched)} of the photos of {model}, two are needed")
     photos = load_images(images, model=model, names=list(matched))
     points = {str(image.name): _depths_of_points(colmap, image) for image in colmap.images.values()}
-    depths = []
+    depths, was_mapped = [], True
     for photo in photos:
         found = matched[photo.name]
         file = model / DEPTH / f"{found}.npz"
+        was_mapped &= file.is_file()
         depths.append(read_depth_map(file)[1] if file.is_file() else depth_of_points(points[found]))
     known = _maps_alone(photos, [poses[matched[photo.name]] for photo in photos], depths)
     if not known.images:
         raise InputError(f"{model}: has no points, so nothing says how far the surfaces are")
     view_of = _view_of(photos)
     disk = DiskArrays(cache_folder())
-    dense, report = densify(known, view_of, options or DenseOptions(), keep=disk.keep)
+    dense, report = densify(
+        known, view_of, options or DenseOptions(), keep=disk.keep, was_mapped=was_mapped
+    )
     with replacing(output, (SPARSE, DENSE, DEPTH)) as folder:
         write_model(folder / SPARSE, colmap)
         write_depth_maps(folder / DEPTH, dense)

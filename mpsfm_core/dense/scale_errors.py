@@ -5,6 +5,7 @@ Lengths are tied where two pairs have a photo in common: by the pixels that both
 depth that was known of that photo before, which joins what either pair measured of it. Along a
 chain of such ties errors add up. The log scale of each pair is an unknown, a tie says that two are
 equal, and the std is that of an unknown beside the mean of all.
+Where the mapper had no depth, something else holds the scales, of which a model says nothing.
 """
 
 from __future__ import annotations

@@ -89,13 +89,16 @@ def densify(
     progress: Callable[[int, int], None] = lambda done, total: None,
     found_before: FoundBefore | None = None,
     keep: Keep = in_memory,
+    was_mapped: bool = True,
 ) -> tuple[Reconstruction, DenseReport]:
     """The reconstruction with depth that was measured in the photos where that is possible.
 
     ``view_of``: undistorted view by name. ``workers``: images at once, None for as many as the run
     may use; what comes out does not depend on it. ``progress``: is told how many images of how many
     are matched. ``found_before``: has what a run that was killed found, and keeps what this finds.
-    ``keep``: holds maps, those of the result too; called from several threads.
+    ``keep``: holds maps, those of the result too; called from several threads. ``was_mapped``: the
+    mapper had the depth of these images, so that scales of pairs may hang together by it alone;
+    else poses are taken to be right.
     Images that no other one overlaps keep their maps, and so do those without confirmed pose.
     """
     posed = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
@@ -125,7 +128,7 @@ def densify(
     for row in found:
         depth = images[row].depth
         agreed[row], ties[row] = _compared(row, found, depth, sources[row], options, keep)
-    scale_std = scale_stds(ties)
+    scale_std = scale_stds(ties) if was_mapped else dict.fromkeys(found, 0.0)
     maps, which = list(reconstruction.images), {}
     for row in found:
         view, name = views[row], images[row].name

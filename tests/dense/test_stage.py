@@ -51,6 +51,18 @@ def test_the_stated_std_is_about_the_error(room) -> None:
     assert error[certain].mean() < error[~certain].mean()
 
 
+def test_scales_that_hang_on_known_depth_are_less_sure(room) -> None:
+    # without shared pixels (a correlation as long as the map) only known depth ties the pairs
+    loose = OPTIONS.model_copy(update={"correlation_px": 1000.0})
+    tied, _ = densify(room.reconstruction, room.views.__getitem__, loose)
+    fixed, _ = densify(room.reconstruction, room.views.__getitem__, loose, was_mapped=False)
+    for a, b in zip(tied.images, fixed.images, strict=True):
+        np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
+        added = (a.depth.variance - b.depth.variance) / a.depth.depth**2
+        np.testing.assert_allclose(added, added.mean(), rtol=1e-2)  # of the photo as a whole
+        assert 0.003 < added.mean() ** 0.5 < 0.1
+
+
 def test_threads_do_not_change_the_result(room) -> None:
     one, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS, workers=1)
     two, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS, workers=2)
