@@ -25,10 +25,12 @@ from mpsfm_core.statistics import MAD_TO_STD, group_medians
 
 CELLS = 4
 """Residuals are compared in a grid of this many cells per side (ours)."""
-MIN_RESIDUALS = 50
+MIN_RESIDUALS = 25
 """Fewer say too little: the declaration stands (ours)."""
 MIN_INDEPENDENT = 0.05
 """Share of the variance of depth that is independent, at least (ours)."""
+POSE_UNKNOWNS = 6
+"""Of a pose beside the others."""
 MULTIPLIER_RANGE = (0.1, 10.0)
 """Bounds of the multiplier (ours): a declaration is not off by more without being broken."""
 WITNESS_VIEWS, WITNESS_ANGLE_DEG = 3, 2.0
@@ -77,16 +79,27 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
 
     What all residuals of a pair have in common is left out: it may be due to the scales of the two
     images, which are unknowns of bundle adjustment and no part of what a prior declares.
+
+    Scales and poses are fitted to what is compared. The variance is the sum of squares over as many
+    independent residuals as there are beyond these unknowns, where the declaration counts as one
+    more of them (a unit information prior). Rays hold most of a pose, so that depth alone is fitted
+    by fewer; but a network errs alike in both views of a pair, which no difference shows, and
+    counted in full unknowns make up for it where few pairs hold an image (ours, on
+    rendered_kitchen: ``benchmarks/results/depth_noise.md``).
     """
     residuals, groups = _cross_view_residuals(scene)
     if len(residuals) < MIN_RESIDUALS:
         return DepthNoise()
     pairs, pair = np.unique(groups // CELLS**2, return_inverse=True)
     residuals = residuals - group_medians(residuals, pair, len(pairs))[pair]
-    spread = MAD_TO_STD * float(np.median(np.abs(residuals)))
-    multiplier = float(np.clip(spread, *MULTIPLIER_RANGE))
-    clipped = np.clip(residuals / max(spread, 1e-12), -3, 3)
-    return DepthNoise(multiplier, *_clustering(clipped, groups))
+    spread = max(MAD_TO_STD * float(np.median(np.abs(residuals))), 1e-12)
+    correlation, effect = _clustering(np.clip(residuals / spread, -3, 3), groups)
+    images = np.unique([pairs // scene.num_images, pairs % scene.num_images])
+    independent = len(residuals) / effect
+    unknown = len(pairs) + POSE_UNKNOWNS * (len(images) - 1)
+    variance = (1.0 + independent * spread**2) / (1.0 + max(independent - unknown, 0.0))
+    multiplier = float(np.clip(np.sqrt(variance), *MULTIPLIER_RANGE))
+    return DepthNoise(multiplier, correlation, effect)
 
 
 def witnesses(scene: Scene, image: int) -> Bool:
@@ -130,10 +143,11 @@ def local_noise(scene: Scene, image: int, witness: Bool, least: float) -> Float3
 
 
 def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
-    """Whitened log differences (m,) and the group of each: a cell of one view beside another."""
+    """Whitened log differences (m,), one of each match, and the group of each: a cell of the first
+    view beside the other."""
     graph, tracks = scene.graph, scene.tracks
     point = tracks.point_of[graph.source]
-    same = (point >= 0) & (point == tracks.point_of[graph.target])
+    same = (point >= 0) & (point == tracks.point_of[graph.target]) & (graph.source < graph.target)
     source, target = graph.source[same], graph.target[same]
     active = np.array([depth_map.active for depth_map in scene.maps])[graph.image_of]
     prior = scene.keypoint_prior * scene.scales()[graph.image_of]

@@ -80,6 +80,19 @@ def test_smooth_errors_are_measured_as_large_as_they_are_and_correlated() -> Non
     assert noise.design_effect > 5
 
 
+def test_fewer_independent_errors_than_unknowns_are_fitted_to_say_less() -> None:
+    """Two views have one pair for the unknowns of one pose, three have three for two."""
+
+    def ratio(errors: Errors) -> float:
+        scene = scene_with(errors)
+        three = measure_depth_noise(scene).multiplier
+        scene.deregister(2)
+        return measure_depth_noise(scene).multiplier / three
+
+    assert ratio(lambda rng, shape: smooth(rng, shape) / 20) > 1.3
+    assert ratio(independent) == pytest.approx(1.0, rel=0.05)
+
+
 def test_scales_that_are_off_are_no_noise() -> None:
     right, wrong = measured(independent), measured(independent, (1.0, 1.05, 0.96))
     assert wrong.multiplier == pytest.approx(right.multiplier, rel=0.15)
