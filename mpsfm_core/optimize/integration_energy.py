@@ -139,8 +139,8 @@ def majorise(z: Float64, terms: EnergyTerms) -> Majoriser:
     energy = _add_normals(framed, terms.normals, 0, losses, east, gradient)
     energy += _add_normals(framed, terms.normals, 1, losses, south, gradient)
     mass = np.empty(z.shape, np.float32)
-    energy += _add_prior(z, terms.prior, losses.prior_scale, mass, gradient[inner])
-    of_points = _add_points(z, terms.points, losses.point_scale, mass, gradient[inner])
+    energy += _add_prior(z, terms.prior, losses.prior_scale, mass, gradient)
+    of_points = _add_points(z, terms.points, losses.point_scale, mass, gradient)
     energy += of_points
     mean = of_points / max(len(terms.points.rows), 1)
     return Majoriser(energy, mean, gradient[inner], east[inner], south[inner], mass)
@@ -277,17 +277,17 @@ def _exp(x: float) -> float:
     scaled = max(x, -60.0) * 1.4426950408889634
     whole = np.floor(scaled + 0.5)
     f = (scaled - whole) * 0.6931471805599453
-    p = 1.0 + f * (1 / 11)
-    p = 1.0 + f * p * (1 / 10)
-    p = 1.0 + f * p * (1 / 9)
-    p = 1.0 + f * p * (1 / 8)
-    p = 1.0 + f * p * (1 / 7)
-    p = 1.0 + f * p * (1 / 6)
-    p = 1.0 + f * p * (1 / 5)
-    p = 1.0 + f * p * (1 / 4)
-    p = 1.0 + f * p * (1 / 3)
-    p = 1.0 + f * p * (1 / 2)
-    p = 1.0 + f * p
+    p = 1 / 39916800 * f + 1 / 3628800
+    p = p * f + 1 / 362880
+    p = p * f + 1 / 40320
+    p = p * f + 1 / 5040
+    p = p * f + 1 / 720
+    p = p * f + 1 / 120
+    p = p * f + 1 / 24
+    p = p * f + 1 / 6
+    p = p * f + 1 / 2
+    p = p * f + 1.0
+    p = p * f + 1.0
     value: float = p * np.int64((np.int64(whole) + 1023) << 52).view(np.float64)
     return value
 
@@ -310,17 +310,17 @@ def _log(x: float) -> float:
 def _add_prior(
     z: Float64, prior: PriorTerms, scale: float, mass: Float32, gradient: Float64
 ) -> float:
-    """Charbonnier loss of the depth prior; sets the mass."""
-    energy = 0.0
+    """Charbonnier loss of the depth prior; sets the mass. The gradient is framed."""
+    energy, square = 0.0, scale * scale
     for i in range(z.shape[0]):
         for j in range(z.shape[1]):
             offset, precision = z[i, j] - prior.log_depth[i, j], prior.precision[i, j]
-            ratio = precision * offset * offset / (scale * scale)
+            ratio = precision * offset * offset / square
             root = np.sqrt(1.0 + ratio)
-            energy += prior.weight * 2.0 * scale * scale * ratio / (root + 1.0)
+            energy += prior.weight * 2.0 * square * ratio / (root + 1.0)
             slope = prior.weight * precision / root
             mass[i, j] = slope
-            gradient[i, j] += slope * offset
+            gradient[i + 1, j + 1] += slope * offset
     return energy
 
 
@@ -328,7 +328,7 @@ def _add_prior(
 def _add_points(
     z: Float64, points: PointTerms, scale: float, mass: Float32, gradient: Float64
 ) -> float:
-    """Cauchy loss of the sparse points; adds to the mass."""
+    """Cauchy loss of the sparse points; adds to the mass. The gradient is framed."""
     energy = 0.0
     for k in range(points.rows.size):
         i, j = points.rows[k], points.columns[k]
@@ -337,5 +337,5 @@ def _add_points(
         energy += scale * scale * np.log1p(ratio)
         slope = points.precision[k] / (1.0 + ratio)
         mass[i, j] += slope
-        gradient[i, j] += slope * offset
+        gradient[i + 1, j + 1] += slope * offset
     return energy

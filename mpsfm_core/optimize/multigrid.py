@@ -190,7 +190,6 @@ def _v_cycle(grids: _Grids) -> None:
     last = len(grids.shapes) - 1
     for number in range(last):
         fine = _level(grids, number)
-        fine.x[:] = 0
         _smooth(fine, number > 0, False)
         _restrict(fine, _level(grids, number + 1), number > 0)
     coarsest = _level(grids, last)
@@ -206,7 +205,7 @@ def _prepare_smoother(level: _Level) -> None:
     """Diagonal and line pivots; in a form without differences, exact for any ratio of sizes."""
     east, south, southeast, southwest = level.east, level.south, level.southeast, level.southwest
     height, width = level.mass.shape
-    above, rest = np.zeros(width), np.empty(width)
+    above, rest, pivot = np.zeros(width), level.work, level.row_pivot
     for i in range(1, height - 1):
         for j in range(1, width - 1):
             diagonal = southeast[i, j] + southeast[i - 1, j - 1]
@@ -214,14 +213,23 @@ def _prepare_smoother(level: _Level) -> None:
             horizontal, vertical = east[i, j] + east[i, j - 1], south[i, j] + south[i - 1, j]
             total = horizontal + vertical + diagonal
             level.diagonal[i, j] = total if total > _TINY else 1.0
-            rest[j] = vertical + diagonal
+            rest[i, j] = vertical + diagonal
             above[j] = _chain(above[j], south[i - 1, j], horizontal + diagonal)
             level.column_pivot[i, j] = _inverse(above[j] + max(south[i, j], 0.0))
-        if i % 2 == 0:
-            left = 0.0
+    last = height - 2 - height % 2
+    for first in range(2, height - 1, 8):
+        a, b, c, d = _four_rows(first, last)
+        p, q, r, s = 0.0, 0.0, 0.0, 0.0
+        for j in range(1, width - 1):
+            p = _chain(p, east[a, j - 1], rest[a, j])
+            q = _chain(q, east[b, j - 1], rest[b, j])
+            r = _chain(r, east[c, j - 1], rest[c, j])
+            s = _chain(s, east[d, j - 1], rest[d, j])
+            pivot[a, j], pivot[b, j] = p, q
+            pivot[c, j], pivot[d, j] = r, s
+        for k in range(first, min(first + 7, last + 1), 2):
             for j in range(1, width - 1):
-                left = _chain(left, east[i, j - 1], rest[j])
-                level.row_pivot[i, j] = _inverse(left + max(east[i, j], 0.0))
+                pivot[k, j] = _inverse(pivot[k, j] + max(east[k, j], 0.0))
 
 
 @_helper
@@ -239,15 +247,25 @@ def _inverse(value: float) -> float:
 
 @_helper
 def _smooth(level: _Level, nine_point: bool, backward: bool) -> None:
-    """Gauss-Seidel over three blocks; `backward` is the adjoint of forward."""
+    """Gauss-Seidel over three blocks, forward from x = 0; `backward` is the adjoint of that."""
     if backward:
         _relax_columns(level, nine_point)
         _relax_rows(level, nine_point)
         _relax_points(level, nine_point)
     else:
-        _relax_points(level, nine_point)
+        _start_points(level)
         _relax_rows(level, nine_point)
         _relax_columns(level, nine_point)
+
+
+@_helper
+def _start_points(level: _Level) -> None:
+    """`_relax_points` from x = 0."""
+    x = level.x
+    x[:] = 0
+    for i in range(1, x.shape[0] - 1, 2):
+        for j in range(1, x.shape[1] - 1, 2):
+            x[i, j] = level.rhs[i, j] / level.diagonal[i, j]
 
 
 @_helper
@@ -262,21 +280,43 @@ def _relax_points(level: _Level, nine_point: bool) -> None:
 
 @_helper
 def _relax_rows(level: _Level, nine_point: bool) -> None:
-    """Solve each row that the coarser grid leaves out."""
-    east, pivot, x, row = level.east, level.row_pivot, level.x, level.work[0]
-    width = x.shape[1]
-    for i in range(2, x.shape[0] - 1, 2):
-        _residual_row(level, i, nine_point, row)
-        change = 0.0
+    """Solve each row that the coarser grid leaves out.
+
+    Four at a time: each waits for its own recurrences, not for those of the others.
+    """
+    east, pivot, x, rows = level.east, level.row_pivot, level.x, level.work
+    height, width = x.shape
+    last = height - 2 - height % 2
+    for first in range(2, height - 1, 8):
+        a, b, c, d = _four_rows(first, last)
+        for k in range(4):
+            if first + 2 * k <= last:
+                _residual_row(level, first + 2 * k, nine_point, rows[k])
+        p, q, r, s = 0.0, 0.0, 0.0, 0.0
         for j in range(1, width - 1):
-            # Everything but one multiply-add is kept out of the recurrence.
-            share = max(east[i, j - 1], 0.0) * pivot[i, j]
-            change = row[j] * pivot[i, j] + share * change
-            row[j] = change
-        change = 0.0
+            # Everything but one multiply-add is kept out of the recurrences.
+            p = rows[0, j] * pivot[a, j] + max(east[a, j - 1], 0.0) * pivot[a, j] * p
+            q = rows[1, j] * pivot[b, j] + max(east[b, j - 1], 0.0) * pivot[b, j] * q
+            r = rows[2, j] * pivot[c, j] + max(east[c, j - 1], 0.0) * pivot[c, j] * r
+            s = rows[3, j] * pivot[d, j] + max(east[d, j - 1], 0.0) * pivot[d, j] * s
+            rows[0, j], rows[1, j], rows[2, j], rows[3, j] = p, q, r, s
+        p, q, r, s = 0.0, 0.0, 0.0, 0.0
         for j in range(width - 2, 0, -1):
-            change = row[j] + max(east[i, j], 0.0) * pivot[i, j] * change
-            x[i, j] += change
+            p = rows[0, j] + max(east[a, j], 0.0) * pivot[a, j] * p
+            q = rows[1, j] + max(east[b, j], 0.0) * pivot[b, j] * q
+            r = rows[2, j] + max(east[c, j], 0.0) * pivot[c, j] * r
+            s = rows[3, j] + max(east[d, j], 0.0) * pivot[d, j] * s
+            rows[0, j], rows[1, j], rows[2, j], rows[3, j] = p, q, r, s
+        for k in range(4):
+            if first + 2 * k <= last:
+                for j in range(1, width - 1):
+                    x[first + 2 * k, j] += rows[k, j]
+
+
+@_helper
+def _four_rows(first: int, last: int) -> tuple[int, int, int, int]:
+    """Every second row from `first` on; the last one again where there are no more."""
+    return first, min(first + 2, last), min(first + 4, last), min(first + 6, last)
 
 
 @_helper
