@@ -121,12 +121,12 @@ class DepthCheck:
         ``once``: those that fall into one pixel of the other view together count as one.
         """
         scene, options, total = self._scene, self._options, 0.0
-        for source, target in ((a, b), (b, a)):
+        one, two = self._grid(a, std_factor), self._grid(b, std_factor)
+        for source, target, seen, by in ((a, b, one, two), (b, a, two, one)):
             rotation = scene.rotations[target] @ scene.rotations[source].T
             translation = scene.translations[target] - rotation @ scene.translations[source]
-            one, two = self._grid(source, std_factor), self._grid(target, std_factor)
             total += unexplained_share(
-                one, two, rotation, translation, options.max_deviation, options.min_gap, once
+                seen, by, rotation, translation, options.max_deviation, options.min_gap, once
             )
         return total
 
@@ -257,17 +257,18 @@ def unexplained_share(
             across = r[0, 0] * x + r[0, 1] * y + r[0, 2]
             down = r[1, 0] * x + r[1, 1] * y + r[1, 2]
             along = r[2, 0] * x + r[2, 1] * y + r[2, 2]
-            explained = False
+            here, explained = np.float64(source.depth[row, column]), False
             for step in range(2 * STEPS + 1):
                 # 0, then nearer and farther in turn: most pixels need no error at all
                 error = limit * ((step + 1) // 2) / STEPS * (1 - 2 * (step % 2))
-                depth = source.depth[row, column] * math.exp(error * source.log_std[row, column])
+                depth = here * math.exp(error * source.log_std[row, column]) if step else here
                 z = depth * along + t[2]
                 explained = z <= 1e-9
                 if explained:
                     break
-                u = (depth * across + t[0]) / z * target.params[0] + target.params[2]
-                v = (depth * down + t[1]) / z * target.params[1] + target.params[3]
+                inverse = 1.0 / z
+                u = (depth * across + t[0]) * inverse * target.params[0] + target.params[2]
+                v = (depth * down + t[1]) * inverse * target.params[1] + target.params[3]
                 explained = not (0 <= u < columns and 0 <= v < rows)
                 if explained:
                     break
@@ -281,7 +282,6 @@ def unexplained_share(
                 if explained:
                     break
             if not explained:
-                depth = source.depth[row, column]
-                pixels = (zoom * depth / (depth * along + t[2])) ** 2
+                pixels = (zoom * here / (here * along + t[2])) ** 2
                 total += min(1.0, pixels) if once else 1.0
     return total / max(visited, 1)
