@@ -146,8 +146,9 @@ def rotation_angle_deg(rotation: Float64) -> Float64:
 
 def angle_between_deg(a: Float64, b: Float64) -> Float64:
     """Angle between vectors (..., 3) in degrees, [0, 180], accurate for small angles."""
-    sine = np.linalg.norm(np.cross(a, b), axis=-1)
-    cosine = (a * b).sum(axis=-1)
+    (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    sine = np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2)
+    cosine = ax * bx + ay * by + az * bz
     angle: Float64 = np.degrees(np.arctan2(sine, cosine))
     return angle
 
