@@ -25,7 +25,9 @@ def thinned(values: NDArray[Scalar], step: int) -> NDArray[Scalar]:
 
 
 def thinned_prior(prior: Prior, step: int) -> Prior:
-    """A depth or normal prior on the grid that :func:`thinned` leaves."""
+    """A depth or normal prior on the grid that :func:`thinned` leaves; itself for a step of 1."""
+    if step == 1:
+        return prior
     maps: dict[str, Any] = {
         field.name: thinned(value, step)
         for field in fields(prior)
