@@ -100,7 +100,7 @@ class Multigrid:
         # One block of memory: large enough for huge pages, which matters from about 300 000 pixels.
         self._grids = _Grids(np.zeros(first[-1]), first, framed)
         self._levels = [_level(self._grids, number) for number in range(len(framed))]
-        self._vectors = np.zeros((4, *self._levels[0].x.shape))
+        self._vectors = np.zeros((3, *self._levels[0].x.shape))
 
     def update(self, east: Float32, south: Float32, mass: Float32) -> None:
         """Set couplings and mass, each (h, w) and non-negative; costs about 1.3 V-cycles.
@@ -116,10 +116,9 @@ class Multigrid:
 
     def solve(self, rhs: Float64, iterations: int, tolerance: float = 0.0) -> Solution:
         """Preconditioned conjugate gradients for A x = rhs (h, w) from x = 0."""
-        x, residual, direction, _ = self._vectors
+        x, direction, _ = self._vectors
         x[:] = direction[:] = 0
-        residual[1:-1, 1:-1] = rhs
-        self._levels[0].rhs[:] = residual
+        self._levels[0].rhs[1:-1, 1:-1] = rhs
         done, error = _conjugate_gradients(self._grids, self._vectors, iterations, tolerance)
         return Solution(x[1:-1, 1:-1].copy(), done, error)
 
@@ -162,10 +161,10 @@ def _conjugate_gradients(
 ) -> tuple[int, float]:
     """Solve for `rhs` of the finest level; iterations and the relative error as in `Solution`.
 
-    `vectors`: x, residual, direction and image, framed; the residual is the right-hand side.
+    `vectors`: x, direction and image, framed. What is left of the right-hand side takes its place.
     """
     finest = _level(grids, 0)
-    x, residual, direction, image = vectors[0], vectors[1], vectors[2], vectors[3]
+    x, direction, image, residual = vectors[0], vectors[1], vectors[2], finest.rhs
     done, first, previous, product = np.int64(0), 0.0, 1.0, 0.0
     while done < iterations:
         _v_cycle(grids)
@@ -178,7 +177,7 @@ def _conjugate_gradients(
         curvature = _apply(finest, direction, image)
         if not curvature > 0:
             break
-        _step(product / curvature, direction, image, x, residual, finest.rhs)
+        _step(product / curvature, direction, image, x, residual)
         done, previous = done + 1, product
     error = np.sqrt(max(product, 0.0) / first) if first > 0 else 0.0
     return done, error
@@ -569,14 +568,11 @@ def _apply(level: _Level, x: Float64, image: Float64) -> float:
 
 
 @_helper
-def _step(
-    length: float, direction: Float64, image: Float64, x: Float64, residual: Float64, rhs: Float64
-) -> None:
+def _step(length: float, direction: Float64, image: Float64, x: Float64, residual: Float64) -> None:
     for i in range(1, x.shape[0] - 1):
         for j in range(1, x.shape[1] - 1):
             x[i, j] += length * direction[i, j]
             residual[i, j] -= length * image[i, j]
-            rhs[i, j] = residual[i, j]
 
 
 @_helper
