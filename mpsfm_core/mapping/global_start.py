@@ -1,7 +1,7 @@
 """Poses of all images at once, from what all pairs together say of them.
 
 Verified pairs know how their images are turned, and in which direction one lies from the other;
-depth priors say how far. Rotations are averaged over all pairs (COLMAP's rotation averaging); with
+depth priors say how far. Rotations are averaged over all pairs; with
 lengths known, the scales of the priors and the places of the images are linear in what the pairs
 say, and follow from least squares that pairs leave which disagree. Images that several agreeing
 pairs hold are placed so; the others are left to registration one by one.
@@ -12,10 +12,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import pycolmap
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import (
+    breadth_first_order,
+    connected_components,
+    minimum_spanning_tree,
+)
 from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import Bool, Float64, Int64, VerifiedPair
 from mpsfm_core.geometry import camera_center, rotation_angle_deg, triangulation_angle_deg
@@ -37,7 +41,6 @@ MAX_SHIFT = 0.3
 baselines by several degrees (ours)."""
 ROUNDS = 20
 """Of least squares, each of which weighs pairs by how well the last one agreed with them (ours)."""
-_FATAL = 3
 
 
 class Placement(NamedTuple):
@@ -66,7 +69,7 @@ class _Links(NamedTuple):
         return _Links(*parts)
 
 
-def place_all(scene: Scene, left: Bool, seed: int) -> Placement | None:
+def place_all(scene: Scene, left: Bool) -> Placement | None:
     """Poses of the images of the largest group that agreeing pairs hold; None without one.
 
     ``left``: (n,) bool, images that may be placed. The scene stays as it is.
@@ -76,9 +79,7 @@ def place_all(scene: Scene, left: Bool, seed: int) -> Placement | None:
     links = links.select(_well_held(links, scene.num_images))
     if not len(links.a):
         return None
-    rotations = averaged_rotations(links, scene.num_images, seed)
-    if rotations is None:
-        return None
+    rotations = averaged_rotations(links.a, links.b, links.rotation, links.weight, scene.num_images)
     differences = links.log_length[:, 0] - links.log_length[:, 1]
     unit = scene.depth_group_of  # priors in one unit share one scale
     scales = agreed(unit[links.a], unit[links.b], differences, links.weight, scene.num_images)
@@ -99,68 +100,77 @@ def place_all(scene: Scene, left: Bool, seed: int) -> Placement | None:
     return Placement(images, rotations[images], translations, np.exp(log_scales[images]))
 
 
-def averaged_rotations(links: _Links, num_images: int, seed: int) -> Float64 | None:
-    """(n, 3, 3) rotations that agree best with those of the links, or None if that fails."""
-    reconstruction, graph = pycolmap.Reconstruction(), pycolmap.PoseGraph()
-    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=2, height=2, params=[1, 1, 1])
-    camera.camera_id = 1
-    reconstruction.add_camera_with_trivial_rig(camera)
-    for image in map(int, np.unique(np.concatenate([links.a, links.b]))):
-        reconstruction.add_image_with_trivial_frame(
-            pycolmap.Image(name=str(image), camera_id=1, image_id=image + 1)
-        )
-    for a, b, rotation, weight in zip(
-        links.a.tolist(), links.b.tolist(), links.rotation, links.weight, strict=True
-    ):
-        edge = pycolmap.PoseGraphEdge()
-        edge.cam2_from_cam1 = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.zeros(3))
-        edge.num_matches = int(weight)
-        graph.add_edge(a + 1, b + 1, edge)
-    options = pycolmap.RotationEstimatorOptions()
-    options.random_seed = seed
-    level = pycolmap.logging.minloglevel
-    # It tells on stderr what it left out, and that nothing is left.
-    pycolmap.logging.minloglevel = max(level, _FATAL)
-    try:
-        if not pycolmap.run_rotation_averaging(options, graph, reconstruction, []):
-            return None
-    finally:
-        pycolmap.logging.minloglevel = level
-    rotations = np.tile(np.eye(3), (num_images, 1, 1))
-    for number, image in reconstruction.images.items():
-        if image.has_pose:
-            rotations[number - 1] = image.cam_from_world().rotation.matrix()
+def averaged_rotations(a: Int64, b: Int64, turns: Float64, weights: Float64, count: int) -> Float64:
+    """Rotations (count, 3, 3) that agree best with ``turns`` (m, 3, 3) = ``R[b] @ R[a].T``.
+
+    From the tree of heaviest links on, least squares in the tangent space, weighted again and again
+    as Cauchy's loss wants it (Chatterjee and Govindu, Efficient and Robust Large-Scale Rotation
+    Averaging, ICCV 2013, with another loss). Links hold all that is placed in one group.
+    """
+    rotations = _rotations_of_tree(a, b, turns, weights, count)
+    for _ in range(ROUNDS):
+        left = rotations[b].transpose(0, 2, 1) @ turns @ rotations[a]
+        steps = -Rotation.from_matrix(left).as_rotvec()
+        robust = _robust_weights(np.linalg.norm(steps, axis=1))
+        moved = _solved(a, b, steps, weights * robust, count)
+        rotations = rotations @ Rotation.from_rotvec(-moved).as_matrix()
     return rotations
 
 
 def agreed(a: Int64, b: Int64, steps: Float64, weights: Float64, count: int) -> Float64:
     """Values (count, ...) whose differences ``x[b] - x[a]`` agree best with ``steps`` (m, ...).
 
-    Least squares, weighted again and again as Cauchy's loss wants it, whose scale is the robust
-    std of what is left. The mean of the values is 0; what no link holds stays there.
+    Least squares, weighted again and again as Cauchy's loss wants it. The mean of the values is 0;
+    what no link holds stays there.
     """
     values = steps.reshape(len(steps), -1)
-    found = np.zeros((count, values.shape[1]))
     robust = np.ones(len(a))
-    ends = np.concatenate([a, b])
     for _ in range(ROUNDS):
-        weight = weights * robust
-        diagonal = np.bincount(ends, np.concatenate([weight, weight]), minlength=count)
-        # a little of the identity: the links say nothing of the mean
-        held = diagonal + 1e-9 * diagonal.max()
-        own = np.arange(count)
-        entries = np.concatenate([-weight, -weight, held])
-        places = np.concatenate([a, b, own]), np.concatenate([b, a, own])
-        laplacian = coo_matrix((entries, places), shape=(count, count)).tocsc()
-        side = np.zeros_like(found)
-        np.add.at(side, b, weight[:, None] * values)
-        np.add.at(side, a, -weight[:, None] * values)
-        found = splu(laplacian).solve(side)
-        off = np.linalg.norm(found[b] - found[a] - values, axis=1)
-        scale = max(MAD_TO_STD * float(np.median(off)), 1e-12)
-        robust = 1 / (1 + (off / scale) ** 2)
+        found = _solved(a, b, values, weights * robust, count)
+        robust = _robust_weights(np.linalg.norm(found[b] - found[a] - values, axis=1))
     found -= found.mean(axis=0)
     return found.reshape(count, *steps.shape[1:])
+
+
+def _solved(a: Int64, b: Int64, steps: Float64, weights: Float64, count: int) -> Float64:
+    """Values (count, d) whose differences ``x[b] - x[a]`` come nearest ``steps`` (m, d)."""
+    ends = np.concatenate([a, b])
+    diagonal = np.bincount(ends, np.concatenate([weights, weights]), minlength=count)
+    # a little of the identity: the links say nothing of the mean
+    held = diagonal + 1e-9 * diagonal.max()
+    own = np.arange(count)
+    entries = np.concatenate([-weights, -weights, held])
+    places = np.concatenate([a, b, own]), np.concatenate([b, a, own])
+    laplacian = coo_matrix((entries, places), shape=(count, count)).tocsc()
+    side = np.zeros((count, steps.shape[1]))
+    np.add.at(side, b, weights[:, None] * steps)
+    np.add.at(side, a, -weights[:, None] * steps)
+    found: Float64 = splu(laplacian).solve(side)
+    return found
+
+
+def _robust_weights(off: Float64) -> Float64:
+    """Of Cauchy's loss, whose scale is the robust std of what is off."""
+    scale = max(MAD_TO_STD * float(np.median(off)), 1e-12)
+    weights: Float64 = 1 / (1 + (off / scale) ** 2)
+    return weights
+
+
+def _rotations_of_tree(a: Int64, b: Int64, turns: Float64, weights: Float64, count: int) -> Float64:
+    """The same along the tree of heaviest links."""
+    graph = coo_matrix((1 / weights, (a, b)), shape=(count, count)).tocsr()
+    tree = minimum_spanning_tree(graph)
+    order, parents = breadth_first_order(tree, int(a[0]), directed=False)
+    turn = {
+        (int(i), int(j)): there
+        for one, other, r in zip(a, b, turns, strict=True)
+        for i, j, there in ((one, other, r), (other, one, r.T))
+    }
+    rotations = np.tile(np.eye(3), (count, 1, 1))
+    for image in map(int, order[1:]):
+        parent = int(parents[image])
+        rotations[image] = turn[parent, image] @ rotations[parent]
+    return rotations
 
 
 def _links(scene: Scene, pairs: list[VerifiedPair]) -> _Links:

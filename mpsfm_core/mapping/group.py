@@ -96,7 +96,7 @@ class Group:
         """
         before = self.scene.snapshot()
         with self.journal.timed("global start"):
-            placed = place_all(self.scene, left, self._options.seed)
+            placed = place_all(self.scene, left)
             if placed is None:
                 return False
             self._build(placed)
