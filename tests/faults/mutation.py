@@ -11,6 +11,8 @@ import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
+
 from mpsfm_core.errors import MpsfmError
 
 LIMIT_S = 10
@@ -81,6 +83,8 @@ def case(name: str, seed: bytes, number: int) -> bytes:
 
 def _in_process(reader: Reader, name: str, seed: bytes, numbers: range):
     receiver, sender = os.pipe()
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # a child waits forever for threads that OpenCV had before the fork
     child = os.fork()
     if child == 0:
         os.close(receiver)
@@ -88,6 +92,7 @@ def _in_process(reader: Reader, name: str, seed: bytes, numbers: range):
             _read_all(reader, name, seed, numbers, sender)
         finally:
             os._exit(0)
+    cv2.setNumThreads(threads)
     os.close(sender)
     last = numbers.start
     with os.fdopen(receiver, "r") as lines:
