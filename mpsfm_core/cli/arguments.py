@@ -22,6 +22,15 @@ Offline: TypeAlias = Annotated[
 Quiet: TypeAlias = Annotated[
     bool, typer.Option("--quiet", "-q", help="No progress, no summary; errors only.")
 ]
+Distances: TypeAlias = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--distance",
+        metavar="D",
+        min=1e-6,
+        help="Of the cloud, in the unit of the truth; may be repeated. Default: 1 to 50 cm.",
+    ),
+]
 ViewerName: TypeAlias = Annotated[
     str | None,
     typer.Option("--viewer", metavar="NAME", help="Of a viewer plugin: viser, rerun."),
@@ -31,6 +40,13 @@ ViewerName: TypeAlias = Annotated[
 def settings(overrides: list[str] | None, offline: bool) -> list[str]:
     """The settings that the options ``--set`` and ``--offline`` mean."""
     return [*(overrides or ()), *(["runtime.offline=true"] if offline else [])]
+
+
+def tolerances(distances: list[float] | None) -> tuple[float, ...]:
+    """The distances that the options ``--distance`` mean, each once, the smallest first."""
+    from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES
+
+    return tuple(sorted(set(distances or TOLERANCES)))
 
 
 def assigned(overrides: list[str] | None) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Overrides, Quiet
+from mpsfm_core.cli.arguments import Distances, Overrides, Quiet, tolerances
 
 if TYPE_CHECKING:
     from mpsfm_core.evaluation.records import Record
@@ -50,14 +50,7 @@ def benchmark(
             "transforms.json. May be repeated.",
         ),
     ] = None,
-    distance: Annotated[
-        list[float] | None,
-        typer.Option(
-            metavar="D",
-            min=1e-6,
-            help="Metres, of dense columns; may be repeated. Default: 1 to 50 cm.",
-        ),
-    ] = None,
+    distance: Distances = None,
     workers: Annotated[int, typer.Option(min=1, help="Sets mapped at the same time.")] = 1,
     overrides: Overrides = None,
     compare: Annotated[
@@ -84,7 +77,6 @@ def benchmark(
         raise InputError("benchmark needs scene folders and --output DIR, or --compare A B")
     from mpsfm_core.cli.progress import showing_progress
     from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
-    from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES
     from mpsfm_core.evaluation.methods import OTHERS
     from mpsfm_core.evaluation.report import make_rows, markdown, write_report
     from mpsfm_core.registry import Registry
@@ -98,7 +90,7 @@ def benchmark(
         tuple(overrides or ()),
         workers,
         dict(_named(text) for text in results or ()),
-        tuple(sorted(set(distance or TOLERANCES))),
+        tolerances(distance),
     )
     registry = Registry.discover()
     with showing_progress(registry, quiet):

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from mpsfm_core.cli.arguments import Distances, tolerances
+
 
 def evaluate(
     model: Annotated[Path, typer.Argument(help="COLMAP model, transforms.json or our output.")],
@@ -29,14 +31,7 @@ def evaluate(
         Path | None,
         typer.Option(metavar="FILE.ply", help="Scan in the frame of GT; for MODEL/dense.ply."),
     ] = None,
-    distance: Annotated[
-        list[float] | None,
-        typer.Option(
-            metavar="D",
-            min=1e-6,
-            help="Of the cloud, in the unit of GT; may be repeated. Default: 1 to 50 cm.",
-        ),
-    ] = None,
+    distance: Distances = None,
 ) -> None:
     """Print pose AUC at 1, 5 and 20 degrees, trajectory errors and registered share as JSON.
 
@@ -56,7 +51,6 @@ def evaluate(
     poses, true_poses = read_poses(model), read_poses(truth)
     report = evaluate(poses, true_poses, names, CONVENTIONS[convention])
     if gt_depth is not None or scan is not None:
-        from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES
         from mpsfm_core.evaluation.output_folder import (
             evaluate_cloud,
             evaluate_depth,
@@ -64,17 +58,17 @@ def evaluate(
             true_surface,
         )
 
-        tolerances, cloud = sorted(set(distance or TOLERANCES)), model / "dense.ply"
+        within, cloud = tolerances(distance), model / "dense.ply"
         if gt_depth is not None:
             report["depth"] = evaluate_depth(model, gt_depth)
         if scan is not None:
             surface = read_points(scan)
         elif gt_depth is not None and cloud.is_file():
-            surface = true_surface(truth, gt_depth, sorted(poses), tolerances)
+            surface = true_surface(truth, gt_depth, sorted(poses), within)
         else:
             surface = None
         if surface is not None:
-            report["cloud"] = evaluate_cloud(cloud, surface, poses, true_poses, tolerances)
+            report["cloud"] = evaluate_cloud(cloud, surface, poses, true_poses, within)
     typer.echo(json.dumps(report, indent=2))
 
 

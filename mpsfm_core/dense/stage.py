@@ -125,10 +125,12 @@ def densify(
             found[row] = own
             progress(len(found), len(rows))
     agreed, ties = {}, {}
-    for row in found:
-        depth = images[row].depth
-        agreed[row], ties[row] = _compared(row, found, depth, sources[row], options, keep)
-    scale_std = scale_stds(ties) if was_mapped else dict.fromkeys(found, 0.0)
+    for row, own in found.items():
+        differences = _differences(row, found, sources[row], options)
+        agreed[row] = _agreement(own, differences, keep)
+        if was_mapped:
+            ties[row] = _ties(own, differences, images[row].depth, options)
+    scale_std = scale_stds(ties)
     maps, which = list(reconstruction.images), {}
     for row in found:
         view, name = views[row], images[row].name
@@ -136,7 +138,7 @@ def densify(
         measured = with_known(_measured(row, view, found, agreed, near[row], options), known)
         which[name] = keep(measured.known)
         joined = posterior(known, measured, options.correlation_px)
-        maps[posed[row]] = _with_depth(images[row], view, joined, scale_std[row], keep)
+        maps[posed[row]] = _with_depth(images[row], view, joined, scale_std.get(row, 0.0), keep)
     names = [image.name for image in images]
     report = DenseReport(
         {names[row]: [names[other] for other in others] for row, others in enumerate(sources)},
@@ -188,26 +190,31 @@ class _Found(NamedTuple):
         return PosedDepth(self.grid, self.log_depth, self.log_std(options))
 
 
-def _compared(
-    row: int,
-    found: Mapping[int, _Found],
-    depth: DepthPrior,
-    sources: Sequence[int],
-    options: DenseOptions,
-    keep: Keep,
-) -> tuple[Agreement, Ties]:
-    """A map beside those of its sources, and beside the ``depth`` that was known."""
+def _differences(
+    row: int, found: Mapping[int, _Found], sources: Sequence[int], options: DenseOptions
+) -> dict[int, Float32]:
+    """From a map to those of its sources."""
     own = found[row].posed_depth(options)
-    differences = {
+    return {
         other: depth_differences(own, found[other].posed_depth(options))
         for other in sources
         if other in found
     }
+
+
+def _agreement(own: _Found, differences: Mapping[int, Float32], keep: Keep) -> Agreement:
+    """A map beside those of its sources."""
     agreement = agreement_of(own.log_depth.shape, differences.values())
     maps = keep(agreement.confirmed), keep(agreement.mean_change)
+    return Agreement(*maps, agreement.noise)
+
+
+def _ties(
+    own: _Found, differences: Mapping[int, Float32], depth: DepthPrior, options: DenseOptions
+) -> Ties:
+    """A map beside those of its sources and the ``depth`` that was known."""
     change = own.log_depth - known_depth(depth, *own.grid.camera.size)[0]
-    ties = ties_of_photo(differences, found[row].supported, change, options.correlation_px)
-    return Agreement(*maps, agreement.noise), ties
+    return ties_of_photo(differences, own.supported, change, options.correlation_px)
 
 
 def _measured(

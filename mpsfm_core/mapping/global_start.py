@@ -1,10 +1,10 @@
 """Poses of all images at once, from what all pairs together say of them.
 
 Verified pairs know how their images are turned, and in which direction one lies from the other;
-depth priors say how far. Rotations are averaged over all pairs; with
-lengths known, the scales of the priors and the places of the images are linear in what the pairs
-say, and follow from least squares that pairs leave which disagree. Images that several agreeing
-pairs hold are placed so; the others are left to registration one by one.
+depth priors say how far. Rotations are averaged over all pairs; with lengths known, the scales of
+the priors and the places of the images are linear in what the pairs say, and follow from least
+squares that pairs leave which disagree. Images that several agreeing pairs hold are placed so; the
+others are left to registration one by one.
 """
 
 from __future__ import annotations
