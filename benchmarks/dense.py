@@ -1,11 +1,14 @@
 """Dense geometry before and after the stage ``dense``, with the same poses.
 
-    python -m benchmarks.dense [--cases kitchen-all ...] [--json] [--output DIR]
+    python -m benchmarks.dense [--cases fountain-all-config ...] [--true-poses] [--output DIR]
 
 A case is a scene, a bucket of its sets and a depth prior. The mapped sets (poses, points, refined
-depth) are kept in the output folder, so that only what comes after the mapper is run again. Depth
-is compared in the scale of the cameras, the cloud after aligning the cameras' centres, with all
-true depth maps of the set as the scan. ``fountain`` has no true depth: there it is the share of
+depth) are kept in the output folder, so that only what comes after the mapper is run again. With
+``--true-poses`` the mapper is given the true poses and holds them; scales of depth, points and
+refined maps are its own.
+
+Depth is compared in the scale of the cameras, the cloud after aligning the cameras' centres, with
+all true depth maps of the set as the scan. ``fountain`` has no true depth: there it is the share of
 matches, triangulated with the true poses, whose depth is right to 1 %. The last line of ``--json``
 is one JSON object.
 """
@@ -89,7 +92,7 @@ CASES: Mapping[str, Case] = {
             ("all", "leq30", "minimal"),
             PRIORS,
         ),
-        ("hololens", "hololens_room", ("all", "leq30"), ("config",)),
+        ("hololens", "hololens_room", ("all", "leq30"), ("sensor", "config")),
         ("fountain", "fountain", ("all",), ("config",)),
     )
     for bucket in buckets
@@ -110,6 +113,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=CASES, metavar="CASE")
+    parser.add_argument("--true-poses", action="store_true", help="map with the true poses, fixed")
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks/dense"))
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
@@ -117,21 +121,24 @@ def main() -> None:
     for name in arguments.cases:
         case = CASES[name]
         scene = read_scene(shared_folder() / "data" / case.scene)
-        mapped = mapped_sets(name, arguments.output)
+        mapped = mapped_sets(name, arguments.output, arguments.true_poses)
         problem = None if scene.depth else problem_of_case(name, arguments.output)[0]
-        rows += measured(name, scene, mapped, problem)
+        rows += measured(name, scene, mapped, problem, not arguments.true_poses)
         print(table(rows[-1:]), file=sys.stderr)
     print(table(rows))
     if arguments.json:
         print(json.dumps({"rows": rows}))
 
 
-def mapped_sets(name: str, output: Path) -> list[MappedSet]:
-    """What the mapper makes of the sets of a case, now or earlier."""
-    kept = output / f"{name}.pickle"
+def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[MappedSet]:
+    """What the mapper makes of the sets of a case, now or earlier; with ``true_poses`` held."""
+    kept = output / f"{name}{'-true-poses' if true_poses else ''}.pickle"
     if kept.is_file():
         return list(pickle.loads(kept.read_bytes()))
     problem, options, sets = problem_of_case(name, output)
+    if true_poses:
+        problem = posed(problem, read_scene(shared_folder() / "data" / CASES[name].scene).truth)
+        options = options.model_copy(update={"known_poses": "fixed"})
     mapped = []
     for item in sets:
         subset = problem.subset(list(item.images))
@@ -140,6 +147,12 @@ def mapped_sets(name: str, output: Path) -> list[MappedSet]:
         mapped.append(MappedSet(best, normals))
     kept.write_bytes(pickle.dumps(mapped))
     return mapped
+
+
+def posed(problem: MappingProblem, poses: Mapping[str, Pose]) -> MappingProblem:
+    """The problem with these poses as the known ones of its images."""
+    images = (replace(image, known_pose=poses[image.name]) for image in problem.images)
+    return replace(problem, images=tuple(images))
 
 
 def problem_of_case(
@@ -163,9 +176,16 @@ def problem_of_case(
 
 
 def measured(
-    name: str, scene: SceneFolder, mapped: Sequence[MappedSet], problem: MappingProblem | None
+    name: str,
+    scene: SceneFolder,
+    mapped: Sequence[MappedSet],
+    problem: MappingProblem | None,
+    posed_by_depth: bool = True,
 ) -> list[dict[str, Any]]:
-    """Means over the sets of a case, a row for each way to make the maps."""
+    """Means over the sets of a case, a row for each way to make the maps.
+
+    ``posed_by_depth``: the mapper found the poses.
+    """
     photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
     rows = []
     for way in WAYS:
@@ -181,7 +201,7 @@ def measured(
                     view_of(photos),
                     DenseOptions(),
                     workers=1,
-                    was_mapped=way != "without prior",
+                    posed_by_depth=posed_by_depth and way != "without prior",
                 )
                 seen = report.measured
                 seconds = (time.process_time() - started) / len(model.images)

@@ -231,7 +231,7 @@ class _Run:
             self._give_up(images, extraction, mapping, photos)
         if config.results.georeference and not known:
             mapping = self._georeference(images, mapping)
-        mapping, self._dense = self._densified(mapping, photos)
+        mapping, self._dense = self._densified(mapping, photos, known)
         summary: dict[str, Any] = {}
         with stage("results"):
             components = [Component.of(part, photos) for part in mapping.reconstructions]
@@ -317,9 +317,12 @@ class _Run:
             checkpoints.forget()
 
     def _densified(
-        self, mapping: MappingResult, photos: Photos
+        self, mapping: MappingResult, photos: Photos, known: Mapping[str, Pose]
     ) -> tuple[MappingResult, list[dict[str, Any]] | None]:
-        """The groups with depth measured in the photos, and what to say of each."""
+        """The groups with depth measured in the photos, and what to say of each.
+
+        ``known``: the poses that the user brought.
+        """
         config = self._provision.config
         if not config.dense.enabled:
             return mapping, None
@@ -335,6 +338,7 @@ class _Run:
                     partial(self._stages.stage_progress, "dense"),
                     self._dense_checkpoints(part, photos),
                     disk.keep,
+                    posed_by_depth=not _poses_are(part, known),
                 )
                 parts.append(dense)
                 reports.append(report.describe())
@@ -488,6 +492,14 @@ def _with_poses(problem: MappingProblem, poses: Mapping[str, Pose]) -> MappingPr
     return replace(problem, images=tuple(images))
 
 
+def _poses_are(part: Reconstruction, known: Mapping[str, Pose]) -> bool:
+    """Whether all images of a group stand where the user's poses have them."""
+    return all(
+        name in known and all(map(np.array_equal, pose, known[name]))
+        for name, pose in part.poses.items()
+    )
+
+
 def _path(value: PathLike | None) -> Path | None:
     return None if value is None else Path(value)
 
@@ -521,11 +533,11 @@ def _densify_model(
         raise InputError(f"{images}: has {len(matched)} of the photos of {model}, two are needed")
     photos = load_images(images, model=model, names=list(matched))
     points = {str(image.name): _depths_of_points(colmap, image) for image in colmap.images.values()}
-    depths, was_mapped = [], True
+    depths, posed_by_depth = [], True
     for photo in photos:
         found = matched[photo.name]
         file = model / DEPTH / f"{found}.npz"
-        was_mapped &= file.is_file()
+        posed_by_depth &= file.is_file()
         depths.append(read_depth_map(file)[1] if file.is_file() else depth_of_points(points[found]))
     known = _maps_alone(photos, [poses[matched[photo.name]] for photo in photos], depths)
     if not known.images:
@@ -533,7 +545,7 @@ def _densify_model(
     view_of = _view_of(photos)
     disk = DiskArrays(cache_folder())
     dense, report = densify(
-        known, view_of, options or DenseOptions(), keep=disk.keep, was_mapped=was_mapped
+        known, view_of, options or DenseOptions(), keep=disk.keep, posed_by_depth=posed_by_depth
     )
     with replacing(output, (SPARSE, DENSE, DEPTH)) as folder:
         write_model(folder / SPARSE, colmap)

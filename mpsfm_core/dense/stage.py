@@ -89,16 +89,16 @@ def densify(
     progress: Callable[[int, int], None] = lambda done, total: None,
     found_before: FoundBefore | None = None,
     keep: Keep = in_memory,
-    was_mapped: bool = True,
+    posed_by_depth: bool = True,
 ) -> tuple[Reconstruction, DenseReport]:
     """The reconstruction with depth that was measured in the photos where that is possible.
 
     ``view_of``: undistorted view by name. ``workers``: images at once, None for as many as the run
     may use; what comes out does not depend on it. ``progress``: is told how many images of how many
     are matched. ``found_before``: has what a run that was killed found, and keeps what this finds.
-    ``keep``: holds maps, those of the result too; called from several threads. ``was_mapped``: the
-    mapper had the depth of these images, so that scales of pairs may hang together by it alone;
-    else poses are taken to be right.
+    ``keep``: holds maps, those of the result too; called from several threads. ``posed_by_depth``:
+    the mapper found the poses with the depth of these images, so that scales of pairs may hang
+    together by it alone; else poses are taken to be right.
     Images that no other one overlaps keep their maps, and so do those without confirmed pose.
     """
     posed = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
@@ -128,7 +128,7 @@ def densify(
     for row, own in found.items():
         differences = _differences(row, found, sources[row], options)
         agreed[row] = _agreement(own, differences, keep)
-        if was_mapped:
+        if posed_by_depth:
             ties[row] = _ties(own, differences, images[row].depth, options)
     scale_std = scale_stds(ties)
     maps, which = list(reconstruction.images), {}

@@ -55,7 +55,7 @@ def test_scales_that_hang_on_known_depth_are_less_sure(room) -> None:
     # without shared pixels (a correlation as long as the map) only known depth ties the pairs
     loose = OPTIONS.model_copy(update={"correlation_px": 1000.0})
     tied, _ = densify(room.reconstruction, room.views.__getitem__, loose)
-    fixed, _ = densify(room.reconstruction, room.views.__getitem__, loose, was_mapped=False)
+    fixed, _ = densify(room.reconstruction, room.views.__getitem__, loose, posed_by_depth=False)
     for a, b in zip(tied.images, fixed.images, strict=True):
         np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
         added = (a.depth.variance - b.depth.variance) / a.depth.depth**2

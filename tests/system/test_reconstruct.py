@@ -12,6 +12,7 @@ import pytest
 
 import mpsfm_core
 from mpsfm_core.cli.reconstruct import _refined_focal_lengths
+from mpsfm_core.dense.stage import densify
 from mpsfm_core.errors import ReconstructionError
 from mpsfm_core.evaluation import evaluate, read_poses, reconstruction_poses
 from mpsfm_core.inputs.nerfstudio import write_transforms
@@ -235,6 +236,29 @@ def test_poses_without_a_photo_are_told(
     )
     assert result.model.num_images() == 3
     assert "2 of its 5 images are not among the photos: 3.png, 4.png" in caplog.text
+
+
+@pytest.mark.parametrize(("poses", "found"), [("fixed", False), ("start", True)])
+def test_fixed_poses_are_taken_to_be_right(
+    photo_scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, poses: str, found: bool
+) -> None:
+    told = []
+
+    def observed(*arguments, posed_by_depth: bool):
+        told.append(posed_by_depth)
+        return densify(*arguments, posed_by_depth=posed_by_depth)
+
+    monkeypatch.setattr("mpsfm_core.pipeline.densify", observed)
+    listed = tmp_path / "list.txt"
+    listed.write_text("0.png\n1.png\n2.png\n")
+    mpsfm_core.reconstruct(
+        photo_scene.images,
+        config=photo_scene.config,
+        image_list=listed,
+        poses=photo_scene.truth,
+        overrides=[f"mapping.known_poses={poses}"],
+    )
+    assert told == [found]
 
 
 @pytest.fixture(scope="module")
