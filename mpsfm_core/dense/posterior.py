@@ -34,6 +34,10 @@ MIN_STD = 1e-4
 """Of log depth that is known: no sensor is better."""
 
 
+UNKNOWN_LOG_STD = 1.0
+"""Of depth that nothing is known of but what is around."""
+
+
 class Observed(NamedTuple):
     """Measured log depth and its std, (h, w) float32; not measured where the std is infinite."""
 
@@ -51,20 +55,21 @@ def with_known(measured: Observed, known: Observed) -> Observed:
 
     The std of the known depth is taken as its distance to the measured one says, less the noise of
     the latter. That may be far less than it declares: depth of a sensor must not suffer.
+    Holes say nothing of it, and nothing is joined there.
     """
-    which = measured.known
-    if not which.any():
+    compared = measured.known & (known.log_std < UNKNOWN_LOG_STD)
+    if not compared.any():
         return measured
-    distance = np.abs(measured.log_depth - known.log_depth)[which]
-    both, own = np.quantile(distance, ONE_SIGMA), np.median(measured.log_std[which])
+    distance = np.abs(measured.log_depth - known.log_depth)[compared]
+    both, own = np.quantile(distance, ONE_SIGMA), np.median(measured.log_std[compared])
     left = max(float(both**2 - own**2), float(_LEAST_LEFT * both) ** 2)
     std = np.float32(max(left**0.5, MIN_STD))
     ours, theirs = measured.log_std**-2.0, std**-2.0
     total = ours + theirs
     mean = (ours * measured.log_depth + theirs * known.log_depth) / total
     return Observed(
-        np.where(which, mean, measured.log_depth).astype(np.float32),
-        np.where(which, total**-0.5, np.inf).astype(np.float32),
+        np.where(compared, mean, measured.log_depth).astype(np.float32),
+        np.where(compared, total**-0.5, measured.log_std).astype(np.float32),
     )
 
 
@@ -76,11 +81,12 @@ def posterior(known: Observed, measured: Observed, correlation_px: float) -> Obs
     height, width = known.log_depth.shape
     small = max(2, width // _REDUCTION), max(2, height // _REDUCTION)
     which = measured.known
-    weight = np.where(which, 1 / measured.log_std**2, 0).astype(np.float32)
+    std = resize_map(known.log_std**-2.0, *small) ** -0.5
+    told = _alike(known.log_std, resize_map(std, width, height, linear=False))
+    weight = np.where(which, told / measured.log_std**2, 0).astype(np.float32)
     error = np.where(which, measured.log_depth - known.log_depth, 0) * weight
     precision = resize_map(weight, *small)
     best = resize_map(np.where(which, measured.log_depth, known.log_depth), *small)
-    std = resize_map(known.log_std, *small)
     length = max(correlation_px / _REDUCTION, 1.0)
     east, south, mass = _field(std, best, length)
     grid = Multigrid(small[1], small[0])
@@ -91,12 +97,20 @@ def posterior(known: Observed, measured: Observed, correlation_px: float) -> Obs
     length = max(length / _VARIANCE_REDUCTION, 1.0)
     east, south, mass = _field(resize_map(std, *tiny), resize_map(best, *tiny), length)
     variance = inverse_diagonal(east, south, mass + resize_map(precision, *tiny))
-    spread = np.sqrt(resize_map(variance.astype(np.float32), width, height))
-    moved = known.log_depth + resize_map(correction, width, height)
+    variance = resize_map(variance.astype(np.float32), width, height)
+    alike = _alike(known.log_std, resize_map(std, width, height))
+    spread = np.sqrt(alike * variance + (1 - alike) * known.log_std**2)
+    moved = known.log_depth + alike * resize_map(correction, width, height)
     return Observed(
         np.where(which, measured.log_depth, moved),
         np.where(which, measured.log_std, spread),
     )
+
+
+def _alike(std: Float32, other: Float32) -> Float32:
+    """What the errors of a pixel and of its block say of each other, 0 to 1: little where far less
+    is known of one of them."""
+    return np.minimum(std / other, other / std) ** 2
 
 
 def _field(std: Float32, log_depth: Float32, length: float) -> tuple[Float32, Float32, Float32]:

@@ -23,6 +23,7 @@ from mpsfm_core.dense.matching_kernels import (
     joined_costs,
 )
 from mpsfm_core.dense.options import DenseOptions
+from mpsfm_core.dense.posterior import UNKNOWN_LOG_STD
 from mpsfm_core.dense.view import DenseView
 from mpsfm_core.geometry import resize_map
 
@@ -36,6 +37,8 @@ _EDGE = 10 / 255
 """Step of grey values that halves the penalty of a step of depth (ours)."""
 _MAX_PRIOR = 9.0
 """Squared deviation from the known depth, in std, above which more costs no more."""
+_BEYOND = 4.0
+"""Cost of a depth further from the known one than is searched (ours: several times the worst)."""
 _SAMPLES = 8
 """Pixels along each side at which parallax is measured."""
 
@@ -92,15 +95,24 @@ def _search(
         correlation_costs(*own, *their, options.window_radius, noise, plane)
     joined = np.empty((*base.shape, len(offsets)), np.float32)
     joined_costs(costs, options.view_share, _UNSEEN_COST, joined)
-    deviation = ((surface - view.log_depth) / view.log_std)[..., None]
-    deviation = deviation + offsets.astype(np.float32) / view.log_std[..., None]
+    change = (surface - view.log_depth)[..., None] + offsets.astype(np.float32)
+    deviation = change / view.log_std[..., None]
     weighed = joined + np.float32(options.prior_weight) * np.minimum(deviation**2, _MAX_PRIOR)
+    weighed[np.abs(change) > _reach(view, options)[..., None] + (offsets[1] - offsets[0])] = _BEYOND
     total = np.zeros_like(joined)
     steps = options.small_step, options.large_step
     aggregated_costs(weighed.astype(np.float32), view.grey, *steps, _EDGE, total)
     offset, cost = np.empty_like(base), np.empty_like(base)
     best_labels(total, joined, offsets, offset, cost)
     return surface + offset, cost
+
+
+def _reach(view: DenseView, options: DenseOptions) -> Float32:
+    """Log depth (h, w) that is searched to either side of what is known; where that is surer than
+    usual as far as usual, where nothing is known wherever there is a label."""
+    known = view.log_std[view.log_std < UNKNOWN_LOG_STD]
+    usual = np.median(known) if len(known) else UNKNOWN_LOG_STD
+    return np.float32(options.range_stds) * np.maximum(view.log_std, np.float32(usual))
 
 
 def _parallax(view: DenseView, sources: Sequence[DenseView]) -> Float32:

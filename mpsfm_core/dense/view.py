@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, PinholeCamera, View
+from mpsfm_core.dense.posterior import UNKNOWN_LOG_STD
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.scene.reconstruction import RegisteredImage
 
@@ -47,7 +48,7 @@ class DenseView(PosedGrid):
 
     ``grey``: (h, w) float32 in [0, 1]. ``usable``: (h, w) bool, False where the photo is masked.
     ``log_depth``, ``log_std``: (h, w) float32, depth known before and its std, natural logarithm of
-    world units; where nothing was known the median, with a std that says so.
+    world units; where nothing was known what was known around, with a std that says so.
     """
 
     grey: Float32
@@ -100,17 +101,14 @@ def known_depth(depth: DepthPrior, width: int, height: int) -> tuple[Float32, Fl
     """:attr:`DenseView.log_depth` and its std of a refined map, on a grid of this size.
 
     What lies between two samples of different surfaces is on neither: where the mean is further
-    from the nearest sample than that may be off, the sample counts.
+    from the nearest sample than that may be off, the sample counts; beside holes it does too.
     """
     log_depth, log_std = _known(depth)
     smooth, smooth_std = (resize_map(each, width, height) for each in (log_depth, log_std))
     nearest, std = (resize_map(each, width, height, linear=False) for each in (log_depth, log_std))
-    between = np.abs(smooth - nearest) > std
+    valid = resize_map(depth.valid.astype(np.float32), width, height)
+    between = (np.abs(smooth - nearest) > std) | ((valid > 0) & (valid < 1))
     return np.where(between, nearest, smooth), np.where(between, std, smooth_std)
-
-
-UNKNOWN_LOG_STD = 1.0
-"""Of depth that nothing is known of but the median of the map."""
 
 
 def _known(depth: DepthPrior) -> tuple[Float32, Float32]:
@@ -119,6 +117,19 @@ def _known(depth: DepthPrior) -> tuple[Float32, Float32]:
     if not valid.any():
         zero = np.zeros(depth.shape, np.float32)
         return zero, zero + np.float32(UNKNOWN_LOG_STD)
-    known = np.log(np.where(valid, depth.depth, np.median(depth.depth[valid])))
+    known = _without_holes(np.log(np.where(valid, depth.depth, 1)).astype(np.float32), valid)
     std = np.sqrt(depth.variance) / np.where(valid, depth.depth, 1)
-    return known.astype(np.float32), np.where(valid, std, UNKNOWN_LOG_STD).astype(np.float32)
+    return known, np.where(valid, std, UNKNOWN_LOG_STD).astype(np.float32)
+
+
+def _without_holes(values: Float32, valid: Bool) -> Float32:
+    """The values (h, w), and where they are not valid the mean of what is valid around, taken as
+    wide as the hole is."""
+    if valid.all():
+        return values
+    width, height = ((size + 1) // 2 for size in values.shape[::-1])
+    share = resize_map(valid.astype(np.float32), width, height)
+    total = resize_map(np.where(valid, values, np.float32(0)), width, height)
+    around = share > 0
+    coarse = _without_holes(total / np.where(around, share, 1), around)
+    return np.where(valid, values, resize_map(coarse, *values.shape[::-1]))

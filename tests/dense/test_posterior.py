@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpsfm_core.dense.posterior import Observed, with_known
+from mpsfm_core.dense.posterior import UNKNOWN_LOG_STD, Observed, posterior, with_known
 
 SHAPE = (80, 100)
 
@@ -36,3 +36,34 @@ def test_what_was_not_measured_stays_unknown() -> None:
     np.testing.assert_array_equal(joined.known, measured.known)
     measured.log_std[:] = np.inf
     assert with_known(measured, known) is measured
+
+
+def test_only_what_was_known_tells_how_sure_it_was() -> None:
+    rng = np.random.default_rng(0)
+    measured, known = observed(rng, 0.01, 0.01), observed(rng, 0.003, stated=0.1)
+    whole = with_known(measured, known)
+    hole = np.zeros(SHAPE, np.bool_)
+    hole[:, 40:] = True
+    holed = Observed(
+        np.where(hole, np.float32(1), known.log_depth),
+        np.where(hole, np.float32(UNKNOWN_LOG_STD), known.log_std),
+    )
+    joined = with_known(measured, holed)
+    np.testing.assert_array_equal(joined.log_depth[hole], measured.log_depth[hole])
+    np.testing.assert_allclose(joined.log_std[~hole], whole.log_std[~hole], rtol=0.1)
+
+
+def test_known_depth_beside_a_hole_stays() -> None:
+    hole = np.zeros(SHAPE, np.bool_)
+    hole[22:58, 31:70] = True
+    known = Observed(
+        np.zeros(SHAPE, np.float32), np.where(hole, UNKNOWN_LOG_STD, 0.01).astype(np.float32)
+    )
+    inside = hole & (np.random.default_rng(0).random(SHAPE) < 0.5)
+    std = np.where(inside, 0.01, np.inf).astype(np.float32)
+    measured = Observed(np.where(inside, 0.3, 0).astype(np.float32), std)
+    joined = posterior(known, measured, correlation_px=20)
+    assert np.abs(joined.log_depth[~hole]).max() < 0.005
+    assert joined.log_std[~hole].max() < 0.04
+    middle = np.s_[32:48, 41:60]
+    assert np.abs(joined.log_depth[middle] - 0.3).mean() < 0.05

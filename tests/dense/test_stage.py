@@ -51,6 +51,25 @@ def test_the_stated_std_is_about_the_error(room) -> None:
     assert error[certain].mean() < error[~certain].mean()
 
 
+def test_a_sensor_s_depth_stays_and_its_holes_are_measured(room) -> None:
+    images, holes = [], {}
+    for number, image in enumerate(room.reconstruction.images):
+        depth = room.truth[image.name]
+        hole = np.zeros(depth.shape, np.bool_)
+        hole[30:90, 50 + 5 * number : 110 + 5 * number] = True
+        hole |= np.random.default_rng(number).random(depth.shape) < 0.1
+        known = DepthPrior.from_arrays(depth, (0.01 * depth) ** 2, ~hole)
+        images.append(replace(image, depth=known))
+        holes[image.name] = hole
+    sensor = replace(room.reconstruction, images=tuple(images))
+    dense, report = densify(sensor, room.views.__getitem__, OPTIONS)
+    for name, error in room.errors(dense).items():
+        hole = holes[name]
+        assert error[~hole].mean() < 0.003
+        assert np.median(error[hole & report.measured[name]]) < 0.01
+        assert error[hole].mean() < 0.1
+
+
 def test_scales_that_hang_on_known_depth_are_less_sure(room) -> None:
     # without shared pixels (a correlation as long as the map) only known depth ties the pairs
     loose = OPTIONS.model_copy(update={"correlation_px": 1000.0})
