@@ -97,9 +97,9 @@ def posterior(known: Observed, measured: Observed, correlation_px: float) -> Obs
     length = max(length / _VARIANCE_REDUCTION, 1.0)
     east, south, mass = _field(resize_map(std, *tiny), resize_map(best, *tiny), length)
     variance = inverse_diagonal(east, south, mass + resize_map(precision, *tiny))
-    variance = resize_map(variance.astype(np.float32), width, height)
+    here = resize_map(variance, width, height)
     alike = _alike(known.log_std, resize_map(std, width, height))
-    spread = np.sqrt(alike * variance + (1 - alike) * known.log_std**2)
+    spread = np.sqrt(alike * here + (1 - alike) * known.log_std**2)
     moved = known.log_depth + alike * resize_map(correction, width, height)
     return Observed(
         np.where(which, measured.log_depth, moved),
@@ -110,7 +110,8 @@ def posterior(known: Observed, measured: Observed, correlation_px: float) -> Obs
 def _alike(std: Float32, other: Float32) -> Float32:
     """What the errors of a pixel and of its block say of each other, 0 to 1: little where far less
     is known of one of them."""
-    return np.minimum(std / other, other / std) ** 2
+    alike: Float32 = np.minimum(std / other, other / std) ** 2
+    return alike
 
 
 def _field(std: Float32, log_depth: Float32, length: float) -> tuple[Float32, Float32, Float32]:

@@ -112,7 +112,8 @@ def _reach(view: DenseView, options: DenseOptions) -> Float32:
     usual as far as usual, where nothing is known wherever there is a label."""
     known = view.log_std[view.log_std < UNKNOWN_LOG_STD]
     usual = np.median(known) if len(known) else UNKNOWN_LOG_STD
-    return np.float32(options.range_stds) * np.maximum(view.log_std, np.float32(usual))
+    reach: Float32 = np.float32(options.range_stds) * np.maximum(view.log_std, np.float32(usual))
+    return reach
 
 
 def _parallax(view: DenseView, sources: Sequence[DenseView]) -> Float32:

@@ -131,5 +131,6 @@ def _without_holes(values: Float32, valid: Bool) -> Float32:
     share = resize_map(valid.astype(np.float32), width, height)
     total = resize_map(np.where(valid, values, np.float32(0)), width, height)
     around = share > 0
-    coarse = _without_holes(total / np.where(around, share, 1), around)
+    mean = (total / np.where(around, share, 1)).astype(np.float32)
+    coarse = _without_holes(mean, around)
     return np.where(valid, values, resize_map(coarse, *values.shape[::-1]))
