@@ -101,12 +101,13 @@ class DepthCheck:
         goes first.
         """
         scene = self._scene
-        shares = np.zeros((scene.num_images, scene.num_images))
+        shares = np.full((scene.num_images, scene.num_images), np.nan)
         for image in map(int, images):
             for other in overlapping_views(scene, image, self._options.num_views):
-                if not shares[image, other]:
+                if np.isnan(shares[image, other]):
                     share = self.between(image, other, std_factor, once=True)
                     shares[image, other] = shares[other, image] = share
+        shares = np.nan_to_num(shares)
         removed = []
         while (shares > limit).any():
             conflicts = (shares > limit).sum(axis=1)

@@ -10,7 +10,8 @@ class FailureLadder:
     """Thresholds that give way step by step and snap back at the next success.
 
     PnP may do with fewer inliers (reference). The depth check does not give way, unlike the
-    reference's: that would let in what it is there to keep out.
+    reference's: that would let in what it is there to keep out. It tightens by the same factor, as
+    what matches do not bear out depth has to (ours).
     """
 
     def __init__(self, options: RegistrationOptions) -> None:
@@ -24,12 +25,16 @@ class FailureLadder:
     @property
     def min_inliers(self) -> int:
         """PnP inliers that an image needs."""
-        return int(self._options.min_inliers / 1.2**self._relaxations)
+        return int(self._options.min_inliers / self._factor)
 
     @property
     def min_inlier_share(self) -> float:
         """Share of the correspondences that must be inliers."""
-        return self._options.min_inlier_share / 1.2**self._relaxations
+        return self._options.min_inlier_share / self._factor
+
+    def max_violations(self, strict: float) -> float:
+        """Share of pixels that may contradict another view, ``strict`` before any relaxation."""
+        return strict / self._factor
 
     def objection(self, pose: AbsolutePose, *, certain: bool = False) -> str | None:
         """Why too few matches agree with a pose, if so; ``certain``: nearly all have to."""
@@ -47,3 +52,7 @@ class FailureLadder:
             return False
         self._relaxations += 1
         return True
+
+    @property
+    def _factor(self) -> float:
+        return 1.2**self._relaxations

@@ -359,12 +359,15 @@ class Group:
             self.attempts.refuted[image, other] |= led.inlier_share >= options.min_inlier_share
 
     def _contradiction(self, image: int, limit: float) -> str | None:
-        """Why the depth of an image contradicts that of another view, if it does."""
+        """Why the depth of an image contradicts that of another view, if it does.
+
+        ``limit``: share of pixels at the strict thresholds.
+        """
         if not self._options.consistency.enabled:
             return None
         with self.journal.timed("depth check"):
             check = self._check.of_image(image, self.refiner.std_factor)
-        if check.share <= limit:
+        if check.share <= self._ladder.max_violations(limit):
             return None
         self.attempts.blame(check.other, image)
         other = self._problem.images[check.other].name
