@@ -6,8 +6,9 @@ z forward, pixel centres at half integers). A pose is a (3, 4) matrix `cam_from_
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -57,7 +58,9 @@ class Box:
         cos, sin = np.cos(np.deg2rad(self.yaw_deg)), np.sin(np.deg2rad(self.yaw_deg))
         world_from_box = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         start = (origin - np.asarray(self.center)) @ world_from_box
-        rays = _away_from_zero(directions @ world_from_box)
+        all_rays = _away_from_zero(directions @ world_from_box)
+        near = self._may_hit(start, all_rays)
+        rays = all_rays[near]
         t_low = (-np.sign(rays) * self.half_size - start) / rays
         t_high = (np.sign(rays) * self.half_size - start) / rays
         t_enter, t_leave = t_low.max(1), t_high.min(1)
@@ -66,7 +69,17 @@ class Box:
         t = np.where(outside, t_enter, t_leave)
         t = np.where((t_leave >= t_enter) & (t > _EPSILON), t, np.inf)
         facing = -np.sign(np.take_along_axis(rays, axis[:, None], 1))
-        return t, facing * world_from_box.T[axis]
+        found, normals = np.full(len(all_rays), np.inf), np.zeros_like(all_rays)
+        found[near], normals[near] = t, facing * world_from_box.T[axis]
+        return found, normals
+
+    def _may_hit(self, start: Float64, rays: Float64) -> Bool:
+        """(n,) bool, rays (n, 3) from ``start``, seen from the centre, that meet the ball around
+        the box."""
+        along, length = rays @ start, np.einsum("ni,ni->n", rays, rays)
+        outside = start @ start - np.dot(self.half_size, self.half_size)
+        meets: Bool = (outside <= 0) | ((along < 0) & (along * along >= outside * length))
+        return meets
 
 
 @dataclass(frozen=True)
@@ -127,7 +140,8 @@ class Texture:
         return np.round(127.5 + 127.5 * np.tanh(value)).astype(np.uint8)
 
 
-class Rendering(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Rendering:
     """What a pinhole camera sees; everything is zero where no surface is.
 
     Normals face the camera along the ray, so at grazing sight off the axis n_z can be positive.
@@ -135,7 +149,12 @@ class Rendering(NamedTuple):
 
     depth: Float32  # (h, w), metres along z
     normals: Float32  # (h, w, 3), unit, camera frame
-    rgb: UInt8  # (h, w, 3)
+    _colors: Callable[[], UInt8]
+
+    @cached_property
+    def rgb(self) -> UInt8:
+        """Colours (h, w, 3)."""
+        return self._colors()
 
 
 class Samples(NamedTuple):
@@ -190,13 +209,17 @@ class AnalyticScene:
         """Depth, normals and colours at every pixel centre."""
         xy = geometry.pixel_centers(camera.width, camera.height)
         seen = self.sample(camera, cam_from_world, xy)
-        rgb = self.texture.colors(seen.points, seen.surface, seen.depth / camera.fx)
-        rgb[~seen.valid] = 0
         shape = (camera.height, camera.width)
+
+        def colors() -> UInt8:
+            rgb = self.texture.colors(seen.points, seen.surface, seen.depth / camera.fx)
+            rgb[~seen.valid] = 0
+            return rgb.reshape(*shape, 3)
+
         return Rendering(
             seen.depth.reshape(shape).astype(np.float32),
             seen.normals.reshape(*shape, 3).astype(np.float32),
-            rgb.reshape(*shape, 3),
+            colors,
         )
 
     def correspondences(
