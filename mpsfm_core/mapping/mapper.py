@@ -17,7 +17,7 @@ from mpsfm_core.mapping.group import Group, nothing
 from mpsfm_core.mapping.initialization import Starts
 from mpsfm_core.mapping.journal import Journal
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.runs import Run, explained_shares, settled, with_all_times
+from mpsfm_core.mapping.runs import Run, best, explained_shares, settled, with_all_times
 from mpsfm_core.mapping.state import canonical
 from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction
 
@@ -35,9 +35,9 @@ def reconstruct(
 
     Disconnected groups of images become reconstructions of their own, the largest first. Where
     much of the matches stays unexplained, other random choices may come to more: then there are
-    several runs, and that counts which explains most. The result is the same bit for bit for the
-    same problem, options and machine, also where a run that ended early goes on from one of its
-    ``checkpoints``.
+    several runs, and that counts which explains most, or one that came out twice if it explains as
+    much. The result is the same bit for bit for the same problem, options and machine, also where a
+    run that ended early goes on from one of its ``checkpoints``.
     """
     options, events = options or MapperOptions(), events or Silent()
     problem = canonical(problem)
@@ -52,11 +52,11 @@ def reconstruct(
         if mapper.keeps_poses or settled(runs, options.enough_explained):
             break
     keeper.finish(runs)
-    best = max(runs, key=lambda run: run.of_largest)
-    models = list(best.models)
+    chosen = best(runs)
+    models = list(chosen.models)
     if models and options.place_unconfirmed:
         models[0] = with_unconfirmed(models[0], models[1:], problem, options)
-    return MappingResult(tuple(models), with_all_times(best.report, runs))
+    return MappingResult(tuple(models), with_all_times(chosen.report, runs))
 
 
 class Mapper:

@@ -39,10 +39,19 @@ class Run(NamedTuple):
 def settled(runs: Sequence[Run], enough: float) -> bool:
     """Whether the last run explains enough, or came to the same as one before it."""
     *before, last = runs
-    return sum(last.explained) >= enough or any(
-        run.size == last.size and abs(run.of_largest - last.of_largest) < AGREEMENT
-        for run in before
-    )
+    return sum(last.explained) >= enough or any(_agree(run, last) for run in before)
+
+
+def best(runs: Sequence[Run]) -> Run:
+    """The run whose largest group explains most; of those that explain about as much, the one to
+    which most others came too."""
+    most = max(run.of_largest for run in runs)
+    equal = [run for run in runs if most - run.of_largest < AGREEMENT]
+    return max(equal, key=lambda run: (sum(_agree(run, other) for other in runs), run.of_largest))
+
+
+def _agree(one: Run, other: Run) -> bool:
+    return one.size == other.size and abs(one.of_largest - other.of_largest) < AGREEMENT
 
 
 def with_all_times(report: MappingReport, runs: Sequence[Run]) -> MappingReport:

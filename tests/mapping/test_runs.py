@@ -12,7 +12,7 @@ from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.runs import Run, explained_score, total_score
+from mpsfm_core.mapping.runs import Run, best, explained_score, total_score
 from mpsfm_core.scene.reconstruction import MappingReport, Reconstruction
 from mpsfm_core.testing.problems import Noise, mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
@@ -120,3 +120,17 @@ def test_poses_that_stay_leave_nothing_to_chance(
     monkeypatch.setattr(Scripted, "keeps_poses", True)
     monkeypatch.setattr(mapper, "Mapper", Scripted)
     assert reconstruct(problem).report.runs == 1
+
+
+def test_a_tie_goes_to_what_came_out_twice(problem: MappingProblem) -> None:
+    """A run that stands alone has to explain clearly more than two that came to the same."""
+    (model,) = reconstruct(problem).reconstructions
+
+    def run(size: int, explained: float) -> Run:
+        return Run([replace(model, images=model.images[:size])], [explained], MappingReport())
+
+    alone, one, other = run(4, 0.662), run(3, 0.655), run(3, 0.660)
+    assert best([alone, one, other]) is other
+    assert best([alone, one]) is alone
+    clearly = run(4, 0.68)
+    assert best([clearly, one, other]) is clearly
