@@ -137,7 +137,8 @@ def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Mappe
         return list(pickle.loads(kept.read_bytes()))
     problem, options, sets = problem_of_case(name, output)
     if true_poses:
-        problem = posed(problem, read_scene(shared_folder() / "data" / CASES[name].scene).truth)
+        truth = read_scene(shared_folder() / "data" / CASES[name].scene).truth
+        problem = problem.with_poses(truth)
         options = options.model_copy(update={"known_poses": "fixed"})
     mapped = []
     for item in sets:
@@ -147,12 +148,6 @@ def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Mappe
         mapped.append(MappedSet(best, normals))
     kept.write_bytes(pickle.dumps(mapped))
     return mapped
-
-
-def posed(problem: MappingProblem, poses: Mapping[str, Pose]) -> MappingProblem:
-    """The problem with these poses as the known ones of its images."""
-    images = (replace(image, known_pose=poses[image.name]) for image in problem.images)
-    return replace(problem, images=tuple(images))
 
 
 def problem_of_case(

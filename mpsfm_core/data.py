@@ -11,6 +11,7 @@ of the first pixel is (0.5, 0.5)); uncertainty is a variance.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -480,6 +481,11 @@ class MappingProblem:
             if pair.image_a in position and pair.image_b in position
         )
         return MappingProblem(tuple(self.images[i] for i in keep), pairs)
+
+    def with_poses(self, poses: Mapping[str, Pose]) -> MappingProblem:
+        """The problem with these poses, by name, as known; other images have none."""
+        images = (replace(image, known_pose=poses.get(image.name)) for image in self.images)
+        return replace(self, images=tuple(images))
 
 
 def along_rays(camera: PinholeCamera, normals: NDArray[Any]) -> Float64:

@@ -218,7 +218,7 @@ class _Run:
         with stage("extraction"):
             images = estimate_focals(images, config, self._registry, self._stages)
             extraction = extract(images, config, self._registry, self._stages, self._imported)
-        problem = _with_poses(extraction.problem, known)
+        problem = extraction.problem.with_poses(known)
         if compilation is not None:
             with stage("compilation"):
                 compilation.wait()
@@ -485,11 +485,6 @@ def _known_poses(model: Path, images: ImageSet) -> dict[str, Pose]:
         text = "%s: %d of its %d images are not among the photos: %s"
         _log.warning(text, model, len(others), len(poses), ", ".join(others[:_MENTIONED]))
     return {name: poses[found] for name, found in matched.items()}
-
-
-def _with_poses(problem: MappingProblem, poses: Mapping[str, Pose]) -> MappingProblem:
-    images = (replace(image, known_pose=poses.get(image.name)) for image in problem.images)
-    return replace(problem, images=tuple(images))
 
 
 def _poses_are(part: Reconstruction, known: Mapping[str, Pose]) -> bool:
