@@ -3,7 +3,8 @@
 A file may say ``extends:`` with the name of a shipped configuration or a path relative to itself.
 Mappings are merged key by key, everything else is replaced; a block whose ``use:`` changes loses
 the rest that its parent said of it, as another provider has other options, and a block that says
-``use:`` loses its parent's ``otherwise:``.
+``use:`` loses its parent's ``otherwise:``. Where features, a
+matcher or a multi-view network are named, the parent's quick matching is lost.
 
 A block may name providers to take ``otherwise``. Which of them it will be is not the
 configuration's to say: it depends on the machine, and :mod:`mpsfm_core.provision` finds it out
@@ -27,6 +28,7 @@ from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.options import MapperOptions, MappingOptions
 from mpsfm_core.options import (
     AS_DEPTH,
+    FROM_MATCHER,
     FROM_MULTIVIEW,
     Backend,
     Options,
@@ -83,6 +85,13 @@ class RuntimeOptions(Options):
     """Never download; a missing weights file is an error."""
 
 
+class QuickMatching(Options):
+    """Features and a sparse matcher that cost little."""
+
+    features: Backend
+    matcher: Backend
+
+
 class Config(Options):
     """Everything a run needs to know besides its images and output folder."""
 
@@ -90,6 +99,9 @@ class Config(Options):
     """One line for ``mpsfm config list``; not inherited."""
     inputs: InputOptions = Field(default_factory=InputOptions)
     pairs: PairOptions = Field(default_factory=PairOptions)
+    quick: QuickMatching | None = None
+    """Matching that is tried first: photos that it holds in place are not given to ``features`` and
+    ``matcher`` again, pairs with others are (:mod:`mpsfm_core.pipeline`)."""
     features: Backend | None = None
     matcher: Backend | None = None
     """Sparse matcher, needs ``features``."""
@@ -112,6 +124,9 @@ class Config(Options):
 
     def backends(self) -> Iterator[tuple[SettingPath, Kind, Backend]]:
         """Every chosen provider: its path in the configuration, kind and block."""
+        if self.quick is not None:
+            yield ("quick", "features"), "features", self.quick.features
+            yield ("quick", "matcher"), "matcher", self.quick.matcher
         for name, kind in _BLOCKS.items():
             backend = getattr(self, name)
             if backend is not None:
@@ -123,9 +138,27 @@ class Config(Options):
         """The configuration with another backend at a path of :meth:`backends`."""
         block, *index = path
         value: Any = backend
-        if index:
+        if block == "quick" and self.quick is not None:
+            value = self.quick.model_copy(update={str(index[0]): backend})
+        elif index:
             value = tuple(backend if i == index[0] else b for i, b in enumerate(self.masks))
         return self.model_copy(update={str(block): value})
+
+    def quick_pass(self) -> Config | None:
+        """The configuration with its quick matching alone, None where it has none."""
+        if self.quick is None:
+            return None
+        alone = {"quick": None, "dense_matcher": None, **dict(self.quick)}
+        return self.model_copy(update=alone)
+
+    @property
+    def tries_again(self) -> bool:
+        """Whether quick matching is followed by another one where it does not suffice; not where
+        the other's first choice cannot be had and the same features would be found again."""
+        if self.quick is None:
+            return False
+        again = self.features is not None and self.features.use == self.quick.features.use
+        return self.dense_matcher is not None or not again
 
     def mapper_options(self) -> MapperOptions:
         """The settings of the mapper, with the seed of the run."""
@@ -147,7 +180,11 @@ _BLOCKS: dict[str, Kind] = {
 }
 
 
-BLOCKS = (*_BLOCKS, "masks")
+_CAREFUL = ("features", "matcher", "dense_matcher", "multiview")
+"""Blocks that quick matching does not go with unasked: who names a matcher wants that one, and what
+a multi-view network is shown together is chosen by matches."""
+
+BLOCKS = ("quick", *_BLOCKS, "masks")
 """The blocks that name providers, each after those that its choice depends on."""
 
 
@@ -184,8 +221,9 @@ def load_config(
     keys and names, the nearest valid one.
     """
     layers = _read_chain(_find(str(name_or_path), Path()))
-    # A change of provider drops the block's options, so it goes before the overrides that set them.
-    last = sorted(overrides, key=lambda text: ".use=" not in text)
+    # A change of provider drops the block's options, one of the matcher drops quick matching too: it
+    # goes before the overrides that set them.
+    last = sorted(overrides, key=lambda text: (text.startswith("quick"), ".use=" not in text))
     layers += [_Layer(f"--set {text}", parse_assignment(text)) for text in last]
     try:
         config = parse_settings(Config, _merge_all(layers))
@@ -269,6 +307,8 @@ def _merge_all(layers: Sequence[_Layer]) -> dict[str, Any]:
     merged: dict[str, Any] = {}
     for layer in layers:
         try:
+            if any(layer.says((block, "use")) for block in _CAREFUL):
+                merged.pop("quick", None)
             merged = _merge(merged, layer.data)
         except IndexError as error:
             raise ConfigError(f"{layer.source}: {error}") from error
@@ -409,6 +449,8 @@ def _missing_blocks(config: Config) -> list[SettingProblem]:
     if config.matcher is None and config.dense_matcher is None:
         return [SettingProblem(("matcher",), "a matcher or a dense_matcher is needed")]
     problems = []
+    if config.quick is not None and config.depth.use == FROM_MATCHER:
+        problems.append(SettingProblem(("quick",), "gives no depth, as depth.use: matcher needs"))
     if config.depth.use == FROM_MULTIVIEW and config.multiview is None:
         problems.append(SettingProblem(("multiview",), "is needed by depth.use: multiview"))
     if config.matcher is not None and config.features is None:
@@ -425,6 +467,9 @@ def combination_problems(config: Config, registry: Registry) -> list[SettingProb
     Open blocks fit for the present. The path of a problem begins with the block that should change.
     """
     problems = []
+    if (alone := config.quick_pass()) is not None:
+        for problem in combination_problems(alone, registry):
+            problems.append(SettingProblem(("quick", *problem.path), problem.text))
     settled = {
         path[0]: registry.spec(kind, backend.use)
         for path, kind, backend in config.backends()

@@ -28,6 +28,9 @@ AS_DEPTH = "as-depth"
 """As the normals provider: the depth network's own normals, of the same pass."""
 
 
+FROM_MATCHER = "matcher"
+"""As the depth provider: the depth that the matcher predicts."""
+
 FROM_MULTIVIEW = "multiview"
 """As the depth provider: the depth of the multi-view network, which sees several photos at once."""
 

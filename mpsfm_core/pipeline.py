@@ -27,8 +27,7 @@ from mpsfm_core.disk_arrays import DiskArrays
 from mpsfm_core.errors import ConfigError, InputError, ReconstructionError
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.focal import estimate_focals
-from mpsfm_core.extraction.predictions import FROM_MATCHER
-from mpsfm_core.extraction.runner import Extraction, extract
+from mpsfm_core.extraction.runner import Extraction, extract, extract_more
 from mpsfm_core.files import claimed, replacing
 from mpsfm_core.formats import VERSION
 from mpsfm_core.geometry import transform
@@ -41,6 +40,7 @@ from mpsfm_core.inputs.matches import (
 from mpsfm_core.inputs.models import match_names, read_model, read_poses, reconstruction_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
+from mpsfm_core.options import FROM_MATCHER
 from mpsfm_core.provision import Provision, provide
 from mpsfm_core.registry import Registry, core_version
 from mpsfm_core.report.page import write_report
@@ -217,15 +217,19 @@ class _Run:
             self._imported = _import_matches(matches, images)
         with stage("extraction"):
             images = estimate_focals(images, config, self._registry, self._stages)
-            extraction = extract(images, config, self._registry, self._stages, self._imported)
-        problem = extraction.problem.with_poses(known)
+            first = config.quick_pass() or config
+            extraction = extract(images, first, self._registry, self._stages, self._imported)
         if compilation is not None:
             with stage("compilation"):
                 compilation.wait()
-        with stage("mapping"):
-            options, checkpoints = config.mapper_options(), self._mapper_checkpoints(problem)
-            mapping = mapper.reconstruct(problem, options, self._stages, checkpoints)
-        photos = Photos(images, problem)
+        mapping = self._map(extraction, known)
+        if config.tries_again and (loose := self._loose(mapping, images)):
+            with stage("extraction"):
+                extraction = extract_more(
+                    images, config, self._registry, extraction, loose, self._stages
+                )
+            mapping = self._map(extraction, known)
+        photos = Photos(images, extraction.problem)
         if not mapping.reconstructions:
             self._forget_checkpoints()
             self._give_up(images, extraction, mapping, photos)
@@ -253,6 +257,33 @@ class _Run:
             with suppress(OSError):  # what was written before stands
                 update_summary(self._output, summary)
         return ReconstructionResult(models[0], models[1:], mapping, summary, self._output)
+
+    def _map(self, extraction: Extraction, known: Mapping[str, Pose]) -> MappingResult:
+        """``known``: the poses that the user brought."""
+        problem = extraction.problem.with_poses(known)
+        with self._stages.stage("mapping"):
+            options = self._provision.config.mapper_options()
+            checkpoints = self._mapper_checkpoints(problem)
+            return mapper.reconstruct(problem, options, self._stages, checkpoints)
+
+    def _loose(self, mapping: MappingResult, images: ImageSet) -> frozenset[int]:
+        """The images that the largest reconstruction does not hold in place: those that see fewer
+        points which three images see than a pose needs (``registration.min_inliers``)."""
+        config = self._provision.config
+        least = config.mapping.registration.min_inliers
+        held = frozenset(
+            image.index
+            for part in mapping.reconstructions[:1]
+            for image, count in zip(part.images, part.num_multi_view_points(), strict=True)
+            if image.confirmed and count >= least
+        )
+        loose = frozenset(range(len(images))) - held
+        if loose:
+            matchers = (config.matcher, config.dense_matcher)
+            names = " and ".join(backend.use for backend in matchers if backend is not None)
+            count = f"{len(loose)} of {len(images)} images"
+            self._stages.notice(f"quick matching does not hold {count}: {names} matches them")
+        return loose
 
     def _foresee(self, images: ImageSet) -> None:
         """Say what the run will take; raises :class:`InputError` where that cannot be had."""
@@ -437,13 +468,14 @@ class _Run:
         """What predicted what, why it was chosen, under which licences, how often, how long."""
         used = {(line["kind"], line["name"]): line for line in usage}
         described = []
+        unused = {"computed": 0, "from_cache": 0, "seconds": 0.0}
         blocks = zip(self._provision.choices, self._provision.config.backends(), strict=True)
         for choice, (_, kind, backend) in blocks:
             spec = choice.provider
             described.append(
                 {
                     "block": choice.block,
-                    **used.get((kind, spec.name), {"kind": kind, "name": spec.name}),
+                    **used.get((kind, spec.name), {"kind": kind, "name": spec.name, **unused}),
                     "from": choice.origin,
                     "chosen": choice.reason,
                     "passed_over": dict(choice.passed_over),
@@ -460,7 +492,7 @@ def _without_matching(config: Config) -> Config:
     """No providers for what is brought."""
     if config.depth.use == FROM_MATCHER:
         raise ConfigError("depth: the matcher gives it, which does not run for matches of others")
-    nothing = dict.fromkeys(("features", "matcher", "dense_matcher", "retrieval"))
+    nothing = dict.fromkeys(("quick", "features", "matcher", "dense_matcher", "retrieval"))
     return config.model_copy(update=nothing)
 
 

@@ -178,7 +178,7 @@ class _Search:
         if name == AS_DEPTH:
             candidate = self._as_depth(config.depth, candidate)
         candidate = check_backend(path, kind, candidate, self._registry)
-        if path[0] in ("matcher", "dense_matcher"):
+        if path[-1] in ("matcher", "dense_matcher"):
             self._check_fit(config.replaced(path, candidate), path)
         self._equip(path, kind, candidate)
         for index, wrapper in enumerate(candidate.wrap):

@@ -22,6 +22,13 @@ class StageRecord:
     seconds: float
     peak_memory_mb: float | None
 
+    def after(self, earlier: StageRecord | None) -> StageRecord:
+        """Of a stage that ran before too: the time of both, the larger peak."""
+        if earlier is None:
+            return self
+        peaks = [p for p in (earlier.peak_memory_mb, self.peak_memory_mb) if p is not None]
+        return StageRecord(earlier.seconds + self.seconds, max(peaks, default=None))
+
 
 class Stages:
     """Receives the events of all rooms and passes them on to the hooks of all plugins."""
@@ -42,7 +49,7 @@ class Stages:
         finally:
             record = self._record(name)
             del self._running[name]
-            self._finished[name] = record
+            self._finished[name] = record.after(self._finished.get(name))
             self.stage_finished(name, record.seconds)
 
     @contextmanager

@@ -48,6 +48,7 @@ def make_registry() -> Registry:
         ProviderSpec("matcher", "loftr", factory, capabilities=dense),
         ProviderSpec("depth", "onnx", factory, NetworkOptions),
         ProviderSpec("depth", "files", factory, FileOptions),
+        ProviderSpec("depth", "matcher", factory),
         ProviderSpec("normals", "from-depth", factory),
         ProviderSpec("mask", "files", factory, FileOptions),
         ProviderSpec("wrapper", "flip", factory, capabilities=frozenset({"wraps-depth"})),
@@ -72,6 +73,9 @@ def error_of(load: Load, text: str, *overrides: str) -> str:
     with pytest.raises(ConfigError) as caught:
         load(text, *overrides)
     return str(caught.value)
+
+
+QUICK = "{features: {use: sift}, matcher: {use: mutual-nearest}}"
 
 
 class TestMerging:
@@ -109,6 +113,27 @@ class TestMerging:
         config = load("extends: fast-cpu\nmatcher: null\ndense_matcher: {use: loftr}\n")
         assert config.matcher is None
         assert config.dense_matcher is not None
+
+    @pytest.mark.parametrize(
+        ("text", "overrides", "kept"),
+        [
+            ("features: {options: {max_keypoints: 7}}", (), True),
+            ("depth: {use: files, options: {directory: maps}}", (), True),
+            ("quick: null", (), False),
+            ("features: {use: xfeat}", (), False),
+            ("dense_matcher: {use: loftr}", (), False),
+            ("", ("matcher.use=lighterglue",), False),
+            (f"features: {{use: xfeat}}\nquick: {QUICK}", (), True),
+            ("", (f"quick={QUICK}", "matcher.use=lighterglue"), True),
+        ],
+    )
+    def test_who_names_a_matcher_wants_that_one(
+        self, load: Load, text: str, overrides: Sequence[str], kept: bool
+    ) -> None:
+        quick = load(f"extends: fast-cpu\n{text}", *overrides).quick
+        assert (quick is not None) == kept
+        if quick is not None:
+            assert (quick.features.use, quick.matcher.use) == ("sift", "mutual-nearest")
 
     def test_circles_are_told(self, tmp_path: Path) -> None:
         (tmp_path / "a.yaml").write_text("extends: b.yaml\n")
@@ -186,6 +211,9 @@ class TestErrors:
             ("dense_matcher: {use: lighterglue}\n", ":2: dense_matcher.use: 'lighterglue' is not"),
             ("matcher: null\n", ":2: matcher: a matcher or a dense_matcher is needed"),
             ("features: null\n", ":2: features: is needed by the sparse matcher 'lighterglue'"),
+            ("quick: {matcher: {use: loftr}}\n", ":2: quick.matcher.use: 'loftr' is not a sparse"),
+            ("quick: {features: {use: sfit}}\n", ":2: quick.features.use: no features provider"),
+            ("quick: {}\ndepth: {use: matcher}\n", ": quick: gives no depth, as depth.use: mat"),
             (
                 "features: {use: sift}\nmatcher: {use: lighterglue}\n",
                 ":3: matcher.use: 'lighterglue' matches xfeat features, not 'sift'",

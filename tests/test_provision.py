@@ -122,7 +122,8 @@ def configured(tmp_path: Path) -> Configured:
 
 
 def names(provision: Provision) -> list[str]:
-    return [choice.provider.name for choice in provision.choices]
+    """Of the providers, without those of quick matching."""
+    return [c.provider.name for c in provision.choices if not c.block.startswith("quick.")]
 
 
 class Listener:
@@ -157,7 +158,7 @@ def test_first_and_second_use(room: Room, server: Server, configured: Configured
     assert listener.notices[-2].endswith("to expect: published")
     again = provide(config, registry)
     assert again.config == first.config and len(server.requests) == 1
-    assert look_up(config, registry).choices[2].to_fetch == ()
+    assert look_up(config, registry).choices[-2].to_fetch == ()
 
 
 def cut(server: Server) -> None:
@@ -314,7 +315,8 @@ def test_config_show_says_what_would_be_chosen(tmp_path: Path) -> None:
     config, _, comment = shown.partition("# here and now:\n")
     assert "otherwise:" in config
     lines = dict(line[2:].split(": ", 1) for line in comment.splitlines())
-    assert lines.keys() == {"features", "matcher", "depth", "normals"}
+    quick = {"quick.features", "quick.matcher"}
+    assert lines.keys() == quick | {"features", "matcher", "depth", "normals"}
     assert "not moge-2-small" in lines["depth"]
     (tmp_path / "shown.yaml").write_text(shown)
     assert load_config(tmp_path / "shown.yaml").to_yaml() == config.rstrip("\n") + "\n"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -14,6 +14,7 @@ from mpsfm_core.data import (
     DepthPrior,
     Features,
     Float64,
+    MappingProblem,
     PairMatches,
     SparseMatches,
     VerifiedPair,
@@ -204,6 +205,38 @@ def assemble(
         tuple(verified),
         [np.concatenate(parts) for parts in keypoints],
         [_typical(parts) for parts in noise],
+    )
+
+
+def joined(problem: MappingProblem, more: Assembled) -> MappingProblem:
+    """The problem with more matches between its images, on keypoints that come after its own."""
+    offsets = [len(image.keypoints) for image in problem.images]
+    images = tuple(
+        replace(
+            image,
+            keypoints=np.concatenate([image.keypoints, xy]),
+            keypoint_std_px=_typical(
+                [(len(image.keypoints), image.keypoint_std_px), (len(xy), std)]
+            ),
+        )
+        for image, xy, std in zip(problem.images, more.keypoints, more.std_px, strict=True)
+    )
+    pairs = {(pair.image_a, pair.image_b): pair for pair in problem.pairs}
+    for pair in more.pairs:
+        key = pair.image_a, pair.image_b
+        rows = pair.matches + np.array([offsets[index] for index in key])
+        pairs[key] = _both(pairs.get(key), replace(pair, matches=rows))
+    return MappingProblem(images, tuple(pairs[key] for key in sorted(pairs)))
+
+
+def _both(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:
+    """All matches of a pair, with the geometry that more of them fit."""
+    if a is None:
+        return b
+    return replace(
+        max(a, b, key=len),
+        matches=np.concatenate([a.matches, b.matches]),
+        scores=np.concatenate([a.scores, b.scores]),
     )
 
 

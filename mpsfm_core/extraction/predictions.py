@@ -12,13 +12,10 @@ from mpsfm_core.extraction.matching import Candidates, PairMatcher
 from mpsfm_core.extraction.multiview import GroupPriors
 from mpsfm_core.extraction.raw_priors import RawPriors
 from mpsfm_core.extraction.workbench import Workbench
-from mpsfm_core.options import FROM_MULTIVIEW
+from mpsfm_core.options import FROM_MATCHER, FROM_MULTIVIEW
 from mpsfm_core.providers import Kind
 from mpsfm_core.registry import Registry
 from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
-
-FROM_MATCHER = "matcher"
-"""The depth provider's name that means: take the depth that the matcher predicts."""
 
 
 class Predictions:

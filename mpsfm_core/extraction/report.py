@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,38 @@ def describe(
         "images": {image.name: _image(image) for image in problem.images},
         "providers": [_provider(provider) for provider in bench.providers],
     }
+
+
+def describe_both(first: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
+    """Two reports in one: ``more`` is of further matches of pairs, in the end of the images too."""
+    pairs = {tuple(pair["images"]): pair for pair in first["pairs"]}
+    for pair in more["pairs"]:
+        images = tuple(pair["images"])
+        pairs[images] = _pair_of_both(pairs.get(images, pair), pair)
+    used = {(provider["kind"], provider["name"]) for provider in more["providers"]}
+    return {
+        **first,
+        "pairs_proposed": first["pairs_proposed"] + more["pairs_proposed"],
+        "pairs_matched": first["pairs_matched"] + more["pairs_matched"],
+        "pairs_verified": more["pairs_verified"],
+        "pairs": [pairs[images] for images in sorted(pairs)],
+        "failed": {**first["failed"], **more["failed"]},
+        "images": more["images"],
+        "providers": [
+            *(p for p in first["providers"] if (p["kind"], p["name"]) not in used),
+            *more["providers"],
+        ],
+    }
+
+
+def _pair_of_both(first: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]:
+    """What was kept, else what was tried last."""
+    if first is more or "dropped" in first:
+        return more
+    if "dropped" in more:
+        return first
+    best = max(first, more, key=lambda pair: pair["inliers"])
+    return {**best, **{key: first[key] + more[key] for key in ("matches", "inliers")}}
 
 
 def _pair(names: list[str], matches: Candidates, outcome: TwoView) -> dict[str, Any]:

@@ -8,6 +8,7 @@ predicts nothing anew.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,10 +22,16 @@ from mpsfm_core.extraction.dense import NO_POINTS
 from mpsfm_core.extraction.events import ExtractionEvents, Silent
 from mpsfm_core.extraction.execution import workers_elsewhere
 from mpsfm_core.extraction.features import FeatureTable
-from mpsfm_core.extraction.matching import Candidates, PairMatcher, PairVerifier, assemble
+from mpsfm_core.extraction.matching import (
+    Candidates,
+    PairMatcher,
+    PairVerifier,
+    assemble,
+    joined,
+)
 from mpsfm_core.extraction.multiview import GroupPriors
 from mpsfm_core.extraction.predictions import Predictions, check_depth_source
-from mpsfm_core.extraction.report import describe
+from mpsfm_core.extraction.report import describe, describe_both
 from mpsfm_core.extraction.selection import PairSelection
 from mpsfm_core.extraction.verification import TwoView
 from mpsfm_core.extraction.workbench import Workbench
@@ -73,6 +80,32 @@ def extract(
         workers_elsewhere(bench),
     ):
         return _extract(bench, imported)
+
+
+def extract_more(
+    images: ImageSet,
+    config: Config,
+    registry: Registry,
+    first: Extraction,
+    loose: Collection[int],
+    events: ExtractionEvents | None = None,
+) -> Extraction:
+    """A finished extraction, with further matches of the pairs that one of the ``loose`` images is
+    in, by the features and matchers of ``config``.
+
+    Depth and normals stay. Raises as :func:`extract`.
+    """
+    bench = Workbench(images, config, registry, events or Silent())
+    with (
+        threadpool_limits(thread_count(config.runtime), user_api="blas"),
+        workers_elsewhere(bench),
+    ):
+        bench.run_masks()
+        found = _match(bench, loose, first.problem.pairs)
+    assembled = assemble(found.candidates, found.outcomes, found.located)
+    problem = joined(first.problem, assembled)
+    more = describe(bench, problem, found.proposed, found.candidates, found.outcomes)
+    return Extraction(problem, describe_both(first.report, more))
 
 
 def _extract(bench: Workbench, imported: ImportedMatches | None) -> Extraction:
@@ -133,17 +166,24 @@ class _Found:
     matcher: PairMatcher | None = None
 
 
-def _match(bench: Workbench) -> _Found:
-    """By the providers of the configuration."""
+def _match(
+    bench: Workbench,
+    loose: Collection[int] | None = None,
+    verified: Sequence[VerifiedPair] = (),
+) -> _Found:
+    """By the providers of the configuration; pairs of ``loose`` images, all if None, beside those
+    that are ``verified`` already."""
     backend = bench.config.features
     table = None if backend is None else FeatureTable(bench, backend)
     located = [_NO_FEATURES] * len(bench.images) if table is None else table.extract()
-    selection = PairSelection(bench, table)
+    selection = PairSelection(bench, table, loose)
     matcher, verifier = PairMatcher(bench, table), PairVerifier(bench, located)
     candidates = matcher.match(selection.choose(), located)
     outcomes = verifier.verify(candidates)
     kept = zip(candidates, outcomes, strict=True)
-    if more := selection.choose_again([c.pair for c, outcome in kept if not outcome.reason]):
+    connected = [(pair.image_a, pair.image_b) for pair in verified]
+    connected += [c.pair for c, outcome in kept if not outcome.reason]
+    if more := selection.choose_again(connected):
         candidates += matcher.match(more, located)
         outcomes += verifier.verify(candidates[len(outcomes) :])
     return _Found(located, selection.proposed, candidates, outcomes, matcher)

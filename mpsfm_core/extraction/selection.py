@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -22,10 +22,19 @@ from mpsfm_core.extraction.workbench import Workbench
 
 
 class PairSelection:
-    """Chooses pairs for the matcher; ``proposed`` counts those before the filters of plugins."""
+    """Chooses pairs for the matcher; ``proposed`` counts those before the filters of plugins.
 
-    def __init__(self, bench: Workbench, table: FeatureTable | None) -> None:
+    ``loose``: images of which one must be in a pair, None for any pair.
+    """
+
+    def __init__(
+        self,
+        bench: Workbench,
+        table: FeatureTable | None,
+        loose: Collection[int] | None = None,
+    ) -> None:
         self.proposed = 0
+        self._loose = loose
         self._bench = bench
         self._table = table
         self._likeness: Float64 | None = None
@@ -77,7 +86,8 @@ class PairSelection:
 
     def _ask(self, chosen: Sequence[Pair]) -> list[Pair]:
         """The pairs that plugins let pass, sorted, each once."""
-        unique = sorted(set(chosen))
+        loose = self._loose
+        unique = sorted({(a, b) for a, b in chosen if loose is None or a in loose or b in loose})
         self._asked.update(unique)
         self.proposed += len(unique)
         names = self._bench.images.names

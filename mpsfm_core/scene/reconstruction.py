@@ -9,6 +9,8 @@ import numpy as np
 
 from mpsfm_core.data import DepthPrior, Float64, Int64, PinholeCamera, Pose
 
+_NO_ROWS = np.zeros(0, np.int64)
+
 
 @dataclass(frozen=True, eq=False)
 class RegisteredImage:
@@ -66,6 +68,12 @@ class Reconstruction:
     def poses(self) -> dict[str, Pose]:
         """Pose of each image by its name."""
         return {image.name: (image.rotation, image.translation) for image in self.images}
+
+    def num_multi_view_points(self) -> Int64:
+        """(n,) how many points of each image three images or more see."""
+        seen = [np.unique(image.point_ids[image.point_ids >= 0]) for image in self.images]
+        views = np.bincount(np.concatenate([*seen, _NO_ROWS]), minlength=len(self.points))
+        return np.array([(views[rows] >= 3).sum() for rows in seen], dtype=np.int64)
 
     @property
     def confirmed_images(self) -> tuple[RegisteredImage, ...]:

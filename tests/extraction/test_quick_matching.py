@@ -1,0 +1,93 @@
+"""Quick matching first, and further matches of the photos that it does not hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mpsfm_core.config import QuickMatching
+from mpsfm_core.data import Float64
+from mpsfm_core.extraction.runner import Extraction, extract_more
+from mpsfm_core.geometry import transform
+from mpsfm_core.inputs.images import load_images
+from mpsfm_core.options import Backend
+from mpsfm_core.pipeline import reconstruct
+
+TRUTH = QuickMatching(features=Backend(use="truth"), matcher=Backend(use="mutual-nearest"))
+DENSE = {"features": None, "matcher": None, "dense_matcher": Backend(use="dense")}
+
+
+def distances_to_epipolar_lines(world, extraction: Extraction, pair) -> Float64:
+    """Of all matches of a pair, in units of the normalised image plane."""
+    names = [extraction.problem.images[index].name for index in (pair.image_a, pair.image_b)]
+    a, b = (world.poses[name] for name in names)
+    rotation = b[:, :3] @ a[:, :3].T
+    translation = b[:, 3] - rotation @ a[:, 3]
+    x, y = (
+        (extraction.problem.images[index].keypoints[pair.matches[:, side]] - (80, 60)) / 140
+        for side, index in enumerate((pair.image_a, pair.image_b))
+    )
+    lines = np.cross(translation, transform(rotation, np.zeros(3), np.c_[x, np.ones(len(x))]))
+    along = (lines * np.c_[y, np.ones(len(y))]).sum(axis=1)
+    return np.abs(along) / np.linalg.norm(lines[:, :2], axis=1)
+
+
+def test_more_matches_of_one_photo(world) -> None:
+    first = world.extract()
+    assert world.asked() == {"features": 4, "depth": 4, "normals": 4}
+    config = world.config(**DENSE)
+    images = load_images(world.root / "images", world.root / "intrinsics.yaml")
+    both = extract_more(images, config, world.registry, first, {3})
+    assert world.asked() == {"dense": 3}  # its pairs alone, and no prior again
+    assert [len(image.keypoints) for image in both.problem.images[:3]] > [
+        len(image.keypoints) for image in first.problem.images[:3]
+    ]
+    before = {(pair.image_a, pair.image_b): pair for pair in first.problem.pairs}
+    for pair in both.problem.pairs:
+        earlier = before[pair.image_a, pair.image_b]
+        np.testing.assert_array_equal(pair.matches[: len(earlier)], earlier.matches)
+        assert (len(pair) > len(earlier)) == (pair.image_b == 3)
+        added = distances_to_epipolar_lines(world, both, pair)[len(earlier) :]
+        assert (added < 1e-6).all()  # rows of the right keypoints
+    for image, earlier in zip(both.problem.images, first.problem.images, strict=True):
+        assert image.depth is earlier.depth and image.normals is earlier.normals
+    report = both.report
+    assert report["pairs_proposed"] == 6 + 3 and report["pairs_matched"] == 6 + 3
+    assert len(report["pairs"]) == report["pairs_verified"] == 6
+    assert {pair["inliers"] for pair in report["pairs"]} == {len(p) for p in both.problem.pairs}
+    assert [provider["kind"] for provider in report["providers"]].count("matcher") == 2
+
+
+def test_a_pair_that_quick_matching_dropped(world) -> None:
+    first = world.extract(matcher=Backend(use="mutual-nearest", options={"ratio": 0.001}))
+    assert not first.problem.pairs
+    images = load_images(world.root / "images", world.root / "intrinsics.yaml")
+    both = extract_more(images, world.config(), world.registry, first, {0})
+    assert [(pair.image_a, pair.image_b) for pair in both.problem.pairs] == [(0, 1), (0, 2), (0, 3)]
+    kept = [pair["images"] for pair in both.report["pairs"] if "dropped" not in pair]
+    assert kept == [[world.names[0], name] for name in world.names[1:]]
+
+
+@pytest.mark.parametrize(("quick", "asked"), [(TRUTH, 0), ("weak", 6)])
+def test_photos_that_are_held_are_not_matched_again(world, quick, asked: int) -> None:
+    if quick == "weak":
+        sift = Backend(use="sift", options={"max_keypoints": 5})
+        quick = TRUTH.model_copy(update={"features": sift})
+    config = world.config(**DENSE, quick=quick)
+    result = reconstruct(
+        world.root / "images",
+        config=config,
+        intrinsics=world.root / "intrinsics.yaml",
+        registry=world.registry,
+    )
+    assert len(result.summary["images"]["registered"]) == 4
+    assert world.asked()["dense"] == asked
+    blocks = [provider["block"] for provider in result.summary["providers"]]
+    assert blocks == ["quick.features", "quick.matcher", "dense_matcher", "depth", "normals"]
+
+
+def test_the_same_features_are_not_found_twice(world) -> None:
+    """Where networks cannot be had both are SIFT."""
+    assert not world.config(quick=TRUTH).tries_again
+    assert world.config(**DENSE, quick=TRUTH).tries_again
+    assert not world.config().tries_again
