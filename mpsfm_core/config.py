@@ -221,7 +221,7 @@ def load_config(
     keys and names, the nearest valid one.
     """
     layers = _read_chain(_find(str(name_or_path), Path()))
-    # A change of provider drops the block's options, one of the matcher drops quick matching too: it
+    # A change of provider drops the options of its block, one of the matcher quick matching: it
     # goes before the overrides that set them.
     last = sorted(overrides, key=lambda text: (text.startswith("quick"), ".use=" not in text))
     layers += [_Layer(f"--set {text}", parse_assignment(text)) for text in last]

@@ -40,6 +40,8 @@ from mpsfm_core.inputs.matches import (
 from mpsfm_core.inputs.models import match_names, read_model, read_poses, reconstruction_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.held import held_images, starting_from
+from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.options import FROM_MATCHER
 from mpsfm_core.provision import Provision, provide
 from mpsfm_core.registry import Registry, core_version
@@ -222,13 +224,15 @@ class _Run:
         if compilation is not None:
             with stage("compilation"):
                 compilation.wait()
-        mapping = self._map(extraction, known)
-        if config.tries_again and (loose := self._loose(mapping, images)):
+        problem = extraction.problem.with_poses(known)
+        mapping = self._map(problem, config.mapper_options())
+        if config.tries_again and (held := self._held(mapping, images)) is not None:
             with stage("extraction"):
+                loose = frozenset(range(len(images))) - {image.index for image in held}
                 extraction = extract_more(
                     images, config, self._registry, extraction, loose, self._stages
                 )
-            mapping = self._map(extraction, known)
+            mapping = self._map_again(extraction, known, held)
         photos = Photos(images, extraction.problem)
         if not mapping.reconstructions:
             self._forget_checkpoints()
@@ -258,32 +262,36 @@ class _Run:
                 update_summary(self._output, summary)
         return ReconstructionResult(models[0], models[1:], mapping, summary, self._output)
 
-    def _map(self, extraction: Extraction, known: Mapping[str, Pose]) -> MappingResult:
-        """``known``: the poses that the user brought."""
-        problem = extraction.problem.with_poses(known)
+    def _map(self, problem: MappingProblem, options: MapperOptions) -> MappingResult:
         with self._stages.stage("mapping"):
-            options = self._provision.config.mapper_options()
-            checkpoints = self._mapper_checkpoints(problem)
+            checkpoints = self._mapper_checkpoints(problem, options)
             return mapper.reconstruct(problem, options, self._stages, checkpoints)
 
-    def _loose(self, mapping: MappingResult, images: ImageSet) -> frozenset[int]:
-        """The images that the largest reconstruction does not hold in place: those that see fewer
-        points which three images see than a pose needs (``registration.min_inliers``)."""
+    def _map_again(
+        self, extraction: Extraction, known: Mapping[str, Pose], held: list[RegisteredImage]
+    ) -> MappingResult:
+        """With more matches, from where the images stand that were held by fewer; poses that the
+        user fixed stay alone. ``known``: the poses that the user brought."""
+        problem = extraction.problem.with_poses(known)
+        options = self._provision.config.mapper_options()
+        if not known:
+            options = options.model_copy(update={"known_poses": "guess"})
+        if options.known_poses != "fixed":
+            problem = starting_from(problem, held)
+        return self._map(problem, options)
+
+    def _held(self, mapping: MappingResult, images: ImageSet) -> list[RegisteredImage] | None:
+        """The images that quick matching holds in place, None if that is all: those that see as
+        many points which three images see as a pose needs (``registration.min_inliers``)."""
         config = self._provision.config
-        least = config.mapping.registration.min_inliers
-        held = frozenset(
-            image.index
-            for part in mapping.reconstructions[:1]
-            for image, count in zip(part.images, part.num_multi_view_points(), strict=True)
-            if image.confirmed and count >= least
-        )
-        loose = frozenset(range(len(images))) - held
-        if loose:
-            matchers = (config.matcher, config.dense_matcher)
-            names = " and ".join(backend.use for backend in matchers if backend is not None)
-            count = f"{len(loose)} of {len(images)} images"
-            self._stages.notice(f"quick matching does not hold {count}: {names} matches them")
-        return loose
+        held = held_images(mapping, config.mapping.registration.min_inliers)
+        if len(held) == len(images):
+            return None
+        matchers = (config.matcher, config.dense_matcher)
+        names = " and ".join(backend.use for backend in matchers if backend is not None)
+        count = f"{len(images) - len(held)} of {len(images)} images"
+        self._stages.notice(f"quick matching does not hold {count}: {names} matches them")
+        return held
 
     def _foresee(self, images: ImageSet) -> None:
         """Say what the run will take; raises :class:`InputError` where that cannot be had."""
@@ -315,14 +323,16 @@ class _Run:
         }
         return {"predicted": asdict(self._needs), "measured": measured}
 
-    def _mapper_checkpoints(self, problem: MappingProblem) -> DiskCheckpoints | None:
+    def _mapper_checkpoints(
+        self, problem: MappingProblem, options: MapperOptions
+    ) -> DiskCheckpoints | None:
         config = self._provision.config
         if config.runtime.checkpoint_s is None:
             return None
         checkpoints = DiskCheckpoints(
             config.runtime.cache_dir,
             problem,
-            config.mapper_options(),
+            options,
             self._stages,
             config.runtime.checkpoint_s,
         )

@@ -120,7 +120,7 @@ class Mapper:
         self._growing = False
         if known or not self._outgrow():
             self.group.finish()
-        self._keep(in_users_world=known)
+        self._keep(in_users_world=known and self.options.known_poses != "guess")
         if fixed:
             self._reject(self.left, "has no known pose, and known poses are fixed")
         return not fixed

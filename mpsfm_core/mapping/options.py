@@ -197,9 +197,10 @@ class ConsistencyOptions(Options):
 class MappingOptions(Options):
     """What a configuration says of the mapper."""
 
-    known_poses: Literal["start", "fixed"] = "start"
+    known_poses: Literal["start", "fixed", "guess"] = "start"
     """Of images that come with a pose: "start" refines them and adds the others, "fixed" keeps
-    them, their world and its unit, and leaves images without a pose out."""
+    them, their world and its unit, and leaves images without a pose out; "guess" is "start" in
+    another unit, metres if depth tells them."""
     min_model_size: int = Field(2, ge=2)
     """Smallest component that is kept."""
     weigh_by_score: bool = True
