@@ -68,10 +68,12 @@ QUALITIES = {"exact": EXACT, "honest": HONEST, "locally wrong": LOCALLY_WRONG}
 
 
 class Hall(NamedTuple):
-    """A mapping problem with its true poses, ``cam_from_world`` by image name."""
+    """A mapping problem with its true poses, ``cam_from_world`` by image name, and the numbers of
+    the surface points that the keypoints of each image belong to, (n,) each."""
 
     problem: MappingProblem
     truth: dict[str, Pose]
+    points: tuple[Int64, ...]
 
 
 def hall_problem(
@@ -113,7 +115,7 @@ def hall_problem(
     truth = {
         image.name: (pose[:, :3], pose[:, 3]) for image, pose in zip(images, poses, strict=True)
     }
-    return Hall(MappingProblem(tuple(images), tuple(pairs)), truth)
+    return Hall(MappingProblem(tuple(images), tuple(pairs)), truth, tuple(numbers))
 
 
 def hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], AnalyticScene]:

@@ -131,7 +131,7 @@ def test_an_error_of_depth_is_a_shift_to_the_side_for_a_view_at_a_right_angle(
 
 def hall_at_truth(errors: PriorErrors) -> Scene:
     """Views of a hall with their tracks and scaled priors."""
-    problem, truth = hall_problem(16, errors)
+    problem, truth, _ = hall_problem(16, errors)
     scene = Scene(problem)
     for image, pose in enumerate(truth.values()):
         scene.register(image, *pose)
