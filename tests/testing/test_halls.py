@@ -14,17 +14,17 @@ def hall(errors: PriorErrors = EXACT) -> Hall:
     return hall_problem(VIEWS, errors, points_per_view=30, map_width=80)
 
 
-def log_errors(errors: PriorErrors) -> list[np.ndarray]:  # type: ignore[type-arg]
+def log_errors(errors: PriorErrors) -> list[np.ndarray]:
     """Of each view's depth."""
     pairs = zip(hall(errors).problem.images, hall().problem.images, strict=True)
     return [np.log(image.depth.depth / true.depth.depth) for image, true in pairs]
 
 
 def test_most_matches_join_what_is_the_same_point() -> None:
-    problem, truth = hall()
+    problem, truth, points = hall()
     poses = list(truth.values())
     assert len(problem.pairs) >= VIEWS
-    near = []
+    near, same = [], []
     for pair in problem.pairs:
         a, b = problem.images[pair.image_a], problem.images[pair.image_b]
         xy = a.keypoints[pair.matches[:, 0]]
@@ -35,11 +35,14 @@ def test_most_matches_join_what_is_the_same_point() -> None:
         world = (rays * depth[:, None] - translation) @ rotation
         there = project(b.camera, transform(*poses[pair.image_b], world))
         near.append(np.linalg.norm(there - b.keypoints[pair.matches[:, 1]], axis=1) < 12)
+        numbers = points[pair.image_a], points[pair.image_b]
+        same.append(numbers[0][pair.matches[:, 0]] == numbers[1][pair.matches[:, 1]])
+    assert 0.94 < np.concatenate(same).mean() < 0.96
     assert 0.85 < np.concatenate(near).mean() < 0.97  # 5 % are wrong, edges take a few more
 
 
 def test_relative_poses_are_estimated_and_good() -> None:
-    problem, truth = hall()
+    problem, truth, _ = hall()
     poses = list(truth.values())
     for pair in problem.pairs:
         turn = poses[pair.image_b][0] @ poses[pair.image_a][0].T

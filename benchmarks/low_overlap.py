@@ -1,0 +1,99 @@
+"""Low overlap from photos alone: quick matching before the networks, networks only, SIFT only.
+
+    python -m benchmarks.low_overlap [--scenes rendered_kitchen ...] [--buckets minimal ...]
+
+`fast-cpu` as it is, without its quick matching (``quick: null``), and `sift`, on the sets of each
+bucket; the mean of the sets' pose AUC in percent, convention `paper`. A set without a
+reconstruction counts as none registered. Seconds are of whole runs, features and depth from the
+cache where an earlier run made them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks._scenes import percent, shared_folder
+from mpsfm_core.data import Pose
+from mpsfm_core.errors import ReconstructionError
+from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
+from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
+from mpsfm_core.pipeline import reconstruct
+
+SCENES = ("rendered_kitchen", "hololens_room")
+METHODS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "`fast-cpu`": ("fast-cpu", ()),
+    "without quick": ("fast-cpu", ("quick=null",)),
+    "`sift`": ("sift", ()),
+}
+"""Label -> configuration and what is set in it."""
+CONVENTION = CONVENTIONS["paper"]
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
+    parser.add_argument("--buckets", nargs="+", help="default: all of a scene")
+    parser.add_argument("--cache", type=Path, default=Path("build/benchmarks/low_overlap"))
+    arguments = parser.parse_args()
+    print("| scene | bucket | method | registered | AUC@1/5/20 | s |")
+    print("| --- | --- | --- | ---: | ---: | ---: |")
+    for name in arguments.scenes:
+        scene = read_scene(shared_folder() / "data" / name)
+        sets: dict[str, list[Sequence[str]]] = {}
+        for one in scene.sets:
+            sets.setdefault(one.bucket, []).append(one.images)
+        for bucket in arguments.buckets or sets:
+            for method in METHODS:
+                print(row(scene, bucket, sets[bucket], method, arguments.cache), flush=True)
+
+
+def row(
+    scene: SceneFolder, bucket: str, sets: Sequence[Sequence[str]], method: str, cache: Path
+) -> str:
+    """One line of the table."""
+    started, registered, areas = time.perf_counter(), 0, []
+    for names in sets:
+        poses = found(scene, names, method, cache)
+        registered += len(poses)
+        errors = pose_errors_deg(poses, {name: scene.truth[name] for name in names}, CONVENTION)
+        areas.append(pose_auc(errors, CONVENTION))
+    mean: dict[float, float] = {
+        limit: float(np.mean([area[limit] for area in areas])) for limit in areas[0]
+    }
+    seconds = time.perf_counter() - started
+    return (
+        f"| {scene.images.parent.name} | {bucket} | {method} | "
+        f"{registered} of {sum(map(len, sets))} | {percent(mean)} | {seconds:.0f} |"
+    )
+
+
+def found(scene: SceneFolder, names: Sequence[str], method: str, cache: Path) -> Mapping[str, Pose]:
+    """Poses of the largest reconstruction of a set."""
+    config, settings = METHODS[method]
+    overrides = ("dense.enabled=false", f"runtime.cache_dir={cache}", *settings)
+    with tempfile.NamedTemporaryFile("w", suffix=".txt") as listed:
+        listed.write("\n".join(names))
+        listed.flush()
+        try:
+            result = reconstruct(
+                scene.images,
+                None,
+                config,
+                intrinsics=scene.intrinsics,
+                image_list=Path(listed.name),
+                overrides=overrides,
+            )
+        except ReconstructionError:
+            return {}
+    return result.mapping.reconstructions[0].poses
+
+
+if __name__ == "__main__":
+    main()
