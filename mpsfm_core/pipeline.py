@@ -281,10 +281,10 @@ class _Run:
         return self._map(problem, options)
 
     def _held(self, mapping: MappingResult, images: ImageSet) -> list[RegisteredImage] | None:
-        """The images that quick matching holds in place, None if that is all: those that see as
-        many points which three images see as a pose needs (``registration.min_inliers``)."""
+        """The images that quick matching holds in place, None if that is all."""
         config = self._provision.config
-        held = held_images(mapping, config.mapping.registration.min_inliers)
+        assert config.quick is not None
+        held = held_images(mapping, config.quick.min_points)
         if len(held) == len(images):
             return None
         matchers = (config.matcher, config.dense_matcher)
