@@ -14,6 +14,8 @@ import argparse
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -46,12 +48,10 @@ def main() -> None:
     print("| --- | --- | --- | ---: | ---: | ---: |")
     for name in arguments.scenes:
         scene = read_scene(shared_folder() / "data" / name)
-        sets: dict[str, list[Sequence[str]]] = {}
-        for one in scene.sets:
-            sets.setdefault(one.bucket, []).append(one.images)
-        for bucket in arguments.buckets or sets:
+        for bucket, chosen in groupby(scene.chosen(arguments.buckets), attrgetter("bucket")):
+            sets = [one.images for one in chosen]
             for method in METHODS:
-                print(row(scene, bucket, sets[bucket], method, arguments.cache), flush=True)
+                print(row(scene, bucket, sets, method, arguments.cache), flush=True)
 
 
 def row(
