@@ -5,16 +5,17 @@ of the surface seen there, the two contradict each other: something would have t
 that was seen to be empty. Behind is an occlusion. Two explanations compete for such a pixel:
 
 * The *priors* are off there. The surface then lies elsewhere on the pixel's own ray, and the other
-  surface elsewhere on its ray. If errors of log depth are normal with std ``s`` and ``s'``, those
-  that explain the pixel best have the likelihood ``exp(-m^2 / 2)`` relative to none, with
-  ``m^2 = min (e / s)^2 + (e' / s')^2`` over all ``e`` along the ray and the ``e'`` that bring the
-  other surface there. This is no matter of depth alone: of two views at a wide angle, an error of
-  depth in one is a shift to the side in the other.
+  surface elsewhere on its ray. If errors of log depth are normal with std ``s`` and ``s'``, what is
+  seen has the likelihood ``L``, the mean of ``exp(-(e' / s')^2 / 2)`` over all ``e`` along the ray,
+  where ``e'`` brings the other surface there (0 where it need not: out of sight, or behind it).
+  This is no matter of depth alone: of two views at a wide angle, an error of depth in one is a
+  shift to the side in the other. The mean and not the best: some error to the side nearly always
+  takes a pixel past an edge, which explains no more than that error is likely.
 * The *pose* is wrong. Then whatever is seen there has nothing to do with the pixel, and one gap is
   as likely as another.
 
-A pixel speaks for the second where ``m`` is above ``max_deviation`` (2.7: errors 38 times less
-likely than none); the share of such pixels decides. So all depends on what std is true at the
+A pixel speaks for the second where ``L`` is below that of a deviation of ``max_deviation`` std (2.7:
+38 times less likely than none); the share of such pixels decides. So all depends on what std is true at the
 place. A prior that is good on the whole may be far off in one spot, and only there. What a map is
 worth at a place is therefore measured: by the points around whose depth hangs on no prior and not
 on this image's pose alone, as three views or more hold them at wide angles
@@ -51,7 +52,8 @@ from mpsfm_core.optimize.thinning import thinned, thinned_camera, thinning_step
 from mpsfm_core.scene.scene import Scene
 
 STEPS = 4
-"""Errors tried to either side along a pixel's ray, evenly spaced up to the limit (ours)."""
+"""Errors to either side along a pixel's ray over which the mean is taken, evenly spaced up to the
+limit (ours)."""
 SAMPLING = 2
 """Every so many columns and rows a pixel of a thinned map is carried over: thousands are left, and
 a share of 5 % of independent ones is known within 0.4 % (ours)."""
@@ -241,13 +243,18 @@ def unexplained_share(
 
     Args:
         source, target: maps of the two. rotation, translation: ``target_from_source``. limit:
-            errors in terms of their std, of both maps together, up to which they are likely.
+            errors in terms of their std up to which they are likely.
         min_gap: share of the seen depth up to which before it is not in front of it. once: those
             that fall into one pixel of the other view together count as one.
     """
     rows, columns = target.depth.shape
     r, t, total, visited = rotation, translation, 0.0, 0
     zoom = target.params[0] / source.params[0]
+    # 0, then nearer and farther in turn: most pixels need no error at all
+    turns = np.arange(2 * STEPS + 1)
+    errors = limit * ((turns + 1) // 2) / STEPS * (1 - 2 * (turns % 2))
+    weights = np.exp(-errors * errors / 2) * limit / STEPS / math.sqrt(2 * math.pi)
+    least = math.exp(-limit * limit / 2)
     for row in range(SAMPLING // 2, source.depth.shape[0], SAMPLING):
         y = (row + 0.5 - source.params[3]) / source.params[1]
         for column in range(SAMPLING // 2, source.depth.shape[1], SAMPLING):
@@ -258,31 +265,24 @@ def unexplained_share(
             across = r[0, 0] * x + r[0, 1] * y + r[0, 2]
             down = r[1, 0] * x + r[1, 1] * y + r[1, 2]
             along = r[2, 0] * x + r[2, 1] * y + r[2, 2]
-            here, explained = np.float64(source.depth[row, column]), False
-            for step in range(2 * STEPS + 1):
-                # 0, then nearer and farther in turn: most pixels need no error at all
-                error = limit * ((step + 1) // 2) / STEPS * (1 - 2 * (step % 2))
-                depth = here * math.exp(error * source.log_std[row, column]) if step else here
-                z = depth * along + t[2]
-                explained = z <= 1e-9
-                if explained:
+            here, likelihood = np.float64(source.depth[row, column]), 0.0
+            for step in range(len(errors)):
+                error = errors[step] * source.log_std[row, column]
+                depth = here * math.exp(error) if step else here
+                z, other = depth * along + t[2], 0.0
+                if z > 1e-9:
+                    inverse = 1.0 / z
+                    u = (depth * across + t[0]) * inverse * target.params[0] + target.params[2]
+                    v = (depth * down + t[1]) * inverse * target.params[1] + target.params[3]
+                    if 0 <= u < columns and 0 <= v < rows:
+                        i, j = int(v), int(u)
+                        seen = target.nearest[i, j]
+                        if target.valid[i, j] and seen - z > min_gap * seen:
+                            other = math.log(seen / z) / target.log_std[i, j]
+                likelihood += weights[step] * math.exp(-other * other / 2)
+                if likelihood >= least:
                     break
-                inverse = 1.0 / z
-                u = (depth * across + t[0]) * inverse * target.params[0] + target.params[2]
-                v = (depth * down + t[1]) * inverse * target.params[1] + target.params[3]
-                explained = not (0 <= u < columns and 0 <= v < rows)
-                if explained:
-                    break
-                i, j = int(v), int(u)
-                seen = target.nearest[i, j]
-                explained = not target.valid[i, j] or seen - z <= min_gap * seen
-                if explained:
-                    break
-                other = math.log(seen / z) / target.log_std[i, j]
-                explained = error * error + other * other <= limit * limit
-                if explained:
-                    break
-            if not explained:
+            if likelihood < least:
                 pixels = (zoom * here / (here * along + t[2])) ** 2
                 total += min(1.0, pixels) if once else 1.0
     return total / max(visited, 1)

@@ -115,6 +115,14 @@ def test_uncertain_depth_contradicts_nothing() -> None:
     assert between(scene, 0, 1, std_factor=4.0) == 0
 
 
+@pytest.mark.parametrize(("gap", "contradicts"), [(0.34, False), (0.40, True)])
+def test_errors_of_both_views_count(gap: float, contradicts: bool) -> None:
+    """Of one line of sight with std s in both, a gap g has the likelihood exp(-g^2 / 4 s^2) / 2^0.5:
+    that of ``max_deviation`` at 3.63 s."""
+    scene = posed_scene([wall(4.0), wall(4.0 * np.exp(-gap))], [HERE, HERE], SMALL, std=0.1)
+    assert (between(scene, 0, 1) > 0.5) == contradicts
+
+
 @pytest.mark.parametrize(("std", "contradicts"), [(0.06, False), (0.01, True)])
 def test_an_error_of_depth_is_a_shift_to_the_side_for_a_view_at_a_right_angle(
     std: float, contradicts: bool
@@ -127,6 +135,18 @@ def test_an_error_of_depth_is_a_shift_to_the_side_for_a_view_at_a_right_angle(
     maps[0] = np.where(maps[0] < 4.5, 1.12 * maps[0], maps[0])
     scene = posed_scene(maps, poses, SMALL, std)
     assert (between(scene, 0, 1) > OPTIONS.max_violations) == contradicts
+
+
+def test_an_error_that_takes_a_pixel_past_an_edge_explains_no_more_than_it_is_likely() -> None:
+    """Beside an edge of what a second view sees, errors of 2.025 std and more do, one of 2.7 not:
+    with its weight of 0.007 it is less likely than one in 38."""
+    aside = np.eye(3, 4)
+    aside[0, 3] = 1.0
+    near, far = np.full((2, 120, 160), [[[4.0]], [[40.0]]], np.float32)
+    far[:, 120:] = 0  # not known
+    scene = posed_scene([near, far], [HERE, aside], SMALL.resized(160, 120), std=0.2)
+    lands = np.arange(1, 160, 2) + 0.5 + 40 * np.exp(2.025 * 0.2)  # columns that are carried over
+    assert between(scene, 0, 1) == pytest.approx((lands < 120).mean())
 
 
 def hall_at_truth(errors: PriorErrors) -> Scene:
