@@ -14,11 +14,11 @@ that was seen to be empty. Behind is an occlusion. Two explanations compete for 
 * The *pose* is wrong. Then whatever is seen there has nothing to do with the pixel, and one gap is
   as likely as another.
 
-A pixel speaks for the second where ``L`` is below that of a deviation of ``max_deviation`` std (2.7:
-38 times less likely than none); the share of such pixels decides. So all depends on what std is true at the
-place. A prior that is good on the whole may be far off in one spot, and only there. What a map is
-worth at a place is therefore measured: by the points around whose depth hangs on no prior and not
-on this image's pose alone, as three views or more hold them at wide angles
+A pixel speaks for the second where ``L`` is below that of a deviation of ``max_deviation`` std
+(2.7: 38 times less likely than none); the share of such pixels decides. So all depends on what std
+is true at the place. A prior that is good on the whole may be far off in one spot, and only there.
+What a map is worth at a place is therefore measured: by the points around whose depth hangs on no
+prior and not on this image's pose alone, as three views or more hold them at wide angles
 (:func:`~mpsfm_core.mapping.depth_noise.local_noise`). Where they deny the prior, it is at fault,
 its std is what they say, and the pixel contradicts nothing. Where they confirm it, or where there
 are none, the std of the whole stands and so does the contradiction. This tells look-alikes from bad

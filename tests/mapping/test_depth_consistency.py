@@ -117,7 +117,7 @@ def test_uncertain_depth_contradicts_nothing() -> None:
 
 @pytest.mark.parametrize(("gap", "contradicts"), [(0.34, False), (0.40, True)])
 def test_errors_of_both_views_count(gap: float, contradicts: bool) -> None:
-    """Of one line of sight with std s in both, a gap g has the likelihood exp(-g^2 / 4 s^2) / 2^0.5:
+    """On one line of sight with std s in both, a gap g has the likelihood exp(-g^2 / 4 s^2) / 2^.5:
     that of ``max_deviation`` at 3.63 s."""
     scene = posed_scene([wall(4.0), wall(4.0 * np.exp(-gap))], [HERE, HERE], SMALL, std=0.1)
     assert (between(scene, 0, 1) > 0.5) == contradicts
