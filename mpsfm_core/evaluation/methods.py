@@ -59,13 +59,15 @@ class Outcome:
 @dataclass(frozen=True, eq=False)
 class Task:
     """One run: ``method`` is :data:`OURS`, :data:`CHAIN` or the name of a peer. ``dense``: how the
-    depth of ours is measured and compared, None where it is not."""
+    depth of ours is measured and compared, None where it is not. ``threads``: at most, one unless
+    wall time with more is what is compared; results of a peer may depend on them."""
 
     label: str
     method: str
     problem: MappingProblem
     options: MapperOptions
     dense: DenseTask | None = None
+    threads: int = 1
 
 
 def run_tasks(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, Outcome]]:
@@ -88,7 +90,7 @@ def run_method(task: Task) -> Outcome:
     found: Sequence[Reconstruction] = ()
     dense, error = None, ""
     try:
-        with limited(1):
+        with limited(task.threads):
             if task.method == CHAIN:
                 models = chained_poses(task.problem, task.options.seed)
             elif task.method != OURS:
@@ -101,7 +103,7 @@ def run_method(task: Task) -> Outcome:
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
     if task.dense is not None and found:
         try:
-            with limited(1):
+            with limited(task.threads):
                 dense = task.dense.measure(found[0], task.problem)
         except Exception as raised:  # the poses stand
             error = f"dense: {type(raised).__name__}: {raised}"

@@ -18,6 +18,7 @@ from mpsfm_core.inputs.images import load_images
 from mpsfm_core.provision import provide
 from mpsfm_core.registry import Registry
 from mpsfm_core.stages import Stages
+from mpsfm_core.threads import limited
 from mpsfm_core.uncertainty.model import DepthCalibration
 
 pytest.importorskip("mpsfm_onnx")
@@ -101,7 +102,8 @@ def test_so_do_the_points_of_a_model_by_colmap(
     images = load_images(photos.folder, photos.intrinsics, photos.image_list, config.inputs)
     problem = extract(images, config, registry, Stages(registry)).problem
     write_database(problem, tmp_path / "database.db")
-    models = PEERS["colmap"](tmp_path / "database.db", tmp_path)
+    with limited(1):  # the same model every time
+        models = PEERS["colmap"](tmp_path / "database.db", tmp_path)
     largest = max(models, key=lambda number: models[number].num_reg_images())
     found = calibrate(photos, room.config, model=tmp_path / str(largest))
     assert_near(found, by_sensor, room, 0.35)
