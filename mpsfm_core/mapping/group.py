@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -23,10 +23,13 @@ from mpsfm_core.mapping.refinement import Refiner
 from mpsfm_core.mapping.registration import PoseSearch
 from mpsfm_core.mapping.triangulation import complete_and_merge, triangulate_image
 from mpsfm_core.mapping.view_selection import local_bundle, pair_score_matrix, rank_next_images
+from mpsfm_core.mapping.weak_holds import WeakHold, pair_matches, weak_holds
 from mpsfm_core.scene.scene import Scene, Snapshot
 
 _log = logging.getLogger(__name__)
 
+WIDE_REFERENCES = 10
+"""Images beside which one is posed that matches want elsewhere (ours; 5 hold fewer images)."""
 JUMP_DEG = 3.0
 """A camera that turns more in a global refinement may have found a wrong minimum (ours)."""
 _WITHOUT = {
@@ -159,12 +162,57 @@ class Group:
             if not pairs or not self._ladder.relax():
                 return False
 
-    def grow(self, available: Bool, paused: Callable[[], None] = nothing) -> None:
-        """Register images until none of the available ones can be; ``paused`` after each."""
-        while self._register_next(available):
+    def grow(
+        self, available: Bool, paused: Callable[[], None] = nothing, *, wide: bool = False
+    ) -> None:
+        """Register images until none of the available ones can be; ``paused`` after each.
+
+        ``wide``: also beside all that they match, before thresholds give way.
+        """
+        while self._register_next(available, wide=wide):
             if self._grown():
                 self._refine_globally()
             paused()
+
+    def reseat(self, available: Bool) -> None:
+        """Take out images that matches hold weakly, and register them elsewhere.
+
+        That counts if no image is lost, more matches tie them to the rest then, and no others want
+        them away; each such group of images is taken out once. Images that came with a pose stay,
+        unless that is a guess.
+        """
+        tried: set[tuple[int, ...]] = set()
+        while hold := next((h for h in self._weak_holds() if h.images not in tried), None):
+            tried.add(hold.images)
+            before, checked, tied = self.scene.snapshot(), self._checked.copy(), self._tied(hold)
+            measured = self.refiner.noise, self.refiner.loss_scale
+            self._drop(list(hold.images), f"{hold.margin} more matches want it elsewhere")
+            self._drop(lost_images(self.scene), "lost its points when another image was taken out")
+            self.attempts.forget()
+            self.attempts.refuted[hold.links[:, 0], hold.links[:, 1]] = True
+            self.grow(available, wide=True)
+            self._refine_globally()
+            lost = (before.registered & ~self.scene.registered).any()
+            still = any(other.images == hold.images for other in self._weak_holds())
+            if lost or still or self._tied(hold) <= tied:
+                self.scene.restore(before)
+                self._checked = checked
+                self.refiner.noise, self.refiner.loss_scale = measured
+                self.attempts.forget()
+                self.journal.scene_changed(self.scene)
+
+    def _weak_holds(self) -> list[WeakHold]:
+        """Weakly held images that may be taken out."""
+        guess = self._options.known_poses == "guess"
+        stays = np.array([image.known_pose is not None for image in self._problem.images])
+        holds = weak_holds(self.scene, self._options.registration.min_inliers)
+        return [hold for hold in holds if guess or not stays[list(hold.images)].any()]
+
+    def _tied(self, hold: WeakHold) -> int:
+        """Matches that see common points in some images and in the rest."""
+        _, explained = pair_matches(self.scene)
+        inside = self.scene.mask(list(hold.images))
+        return int(explained[np.ix_(inside, ~inside)].sum())
 
     def finish(self) -> None:
         """Last refinements, and the depth check once more for every image."""
@@ -209,26 +257,34 @@ class Group:
             return "too few points are left after refinement"
         return self._contradiction(b, self._options.consistency.max_violations_initial)
 
-    def _register_next(self, available: Bool) -> bool:
+    def _register_next(self, available: Bool, *, wide: bool) -> bool:
         """Register one more image, relaxing step by step; False when none can be."""
         options = self._options.registration
         while True:
             trusted = np.where(self.attempts.refuted, 0, self._scores)
             ranked = rank_next_images(self.scene, trusted, available, options)
-            for image, reference in ranked:
-                references = self._references(image, reference)
-                if self._known_to_fail(image, references):
-                    continue
-                reason = self._try_image(image, references)
-                if reason is None:
-                    self._ladder.reset()
-                    self._accept(image)
-                    return True
-                self.journal.rejected(image, reason)
+            if self._register_one_of(ranked, wide=False):
+                return True
             if self._displace():
                 continue
+            if wide and self._register_one_of(ranked, wide=True):
+                return True
             if not ranked or not self._ladder.relax():
                 return self._reconsider(available)
+
+    def _register_one_of(self, ranked: Sequence[tuple[int, int]], *, wide: bool) -> bool:
+        """Register the first of some images that can be; each comes with a registered one."""
+        for image, reference in ranked:
+            references = self._references(image, reference, wide=wide)
+            if self._known_to_fail(image, references):
+                continue
+            reason = self._try_image(image, references)
+            if reason is None:
+                self._ladder.reset()
+                self._accept(image)
+                return True
+            self.journal.rejected(image, reason)
+        return False
 
     def _reconsider(self, available: Bool) -> bool:
         """Register a contradicted image, if refining everything around it settles that.
@@ -257,10 +313,18 @@ class Group:
         self.attempts.forget()
         return True
 
-    def _references(self, image: int, reference: int) -> list[int]:
-        """The registered images by whose points an image is posed."""
-        options = self._options.registration
-        nearby = local_bundle(self.scene, reference, options.num_neighbors, self._scores)
+    def _references(self, image: int, reference: int, *, wide: bool = False) -> list[int]:
+        """The registered images by whose points an image is posed.
+
+        Those that share most points with the ``reference``; or, if ``wide``, match the image best.
+        """
+        scores, options = self._scores, self._options.registration
+        if wide:
+            matching = np.flatnonzero(self.scene.registered & (scores[image] > 0))
+            order = np.argsort(-scores[image, matching], kind="stable")
+            nearby = matching[order[:WIDE_REFERENCES]].tolist()
+        else:
+            nearby = local_bundle(self.scene, reference, options.num_neighbors, scores)
         return [other for other in nearby if not self.attempts.refuted[image, other]]
 
     def _known_to_fail(self, image: int, references: list[int]) -> bool:

@@ -117,6 +117,7 @@ class Mapper:
         fixed = known and self.options.known_poses == "fixed"
         if not fixed:
             self.group.grow(self.left, paused)
+            self.group.reseat(self.left)
         self._growing = False
         if known or not self._outgrow():
             self.group.finish()
