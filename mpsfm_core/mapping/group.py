@@ -257,7 +257,7 @@ class Group:
             return "too few points are left after refinement"
         return self._contradiction(b, self._options.consistency.max_violations_initial)
 
-    def _register_next(self, available: Bool, *, wide: bool) -> bool:
+    def _register_next(self, available: Bool, *, wide: bool = False) -> bool:
         """Register one more image, relaxing step by step; False when none can be."""
         options = self._options.registration
         while True:

@@ -42,6 +42,8 @@ def weak_holds(scene: Scene, min_matches: int) -> list[WeakHold]:
     matches, explained = pair_matches(scene)
     held = explained > MAX_EXPLAINED * matches
     apart = _apart(scene.registered, np.where(held | (matches < min_matches), 0, matches))
+    if not apart.any():
+        return []
     flows = csr_array(explained.astype(np.int32))
     found: dict[tuple[int, ...], WeakHold] = {}
     for a, b in np.argwhere(np.triu(apart > widest_ways(explained))):

@@ -154,9 +154,9 @@ class Limited(Group):
     limit = 0
     kept = 9
 
-    def _register_next(self, available: Bool) -> bool:
+    def _register_next(self, available: Bool, *, wide: bool = False) -> bool:
         self.limit -= 1
-        return self.limit >= 0 and super()._register_next(available)
+        return self.limit >= 0 and super()._register_next(available, wide=wide)
 
     def _check_all(self, limit: float, when: str) -> None:
         images = self.scene.registered_images()
