@@ -199,7 +199,8 @@ class Group:
                 self._checked = checked
                 self.refiner.noise, self.refiner.loss_scale = measured
                 self.attempts.forget()
-                self.journal.scene_changed(self.scene)
+                for image in hold.images:
+                    self._accept(image)
 
     def _weak_holds(self) -> list[WeakHold]:
         """Weakly held images that may be taken out."""
