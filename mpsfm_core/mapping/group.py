@@ -135,11 +135,10 @@ class Group:
 
     def _explained_share(self, images: Int64) -> float:
         """Of the matches between some images, by score, whose keypoints see the same point."""
-        graph, point_of = self.scene.graph, self.scene.tracks.point_of
+        graph = self.scene.graph
         chosen = self.scene.mask(images)[graph.image_of]
         between = chosen[graph.source] & chosen[graph.target]
-        points = point_of[graph.source]
-        same = between & (points >= 0) & (points == point_of[graph.target])
+        same = between & self.scene.explained_edges()
         return float(graph.score[same].sum() / max(graph.score[between].sum(), 1e-12))
 
     def start_from_pair(self, left: Bool) -> bool:
@@ -167,7 +166,7 @@ class Group:
     ) -> None:
         """Register images until none of the available ones can be; ``paused`` after each.
 
-        ``wide``: also beside all that they match, before thresholds give way.
+        ``wide``: also beside those that they match best, before thresholds give way.
         """
         while self._register_next(available, wide=wide):
             if self._grown():
@@ -192,15 +191,16 @@ class Group:
             self.attempts.refuted[hold.links[:, 0], hold.links[:, 1]] = True
             self.grow(available, wide=True)
             self._refine_globally()
-            lost = (before.registered & ~self.scene.registered).any()
+            lost = np.flatnonzero(before.registered & ~self.scene.registered)
             still = any(other.images == hold.images for other in self._weak_holds())
-            if lost or still or self._tied(hold) <= tied:
+            if len(lost) or still or self._tied(hold) <= tied:
                 self.scene.restore(before)
                 self._checked = checked
                 self.refiner.noise, self.refiner.loss_scale = measured
                 self.attempts.forget()
-                for image in hold.images:
-                    self._accept(image)
+                for image in map(int, lost):
+                    self.journal.registered(image, self.size)
+                self.journal.scene_changed(self.scene)
 
     def _weak_holds(self) -> list[WeakHold]:
         """Weakly held images that may be taken out."""

@@ -54,7 +54,7 @@ def weak_holds(scene: Scene, min_matches: int) -> list[WeakHold]:
         open_ways = flows - flow.flow
         open_ways.eliminate_zeros()
         side = breadth_first_order(open_ways, int(a), return_predecessors=False)
-        inside = scene.mask(side) & scene.registered
+        inside = scene.mask(side)
         if 2 * inside.sum() > scene.registered.sum():
             inside = scene.registered & ~inside
         images = tuple(map(int, np.flatnonzero(inside)))
@@ -68,11 +68,10 @@ def pair_matches(scene: Scene) -> tuple[Int64, Int64]:
     """(n, n) matches of each two images, and those of them that see the same point."""
     graph, n = scene.graph, scene.num_images
     a, b = graph.image_of[graph.source], graph.image_of[graph.target]
-    points = scene.tracks.point_of[graph.source]
-    same = (points >= 0) & (points == scene.tracks.point_of[graph.target])
+    pairs = a * n + b
     matches, explained = (
-        np.bincount((a * n + b)[chosen], minlength=n * n).reshape(n, n)
-        for chosen in (np.ones_like(same), same)
+        np.bincount(edges, minlength=n * n).reshape(n, n)
+        for edges in (pairs, pairs[scene.explained_edges()])
     )
     return matches, explained
 

@@ -180,6 +180,12 @@ class Scene:
         """(n,) of the priors, 1 where not set yet."""
         return np.array([depth_map.scale for depth_map in self.maps])
 
+    def explained_edges(self) -> Bool:
+        """(e,) bool, edges of the graph whose two keypoints see the same point."""
+        points = self.tracks.point_of[self.graph.source]
+        same: Bool = (points >= 0) & (points == self.tracks.point_of[self.graph.target])
+        return same
+
     def track_angles_deg(self) -> Float64:
         """(p,) largest triangulation angle of each point of the tracks, degrees."""
         observations = self.tracks.observations()

@@ -86,7 +86,7 @@ def test_widest_ways_are_those_of_all_ways() -> None:
 
 @pytest.fixture
 def group() -> Group:
-    """All of an exact scene is registered, but one camera is turned and has lost its points."""
+    """All of an exact scene is registered."""
     problem = mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0))
     mapper = Mapper(problem, MapperOptions(), Silent())
     mapper.reconstruct_next()
