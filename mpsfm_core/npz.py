@@ -14,6 +14,19 @@ MOST_BYTES = 4_000_000_000
 number of zeros (ours: 16 bytes for each of the most pixels that a photo may have)."""
 
 
+_LEVEL = 1
+"""Of the compression: on depth maps 6, numpy's, takes twice the time to save 0.5 % (measured)."""
+
+
+def write_npz(path: Path, **arrays: NDArray[Any]) -> None:
+    """Write arrays by name, compressed; folders are made. Raises :class:`OSError`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, array, allow_pickle=False)
+
+
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of a file by name.
 

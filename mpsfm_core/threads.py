@@ -7,12 +7,17 @@ Providers are handed theirs in their context, since networks have pools of their
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import TypeVar
 
 import cv2
 from threadpoolctl import threadpool_limits
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 _LIMIT: ContextVar[int | None] = ContextVar("threads", default=None)
 
@@ -27,6 +32,12 @@ def cores() -> int:
 def allowed() -> int:
     """Threads that the caller may keep busy: the limit, or one a core where there is none."""
     return _LIMIT.get() or cores()
+
+
+def each(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """What a function gives for each item, in order, on as many threads as are allowed."""
+    with ThreadPoolExecutor(allowed()) as pool:
+        return list(pool.map(function, items))
 
 
 @contextmanager

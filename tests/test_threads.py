@@ -21,7 +21,7 @@ from mpsfm_core.pipeline import reconstruct
 from mpsfm_core.providers import ProviderContext
 from mpsfm_core.registry import Registry
 from mpsfm_core.testing.scenes import arc_poses, room_scene
-from mpsfm_core.threads import allowed, cores, limited
+from mpsfm_core.threads import allowed, cores, each, limited
 
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
 TASKS = Path("/proc/self/task")
@@ -120,6 +120,21 @@ def test_the_limit_is_that_of_all_libraries_and_goes_again() -> None:
         assert allowed() == 1
     assert (pools(), cv2.getNumThreads()) == before
     assert allowed() == cores()
+
+
+def test_each_gives_results_in_order_from_as_many_threads_as_are_allowed() -> None:
+    together = threading.Barrier(2, timeout=10)
+
+    def halved(number: int) -> tuple[float, int]:
+        together.wait()  # passes only when both are at work
+        return number / 2, threading.get_ident()
+
+    with limited(2):
+        found = each(halved, range(4))
+    assert [half for half, _ in found] == [0, 0.5, 1, 1.5]
+    assert len({thread for _, thread in found} - {threading.get_ident()}) == 2
+    with pytest.raises(ZeroDivisionError):
+        each(lambda number: 1 / number, [1, 0, 2])
 
 
 def test_torch_computes_with_the_threads_of_the_context_in_every_thread() -> None:

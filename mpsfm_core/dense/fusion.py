@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from mpsfm_core.geometry import camera_center, pixel_centers, resize_map, unproj
 from mpsfm_core.jit import kernel
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.threads import each
+
+_T = TypeVar("_T")
 
 _NEIGHBORS = 8
 """Images that vote on the points of one image: those that see most of it."""
@@ -67,45 +70,60 @@ def fuse_depth_maps(
     is taken.
     """
     images = reconstruction.confirmed_images
-    found = []
-    for pixels, verdict in _judged(images, options):
-        kept = verdict.stays & ~verdict.better_elsewhere
-        found.append((pixels[kept], verdict.views[kept]))
+
+    def kept(_: int, pixels: Int64, verdict: _Verdict) -> tuple[Int64, UInt8]:
+        ours = verdict.stays & ~verdict.better_elsewhere
+        return pixels[ours], verdict.views[ours]
+
+    found = _judged(images, options, kept)
     total = sum(len(pixels) for pixels, _ in found)
     share = min(1.0, options.dense_max_points / max(1, total))
     rng = np.random.default_rng(seed)
-    parts = [_EMPTY]
-    for image, (pixels, views) in zip(images, found, strict=True):
+    for row, (pixels, views) in enumerate(found):
         chosen = np.sort(rng.choice(len(pixels), int(share * len(pixels)), replace=False))
-        points, variance = _lift(image, pixels[chosen])
-        colors = _colors(view_of(image.name), image, pixels[chosen])
-        normals = _normals(image).reshape(-1, 3)[pixels[chosen]]
-        std = np.sqrt(variance).astype(np.float32)
-        parts.append(Cloud(points, colors, normals, std, views[chosen]))
+        found[row] = pixels[chosen], views[chosen]
+
+    def part(row: int) -> Cloud:
+        image, (pixels, views) = images[row], found[row]
+        points, variance = _lift(image, pixels)
+        colors = _colors(view_of(image.name), image, pixels)
+        normals = _normals(image).reshape(-1, 3)[pixels]
+        return Cloud(points, colors, normals, np.sqrt(variance).astype(np.float32), views)
+
+    parts = [_EMPTY, *each(part, range(len(images)))]
     return Cloud(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def consistent_pixels(images: Sequence[RegisteredImage], options: ResultOptions) -> list[Bool]:
     """For each image (h, w): certain pixels that not more images see through than confirm."""
-    masks = []
-    for image, (pixels, verdict) in zip(images, _judged(images, options), strict=True):
-        mask = np.zeros(image.depth.shape, np.bool_)
-        mask.ravel()[pixels[verdict.stays]] = True
-        masks.append(mask)
-    return masks
+
+    def mask(row: int, pixels: Int64, verdict: _Verdict) -> Bool:
+        which = np.zeros(images[row].depth.shape, np.bool_)
+        which.ravel()[pixels[verdict.stays]] = True
+        return which
+
+    return _judged(images, options, mask)
 
 
 def _judged(
-    images: Sequence[RegisteredImage], options: ResultOptions
-) -> Iterator[tuple[Int64, _Verdict]]:
-    """For each image its certain pixels, flat, and what the others say of them."""
+    images: Sequence[RegisteredImage],
+    options: ResultOptions,
+    take: Callable[[int, Int64, _Verdict], _T],
+) -> list[_T]:
+    """What is taken of each image: of its row, its certain pixels, flat, and what the others say
+    of them."""
     limit = max(options.dense_max_relative_std, _WORSE * _median_relative_std(images))
     usable = [_certain(image, limit) for image in images]
-    for row, near in enumerate(choose_sources(images, _NEIGHBORS)):
+    near = choose_sources(images, _NEIGHBORS)
+
+    def judged(row: int) -> _T:
         pixels = np.flatnonzero(usable[row])
         points, variance = _lift(images[row], pixels)
-        others = [(images[j], usable[j], j < row) for j in near]
-        yield pixels, _votes(points, variance, others, options.dense_consistency_sigmas)
+        others = [(images[j], usable[j], j < row) for j in near[row]]
+        verdict = _votes(points, variance, others, options.dense_consistency_sigmas)
+        return take(row, pixels, verdict)
+
+    return each(judged, range(len(images)))
 
 
 _EMPTY = Cloud(

@@ -7,7 +7,6 @@ works beside the scaled priors and maps are refined on what comes out.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +29,7 @@ from mpsfm_core.optimize.thinning import (
     thinning_step,
 )
 from mpsfm_core.scene.scene import Scene
-from mpsfm_core.threads import allowed
+from mpsfm_core.threads import each
 
 LOCAL_MAX_TRACK_LENGTH = 15
 """Longer tracks stay fixed in local bundle adjustment (COLMAP, reference)."""
@@ -150,8 +149,7 @@ class Refiner:
             return
         images = [image for image in images if self.scene.maps[image].active]
         covariances = self._covariances(images)
-        with ThreadPoolExecutor(allowed()) as pool:
-            list(pool.map(lambda image: self._integrate(image, *covariances), images))
+        each(lambda image: self._integrate(image, *covariances), images)
 
     def adjust(
         self,

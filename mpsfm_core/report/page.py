@@ -24,6 +24,7 @@ from mpsfm_core.report.points import PointSet, dense_points, sparse_points
 from mpsfm_core.report.reasons import explain
 from mpsfm_core.report.result_folder import PairLines, PriorMaps, RefinedMap, ResultFolder
 from mpsfm_core.results.writer import REPORT
+from mpsfm_core.threads import each
 from mpsfm_core.yaml_text import write_yaml
 
 DENSE_POINTS = 280_000
@@ -87,7 +88,7 @@ def _script_safe(data: str) -> str:
 
 def _payload(result: ResultFolder) -> dict[str, Any]:
     summary = result.summary
-    maps = {name: result.refined(name) for name in result.names}
+    maps = dict(zip(result.names, each(result.refined, result.names), strict=True))
     used = [refined for refined in maps.values() if refined is not None]
     photos = _Photos(result, maps)
     ids = {name: row for row, name in enumerate(result.names)}
@@ -95,7 +96,7 @@ def _payload(result: ResultFolder) -> dict[str, Any]:
         "folder": result.path.resolve().name,
         "verdict": asdict(verdict(summary)),
         "findings": [asdict(finding) for finding in findings(summary)],
-        "photos": [photos.describe(name) for name in result.names],
+        "photos": each(photos.describe, result.names),
         "pairs": _pairs(summary, ids),
         "lines": {
             f"{ids[pair.image_a]} {ids[pair.image_b]}": photos.lines(pair)

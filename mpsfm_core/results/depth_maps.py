@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from mpsfm_core.data import DepthPrior, PinholeCamera
 from mpsfm_core.errors import InputError
 from mpsfm_core.formats import VERSION, check_version
-from mpsfm_core.npz import read_npz
-from mpsfm_core.scene.reconstruction import Reconstruction
+from mpsfm_core.npz import read_npz, write_npz
+from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.threads import each
 
 FORMAT = 1
 """Of the files."""
@@ -25,10 +26,9 @@ def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
     those units squared; ``valid`` (h, w) bool; ``camera`` (4,) float64, fx, fy, cx, cy on this
     grid (COLMAP pixels, undistorted); ``cam_from_world`` (3, 4) float64; ``format_version``.
     """
-    for image in reconstruction.images:
+
+    def write(image: RegisteredImage) -> None:
         height, width = image.depth.shape
-        path = folder / f"{image.name}.npz"
-        path.parent.mkdir(parents=True, exist_ok=True)
         assert image.depth.variance is not None  # of a refined map always
         arrays: dict[str, Any] = {
             VERSION: np.array(FORMAT),
@@ -38,7 +38,9 @@ def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
             "camera": image.camera.resized(width, height).params,
             "cam_from_world": np.column_stack([image.rotation, image.translation]),
         }
-        np.savez_compressed(path, **arrays)
+        write_npz(folder / f"{image.name}.npz", **arrays)
+
+    each(write, reconstruction.images)
 
 
 def read_depth_map(path: Path, scale: float = 1.0) -> tuple[PinholeCamera, DepthPrior]:

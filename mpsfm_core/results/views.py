@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Float64, MappingImage, MappingProblem, UInt8, View
+from mpsfm_core.npz import write_npz
+from mpsfm_core.threads import each
 
 PICTURE_SIDE = 960
 """Longer side of the pictures in pixels: enough to judge a photo on a screen."""
@@ -32,11 +34,10 @@ def write_views(folder: Path, problem: MappingProblem, view_of: Callable[[str], 
     ``pairs`` (p, 2) int64 rows of names, ``starts`` (p + 1,) int64 rows where the matches of each
     pair begin in ``points_a`` and ``points_b``, (m, 2) float32, pixels of the views.
     """
-    for image in problem.images:
-        path = folder / f"{image.name}.npz"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(
-            path,
+
+    def write(image: MappingImage) -> None:
+        write_npz(
+            folder / f"{image.name}.npz",
             depth=image.depth.depth,
             relative_std=_relative_std(image),
             normals=image.normals.normals.astype(np.float16),
@@ -44,6 +45,8 @@ def write_views(folder: Path, problem: MappingProblem, view_of: Callable[[str], 
             camera=np.array([*image.camera.size, *image.camera.params]),
         )
         _write_picture(folder / f"{image.name}.webp", view_of(image.name).image)
+
+    each(write, problem.images)
     _write_matches(folder / MATCHES, problem)
 
 
@@ -73,7 +76,7 @@ def _write_matches(path: Path, problem: MappingProblem) -> None:
         counts.append(len(rows))
         for side, image in enumerate((pair.image_a, pair.image_b)):
             points[side].append(problem.images[image].keypoints[rows[:, side]])
-    np.savez_compressed(
+    write_npz(
         path,
         names=np.array([image.name for image in problem.images], dtype=np.str_),
         pairs=np.array([(p.image_a, p.image_b) for p in problem.pairs], np.int64).reshape(-1, 2),

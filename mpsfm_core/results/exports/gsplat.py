@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Float64, UInt8
+from mpsfm_core.npz import write_npz
 from mpsfm_core.results.colmap_model import write_model
 from mpsfm_core.results.exports.source import Source
 
@@ -54,11 +55,9 @@ def write_maps(source: Source, folder: Path) -> None:
         maps = source.maps(name)
         if maps is None:
             continue
-        path = folder / f"{name}.npz"
-        path.parent.mkdir(parents=True, exist_ok=True)
         assert maps.depth.variance is not None and maps.normals.variance is not None
-        np.savez_compressed(
-            path,
+        write_npz(
+            folder / f"{name}.npz",
             depth=maps.depth.depth,
             depth_std=np.sqrt(maps.depth.variance),
             depth_valid=maps.depth.valid,
