@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks._scenes import percent
-from mpsfm_core.data import Bool, MappingProblem, VerifiedPair
+from mpsfm_core.data import MappingProblem
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.mapping.depth_consistency import DepthCheck
@@ -27,6 +27,7 @@ from mpsfm_core.mapping.events import Silent
 from mpsfm_core.mapping.group import Group
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.upkeep import Upkeep
 from mpsfm_core.scene.tracks import NO_POINT
 from mpsfm_core.testing.degraded_depth import DepthErrors
 from mpsfm_core.testing.symmetric import SymmetricProblem, moved, twin_room_problem
@@ -67,30 +68,26 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
             scene.tracks.point_of = seen
 
 
-class Observed(Group):
-    """A group with a list of every check: whether the pose was wrong, and the verdict."""
+class Observed(Upkeep):
+    """A scene with a list of every check: whether the pose was wrong, and the verdict."""
 
     case: SymmetricProblem
     verdicts: list[tuple[bool, bool]]
-    first: int
+    first: int | None = None
 
-    def start_from_all(self, left: Bool) -> bool:
-        started = super().start_from_all(left)
-        self.first = int(self.scene.registered.argmax())
-        return started
-
-    def _try_pair(self, pair: VerifiedPair) -> str | None:
-        self.first = pair.image_a
-        return super()._try_pair(pair)
-
-    def _contradiction(self, image: int, limit: float) -> str | None:
-        reason = super()._contradiction(image, limit)
+    def contradiction(self, image: int, limit: float) -> str | None:
+        reason = super().contradiction(image, limit)
         self.verdicts.append((self._misplaced(image), reason is not None))
         return reason
 
     def _misplaced(self, image: int) -> bool:
         """Whether an image is nearer to its twin's place, the first image being in its own."""
-        scene, poses, first = self.scene, np.array(self.case.poses), self.first
+        scene, poses = self.scene, np.array(self.case.poses)
+        if self.first is None or self.size == 2:
+            others = scene.registered.copy()
+            others[image] = False
+            self.first = int(others.argmax())
+        first = self.first
         turn = poses[first, :, :3].T @ scene.rotations[first]
         centers, truth = scene.centers(), camera_center(poses[..., :3], poses[..., 3])
         step = turn @ (centers[image] - centers[first]) / scene.maps[first].scale
@@ -102,7 +99,8 @@ def mapped(case: SymmetricProblem, enabled: bool) -> tuple[np.ndarray, int, list
     options = MapperOptions.model_validate({"consistency": {"enabled": enabled}})
     verdicts: list[tuple[bool, bool]] = []
     mapper = Mapper(case.problem, options, Silent())
-    mapper.group_type = type("Observed", (Observed,), {"case": case, "verdicts": verdicts})
+    observed = type("Told", (Observed,), {"case": case, "verdicts": verdicts})
+    mapper.group_type = type("ObservedGroup", (Group,), {"upkeep_type": observed})
     start = time.perf_counter()
     best = max(mapper.components(), key=lambda c: len(c.images), default=None)
     seconds = time.perf_counter() - start

@@ -152,13 +152,13 @@ class Mapper:
         largest = max((len(model.images) for model in self.models), default=0)
         if not largest or group.size < CONTENDER_SHARE * largest:
             return False
-        before = group.scene.snapshot()
-        group.attempts.forget()
+        before = group.upkeep.state()
+        group.upkeep.attempts.forget()
         group.grow(np.array([image.known_pose is None for image in self.problem.images]))
         if group.size > largest:
             group.finish()
         if group.size <= largest:
-            group.scene.restore(before)
+            group.upkeep.restore(before)
             return False
         for model in list(self.models):
             images = [image.index for image in model.images]

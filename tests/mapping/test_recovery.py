@@ -12,9 +12,11 @@ from mpsfm_core.data import Bool, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.events import Silent
 from mpsfm_core.mapping.group import Group
+from mpsfm_core.mapping.growth import Growth
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.pose_support import AbsolutePose
+from mpsfm_core.mapping.upkeep import Upkeep
 from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 
@@ -46,48 +48,48 @@ def take_out(group: Group, *images: int) -> None:
 
 def test_the_view_that_several_newcomers_contradict_goes_once(group: Group) -> None:
     take_out(group, 0, 4)
-    group.attempts.blame(3, 0)
-    group.attempts.blame(3, 4)
-    group.attempts.blame(1, 4)
-    assert group._displace()
+    group.upkeep.attempts.blame(3, 0)
+    group.upkeep.attempts.blame(3, 4)
+    group.upkeep.attempts.blame(1, 4)
+    assert group.growth.displace()
     assert np.flatnonzero(~group.scene.registered).tolist() == [0, 3, 4]
-    assert "2 other images contradict" in group.journal.image_reasons["view_3.png"]
-    while group._register_next(np.ones(5, dtype=np.bool_)):
+    assert "2 other images contradict" in group.upkeep.journal.image_reasons["view_3.png"]
+    while group.growth.register_next(np.ones(5, dtype=np.bool_)):
         pass
     assert group.scene.registered[3], "it may come back"
     take_out(group, 0, 4)
-    group.attempts.blame(3, 0)
-    group.attempts.blame(3, 4)
-    assert not group._displace(), "but goes only once"
+    group.upkeep.attempts.blame(3, 0)
+    group.upkeep.attempts.blame(3, 4)
+    assert not group.growth.displace(), "but goes only once"
 
 
 def test_one_newcomer_is_not_believed(group: Group) -> None:
     take_out(group, 4)
-    group.attempts.blame(3, 4)
-    assert not group._displace()
+    group.upkeep.attempts.blame(3, 4)
+    assert not group.growth.displace()
     assert group.scene.registered[3]
 
 
 def test_newcomers_that_were_registered_since_blame_no_more(group: Group) -> None:
-    group.attempts.blame(3, 0)
-    group.attempts.blame(3, 4)
-    assert not group._displace()
+    group.upkeep.attempts.blame(3, 0)
+    group.upkeep.attempts.blame(3, 4)
+    assert not group.growth.displace()
 
 
 def test_a_refused_pose_is_tried_again_only_in_another_scene(group: Group) -> None:
     pose = AbsolutePose(np.eye(3), np.zeros(3), "PnP", 1.0, 30, 1.0)
-    group.attempts.refuse(2, pose, "it floats")
-    assert group.attempts.refusal(2, replace(pose, support=2.0)) == "it floats"
-    assert group.attempts.refusal(2, replace(pose, translation=np.ones(3))) is None
-    assert group.attempts.refusal(1, pose) is None
-    group._drop([4], "to change the scene")
-    assert group.attempts.refusal(2, pose) is None
+    group.upkeep.attempts.refuse(2, pose, "it floats")
+    assert group.upkeep.attempts.refusal(2, replace(pose, support=2.0)) == "it floats"
+    assert group.upkeep.attempts.refusal(2, replace(pose, translation=np.ones(3))) is None
+    assert group.upkeep.attempts.refusal(1, pose) is None
+    group.upkeep.drop([4], "to change the scene")
+    assert group.upkeep.attempts.refusal(2, pose) is None
 
 
 def test_a_jump_that_contradicts_is_undone(group: Group) -> None:
     before = group.scene.snapshot()
     turned(group, 2, 25.0)
-    group._undo_jump(before)
+    group.upkeep._undo_jump(before)
     assert np.array_equal(group.scene.rotations, before.rotations)
 
 
@@ -96,7 +98,7 @@ def test_a_jump_to_a_better_state_stays(group: Group) -> None:
     turned(group, 2, 25.0)
     before = group.scene.snapshot()
     turned(group, 2, -25.0)
-    group._undo_jump(before)
+    group.upkeep._undo_jump(before)
     assert rotation_angle_deg(group.scene.rotations @ right.transpose(0, 2, 1)).max() < 1e-6
 
 
@@ -107,7 +109,7 @@ def test_an_undone_jump_takes_its_focal_lengths_with_it(group: Group) -> None:
     turned(group, 2, 25.0)
     group.scene.set_focal(2, 300.0, 300.0)
     group.refiner.integrate([2])
-    group._undo_jump(before)
+    group.upkeep._undo_jump(before)
     assert group.scene.intrinsics[2].tolist() == [260.0, 260.0, 160.0, 120.0]
     assert group.scene.maps[2].camera == CAMERA.resized(*group.scene.maps[2].camera.size)
     group.refiner.integrate([2])
@@ -130,38 +132,47 @@ def test_an_image_that_only_drift_contradicts_is_registered(
     scene = group.scene
     true_centers = scene.centers()
     take_out(group, 2)
-    group.attempts.forget()
+    group.upkeep.attempts.forget()
     observed = np.flatnonzero(scene.tracks.point_of >= 0)
     far = scene.mask([3, 4])[scene.graph.image_of[observed]]
     scene.tracks.xyz[np.unique(scene.tracks.point_of[observed[far]])] += drift
     for image in (3, 4):
         scene.translations[image] -= scene.rotations[image] @ drift
     if not settles:
-        monkeypatch.setattr(group, "_reconsider", lambda available: False)
-    registered = group._register_next(np.ones(5, dtype=np.bool_))
+        monkeypatch.setattr(group.growth, "_reconsider", lambda available: False)
+    registered = group.growth.register_next(np.ones(5, dtype=np.bool_))
     assert registered == scene.registered[2] == settles
     if settles:
         steps = np.linalg.norm(np.diff(scene.centers(), axis=0), axis=1)
         true_steps = np.linalg.norm(np.diff(true_centers, axis=0), axis=1)
         assert steps == pytest.approx(true_steps, rel=0.02)
     else:
-        assert "contradict the depth" in group.journal.image_reasons["view_2.png"]
+        assert "contradict the depth" in group.upkeep.journal.image_reasons["view_2.png"]
+
+
+class Few(Growth):
+    """Registers ``limit`` images beside the first pair."""
+
+    limit = 0
+
+    def register_next(self, available: Bool, *, wide: bool = False) -> bool:
+        self.limit -= 1
+        return self.limit >= 0 and super().register_next(available, wide=wide)
+
+
+class Critical(Upkeep):
+    """More than four images end as ``kept``."""
+
+    kept = 9
+
+    def check_all(self, limit: float, when: str) -> None:
+        images = self.scene.registered_images()
+        if len(images) > 4:
+            self.drop(images[self.kept :].tolist(), "contradicted at the end")
 
 
 class Limited(Group):
-    """Registers ``limit`` images beside the first pair; more than four end as ``kept``."""
-
-    limit = 0
-    kept = 9
-
-    def _register_next(self, available: Bool, *, wide: bool = False) -> bool:
-        self.limit -= 1
-        return self.limit >= 0 and super()._register_next(available, wide=wide)
-
-    def _check_all(self, limit: float, when: str) -> None:
-        images = self.scene.registered_images()
-        if len(images) > 4:
-            self._drop(images[self.kept :].tolist(), "contradicted at the end")
+    upkeep_type, growth_type = Critical, Few
 
 
 @pytest.mark.parametrize(
@@ -174,11 +185,11 @@ def test_the_group_that_ends_larger_gets_the_images(
     options = MapperOptions.model_validate({"initialization": {"all_at_once": False}})
     mapper = Mapper(problem, options, Silent())
     mapper.group_type = Limited
-    monkeypatch.setattr(Limited, "kept", kept)
-    monkeypatch.setattr(Limited, "limit", 2)
+    monkeypatch.setattr(Critical, "kept", kept)
+    monkeypatch.setattr(Few, "limit", 2)
     mapper.reconstruct_next()
     assert [len(model.images) for model in mapper.models] == [4]
-    monkeypatch.setattr(Limited, "limit", second_limit)
+    monkeypatch.setattr(Few, "limit", second_limit)
     mapper.reconstruct_next()
     assert [len(model.images) for model in mapper.models] == sizes
     images = [image.index for model in mapper.models for image in model.images]
