@@ -23,6 +23,17 @@ _FARTHEST = 1.0
 came so far)."""
 
 
+class Blocks(NamedTuple):
+    """What was measured, on a coarse grid (h, w).
+
+    ``change``: of log depth, from what was known. ``precision``: 1 / variance, 0 where nothing was
+    measured.
+    """
+
+    change: Float32
+    precision: Float32
+
+
 class Flatness(NamedTuple):
     """What is known of second differences of inverse depth, relative to it.
 
@@ -34,14 +45,11 @@ class Flatness(NamedTuple):
     weight: Float64
 
 
-def flatness(
-    log_depth: Float32, hole: Bool, change: Float32, precision: Float32, least: float
-) -> Flatness:
+def flatness(log_depth: Float32, hole: Bool, found: Blocks, least: float) -> Flatness:
     """How flat the surfaces of a photo are.
 
-    All (h, w). ``log_depth``: what was known; in each ``hole`` it is what was known around.
-    ``change``: from it to what was measured. ``precision``: of the latter, 0 where nothing was.
-    ``least``: the smallest std of log depth.
+    ``log_depth``: (h, w), what was known; in each ``hole`` it is what was known around. ``found``:
+    what was measured. ``least``: the smallest std of log depth.
     The std is that of measured bends. Where the known map bends as much there may be an edge: half
     the weight. At the rim of a hole it tells nothing of edges, and where nothing was measured
     nothing is known to be flat.
@@ -51,10 +59,10 @@ def flatness(
     size = abs(second)
     relative = size.sum(axis=1) / (size @ inverse)
     bends = csr_array(diags_array(relative) @ second @ diags_array(inverse))
-    inside = size @ (precision.ravel() == 0).astype(np.float64) == 0
+    inside = size @ (found.precision.ravel() == 0).astype(np.float64) == 0
     if not inside.any():
         return Flatness(bends, np.zeros(len(relative)))
-    measured = (bends @ np.exp(-change.astype(np.float64)).ravel())[inside]
+    measured = (bends @ np.exp(-found.change.astype(np.float64)).ravel())[inside]
     std = max(float(np.quantile(np.abs(measured), ONE_SIGMA)), least)
     known = bends @ np.ones(len(inverse))
     holes = size @ hole.ravel().astype(np.float64)
@@ -62,31 +70,21 @@ def flatness(
     return Flatness(bends, alike / (std**2 + known**2))
 
 
-def continued(
-    strength: Float32, mass: Float32, flat: Flatness, change: Float32, precision: Float32
-) -> Float32:
+def continued(field: tuple[Float32, Float32, Float32], flat: Flatness, found: Blocks) -> Float32:
     """By how much known log depth is moved, (h, w).
 
-    ``strength``, ``mass``: (h, w), of the ratio as a Markov random field: coupling of a pixel with
-    its neighbours, and with 1. ``flat``: of the photo. ``change``, ``precision``: as there.
+    ``field``: the ratio as a Markov random field, couplings (east, south) of a pixel with its
+    neighbours, and with 1. ``flat``: of the photo. ``found``: what was measured.
     """
-    height, width = change.shape
-    steps = vstack(
-        [
-            kron(eye_array(height), _differences(width)),
-            kron(_differences(height), eye_array(width)),
-        ]
-    )
-    coupling = np.concatenate(
-        [
-            np.minimum(strength[:, 1:], strength[:, :-1]).ravel(),
-            np.minimum(strength[1:], strength[:-1]).ravel(),
-        ]
-    )
-    ratio = np.exp(-change.astype(np.float64)).ravel()
-    told = precision.ravel() / ratio**2
+    height, width = found.change.shape
+    east, south, mass = (each.astype(np.float64) for each in field)
+    across = kron(eye_array(height), _differences(width))
+    down = kron(_differences(height), eye_array(width))
+    ratio = np.exp(-found.change.astype(np.float64)).ravel()
+    told = found.precision.ravel() / ratio**2
     matrix = (
-        steps.T @ diags_array(coupling.astype(np.float64)) @ steps
+        across.T @ diags_array(east[:, :-1].ravel()) @ across
+        + down.T @ diags_array(south[:-1].ravel()) @ down
         + flat.bends.T @ diags_array(flat.weight) @ flat.bends
         + diags_array(told + mass.ravel())
     )
@@ -96,9 +94,9 @@ def continued(
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    found = factors.solve(told * ratio + mass.ravel()).reshape(height, width)
+    solved = factors.solve(told * ratio + mass.ravel()).reshape(height, width)
     farthest = np.exp(_FARTHEST)
-    moved: Float32 = -np.log(np.clip(found, 1 / farthest, farthest)).astype(np.float32)
+    moved: Float32 = -np.log(np.clip(solved, 1 / farthest, farthest)).astype(np.float32)
     return moved
 
 

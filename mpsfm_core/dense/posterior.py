@@ -1,10 +1,10 @@
 """Joins what the photos say with what was known before, and says how sure that is.
 
 Known depth is moved everywhere as :mod:`mpsfm_core.dense.continuation` says. Its std is that of a
-smooth random field, the error of known log depth: of the declared std where nothing was measured
-near, and less where measured depth observes it. The field hangs together over some distance, but
-not across depth edges. It is a Gaussian Markov random field (Lindgren et al., 2011): one sparse
-system on the pixels. That surfaces are flat is not counted: they are not, where nobody looks.
+smooth random field, the error of known log depth, which hangs together over some distance: the
+declared one where nothing was measured near, and less where measured depth observes it. The field
+is a Gaussian Markov random field (Lindgren et al., 2011): one sparse system on the pixels. That
+surfaces are flat lowers no std: what was not measured often lies behind an edge.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, Float32
-from mpsfm_core.dense.continuation import continued, flatness
+from mpsfm_core.dense.continuation import Blocks, continued, flatness
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.optimize.depth_variance import inverse_diagonal
 from mpsfm_core.statistics import ONE_SIGMA
@@ -24,8 +24,6 @@ _REDUCTION = 8
 _ENOUGH = 0.3
 """Share of the pixels of a block above which it counts as measured: single ones that other views
 confirm may agree by chance (ours; 0.2 to 0.6 do as well)."""
-_EDGE = 0.03
-"""Step of log depth between neighbours of the field's grid that halves their coupling (ours)."""
 _LEAST_LEFT = 0.5
 """Of a distance between known and measured depth, what the known one has of it at least: the std of
 the measured one is not told to better than an eighth. With true depth as the prior 69 % of the
@@ -85,10 +83,16 @@ def posterior(known: Observed, measured: Observed, correlation_px: float) -> Obs
     std = resize_map(known.log_std**-2.0, *small) ** -0.5
     told = _alike(known.log_std, resize_map(std, width, height, linear=False))
     weight = np.where(which, told / measured.log_std**2, 0).astype(np.float32)
-    best = resize_map(np.where(which, measured.log_depth, known.log_depth), *small)
-    east, south, mass = _field(std, best, length)
-    variance = inverse_diagonal(east, south, mass + resize_map(weight, *small))
-    correction = _correction(known, measured, weight, std, length)
+    enough = resize_map(which.astype(np.float32), *small) > _ENOUGH
+    precision = np.where(enough, resize_map(weight, *small), np.float32(0))
+    error = np.where(which, measured.log_depth - known.log_depth, 0) * weight
+    mean = resize_map(error, *small) / np.where(enough, precision, np.float32(1))
+    found = Blocks(np.where(enough, mean, np.float32(0)), precision)
+    hole = std >= UNKNOWN_LOG_STD
+    flat = flatness(resize_map(known.log_depth, *small), hole, found, MIN_STD)
+    correction = continued(_field(_found_std(known, measured, std), length), flat, found)
+    east, south, mass = _field(std, length)
+    variance = inverse_diagonal(east, south, mass + precision)
     alike = _alike(known.log_std, resize_map(std, width, height))
     here = resize_map(variance, width, height)
     spread = np.sqrt(alike * here + (1 - alike) * known.log_std**2)
@@ -97,26 +101,6 @@ def posterior(known: Observed, measured: Observed, correlation_px: float) -> Obs
         np.where(which, measured.log_depth, moved),
         np.where(which, measured.log_std, spread),
     )
-
-
-def _correction(
-    known: Observed, measured: Observed, weight: Float32, std: Float32, length: float
-) -> Float32:
-    """Of known log depth, on the field's grid, where it has this ``std`` and correlation length.
-
-    ``weight``: (h, w) of the maps, of what was measured.
-    """
-    size = std.shape[1], std.shape[0]
-    which = measured.known
-    enough = resize_map(which.astype(np.float32), *size) > _ENOUGH
-    error = np.where(which, measured.log_depth - known.log_depth, 0) * weight
-    precision: Float32 = np.where(enough, resize_map(weight, *size), np.float32(0))
-    mean = resize_map(error, *size) / np.where(enough, precision, np.float32(1))
-    change: Float32 = np.where(enough, mean, np.float32(0))
-    hole = std >= UNKNOWN_LOG_STD
-    flat = flatness(resize_map(known.log_depth, *size), hole, change, precision, MIN_STD)
-    strength = _strength(_found_std(known, measured, std), length)
-    return continued(strength, strength / np.float32(length**2), flat, change, precision)
 
 
 def _found_std(known: Observed, measured: Observed, std: Float32) -> Float32:
@@ -137,23 +121,14 @@ def _alike(std: Float32, other: Float32) -> Float32:
     return alike
 
 
-def _field(std: Float32, log_depth: Float32, length: float) -> tuple[Float32, Float32, Float32]:
-    """Couplings (east, south) and mass of a field of this std and correlation length in pixels."""
-    strength = _strength(std, length)
-    east, south = np.zeros_like(strength), np.zeros_like(strength)
-    for axis, couplings in ((1, east), (0, south)):
-        step = np.diff(log_depth, axis=axis) / _EDGE
-        here = np.moveaxis(strength, axis, 0)
-        joined = np.minimum(here[1:], here[:-1]) / (1 + np.moveaxis(step, axis, 0) ** 2)
-        np.moveaxis(couplings, axis, 0)[:-1] = joined
-    return east, south, (strength / length**2).astype(np.float32)
-
-
-def _strength(std: Float32, length: float) -> Float32:
-    """Coupling of a field of this std and correlation length in pixels.
+def _field(std: Float32, length: float) -> tuple[Float32, Float32, Float32]:
+    """Couplings (east, south) and mass of a field of this std and correlation length in pixels.
 
     In the plane the variance of such a field is about log(3 length) / (2 pi coupling), the mass
     coupling / length^2.
     """
-    strength: Float32 = (np.log(3 * length) / (2 * np.pi * std**2)).astype(np.float32)
-    return strength
+    strength = (np.log(3 * length) / (2 * np.pi * std**2)).astype(np.float32)
+    east, south = np.zeros_like(strength), np.zeros_like(strength)
+    east[:, :-1] = np.minimum(strength[:, 1:], strength[:, :-1])
+    south[:-1] = np.minimum(strength[1:], strength[:-1])
+    return east, south, (strength / length**2).astype(np.float32)
