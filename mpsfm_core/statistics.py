@@ -8,6 +8,8 @@ from mpsfm_core.data import Float64, Int64
 
 MAD_TO_STD = 1.4826
 """Of normal errors: from the median of their absolute values to their std."""
+ONE_SIGMA = 0.683
+"""Share within one std of a normal distribution."""
 
 
 def weighted_quantile(values: Float64, weights: Float64, share: float) -> float:

@@ -1,10 +1,10 @@
 """Joins what the photos say with what was known before, and says how sure that is.
 
-The error of the known log depth is a smooth random field: its std is the declared one, and it hangs
-together over some distance, but not across depth edges. Measured depth observes it. The mean of the
-field given these observations moves the known depth everywhere; where nothing is near it stays as
-it was, with the std that it had. The field is a Gaussian Markov random field (Lindgren et al.,
-2011): one sparse system on the pixels.
+Known depth is moved everywhere as :mod:`mpsfm_core.dense.continuation` says. Its std is that of a
+smooth random field, the error of known log depth, which hangs together over some distance: the
+declared one where nothing was measured near, and less where measured depth observes it. The field
+is a Gaussian Markov random field (Lindgren et al., 2011): one sparse system on the pixels. That
+surfaces are flat lowers no std: what was not measured often lies behind an edge.
 """
 
 from __future__ import annotations
@@ -14,18 +14,16 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, Float32
+from mpsfm_core.dense.continuation import Blocks, continued, flatness
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.optimize.depth_variance import inverse_diagonal
-from mpsfm_core.optimize.multigrid import Multigrid
+from mpsfm_core.statistics import ONE_SIGMA
 
-_REDUCTION = 4
-"""Of the grid that the field lives on, and of the one that its variance is computed on beyond."""
-_VARIANCE_REDUCTION = 2
-_EDGE = 0.03
-"""Step of log depth between neighbours of the field's grid that halves their coupling (ours)."""
-_ITERATIONS, _TOLERANCE = 30, 1e-3
-ONE_SIGMA = 0.683
-"""Share within one std of a normal distribution."""
+_REDUCTION = 8
+"""Of the grid that the field lives on."""
+_ENOUGH = 0.3
+"""Share of the pixels of a block above which it counts as measured: single ones that other views
+confirm may agree by chance (ours; 0.2 to 0.6 do as well)."""
 _LEAST_LEFT = 0.5
 """Of a distance between known and measured depth, what the known one has of it at least: the std of
 the measured one is not told to better than an eighth. With true depth as the prior 69 % of the
@@ -80,31 +78,40 @@ def posterior(known: Observed, measured: Observed, correlation_px: float) -> Obs
     """
     height, width = known.log_depth.shape
     small = max(2, width // _REDUCTION), max(2, height // _REDUCTION)
+    length = max(correlation_px / _REDUCTION, 1.0)
     which = measured.known
     std = resize_map(known.log_std**-2.0, *small) ** -0.5
     told = _alike(known.log_std, resize_map(std, width, height, linear=False))
     weight = np.where(which, told / measured.log_std**2, 0).astype(np.float32)
+    enough = resize_map(which.astype(np.float32), *small) > _ENOUGH
+    precision = np.where(enough, resize_map(weight, *small), np.float32(0))
     error = np.where(which, measured.log_depth - known.log_depth, 0) * weight
-    precision = resize_map(weight, *small)
-    best = resize_map(np.where(which, measured.log_depth, known.log_depth), *small)
-    length = max(correlation_px / _REDUCTION, 1.0)
-    east, south, mass = _field(std, best, length)
-    grid = Multigrid(small[1], small[0])
-    grid.update(east, south, mass + precision)
-    rhs = resize_map(error, *small).astype(np.float64)
-    correction = grid.solve(rhs, _ITERATIONS, _TOLERANCE).x.astype(np.float32)
-    tiny = max(2, small[0] // _VARIANCE_REDUCTION), max(2, small[1] // _VARIANCE_REDUCTION)
-    length = max(length / _VARIANCE_REDUCTION, 1.0)
-    east, south, mass = _field(resize_map(std, *tiny), resize_map(best, *tiny), length)
-    variance = inverse_diagonal(east, south, mass + resize_map(precision, *tiny))
-    here = resize_map(variance, width, height)
+    mean = resize_map(error, *small) / np.where(enough, precision, np.float32(1))
+    found = Blocks(np.where(enough, mean, np.float32(0)), precision)
+    hole = std >= UNKNOWN_LOG_STD
+    flat = flatness(resize_map(known.log_depth, *small), hole, found, MIN_STD)
+    correction = continued(_field(_found_std(known, measured, std), length), flat, found)
+    east, south, mass = _field(std, length)
+    variance = inverse_diagonal(east, south, mass + precision)
     alike = _alike(known.log_std, resize_map(std, width, height))
+    here = resize_map(variance, width, height)
     spread = np.sqrt(alike * here + (1 - alike) * known.log_std**2)
     moved = known.log_depth + alike * resize_map(correction, width, height)
     return Observed(
         np.where(which, measured.log_depth, moved),
         np.where(which, measured.log_std, spread),
     )
+
+
+def _found_std(known: Observed, measured: Observed, std: Float32) -> Float32:
+    """The declared ``std`` of known depth on any grid, as large as its distances to measured depth
+    say it is; holes stay unknown."""
+    compared = measured.known & (known.log_std < UNKNOWN_LOG_STD)
+    if not compared.any():
+        return std
+    distance = np.abs(measured.log_depth - known.log_depth)[compared] / known.log_std[compared]
+    found = np.maximum(std * np.float32(np.quantile(distance, ONE_SIGMA)), np.float32(MIN_STD))
+    return np.where(std < UNKNOWN_LOG_STD, found, std)
 
 
 def _alike(std: Float32, other: Float32) -> Float32:
@@ -114,7 +121,7 @@ def _alike(std: Float32, other: Float32) -> Float32:
     return alike
 
 
-def _field(std: Float32, log_depth: Float32, length: float) -> tuple[Float32, Float32, Float32]:
+def _field(std: Float32, length: float) -> tuple[Float32, Float32, Float32]:
     """Couplings (east, south) and mass of a field of this std and correlation length in pixels.
 
     In the plane the variance of such a field is about log(3 length) / (2 pi coupling), the mass
@@ -122,9 +129,6 @@ def _field(std: Float32, log_depth: Float32, length: float) -> tuple[Float32, Fl
     """
     strength = (np.log(3 * length) / (2 * np.pi * std**2)).astype(np.float32)
     east, south = np.zeros_like(strength), np.zeros_like(strength)
-    for axis, couplings in ((1, east), (0, south)):
-        step = np.diff(log_depth, axis=axis) / _EDGE
-        here = np.moveaxis(strength, axis, 0)
-        joined = np.minimum(here[1:], here[:-1]) / (1 + np.moveaxis(step, axis, 0) ** 2)
-        np.moveaxis(couplings, axis, 0)[:-1] = joined
+    east[:, :-1] = np.minimum(strength[:, 1:], strength[:, :-1])
+    south[:-1] = np.minimum(strength[1:], strength[:-1])
     return east, south, (strength / length**2).astype(np.float32)

@@ -20,7 +20,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64
-from mpsfm_core.dense.posterior import MIN_STD, ONE_SIGMA
+from mpsfm_core.dense.posterior import MIN_STD
+from mpsfm_core.statistics import ONE_SIGMA
 
 _COLUMNS = 256
 """Of an inverse that are held at once."""
