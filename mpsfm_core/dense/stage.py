@@ -118,27 +118,31 @@ def densify(
         supported = view.usable & (stereo.cost < _MAX_COST)
         return _Found(view.grid, keep(stereo.log_depth), stereo.parallax, keep(supported))
 
+    def compared(row: int) -> tuple[Agreement, Ties | None]:
+        own, differences = found[row], _differences(row, found, sources[row], options)
+        ties = _ties(own, differences, images[row].depth, options) if posed_by_depth else None
+        return _agreement(own, differences, keep), ties
+
+    def finished(row: int) -> tuple[RegisteredImage, Bool]:
+        view = views[row]
+        known = Observed(view.log_depth, view.log_std)
+        measured = with_known(_measured(row, view, found, agreed, near[row], options), known)
+        joined = posterior(known, measured, options.correlation_px)
+        image = _with_depth(images[row], view, joined, scale_std.get(row, 0.0), keep)
+        return image, keep(measured.known)
+
     rows = [row for row, others in enumerate(sources) if others]
     found: dict[int, _Found] = {}
     with ThreadPoolExecutor(workers or allowed()) as pool:
         for row, own in zip(rows, pool.map(matched, rows), strict=True):
             found[row] = own
             progress(len(found), len(rows))
-    agreed, ties = {}, {}
-    for row, own in found.items():
-        differences = _differences(row, found, sources[row], options)
-        agreed[row] = _agreement(own, differences, keep)
-        if posed_by_depth:
-            ties[row] = _ties(own, differences, images[row].depth, options)
-    scale_std = scale_stds(ties)
-    maps, which = list(reconstruction.images), {}
-    for row in found:
-        view, name = views[row], images[row].name
-        known = Observed(view.log_depth, view.log_std)
-        measured = with_known(_measured(row, view, found, agreed, near[row], options), known)
-        which[name] = keep(measured.known)
-        joined = posterior(known, measured, options.correlation_px)
-        maps[posed[row]] = _with_depth(images[row], view, joined, scale_std.get(row, 0.0), keep)
+        judged = dict(zip(rows, pool.map(compared, rows), strict=True))
+        agreed = {row: agreement for row, (agreement, _) in judged.items()}
+        scale_std = scale_stds({row: ties for row, (_, ties) in judged.items() if ties})
+        maps, which = list(reconstruction.images), {}
+        for row, (image, measured) in zip(rows, pool.map(finished, rows), strict=True):
+            maps[posed[row]], which[image.name] = image, measured
     names = [image.name for image in images]
     report = DenseReport(
         {names[row]: [names[other] for other in others] for row, others in enumerate(sources)},
