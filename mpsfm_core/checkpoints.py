@@ -17,6 +17,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from threading import Lock
 from typing import Any, cast
 
 import numpy as np
@@ -166,7 +167,7 @@ class DenseCheckpoints:
             code_key(), fingerprint(reconstruction), list(photos), options.model_dump(mode="json")
         )
         self._names = [image.name for image in reconstruction.images]
-        self._failed = False
+        self._failed, self._telling = False, Lock()
 
     def load(self, name: str) -> StereoDepth | None:
         """As :class:`mpsfm_core.dense.stage.FoundBefore`."""
@@ -179,8 +180,10 @@ class DenseCheckpoints:
         try:
             self._cache.store("dense", self._key(name), depth)
         except OutputError as error:
-            _log.warning(_GIVEN_UP, error)
-            self._failed = True
+            with self._telling:  # images are saved by several threads
+                if not self._failed:
+                    _log.warning(_GIVEN_UP, error)
+                self._failed = True
 
     def forget(self) -> None:
         """The run is finished."""
