@@ -22,8 +22,8 @@ _T = TypeVar("_T")
 
 _NEIGHBORS = 8
 """Images that vote on the points of one image: those that see most of it."""
-_WORSE = 1.5
-"""Pixels of so many times the median std stay in any case: a network that promises little still
+_SUREST = 0.25
+"""Share of the pixels, surest first, that stay in any case: a network that promises little still
 gives a cloud (ours)."""
 _SAME = 0.02
 """Relative distance up to which points that agree are one, whatever their std (ours)."""
@@ -112,7 +112,7 @@ def _judged(
 ) -> list[_T]:
     """What is taken of each image: of its row, its certain pixels, flat, and what the others say
     of them."""
-    limit = max(options.dense_max_relative_std, _WORSE * _median_relative_std(images))
+    limit = max(options.dense_max_relative_std, _std_of_surest(images))
     usable = [_certain(image, limit) for image in images]
     near = choose_sources(images, _NEIGHBORS)
 
@@ -135,10 +135,10 @@ _EMPTY = Cloud(
 )
 
 
-def _median_relative_std(images: Sequence[RegisteredImage]) -> float:
-    """Over the images, of the median over the pixels."""
+def _std_of_surest(images: Sequence[RegisteredImage]) -> float:
+    """The largest relative std of the share that stays; the median over the images."""
     spreads = [
-        np.median(np.sqrt(_variance(image)[valid]) / image.depth.depth[valid])
+        np.quantile(np.sqrt(_variance(image)[valid]) / image.depth.depth[valid], _SUREST)
         for image in images
         if (valid := image.depth.valid).any()
     ]
