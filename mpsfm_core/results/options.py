@@ -25,7 +25,7 @@ class ResultOptions(Options):
     dense_max_relative_std: float = Field(0.1, gt=0)
     """Pixels whose depth has a larger relative std are left out of ``dense.ply``. Twice the
     relative std of the weaker networks of the paper's appendix C, so it takes the worst pixels.
-    Where most pixels are worse, the limit is 1.5 times their median."""
+    Where more than three quarters are worse, the surest quarter stays."""
     dense_consistency_sigmas: float = Field(3.0, gt=0)
     """A pixel that another image sees through, by more than this many standard deviations, is left
     out of ``dense.ply`` unless more images confirm than contradict it."""
