@@ -30,7 +30,7 @@ import pycolmap
 
 from benchmarks._scenes import shared_folder
 from benchmarks.accuracy import FASTDEPTH, PRIORS
-from mpsfm_core.data import Bool, DepthPrior, Float64, MappingProblem, NormalPrior, Pose
+from mpsfm_core.data import Bool, DepthPrior, Float64, MappingProblem, Pose
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.sparse_depth import depth_of_points
@@ -38,13 +38,13 @@ from mpsfm_core.dense.stage import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.benchmark import PairsOfSets, problem_of_sets
 from mpsfm_core.evaluation.dense_geometry import dense_accuracy
+from mpsfm_core.evaluation.depth_accuracy import depth_beside_truth
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.report import CLOUD
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
 from mpsfm_core.evaluation.true_surface import depth_file
 from mpsfm_core.geometry import (
     camera_center,
-    pixel_centers,
     project,
     rays,
     sample_bilinear,
@@ -101,14 +101,6 @@ CASES: Mapping[str, Case] = {
 """``config`` is FastDepth."""
 
 
-@dataclass(frozen=True, eq=False)
-class MappedSet:
-    """The largest model of a set, and the normal priors of its images by name."""
-
-    reconstruction: Reconstruction
-    normals: Mapping[str, NormalPrior]
-
-
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
@@ -130,7 +122,7 @@ def main() -> None:
         print(json.dumps({"rows": rows}))
 
 
-def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[MappedSet]:
+def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Reconstruction]:
     """What the mapper makes of the sets of a case, now or earlier; with ``true_poses`` held."""
     kept = output / f"{name}{'-true-poses' if true_poses else ''}.pickle"
     if kept.is_file():
@@ -143,9 +135,7 @@ def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Mappe
     mapped = []
     for item in sets:
         subset = problem.subset(list(item.images))
-        best = reconstruct(subset, options).reconstructions[0]
-        normals = {image.name: image.normals for image in subset.images}
-        mapped.append(MappedSet(best, normals))
+        mapped.append(reconstruct(subset, options).reconstructions[0])
     kept.write_bytes(pickle.dumps(mapped))
     return mapped
 
@@ -173,7 +163,7 @@ def problem_of_case(
 def measured(
     name: str,
     scene: SceneFolder,
-    mapped: Sequence[MappedSet],
+    mapped: Sequence[Reconstruction],
     problem: MappingProblem | None,
     posed_by_depth: bool = True,
 ) -> list[dict[str, Any]]:
@@ -186,7 +176,7 @@ def measured(
     for way in WAYS:
         found = []
         for item in mapped:
-            model, seconds, seen = item.reconstruction, 0.0, {}
+            model, seconds, seen = item, 0.0, {}
             if way == "without prior":
                 model = without_prior(model)
             if way != "mapper":
@@ -268,19 +258,13 @@ def map_errors(
     """The share that is near of one map; of pixels that were ``seen`` and of the rest
     the share within the stated std, and the part that the rest has in the AbsRel."""
     assert depth.variance is not None  # of a refined map always
-    known = truth > 0
-    height, width = truth.shape
-    grid = depth.shape
-    xy = pixel_centers(width, height)[known] * (np.array(grid[::-1]) / (width, height))
-    found, ok = sample_bilinear(depth.depth, depth.valid, xy)
+    xy, found, true = depth_beside_truth(depth.depth, depth.valid, truth)
     variance, _ = sample_bilinear(depth.variance, depth.valid, xy)
-    ok &= found > 0
-    true = truth[known][ok]
-    error = np.abs(scale * found[ok] - true)
-    std = np.sqrt(np.maximum(variance[ok], 0))
+    error = np.abs(scale * found - true)
+    std = np.sqrt(np.maximum(variance, 0))
     within, relative = error <= scale * std, error / true
-    own = np.zeros(grid, np.bool_) if seen is None else seen
-    measured = sample_nearest(own, xy)[ok]
+    own = np.zeros(depth.shape, np.bool_) if seen is None else seen
+    measured = sample_nearest(own, xy)
     return {
         "near": float((error <= NEAR * true).mean()),
         "measured": float(measured.mean()),

@@ -33,11 +33,12 @@ from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.dense_geometry import dense_accuracy
+from mpsfm_core.evaluation.depth_accuracy import depth_beside_truth
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.report import CLOUD
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
 from mpsfm_core.evaluation.true_surface import depth_file
-from mpsfm_core.geometry import pixel_centers, sample_bilinear, sample_nearest
+from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.results.colmap_model import build_model, pinhole
@@ -47,6 +48,7 @@ from mpsfm_core.scene.reconstruction import Reconstruction
 
 MODE = "moderate"
 """The peer's own default."""
+_INSTALL = "pip install --no-deps pyarchinit-photogrammetry pyarchinit-photogrammetry-core"
 Maps = dict[str, DepthPrior]
 
 
@@ -57,7 +59,7 @@ def peer_result(
     try:
         from pyarchinit_photogrammetry.engine import dense as peer
     except ImportError as error:
-        raise SystemExit((__doc__ or "").split("\n\n")[3].strip()) from error
+        raise SystemExit(_INSTALL) from error
     for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps"):
         (folder / name).mkdir(parents=True)
     grey = {}
@@ -147,15 +149,11 @@ def depth_errors(
     total, errors = 0, [np.zeros(0)]
     for name in names:
         truth = read_depth(depth_file(scene.depth, name))
-        known = truth > 0
-        total += int(known.sum())
+        total += int((truth > 0).sum())
         if name not in maps:
             continue
-        depth, grid = maps[name], np.array(maps[name].shape[::-1])
-        xy = pixel_centers(*truth.shape[::-1])[known] * (grid / truth.shape[::-1])
-        found, ok = sample_bilinear(depth.depth, depth.valid, xy)
-        ok &= sample_nearest(chosen[name], xy) & (found > 0)
-        errors.append(np.abs(scale * found[ok] / truth[known][ok] - 1))
+        xy, found, true = depth_beside_truth(maps[name].depth, maps[name].valid, truth)
+        errors.append(np.abs(scale * found / true - 1)[sample_nearest(chosen[name], xy)])
     relative = np.concatenate(errors)
     return {
         "known": len(relative) / total,
@@ -178,8 +176,8 @@ def main() -> None:
         scene = read_scene(shared_folder() / "data" / CASES[case].scene)
         photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
         cameras = {photo.name: photo.pinhole for photo in photos}
-        for number, item in enumerate(mapped_sets(case, arguments.output, arguments.true_poses)):
-            model, view = item.reconstruction, view_of(photos)
+        for number, model in enumerate(mapped_sets(case, arguments.output, arguments.true_poses)):
+            view = view_of(photos)
             errors = trajectory_errors(model.poses, scene.truth)
             if errors is None:
                 continue

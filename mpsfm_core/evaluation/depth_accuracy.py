@@ -41,14 +41,9 @@ def depth_accuracy(
     ``scale``: the map is multiplied with it; None for the one that makes the median of
     ``truth / depth`` one. Returns None when no pixel can be compared.
     """
-    known = truth > 0
-    height, width = truth.shape
-    xy = scale_pixels(pixel_centers(width, height)[known], (width, height), depth.shape[::-1])
-    found, ok = sample_bilinear(depth, valid, xy)
-    ok &= found > 0
-    if not ok.any():
+    _, predicted, true = depth_beside_truth(depth, valid, truth)
+    if not len(true):
         return None
-    predicted, true = found[ok], truth[known][ok].astype(np.float64)
     if scale is None:
         scale = float(np.median(true / predicted))
     predicted = scale * predicted
@@ -59,10 +54,25 @@ def depth_accuracy(
         delta1=float((ratio < _DELTA).mean()),
         delta2=float((ratio < _DELTA**2).mean()),
         delta3=float((ratio < _DELTA**3).mean()),
-        pixels=int(ok.sum()),
-        coverage=float(ok.mean()),
+        pixels=len(true),
+        coverage=len(true) / int((truth > 0).sum()),
         scale=scale,
     )
+
+
+def depth_beside_truth(
+    depth: Float32, valid: Bool, truth: Float32
+) -> tuple[Float64, Float64, Float64]:
+    """A map (h, w) at the pixels of the truth (H, W), 0 where unknown.
+
+    Of those where both are known: the pixel of the map (n, 2), its depth (n,) and the true one.
+    """
+    known = truth > 0
+    height, width = truth.shape
+    xy = scale_pixels(pixel_centers(width, height)[known], (width, height), depth.shape[::-1])
+    found, ok = sample_bilinear(depth, valid, xy)
+    ok &= found > 0
+    return xy[ok], found[ok], truth[known][ok].astype(np.float64)
 
 
 def mean_accuracy(images: Sequence[DepthAccuracy]) -> dict[str, float]:

@@ -104,6 +104,18 @@ def test_a_network_that_promises_little_gives_a_cloud_too(solved) -> None:
     assert_covers_every_map(solved, points)
 
 
+@pytest.mark.parametrize(("sure", "left"), [(0.4, 0.4), (0.1, 0.25)])
+def test_where_most_is_unsure_the_surest_quarter_stays(solved, sure: float, left: float) -> None:
+    old = solved.best.images[1].depth
+    spread = np.linspace(0.2, 0.4, old.depth.size).reshape(old.depth.shape)
+    spread.ravel()[: int(sure * old.depth.size)] = 0.01
+    unsure = with_depth(solved, 1, old.depth, (spread * old.depth).astype(np.float32) ** 2)
+    alone = replace(unsure, images=(unsure.images[1],))
+    cloud = fuse_depth_maps(alone, solved.views.__getitem__, ResultOptions())
+    assert old.valid.all()
+    assert len(cloud.points) == pytest.approx(left * old.valid.sum(), abs=2)
+
+
 def test_a_wall_in_free_space_is_left_out(solved) -> None:
     depth = solved.best.images[1].depth.depth.copy()
     depth[20:40, 30:50] = 1.0  # other images see right through
