@@ -399,7 +399,8 @@ class Refiner:
         """By how much the logarithms of some images' scales are expected to change, and the std of
         that: (m,) each.
 
-        Metric priors agree on a metre, give or take the spread of those of all registered images.
+        Metric priors agree on a metre, the mean of what registered images take for it (the median
+        would pull at all of them, and nothing else holds the unit), give or take their spread.
         What priors declare, by the measured noise, counts as one more of them (a unit information
         prior). Of relative ones nothing is known.
         """
@@ -409,13 +410,14 @@ class Refiner:
         log_scales = np.log(scene.scales())
         expected, std = np.zeros(len(images)), np.full(len(images), np.inf)
         if posed.any():
-            off = log_scales[posed] - np.median(log_scales[posed])
+            mean = log_scales[posed].mean()
+            off = log_scales[posed] - mean
             declared = np.median(
                 [m.typical_log_std for m, of in zip(maps, posed, strict=True) if of]
             )
             squares = (self.noise.multiplier * declared) ** 2 + (off**2).sum()
             std[metric[images]] = np.sqrt(squares / len(off))
-            expected[:] = np.median(log_scales[posed]) - log_scales[images]
+            expected[:] = mean - log_scales[images]
         return expected, std
 
     def _near(self, ratio: Float64) -> Bool:

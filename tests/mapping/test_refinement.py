@@ -19,11 +19,14 @@ from mpsfm_core.testing.scenes import arc_poses, room_scene
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
-def mapped(declared_depth_std: float) -> Group:
-    """Three registered images, in metres."""
+def mapped(declared_depth_std: float, *, nearer: float = 1.0) -> Group:
+    """Three registered images, in metres; the prior of the last one is so many times too near."""
     problem = mapping_problem(
         room_scene(), CAMERA, arc_poses(3, 14.0), declared_depth_std=declared_depth_std
     )
+    last = problem.images[-1]
+    depth = replace(last.depth, depth=last.depth.depth / np.float32(nearer))
+    problem = replace(problem, images=(*problem.images[:-1], replace(last, depth=depth)))
     mapper = Mapper(problem, MapperOptions(), Silent())
     mapper.reconstruct_next()
     group = mapper.group
@@ -72,6 +75,17 @@ def test_a_wrong_scale_is_found_at_once_and_then_stays() -> None:
     for _ in range(5):
         refiner.adjust([0, 1, 2])
     assert [depth_map.scale for depth_map in maps] == pytest.approx(found, rel=1e-3)
+
+
+def test_the_unit_of_the_world_stays_where_one_scale_is_unlike_the_others() -> None:
+    """What is expected of scales must not pull at all of them: nothing else holds the unit."""
+    group = mapped(0.01, nearer=1.3)
+    maps = group.scene.maps
+    before = np.array([depth_map.scale for depth_map in maps])
+    assert before[2] / before[0] == pytest.approx(1.3, rel=0.02)
+    for _ in range(5):
+        group.refiner.adjust([0, 1, 2])
+    assert [depth_map.scale for depth_map in maps] == pytest.approx(before, rel=0.01)
 
 
 def test_a_focal_length_that_runs_away_changes_nothing() -> None:
