@@ -57,7 +57,7 @@ def main() -> None:
         options = prepared.config.mapper_options()
         for item in sets:
             truth = {name: scene.truth[name] for name in item.images}
-            plain = prepared.problem.subset(list(item.images))
+            plain = prepared.of(item)
             for start, run in (("by itself", plain), ("at the truth", _posed(plain, truth))):
                 models = reconstruct(run, options).reconstructions
                 found = models[0].poses if models else {}

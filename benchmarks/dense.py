@@ -36,7 +36,7 @@ from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.sparse_depth import depth_of_points
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
-from mpsfm_core.evaluation.benchmark import PairsOfSets, problem_of_sets
+from mpsfm_core.evaluation.benchmark import PairsOfSets, PreparedSets, problem_of_sets
 from mpsfm_core.evaluation.dense_geometry import dense_accuracy
 from mpsfm_core.evaluation.depth_accuracy import depth_beside_truth
 from mpsfm_core.evaluation.prior_quality import read_depth
@@ -56,7 +56,6 @@ from mpsfm_core.geometry import (
 from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.mapper import reconstruct
-from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.registry import Registry
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.scene.reconstruction import Reconstruction
@@ -114,7 +113,7 @@ def main() -> None:
         case = CASES[name]
         scene = read_scene(shared_folder() / "data" / case.scene)
         mapped = mapped_sets(name, arguments.output, arguments.true_poses)
-        problem = None if scene.depth else problem_of_case(name, arguments.output)[0]
+        problem = None if scene.depth else problem_of_case(name, arguments.output)[0].problem
         rows += measured(name, scene, mapped, problem, not arguments.true_poses)
         print(table(rows[-1:]), file=sys.stderr)
     print(table(rows))
@@ -127,22 +126,20 @@ def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Recon
     kept = output / f"{name}{'-true-poses' if true_poses else ''}.pickle"
     if kept.is_file():
         return list(pickle.loads(kept.read_bytes()))
-    problem, options, sets = problem_of_case(name, output)
+    prepared, sets = problem_of_case(name, output)
+    options, truth = prepared.config.mapper_options(), {}
     if true_poses:
         truth = read_scene(shared_folder() / "data" / CASES[name].scene).truth
-        problem = problem.with_poses(truth)
         options = options.model_copy(update={"known_poses": "fixed"})
     mapped = []
     for item in sets:
-        subset = problem.subset(list(item.images))
-        mapped.append(reconstruct(subset, options).reconstructions[0])
+        problem = prepared.of(item).with_poses(truth)
+        mapped.append(reconstruct(problem, options).reconstructions[0])
     kept.write_bytes(pickle.dumps(mapped))
     return mapped
 
 
-def problem_of_case(
-    name: str, output: Path
-) -> tuple[MappingProblem, MapperOptions, list[EvaluationSet]]:
+def problem_of_case(name: str, output: Path) -> tuple[PreparedSets, list[EvaluationSet]]:
     """What is mapped for a case; extracted now, or earlier and kept in the output folder."""
     case = CASES[name]
     scene = read_scene(shared_folder() / "data" / case.scene)
@@ -157,7 +154,7 @@ def problem_of_case(
     prepared = problem_of_sets(
         scene, sets, case.prior, str(config), ("runtime.workers=1",), output / name, registry
     )
-    return prepared.problem, prepared.config.mapper_options(), sets
+    return prepared, sets
 
 
 def measured(

@@ -22,7 +22,12 @@ from pydantic import Field
 
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.errors import ConfigError, ProviderError, did_you_mean
-from mpsfm_core.extraction.options import ExtractionOptions, PairOptions, VerificationOptions
+from mpsfm_core.extraction.options import (
+    AdjustmentOptions,
+    ExtractionOptions,
+    PairOptions,
+    VerificationOptions,
+)
 from mpsfm_core.formats import VERSION, check_version
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.options import MapperOptions, MappingOptions
@@ -121,6 +126,7 @@ class Config(Options):
     masks: tuple[Backend, ...] = ()
     """A pixel is used when all masks allow it."""
     verification: VerificationOptions = Field(default_factory=VerificationOptions)
+    adjustment: AdjustmentOptions = Field(default_factory=AdjustmentOptions)
     extraction: ExtractionOptions = Field(default_factory=ExtractionOptions)
     mapping: MappingOptions = Field(default_factory=MappingOptions)
     dense: DenseOptions = Field(default_factory=DenseOptions)

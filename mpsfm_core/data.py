@@ -367,7 +367,9 @@ class MappingImage:
 
     ``keypoints``: (n, 2) float64, COLMAP pixels of the undistorted camera; dense matches add
     theirs behind the sparse ones. ``depth`` has a variance; ``depth`` and ``normals`` share one
-    grid. ``keypoint_std_px``: localisation noise. ``focal_known``: False when the focal length is
+    grid. ``keypoint_std_px``: localisation noise of keypoints as they were found, by which wrong
+    matches are told from right ones. ``keypoint_std_factor``: (n,) float64, > 0, what adjustment
+    left of it in each keypoint, None for all of it. ``focal_known``: False when the focal length is
     a guess that bundle adjustment may refine; images of equal camera then share it.
     ``known_pose``: ``cam_from_world``, when the user brought one. ``depth_group``: images of equal
     number have depth in one unit, so that they share one scale; None for a scale of its own.
@@ -381,6 +383,7 @@ class MappingImage:
     depth: DepthPrior
     normals: NormalPrior
     keypoint_std_px: float = 1.0
+    keypoint_std_factor: Float64 | None = None
     focal_known: bool = True
     known_pose: Pose | None = None
     depth_group: int | None = None
@@ -388,6 +391,10 @@ class MappingImage:
 
     def __post_init__(self) -> None:
         _array(self, "keypoints", np.float64, (None, 2))
+        if self.keypoint_std_factor is not None:
+            _array(self, "keypoint_std_factor", np.float64, (len(self.keypoints),))
+            if not (self.keypoint_std_factor > 0).all():
+                raise DataError("keypoint_std_factor", "must be positive")
         if self.depth.variance is None:
             raise DataError("depth", "the mapper needs a variance (calibrate the prior)")
         if self.normals.variance is None:

@@ -1,4 +1,4 @@
-"""Compiles the kernels of matching and mapping before they are needed.
+"""Compiles the kernels of extraction and mapping before they are needed.
 
 A run that finds them not compiled starts this beside its extraction and waits for it before it
 maps; ``python -m mpsfm_core.precompile`` does it at installation. Two processes map a tiny scene,
@@ -21,6 +21,7 @@ from mpsfm_core.data import PinholeCamera, View
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
+from mpsfm_core.extraction.patch_alignment import align_patches
 from mpsfm_core.mapping import mapper
 from mpsfm_core.optimize.bundle_kernels import step_points
 from mpsfm_core.optimize.depth_integration import DepthIntegrator
@@ -29,7 +30,7 @@ from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 
 _ENDS = ("bundles", "depth")
-_ROOMS = ("builtin", "optimize", "scene", "mapping", "dense")
+_ROOMS = ("builtin", "extraction", "optimize", "scene", "mapping", "dense")
 _CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
@@ -74,6 +75,8 @@ def compile_kernels(end: str) -> None:
     dense, _ = densify(mapping.reconstructions[0], views.__getitem__, DenseOptions())
     fuse_depth_maps(dense, views.__getitem__, ResultOptions())
     mutual_nearest(*np.ones((2, 1, 1), np.float32))
+    grey, nothing = np.ones((1, 1), np.float32), np.zeros((0, 2))
+    align_patches(grey, grey, nothing, nothing, np.zeros((0, 2, 2)), 3, 1.0)
 
 
 def _stamp() -> Path | None:

@@ -8,7 +8,7 @@ the sets, matches only for pairs inside a set; the cache keeps them. Each finish
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
@@ -33,7 +33,7 @@ from mpsfm_core.evaluation.records import Record, read_record, record_file, writ
 from mpsfm_core.evaluation.results_of_others import records_of
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
 from mpsfm_core.extraction.cache import content_key, digest
-from mpsfm_core.extraction.runner import extract
+from mpsfm_core.extraction.runner import adjust, extract
 from mpsfm_core.files import write_file
 from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.providers import hookimpl
@@ -123,12 +123,24 @@ class PairsOfSets:
 
 
 class PreparedSets(NamedTuple):
-    """``problem``: verified matches and priors of all ``images`` of some sets. ``config``: as it
-    was resolved for them."""
+    """``problem``: verified matches, on keypoints as they were found, and priors of all ``images``
+    of some sets. ``config``: as it was resolved for them."""
 
     problem: MappingProblem
     images: ImageSet
     config: Config
+    registry: Registry
+
+    def of(self, item: EvaluationSet) -> MappingProblem:
+        """The problem of one set; its keypoints are adjusted by its own pairs alone."""
+        names, images = set(item.images), self.problem.images
+        inside = [
+            pair
+            for pair in self.problem.pairs
+            if {images[pair.image_a].name, images[pair.image_b].name} <= names
+        ]
+        alone = replace(self.problem, pairs=tuple(inside))
+        return adjust(self.images, self.config, self.registry, alone).subset(list(item.images))
 
 
 def problem_of_sets(
@@ -154,8 +166,10 @@ def problem_of_sets(
     write_file(listed, "\n".join(names) + "\n")
     inputs = loaded.inputs.model_copy(update={"strict": True})  # a set is compared as a whole
     images = load_images(scene.images, scene.intrinsics, listed, inputs)
-    extraction = extract(images, loaded, registry, stages)
-    return PreparedSets(extraction.problem, images, loaded)
+    as_found = loaded.adjustment.model_copy(update={"enabled": False})
+    alone = loaded.model_copy(update={"adjustment": as_found})
+    extraction = extract(images, alone, registry, stages)
+    return PreparedSets(extraction.problem, images, loaded, registry)
 
 
 class _SceneRuns:
@@ -198,7 +212,7 @@ class _SceneRuns:
             options, dense = prepared.config.mapper_options(), self._dense(prepared)
             places: dict[Task, tuple[EvaluationSet, str]] = {}
             for item in self._sets:
-                subset = prepared.problem.subset(list(item.images))
+                subset = prepared.of(item)
                 for label, method in methods.items():
                     task = Task(label, method, subset, options, dense if method == OURS else None)
                     key = _key(task)

@@ -14,11 +14,13 @@ from mpsfm_core.data import (
     DepthPrior,
     Features,
     Float64,
+    MappingImage,
     MappingProblem,
     PairMatches,
     SparseMatches,
     VerifiedPair,
 )
+from mpsfm_core.extraction.adjustment import KeypointAdjuster
 from mpsfm_core.extraction.backends import ActiveProvider
 from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.dense import NO_POINTS, PointMatches, sample, snap
@@ -163,11 +165,16 @@ class PairVerifier:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """Verified pairs, and the keypoints (n, 2) and their noise of each image they refer to."""
+    """Verified pairs, and the keypoints (n, 2) of each image they refer to, and their noise as they
+    were found.
+
+    ``std_factor``: (n,) for each image, what adjustment left of that noise.
+    """
 
     pairs: tuple[VerifiedPair, ...]
     keypoints: list[Float64]
     std_px: list[float]
+    std_factor: list[Float64]
 
 
 def assemble(
@@ -205,7 +212,41 @@ def assemble(
         tuple(verified),
         [np.concatenate(parts) for parts in keypoints],
         [_typical(parts) for parts in noise],
+        [np.ones(count) for count in counts],
     )
+
+
+def adjusted(bench: Workbench, assembled: Assembled) -> Assembled:
+    """With keypoints moved to where the patches of their matches are alike."""
+    options = bench.config.adjustment
+    if not (options.enabled and assembled.pairs):
+        return assembled
+    adjuster = KeypointAdjuster(bench, assembled.keypoints, assembled.std_px)
+    found = adjuster.run(assembled.pairs)
+    return replace(
+        assembled,
+        keypoints=[image.keypoints for image in found],
+        std_factor=[np.where(image.measured, options.std_factor, 1.0) for image in found],
+    )
+
+
+def adjusted_problem(bench: Workbench, problem: MappingProblem) -> MappingProblem:
+    """A problem that was assembled without adjustment, with keypoints that are adjusted."""
+    images = problem.images
+    found = adjusted(
+        bench,
+        Assembled(
+            problem.pairs,
+            [image.keypoints for image in images],
+            [image.keypoint_std_px for image in images],
+            [_std_factor(image) for image in images],
+        ),
+    )
+    moved = (
+        replace(image, keypoints=keypoints, keypoint_std_factor=factor)
+        for image, keypoints, factor in zip(images, found.keypoints, found.std_factor, strict=True)
+    )
+    return replace(problem, images=tuple(moved))
 
 
 def joined(problem: MappingProblem, more: Assembled) -> MappingProblem:
@@ -218,8 +259,11 @@ def joined(problem: MappingProblem, more: Assembled) -> MappingProblem:
             keypoint_std_px=_typical(
                 [(len(image.keypoints), image.keypoint_std_px), (len(xy), std)]
             ),
+            keypoint_std_factor=np.concatenate([_std_factor(image), factor]),
         )
-        for image, xy, std in zip(problem.images, more.keypoints, more.std_px, strict=True)
+        for image, xy, std, factor in zip(
+            problem.images, more.keypoints, more.std_px, more.std_factor, strict=True
+        )
     )
     pairs = {(pair.image_a, pair.image_b): pair for pair in problem.pairs}
     for pair in more.pairs:
@@ -227,6 +271,11 @@ def joined(problem: MappingProblem, more: Assembled) -> MappingProblem:
         rows = pair.matches + np.array([offsets[index] for index in key])
         pairs[key] = _both(pairs.get(key), replace(pair, matches=rows))
     return MappingProblem(images, tuple(pairs[key] for key in sorted(pairs)))
+
+
+def _std_factor(image: MappingImage) -> Float64:
+    factor = image.keypoint_std_factor
+    return np.ones(len(image.keypoints)) if factor is None else factor
 
 
 def _both(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:

@@ -56,6 +56,24 @@ class VerificationOptions(Options):
     panoramic (reference, COLMAP)."""
 
 
+class AdjustmentOptions(Options):
+    """Keypoints to a fraction of a pixel, by aligning the patches of verified matches."""
+
+    enabled: bool = True
+    """Off: keypoints stay where they were found (reference). Imported ones always do."""
+    radius: int = Field(8, ge=3, le=50)
+    """Of the patches, in stds of a keypoint (ours: 6 and 11 are less exact on
+    rendered_kitchen)."""
+    min_correlation: float = Field(0.8, ge=0, lt=1)
+    """Patches that are less alike say nothing (ours)."""
+    max_shift: float = Field(3.0, gt=0)
+    """Nor do those that lie farther from where they were looked for, in stds of a keypoint
+    (ours)."""
+    std_factor: float = Field(0.25, gt=0, le=1)
+    """Noise of an adjusted keypoint in terms of what it was before, in bundle adjustment (ours:
+    distances from the true epipolar line fall to a seventh)."""
+
+
 class ExtractionOptions(Options):
     """Grid of the prior maps, and how dense matches become keypoints."""
 

@@ -1,9 +1,9 @@
 """Runs the chosen providers over the images and assembles the mapper's problem.
 
 Order: masks, features, first look or retrieval, matching, verification (both again where photos
-stay apart), groups of photos for a multi-view network, depth, normals. Whatever a provider returns
-is validated, then cached; calibration and resizing come after the cache, so that a change of them
-predicts nothing anew.
+stay apart), adjustment of keypoints, groups of photos for a multi-view network, depth, normals.
+Whatever a provider returns is validated, then cached; calibration and resizing come after the
+cache, so that a change of them predicts nothing anew.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from mpsfm_core.extraction.matching import (
     Candidates,
     PairMatcher,
     PairVerifier,
+    adjusted,
+    adjusted_problem,
     assemble,
     joined,
 )
@@ -102,10 +104,21 @@ def extract_more(
     ):
         bench.run_masks()
         found = _match(bench, loose, first.problem.pairs)
-    assembled = assemble(found.candidates, found.outcomes, found.located)
+        assembled = assemble(found.candidates, found.outcomes, found.located)
+        assembled = adjusted(bench, assembled)
     problem = joined(first.problem, assembled)
     more = describe(bench, problem, found.proposed, found.candidates, found.outcomes)
     return Extraction(problem, describe_both(first.report, more))
+
+
+def adjust(
+    images: ImageSet, config: Config, registry: Registry, problem: MappingProblem
+) -> MappingProblem:
+    """The problem of an extraction without adjustment, or a part of its pairs, with adjusted
+    keypoints. Raises as :func:`extract`."""
+    bench = Workbench(images, config, registry, Silent())
+    with threadpool_limits(thread_count(config.runtime), user_api="blas"):
+        return adjusted_problem(bench, problem)
 
 
 def _extract(bench: Workbench, imported: ImportedMatches | None) -> Extraction:
@@ -114,6 +127,8 @@ def _extract(bench: Workbench, imported: ImportedMatches | None) -> Extraction:
     found = _match(bench) if imported is None else _verify(bench, imported)
     candidates, outcomes, located = found.candidates, found.outcomes, found.located
     assembled = assemble(candidates, outcomes, located)
+    if imported is None:
+        assembled = adjusted(bench, assembled)
     groups = _see_groups(bench, assembled.pairs)
     priors = Predictions(bench, found.matcher, candidates, groups).run()
     problem = MappingProblem(
@@ -124,6 +139,7 @@ def _extract(bench: Workbench, imported: ImportedMatches | None) -> Extraction:
                 assembled.keypoints[index],
                 *priors[index],
                 keypoint_std_px=assembled.std_px[index],
+                keypoint_std_factor=assembled.std_factor[index],
                 focal_known=image.focal_known,
                 **_place(bench, groups, index),
             )

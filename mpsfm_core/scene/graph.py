@@ -23,10 +23,11 @@ class CorrespondenceGraph:
         score: (e,) float64 in [0.05, 1], what the matcher thinks of the match.
         pair_scores: (p,) float64, summed match scores of each pair.
         pairs_of: for each image the pairs it is in, in their order.
-        keypoint_weight: (k,) float64, score of a keypoint's best match in terms of the mean score
-            of all matches: the weight of its squared reprojection error. Of XFeat + LighterGlue's
-            matches the fifth of lowest score misses the true epipolar line by 2.3 px in the median
-            on rendered_kitchen and by 7 px on hololens_room, the highest fifth by 0.3 and 0.9 px.
+        keypoint_weight: (k,) float64, the weight of a keypoint's squared reprojection error: score
+            of its best match in terms of the mean score of all matches, and by how much adjustment
+            made its variance smaller. Of XFeat + LighterGlue's matches the fifth of lowest score
+            misses the true epipolar line by 2.3 px in the median on rendered_kitchen and by 7 px on
+            hololens_room, the highest fifth by 0.3 and 0.9 px.
     """
 
     def __init__(self, problem: MappingProblem, *, weigh_by_score: bool = True) -> None:
@@ -63,6 +64,9 @@ class CorrespondenceGraph:
         np.maximum.at(self.keypoint_weight, self.source, self.score)
         if len(self.score):
             self.keypoint_weight /= self.score.mean()
+        for index, image in enumerate(problem.images):
+            if image.keypoint_std_factor is not None:
+                self.keypoint_weight[self.keypoints_of(index)] /= image.keypoint_std_factor**2
 
     def edges_of(self, image: int) -> slice:
         """The edges that start in an image."""
