@@ -23,6 +23,7 @@ from mpsfm_core.config import Config
 from mpsfm_core.dense.view import dense_size
 from mpsfm_core.disk_arrays import IN_MEMORY
 from mpsfm_core.errors import InputError
+from mpsfm_core.extraction.adjustment import CACHED_BYTES as CACHED_GREY
 from mpsfm_core.extraction.backends import worker_count
 from mpsfm_core.extraction.features import CACHED_BYTES as CACHED_FEATURES
 from mpsfm_core.extraction.priors import integration_grid
@@ -127,6 +128,8 @@ def predict(
     features = _KEYPOINT_BYTES * sum(min(most, size / _KEYPOINT_PIXELS) for size in pixels)
     memory = (_PROGRAM_MB + _COMPILED_MB + torch * _TORCH_MB) * _MB
     memory += min(CACHED_VIEWS, 3 * sum(pixels)) + min(CACHED_FEATURES, features)
+    if config.adjustment.enabled:
+        memory += min(CACHED_GREY, 4 * sum(pixels))
     memory += _PRIOR_BYTES * prior + workers * _WORKER_BYTES * max(pixels)
     for size in networks:
         memory += workers * (_WEIGHTS * size + min(_WORKING * size, _MOST_WORKING_MB * _MB))

@@ -20,6 +20,7 @@ _FIRST_GUESS = {
     "features": 0.3,
     "matching": 0.5,
     "verification": 0.01,
+    "adjustment": 0.01,
     "depth": 0.3,
     "normals": 0.1,
     "mapping": 1.0,
@@ -30,7 +31,7 @@ _FIRST_GUESS = {
 """Steps in their order, with seconds a unit (an image, of matching and verification a pair) on two
 cores, with the default configuration (measured with 28 photos of a room; dense with 16 of a
 rendered kitchen). Where a run went before, its own are taken."""
-_PAIRWISE = {"matching", "verification"}
+_PAIRWISE = {"matching", "verification", "adjustment"}
 _TRUST_AFTER = 0.2
 """Share of a step after which its own speed is believed alone (ours)."""
 

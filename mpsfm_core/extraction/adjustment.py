@@ -10,7 +10,7 @@ with as a plane would be that faces the camera at the depth of the match.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -59,6 +59,9 @@ class AlignedPair:
     information: Float64
 
 
+_EQUATION = ("warp", "offset", "information")
+
+
 class Adjusted(NamedTuple):
     """Of one image: keypoints (n, 2), and which of them were measured (n,)."""
 
@@ -97,9 +100,11 @@ class KeypointAdjuster:
 
     def run(self, pairs: Sequence[VerifiedPair]) -> list[Adjusted]:
         """The stage."""
+        options = self._bench.config.adjustment
+        counts = [len(xy) for xy in self._keypoints]
+        pairs = with_best_matches(pairs, counts, options.max_alignments)
         aligned = self._bench.each("adjustment", pairs, self._aligned)
-        limit = self._bench.config.adjustment.max_shift
-        return adjust_keypoints(self._keypoints, self._std_px, pairs, aligned, limit)
+        return adjust_keypoints(self._keypoints, self._std_px, pairs, aligned, options.max_shift)
 
     def _aligned(self, pair: VerifiedPair) -> AlignedPair:
         bench, options = self._bench, self._bench.config.adjustment
@@ -124,6 +129,37 @@ class KeypointAdjuster:
     def _image(self, index: int) -> Float32:
         std_px = self._std_px[index]
         return self._grey.get(index, lambda: grey(self._bench.view(index).image, std_px))
+
+
+def with_best_matches(
+    pairs: Sequence[VerifiedPair], counts: Sequence[int], most: int
+) -> list[VerifiedPair]:
+    """The pairs with those matches alone that are among the ``most`` best of one of their
+    keypoints; ``counts``: keypoints of each image."""
+    if not pairs:
+        return []
+    a, b = _numbered(pairs, counts)
+    match = np.tile(np.arange(len(a)), 2)
+    keypoint = np.concatenate([a, b])
+    score = np.tile(np.concatenate([pair.scores for pair in pairs]), 2)
+    order = np.lexsort((match, -score, keypoint))
+    rank = np.arange(len(order)) - np.searchsorted(keypoint[order], keypoint[order])
+    best = np.zeros(len(a), dtype=np.bool_)
+    best[match[order[rank < most]]] = True
+    of_pairs = np.split(best, np.cumsum([len(pair) for pair in pairs])[:-1])
+    return [
+        replace(pair, matches=pair.matches[rows], scores=pair.scores[rows])
+        for pair, rows in zip(pairs, of_pairs, strict=True)
+        if rows.any()
+    ]
+
+
+def _numbered(pairs: Sequence[VerifiedPair], counts: Sequence[int]) -> tuple[Int64, Int64]:
+    """Keypoints of all matches (m,), on either side, numbered through all images."""
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    a = [offsets[pair.image_a] + pair.matches[:, 0] for pair in pairs]
+    b = [offsets[pair.image_b] + pair.matches[:, 1] for pair in pairs]
+    return np.concatenate(a), np.concatenate(b)
 
 
 def grey(rgb: UInt8, std_px: float) -> Float32:
@@ -204,28 +240,21 @@ def adjust_keypoints(
     stds stays, and counts as not measured.
     """
     counts = [len(xy) for xy in keypoints]
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     std = np.repeat(np.asarray(std_px, dtype=np.float64), counts)
-    a, b = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    for pair, found in zip(pairs, aligned, strict=True):
-        a.append(offsets[pair.image_a] + pair.matches[found.rows, 0])
-        b.append(offsets[pair.image_b] + pair.matches[found.rows, 1])
-    in_a, in_b = np.concatenate(a), np.concatenate(b)
-    shifts = np.zeros((len(std), 2))
-    if len(in_a):
-        together = [np.concatenate([getattr(f, n) for f in aligned]) for n in _EQUATION]
-        shifts = solve_shifts(std, in_a, in_b, *together)
-    measured = np.zeros(len(std), dtype=np.bool_)
-    measured[in_a] = measured[in_b] = True
+    shifts, measured = np.zeros((len(std), 2)), np.zeros(len(std), dtype=np.bool_)
+    if any(len(found.rows) for found in aligned):
+        a, b = _numbered(pairs, counts)
+        starts = np.cumsum([0, *map(len, pairs)])
+        rows = np.concatenate(
+            [start + found.rows for start, found in zip(starts, aligned, strict=False)]
+        )
+        together = [np.concatenate([getattr(f, name) for f in aligned]) for name in _EQUATION]
+        shifts = solve_shifts(std, a[rows], b[rows], *together)
+        measured[a[rows]] = measured[b[rows]] = True
     measured &= np.linalg.norm(shifts, axis=1) <= max_shift * std
-    shifts[~measured] = 0
-    return [
-        Adjusted(xy + shifts[start : start + len(xy)], measured[start : start + len(xy)])
-        for xy, start in zip(keypoints, offsets, strict=False)
-    ]
-
-
-_EQUATION = ("warp", "offset", "information")
+    moved = np.concatenate(keypoints) + np.where(measured[:, None], shifts, 0.0)
+    ends = np.cumsum(counts)[:-1]
+    return list(map(Adjusted, np.split(moved, ends), np.split(measured, ends)))
 
 
 def solve_shifts(

@@ -22,13 +22,16 @@ WINDOW = 0.6
 """Std of the Gaussian window in terms of the patch's radius (ours)."""
 _ROUNDS = 12
 """Of each of the two warps, at most."""
-_CONVERGED_PX = 0.005
+_CONVERGED_PX = 0.1, 0.01
+"""Steps after which the two are near enough."""
 _DAMPING = 0.01
 """Of the affine part, relative to its Hessian's diagonal (ours)."""
 _REGULAR = 1e-9
 """Added to the diagonal of a Hessian, of intensities of unit contrast per pixel."""
 _TRANSLATION = 2
 _AFFINE = 6
+_FIRST = 2
+"""Place of the derivatives in a basis."""
 _FLAT = 1e-3
 """Grey levels: a patch of smaller contrast shows nothing."""
 
@@ -91,48 +94,35 @@ def _align(
     independent: float,
 ) -> tuple[Float64, Float64, Float64, Float64]:
     count, size = len(in_template), len(window)
-    radius = size // 2
     shifts = np.zeros((count, 2))
     found = np.zeros((count, 2, 2))
     correlations = np.full(count, -1.0)
     covariances = np.zeros((count, 2, 2))
     patch = np.empty((size + 2, size + 2))
-    other = np.empty((size, size))
-    jacobian = np.empty((size, size, _AFFINE))
+    basis = np.empty((size, size, _FIRST + _AFFINE))
     hessian = np.empty((_AFFINE, _AFFINE))
     inverse = np.empty((_AFFINE, _AFFINE))
+    products = np.empty(_FIRST + _AFFINE)
     step = np.empty(_AFFINE)
     for n in range(count):
-        x, y = in_template[n, 0], in_template[n, 1]
-        left, top = math.floor(x) - radius - 1, math.floor(y) - radius - 1
-        if left < 0 or top < 0:
+        if not _cut(template, in_template[n, 0], in_template[n, 1], window, patch):
             continue
-        if left + size + 2 >= template.shape[1] or top + size + 2 >= template.shape[0]:
-            continue
-        for row in range(size + 2):
-            for column in range(size + 2):
-                patch[row, column] = _bilinear(
-                    template, x + column - radius - 1, y + row - radius - 1
-                )
-        if not _prepare(patch, window, jacobian):
-            continue
-        _hessian(jacobian, window, hessian)
+        _derive(patch, window, basis, hessian)
         warp, at = found[n], in_searched[n].copy()
         warp[:] = warps[n]
-        parameters, rounds, fresh, correlation = _TRANSLATION, 0, True, 1.0
+        parameters, rounds, fresh = _TRANSLATION, 0, True
+        correlation = 1.0
         while correlation >= 0.0:
-            correlation = -1.0
-            if _sample(searched, at, warp, other, window):
-                correlation = _correlate(patch, other, window)
+            correlation = _compare(searched, at, warp, basis, products)
             if rounds == _ROUNDS and parameters == _AFFINE:
                 break
             if fresh:
                 _invert(hessian, parameters, inverse)
                 fresh = False
-            _solve(inverse, jacobian, patch, other, window, parameters, step)
+            _solve(inverse, products, parameters, size // 2, step)
             _compose(warp, at, step)
             rounds += 1
-            if math.hypot(step[0], step[1]) < _CONVERGED_PX:
+            if math.hypot(step[0], step[1]) < _CONVERGED_PX[int(parameters == _AFFINE)]:
                 rounds = _ROUNDS
             if rounds == _ROUNDS and parameters == _TRANSLATION:
                 parameters, rounds, fresh = _AFFINE, 0, True
@@ -162,70 +152,116 @@ def _bilinear(image: Float32, x: float, y: float) -> float:
 
 
 @helper()
-def _normalise(values: Float64, border: int, window: Float64) -> bool:
-    """Take mean and contrast away, of all that is inside of a border; False where it is flat."""
+def _cut(image: Float32, x: float, y: float, window: Float64, patch: Float64) -> bool:
+    """The template and a border of one pixel, without its mean and of unit contrast; False where it
+    leaves the image or is flat."""
     size = len(window)
-    mean = 0.0
-    for row in range(size):
-        for column in range(size):
-            mean += window[row, column] * values[row + border, column + border]
-    variance = 0.0
-    for row in range(size):
-        for column in range(size):
-            variance += window[row, column] * (values[row + border, column + border] - mean) ** 2
-    if variance < _FLAT**2:
+    left, top = x - size // 2 - 1, y - size // 2 - 1
+    # Said so that what is not a number is outside too.
+    if not (left >= 0.0 and left + size + 1 < image.shape[1] - 1):
+        return False
+    if not (top >= 0.0 and top + size + 1 < image.shape[0] - 1):
+        return False
+    mean, square = 0.0, 0.0
+    for row in range(size + 2):
+        for column in range(size + 2):
+            value = _bilinear(image, left + column, top + row)
+            patch[row, column] = value
+            if 1 <= row <= size and 1 <= column <= size:
+                weight = window[row - 1, column - 1]
+                mean += weight * value
+                square += weight * value * value
+    variance = square - mean * mean
+    if not variance > _FLAT**2:
         return False
     scale = 1.0 / math.sqrt(variance)
-    for row in range(len(values)):
-        for column in range(len(values)):
-            values[row, column] = (values[row, column] - mean) * scale
+    for row in range(size + 2):
+        for column in range(size + 2):
+            patch[row, column] = (patch[row, column] - mean) * scale
     return True
 
 
 @helper()
-def _prepare(patch: Float64, window: Float64, jacobian: Float64) -> bool:
-    """Normalise the template, and derive it by the parameters of a warp: two of a translation, four
-    of an affine map. What a change of mean and contrast explains is not the warp's."""
-    if not _normalise(patch, 1, window):
-        return False
+def _derive(patch: Float64, window: Float64, basis: Float64, hessian: Float64) -> None:
+    """What another patch is multiplied with, pixel by pixel: the window, the window times the
+    template, and the window times the template's derivatives by the parameters of a warp, two of a
+    translation and four of an affine map with offsets in terms of the radius. What a change of mean
+    and contrast explains is taken out of the derivatives."""
     size = len(window)
     radius = size // 2
-    mean = np.zeros(_AFFINE)
-    along = np.zeros(_AFFINE)
+    mean, along = np.zeros(_AFFINE), np.zeros(_AFFINE)
     for row in range(size):
         for column in range(size):
             gx = 0.5 * (patch[row + 1, column + 2] - patch[row + 1, column])
             gy = 0.5 * (patch[row + 2, column + 1] - patch[row, column + 1])
             dx, dy = (column - radius) / radius, (row - radius) / radius
-            of_pixel = jacobian[row, column]
-            of_pixel[0], of_pixel[1] = gx, gy
-            of_pixel[2], of_pixel[3] = gx * dx, gx * dy
-            of_pixel[4], of_pixel[5] = gy * dx, gy * dy
+            slopes = basis[row, column, _FIRST:]
+            slopes[0], slopes[1] = gx, gy
+            slopes[2], slopes[3] = gx * dx, gx * dy
+            slopes[4], slopes[5] = gy * dx, gy * dy
             weight, value = window[row, column], patch[row + 1, column + 1]
+            basis[row, column, 0], basis[row, column, 1] = weight, weight * value
             for k in range(_AFFINE):
-                mean[k] += weight * of_pixel[k]
-                along[k] += weight * of_pixel[k] * value
-    for row in range(size):
-        for column in range(size):
-            value = patch[row + 1, column + 1]
-            for k in range(_AFFINE):
-                jacobian[row, column, k] -= mean[k] + along[k] * value
-    return True
-
-
-@helper()
-def _hessian(jacobian: Float64, window: Float64, hessian: Float64) -> None:
+                mean[k] += weight * slopes[k]
+                along[k] += weight * slopes[k] * value
     hessian[:] = 0.0
-    size = len(window)
     for row in range(size):
         for column in range(size):
-            of_pixel, weight = jacobian[row, column], window[row, column]
+            slopes = basis[row, column, _FIRST:]
+            weight, value = window[row, column], patch[row + 1, column + 1]
             for i in range(_AFFINE):
+                slopes[i] -= mean[i] + along[i] * value
                 for j in range(i + 1):
-                    hessian[i, j] += weight * of_pixel[i] * of_pixel[j]
+                    hessian[i, j] += weight * slopes[i] * slopes[j]
+            for i in range(_AFFINE):
+                slopes[i] *= weight
     for i in range(_AFFINE):
         for j in range(i):
             hessian[j, i] = hessian[i, j]
+
+
+@helper()
+def _compare(
+    image: Float32, at: Float64, warp: Float64, basis: Float64, products: Float64
+) -> float:
+    """Correlation of the template with the patch at a place under a warp, -1 where that leaves the
+    image or is flat; ``products``: of the basis and the patch at unit contrast."""
+    size = len(basis)
+    radius = size // 2
+    reach_x = radius * (abs(warp[0, 0]) + abs(warp[0, 1]))
+    reach_y = radius * (abs(warp[1, 0]) + abs(warp[1, 1]))
+    if not (at[0] - reach_x >= 0.0 and at[0] + reach_x < image.shape[1] - 1):
+        return -1.0
+    if not (at[1] - reach_y >= 0.0 and at[1] + reach_y < image.shape[0] - 1):
+        return -1.0
+    mean, square, product = 0.0, 0.0, 0.0
+    s0, s1, s2, s3, s4, s5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for row in range(size):
+        x = at[0] - warp[0, 0] * radius + warp[0, 1] * (row - radius)
+        y = at[1] - warp[1, 0] * radius + warp[1, 1] * (row - radius)
+        for column in range(size):
+            value = _bilinear(image, x + warp[0, 0] * column, y + warp[1, 0] * column)
+            weighed = value * basis[row, column, 0]
+            mean += weighed
+            square += weighed * value
+            product += value * basis[row, column, 1]
+            s0 += value * basis[row, column, 2]
+            s1 += value * basis[row, column, 3]
+            s2 += value * basis[row, column, 4]
+            s3 += value * basis[row, column, 5]
+            s4 += value * basis[row, column, 6]
+            s5 += value * basis[row, column, 7]
+    variance = square - mean * mean
+    if not variance > _FLAT**2:
+        return -1.0
+    products[1] = product
+    products[2], products[3], products[4] = s0, s1, s2
+    products[5], products[6], products[7] = s3, s4, s5
+    scale = 1.0 / math.sqrt(variance)
+    for k in range(1, _FIRST + _AFFINE):
+        products[k] *= scale
+    correlation: float = products[1]
+    return correlation
 
 
 @helper()
@@ -252,58 +288,16 @@ def _invert(matrix: Float64, size: int, inverse: Float64) -> None:
 
 
 @helper()
-def _sample(image: Float32, at: Float64, warp: Float64, values: Float64, window: Float64) -> bool:
-    """The patch at a place under a warp, normalised; False where it leaves the image or is flat."""
-    size = len(values)
-    radius = size // 2
-    reach_x = radius * (abs(warp[0, 0]) + abs(warp[0, 1]))
-    reach_y = radius * (abs(warp[1, 0]) + abs(warp[1, 1]))
-    if not (at[0] >= reach_x and at[0] + reach_x < image.shape[1] - 1):
-        return False
-    if not (at[1] >= reach_y and at[1] + reach_y < image.shape[0] - 1):
-        return False
-    for row in range(size):
-        for column in range(size):
-            dx, dy = column - radius, row - radius
-            x = at[0] + warp[0, 0] * dx + warp[0, 1] * dy
-            y = at[1] + warp[1, 0] * dx + warp[1, 1] * dy
-            values[row, column] = _bilinear(image, x, y)
-    return _normalise(values, 0, window)
-
-
-@helper()
-def _correlate(patch: Float64, other: Float64, window: Float64) -> float:
-    product = 0.0
-    for row in range(len(window)):
-        for column in range(len(window)):
-            product += window[row, column] * patch[row + 1, column + 1] * other[row, column]
-    return product
-
-
-@helper()
 def _solve(
-    inverse: Float64,
-    jacobian: Float64,
-    patch: Float64,
-    other: Float64,
-    window: Float64,
-    parameters: int,
-    step: Float64,
+    inverse: Float64, products: Float64, parameters: int, radius: int, step: Float64
 ) -> None:
-    """The warp of the template that explains the difference best, into ``step``."""
-    slope = np.zeros(_AFFINE)
-    for row in range(len(window)):
-        for column in range(len(window)):
-            difference = other[row, column] - patch[row + 1, column + 1]
-            difference *= window[row, column]
-            for k in range(parameters):
-                slope[k] += difference * jacobian[row, column, k]
+    """The warp of the template that explains the difference of the patches best."""
     step[:] = 0.0
     for i in range(parameters):
         for j in range(parameters):
-            step[i] += inverse[i, j] * slope[j]
+            step[i] += inverse[i, j] * products[_FIRST + j]
         if i >= _TRANSLATION:
-            step[i] /= len(window) // 2  # offsets were in terms of the radius
+            step[i] /= radius
 
 
 @helper()

@@ -84,10 +84,16 @@ def _pair(names: list[str], matches: Candidates, outcome: TwoView) -> dict[str, 
 def _image(image: MappingImage) -> dict[str, Any]:
     return {
         "keypoints": len(image.keypoints),
+        "adjusted_keypoints": _num_adjusted(image),
         "valid_depth": round(float(image.depth.valid.mean()), 4),
         "median_relative_depth_std": _relative_std(image.depth),
         "valid_normals": round(float(image.normals.valid.mean()), 4),
     }
+
+
+def _num_adjusted(image: MappingImage) -> int:
+    factor = image.keypoint_std_factor
+    return 0 if factor is None else int((factor < 1).sum())
 
 
 def _relative_std(depth: DepthPrior) -> float | None:

@@ -23,6 +23,7 @@ from mpsfm_core.data import (
     PinholeCamera,
     View,
 )
+from mpsfm_core.extraction.options import AdjustmentOptions
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.options import Backend, Options
@@ -89,6 +90,7 @@ class World:
             "matcher": Backend(use="mutual-nearest"),
             "depth": Backend(use="truth"),
             "normals": Backend(use="truth"),
+            "adjustment": AdjustmentOptions(enabled=False),  # true keypoints are exact
             "runtime": RuntimeOptions(cache_dir=self.cache, workers=2),
             **changes,
         }

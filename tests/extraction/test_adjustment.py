@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from mpsfm_core.config import RuntimeOptions
-from mpsfm_core.data import Features, MappingProblem, PinholeCamera, VerifiedPair, View
+from mpsfm_core.data import (
+    Features,
+    MappingProblem,
+    PinholeCamera,
+    SparseMatches,
+    VerifiedPair,
+    View,
+)
 from mpsfm_core.extraction import adjustment
 from mpsfm_core.extraction.adjustment import (
     AlignedPair,
@@ -18,12 +25,14 @@ from mpsfm_core.extraction.adjustment import (
     facing_plane_warp,
     grey,
     solve_shifts,
+    with_best_matches,
 )
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.options import AdjustmentOptions
-from mpsfm_core.extraction.runner import adjust
+from mpsfm_core.extraction.runner import adjust, extract, extract_more
 from mpsfm_core.geometry import compose, invert, project, transform, unproject
 from mpsfm_core.inputs.images import load_images
+from mpsfm_core.inputs.matches import ImportedMatches
 from mpsfm_core.options import Backend
 from mpsfm_core.providers import ProviderSpec
 from mpsfm_core.testing.scenes import arc_poses, room_scene
@@ -183,6 +192,10 @@ def test_images_of_coarse_keypoints_are_made_smaller() -> None:
     assert grey(rgb, 1e6).shape == (1, 1)
 
 
+OFF = AdjustmentOptions(enabled=False)
+ROUNDED = {"features": Backend(use="rounded"), "adjustment": AdjustmentOptions()}
+
+
 class RoundedFeatures:
     """True keypoints as a network gives them: of whole pixels."""
 
@@ -219,9 +232,8 @@ def miss(world, problem: MappingProblem, measured: bool) -> float:
 
 
 def test_rounded_keypoints_become_exact(rounded) -> None:
-    use = {"features": Backend(use="rounded")}
-    off = rounded.extract(**use, adjustment=AdjustmentOptions(enabled=False)).problem
-    on = rounded.extract(**use).problem
+    off = rounded.extract(**{**ROUNDED, "adjustment": OFF}).problem
+    on = rounded.extract(**ROUNDED).problem
     assert all(image.keypoint_std_factor.min() == 1 for image in off.images)
     assert miss(rounded, off, measured=False) > 0.4
     assert miss(rounded, on, measured=True) < 0.2
@@ -234,16 +246,15 @@ def test_rounded_keypoints_become_exact(rounded) -> None:
     assert max(moved) <= AdjustmentOptions().max_shift
     alone = MappingProblem(off.images, off.pairs)
     images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml", None)
-    later = adjust(images, rounded.config(**use), rounded.registry, alone)
+    later = adjust(images, rounded.config(**ROUNDED), rounded.registry, alone)
     for a, b in zip(later.images, on.images, strict=True):
         assert np.array_equal(a.keypoints, b.keypoints)
 
 
 def test_the_order_of_pairs_does_not_matter(rounded) -> None:
-    use = {"features": Backend(use="rounded")}
-    off = rounded.extract(**use, adjustment=AdjustmentOptions(enabled=False)).problem
+    off = rounded.extract(**{**ROUNDED, "adjustment": OFF}).problem
     images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml", None)
-    config = rounded.config(**use)
+    config = rounded.config(**ROUNDED)
     forth = adjust(images, config, rounded.registry, off)
     back = adjust(images, config, rounded.registry, replace(off, pairs=off.pairs[::-1]))
     for a, b in zip(forth.images, back.images, strict=True):
@@ -251,13 +262,52 @@ def test_the_order_of_pairs_does_not_matter(rounded) -> None:
 
 
 def test_alignments_are_cached(rounded, monkeypatch: pytest.MonkeyPatch) -> None:
-    use = {
-        "features": Backend(use="rounded"),
-        "runtime": RuntimeOptions(cache_dir=rounded.cache, workers=1),
-    }
+    use = {**ROUNDED, "runtime": RuntimeOptions(cache_dir=rounded.cache, workers=1)}
     first = rounded.extract(**use).problem
     monkeypatch.setattr(adjustment, "align_patches", None)
     again = rounded.extract(**use).problem
     assert [digest(image) for image in again.images] == [digest(image) for image in first.images]
     with pytest.raises(TypeError):
-        rounded.extract(**use, adjustment=AdjustmentOptions(radius=6))
+        rounded.extract(**{**use, "adjustment": AdjustmentOptions(radius=6)})
+
+
+def test_imported_keypoints_stay(rounded) -> None:
+    found = rounded.extract(**{**ROUNDED, "adjustment": OFF}).problem
+    images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml")
+    imported = ImportedMatches(
+        "another program",
+        tuple(image.keypoints for image in found.images),
+        (1.0,) * len(found.images),
+        {(p.image_a, p.image_b): SparseMatches(p.matches, p.scores) for p in found.pairs},
+    )
+    config = rounded.config(**ROUNDED)
+    problem = extract(images, config, rounded.registry, imported=imported).problem
+    for image, as_found in zip(problem.images, found.images, strict=True):
+        assert np.array_equal(image.keypoints, as_found.keypoints)
+        assert (image.keypoint_std_factor == 1).all()
+
+
+def test_more_matches_leave_keypoints_that_are_adjusted(rounded) -> None:
+    """Those of the second matching alone are measured, beside the first ones."""
+    images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml")
+    config = rounded.config(**ROUNDED)
+    first = extract(images, config, rounded.registry)
+    both = extract_more(images, config, rounded.registry, first, {3}).problem
+    for before, after in zip(first.problem.images, both.images, strict=True):
+        count = len(before.keypoints)
+        assert np.array_equal(after.keypoints[:count], before.keypoints)
+        assert np.array_equal(after.keypoint_std_factor[:count], before.keypoint_std_factor)
+        assert (after.keypoint_std_factor[count:] < 1).any()
+
+
+def test_a_match_that_no_keypoint_needs_is_not_aligned() -> None:
+    """Of a star the best of its middle, and those that are the only ones of their ends."""
+    pairs = [
+        replace(pair_of([(0, 0)], (0, other)), scores=np.array([score], np.float32))
+        for other, score in ((1, 0.9), (2, 0.5), (3, 0.7))
+    ]
+    pairs.append(replace(pair_of([(0, 0)], (2, 3)), scores=np.array([0.6], np.float32)))
+    kept = with_best_matches(pairs, [1] * 4, 1)
+    assert [(p.image_a, p.image_b) for p in kept] == [(0, 1), (0, 3), (2, 3)]
+    assert len(with_best_matches(pairs, [1] * 4, 3)) == len(pairs)
+    assert with_best_matches([], [], 1) == []

@@ -13,7 +13,7 @@ from mpsfm_core.data import DepthPrior
 from mpsfm_core.errors import ConfigError, ProviderOutputError, ProviderRunError
 from mpsfm_core.extraction import first_look, pairs
 from mpsfm_core.extraction.cache import digest
-from mpsfm_core.extraction.options import ExtractionOptions, PairOptions
+from mpsfm_core.extraction.options import AdjustmentOptions, ExtractionOptions, PairOptions
 from mpsfm_core.extraction.priors import EDGE_VARIANCE
 from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_angle_deg
 from mpsfm_core.inputs.options import InputOptions
@@ -273,10 +273,17 @@ def test_stages_in_order(world) -> None:
             self.events.append(("finished", stage))
 
     recorder = Recorder()
-    world.extract(recorder, masks=(Backend(use="left"),))
+    world.extract(recorder, masks=(Backend(use="left"),), adjustment=AdjustmentOptions())
     started = [event[1:] for event in recorder.events if event[0] == "started"]
-    names = ["masks", "features", "matching", "verification", "depth", "normals"]
-    assert started == [(n, 6 if n in ("matching", "verification") else 4) for n in names]
+    assert started == [
+        ("masks", 4),
+        ("features", 4),
+        ("matching", 6),
+        ("verification", 6),
+        ("adjustment", 6),
+        ("depth", 4),
+        ("normals", 4),
+    ]
     progress = [event[2:] for event in recorder.events if event[:2] == ("progress", "depth")]
     assert progress == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert recorder.events[-1] == ("finished", "normals")

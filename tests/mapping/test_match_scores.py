@@ -86,6 +86,22 @@ def test_keypoints_weigh_by_their_best_match_relative_to_the_mean() -> None:
     np.testing.assert_allclose(graph.keypoint_weight, best / mean, rtol=1e-6)
 
 
+def test_adjusted_keypoints_weigh_by_what_is_left_of_their_variance() -> None:
+    problem = mapping_problem(room_scene(), CAMERA, POSES)
+    factor = np.ones(problem.num_keypoints(1))
+    factor[::2] = 0.25
+    images = list(problem.images)
+    images[1] = replace(images[1], keypoint_std_factor=factor)
+    before, after = (
+        CorrespondenceGraph(each) for each in (problem, replace(problem, images=tuple(images)))
+    )
+    ratio = after.keypoint_weight / np.where(before.keypoint_weight, before.keypoint_weight, np.nan)
+    seen = before.keypoint_weight > 0
+    expected = np.ones(len(seen))
+    expected[before.keypoints_of(1)] = factor**-2
+    np.testing.assert_allclose(ratio[seen], expected[seen])
+
+
 @pytest.mark.parametrize("score", [0.0, 0.3, 1.0])
 def test_equal_scores_are_as_good_as_none(score: float) -> None:
     problem = mapping_problem(room_scene(), CAMERA, POSES)
