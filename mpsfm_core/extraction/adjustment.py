@@ -10,7 +10,7 @@ with as a plane would be that faces the camera at the depth of the match.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -19,7 +19,6 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8, VerifiedPair
-from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.options import AdjustmentOptions
 from mpsfm_core.extraction.patch_alignment import align_patches
 from mpsfm_core.extraction.workbench import Workbench
@@ -38,7 +37,7 @@ planes (ours)."""
 _TAIL = 0.3
 """Scale of Cauchy's loss on what an alignment says and the shifts do not, in stds of a keypoint
 (ours)."""
-_ROUNDS = 5
+_ROUNDS = 3
 """Of reweighted least squares."""
 _SINGULAR = 0.05
 """Ratio of areas below which a warp squeezes a patch to nothing."""
@@ -107,24 +106,17 @@ class KeypointAdjuster:
         return adjust_keypoints(self._keypoints, self._std_px, pairs, aligned, options.max_shift)
 
     def _aligned(self, pair: VerifiedPair) -> AlignedPair:
-        bench, options = self._bench, self._bench.config.adjustment
-        both = pair.image_a, pair.image_b
-        xy = [self._keypoints[i][pair.matches[:, side]] for side, i in enumerate(both)]
-        described: list[object] = [options.model_dump(mode="json")]
-        for i in both:
-            camera = bench.images[i].pinhole
-            described += [bench.images.pixel_key(i), asdict(camera), self._std_px[i]]
-        arrays = (*xy, pair.rotation, pair.translation)
-        key = content_key(described, *map(digest, arrays))
-        found = bench.cache.load("adjustment", key, AlignedPair)
-        if found is None:
-            a, b = (
-                Side(bench.images[i].pinhole, self._image(i), of_side, self._std_px[i])
-                for i, of_side in zip(both, xy, strict=True)
+        a, b = (
+            Side(
+                self._bench.images[index].pinhole,
+                self._image(index),
+                self._keypoints[index][pair.matches[:, column]],
+                self._std_px[index],
             )
-            found = align_pair(a, b, pair.rotation, pair.translation, options)
-            bench.cache.store("adjustment", key, found)
-        return found
+            for column, index in enumerate((pair.image_a, pair.image_b))
+        )
+        options = self._bench.config.adjustment
+        return align_pair(a, b, pair.rotation, pair.translation, options)
 
     def _image(self, index: int) -> Float32:
         std_px = self._std_px[index]

@@ -64,10 +64,11 @@ class AdjustmentOptions(Options):
     max_alignments: int = Field(4, ge=1)
     """A match is aligned if it is among so many best of one of its keypoints (ours: with SIFT on
     rendered_kitchen, pairs of 54 photos, half of the time of aligning all, and as exact)."""
-    radius: int = Field(8, ge=3, le=50)
-    """Of the patches, in stds of a keypoint (ours: on rendered_kitchen 6, 8 and 11 leave 0.054,
-    0.041 and 0.032 px to the true epipolar line in 79, 77 and 73 % of the matches; cost grows with
-    the square, and a larger patch is less often a plane)."""
+    radius: int = Field(9, ge=3, le=50)
+    """Of the round patches, in stds of a keypoint (ours: on rendered_kitchen 8, 9 and 10 leave
+    0.048, 0.042 and 0.038 px to the true epipolar line in 77, 76 and 75 % of the matches, 0.4 px
+    are the keypoints' own; cost grows with the square, and a larger patch is less often a plane).
+    """
     min_correlation: float = Field(0.8, ge=0, lt=1)
     """Patches that are less alike say nothing (ours)."""
     max_shift: float = Field(3.0, gt=0)

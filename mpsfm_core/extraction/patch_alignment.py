@@ -63,13 +63,12 @@ def align_patches(
         in_template, in_searched: (n, 2) centres of the patches and where to look for them, COLMAP
             pixels (centres of pixels at .5).
         warp: (n, 2, 2) offsets in the template to offsets in the other image, to begin with.
-        radius: of the square patch, pixels of the template.
+        radius: of the round patch, pixels of the template.
         correlation_length: pixels of the template within which noise of the images hangs together.
     """
-    offsets = np.arange(-radius, radius + 1, dtype=np.float64)
-    window = np.exp(-0.5 * (offsets / (WINDOW * radius)) ** 2)
-    window /= window.sum()
-    independent = 1.0 / ((window**2).sum() * correlation_length) ** 2
+    offsets, window = _samples(radius)
+    # Samples stand for two pixels each; weights of independent ones would sum up so.
+    independent = 1.0 / ((window**2).sum() / 2 * correlation_length**2)
     return Alignment(
         *_align(
             template,
@@ -77,10 +76,23 @@ def align_patches(
             in_template - 0.5,
             in_searched - 0.5,
             np.ascontiguousarray(warp, dtype=np.float64),
-            np.outer(window, window),
+            radius,
+            offsets,
+            window,
             max(1.0, independent),
         )
     )
+
+
+def _samples(radius: int) -> tuple[Float64, Float64]:
+    """Pixels of a round patch from its centre (q, 2), and their weights. Every other one, like the
+    black fields of a chessboard: smooth images have nothing more to say in between."""
+    line = np.arange(-radius, radius + 1, dtype=np.float64)
+    x, y = (each.ravel() for each in np.meshgrid(line, line))
+    chosen = ((x + y) % 2 == 0) & (np.hypot(x, y) <= radius)
+    offsets = np.stack([x[chosen], y[chosen]], axis=1)
+    window = np.exp(-0.5 * (offsets**2).sum(axis=1) / (WINDOW * radius) ** 2)
+    return offsets, window / window.sum()
 
 
 @kernel()
@@ -90,36 +102,36 @@ def _align(
     in_template: Float64,
     in_searched: Float64,
     warps: Float64,
+    radius: int,
+    offsets: Float64,
     window: Float64,
     independent: float,
 ) -> tuple[Float64, Float64, Float64, Float64]:
-    count, size = len(in_template), len(window)
+    count = len(in_template)
     shifts = np.zeros((count, 2))
     found = np.zeros((count, 2, 2))
     correlations = np.full(count, -1.0)
     covariances = np.zeros((count, 2, 2))
-    patch = np.empty((size + 2, size + 2))
-    basis = np.empty((size, size, _FIRST + _AFFINE))
+    basis = np.empty((len(window), _FIRST + _AFFINE))
     hessian = np.empty((_AFFINE, _AFFINE))
     inverse = np.empty((_AFFINE, _AFFINE))
     products = np.empty(_FIRST + _AFFINE)
     step = np.empty(_AFFINE)
     for n in range(count):
-        if not _cut(template, in_template[n, 0], in_template[n, 1], window, patch):
+        if not _derive(template, in_template[n], radius, offsets, window, basis, hessian):
             continue
-        _derive(patch, window, basis, hessian)
         warp, at = found[n], in_searched[n].copy()
         warp[:] = warps[n]
         parameters, rounds, fresh = _TRANSLATION, 0, True
         correlation = 1.0
         while correlation >= 0.0:
-            correlation = _compare(searched, at, warp, basis, products)
+            correlation = _compare(searched, at, warp, radius, offsets, basis, products)
             if rounds == _ROUNDS and parameters == _AFFINE:
                 break
             if fresh:
                 _invert(hessian, parameters, inverse)
                 fresh = False
-            _solve(inverse, products, parameters, size // 2, step)
+            _solve(inverse, products, parameters, radius, step)
             _compose(warp, at, step)
             rounds += 1
             if math.hypot(step[0], step[1]) < _CONVERGED_PX[int(parameters == _AFFINE)]:
@@ -152,116 +164,109 @@ def _bilinear(image: Float32, x: float, y: float) -> float:
 
 
 @helper()
-def _cut(image: Float32, x: float, y: float, window: Float64, patch: Float64) -> bool:
-    """The template and a border of one pixel, without its mean and of unit contrast; False where it
-    leaves the image or is flat."""
-    size = len(window)
-    left, top = x - size // 2 - 1, y - size // 2 - 1
-    # Said so that what is not a number is outside too.
-    if not (left >= 0.0 and left + size + 1 < image.shape[1] - 1):
-        return False
-    if not (top >= 0.0 and top + size + 1 < image.shape[0] - 1):
+def _inside(image: Float32, x: float, y: float, reach_x: float, reach_y: float) -> bool:
+    """Whether all can be interpolated that is so near to a place; not if that is no number."""
+    fits_x = x - reach_x >= 0.0 and x + reach_x < image.shape[1] - 1
+    return fits_x and y - reach_y >= 0.0 and y + reach_y < image.shape[0] - 1
+
+
+@helper()
+def _derive(
+    image: Float32,
+    at: Float64,
+    radius: int,
+    offsets: Float64,
+    window: Float64,
+    basis: Float64,
+    hessian: Float64,
+) -> bool:
+    """What another patch is multiplied with, sample by sample: the window, the window times the
+    template without its mean and of unit contrast, and the window times the template's derivatives
+    by the parameters of a warp, two of a translation and four of an affine map with offsets in
+    terms of the radius. What a change of mean and contrast explains is taken out of them. False
+    where the template leaves the image or is flat."""
+    if not _inside(image, at[0], at[1], radius + 1.0, radius + 1.0):
         return False
     mean, square = 0.0, 0.0
-    for row in range(size + 2):
-        for column in range(size + 2):
-            value = _bilinear(image, left + column, top + row)
-            patch[row, column] = value
-            if 1 <= row <= size and 1 <= column <= size:
-                weight = window[row - 1, column - 1]
-                mean += weight * value
-                square += weight * value * value
+    for q in range(len(window)):
+        x, y = at[0] + offsets[q, 0], at[1] + offsets[q, 1]
+        value = _bilinear(image, x, y)
+        mean += window[q] * value
+        square += window[q] * value * value
+        basis[q, 1] = value
+        basis[q, 2] = 0.5 * (_bilinear(image, x + 1.0, y) - _bilinear(image, x - 1.0, y))
+        basis[q, 3] = 0.5 * (_bilinear(image, x, y + 1.0) - _bilinear(image, x, y - 1.0))
     variance = square - mean * mean
     if not variance > _FLAT**2:
         return False
     scale = 1.0 / math.sqrt(variance)
-    for row in range(size + 2):
-        for column in range(size + 2):
-            patch[row, column] = (patch[row, column] - mean) * scale
+    means, along = np.zeros(_AFFINE), np.zeros(_AFFINE)
+    for q in range(len(window)):
+        weight, value = window[q], (basis[q, 1] - mean) * scale
+        dx, dy = offsets[q, 0] / radius, offsets[q, 1] / radius
+        gx, gy = basis[q, 2] * scale, basis[q, 3] * scale
+        basis[q, 0], basis[q, 1] = weight, weight * value
+        slopes = basis[q, _FIRST:]
+        slopes[0], slopes[1] = gx, gy
+        slopes[2], slopes[3] = gx * dx, gx * dy
+        slopes[4], slopes[5] = gy * dx, gy * dy
+        for k in range(_AFFINE):
+            means[k] += weight * slopes[k]
+            along[k] += weight * value * slopes[k]
+    hessian[:] = 0.0
+    for q in range(len(window)):
+        slopes, weight = basis[q, _FIRST:], window[q]
+        for i in range(_AFFINE):
+            slopes[i] -= means[i] + along[i] * basis[q, 1] / weight
+            for j in range(i + 1):
+                hessian[i, j] += weight * slopes[i] * slopes[j]
+        for i in range(_AFFINE):
+            slopes[i] *= weight
+    for i in range(_AFFINE):
+        for j in range(i):
+            hessian[j, i] = hessian[i, j]
     return True
 
 
 @helper()
-def _derive(patch: Float64, window: Float64, basis: Float64, hessian: Float64) -> None:
-    """What another patch is multiplied with, pixel by pixel: the window, the window times the
-    template, and the window times the template's derivatives by the parameters of a warp, two of a
-    translation and four of an affine map with offsets in terms of the radius. What a change of mean
-    and contrast explains is taken out of the derivatives."""
-    size = len(window)
-    radius = size // 2
-    mean, along = np.zeros(_AFFINE), np.zeros(_AFFINE)
-    for row in range(size):
-        for column in range(size):
-            gx = 0.5 * (patch[row + 1, column + 2] - patch[row + 1, column])
-            gy = 0.5 * (patch[row + 2, column + 1] - patch[row, column + 1])
-            dx, dy = (column - radius) / radius, (row - radius) / radius
-            slopes = basis[row, column, _FIRST:]
-            slopes[0], slopes[1] = gx, gy
-            slopes[2], slopes[3] = gx * dx, gx * dy
-            slopes[4], slopes[5] = gy * dx, gy * dy
-            weight, value = window[row, column], patch[row + 1, column + 1]
-            basis[row, column, 0], basis[row, column, 1] = weight, weight * value
-            for k in range(_AFFINE):
-                mean[k] += weight * slopes[k]
-                along[k] += weight * slopes[k] * value
-    hessian[:] = 0.0
-    for row in range(size):
-        for column in range(size):
-            slopes = basis[row, column, _FIRST:]
-            weight, value = window[row, column], patch[row + 1, column + 1]
-            for i in range(_AFFINE):
-                slopes[i] -= mean[i] + along[i] * value
-                for j in range(i + 1):
-                    hessian[i, j] += weight * slopes[i] * slopes[j]
-            for i in range(_AFFINE):
-                slopes[i] *= weight
-    for i in range(_AFFINE):
-        for j in range(i):
-            hessian[j, i] = hessian[i, j]
-
-
-@helper()
 def _compare(
-    image: Float32, at: Float64, warp: Float64, basis: Float64, products: Float64
+    image: Float32,
+    at: Float64,
+    warp: Float64,
+    radius: int,
+    offsets: Float64,
+    basis: Float64,
+    products: Float64,
 ) -> float:
     """Correlation of the template with the patch at a place under a warp, -1 where that leaves the
     image or is flat; ``products``: of the basis and the patch at unit contrast."""
-    size = len(basis)
-    radius = size // 2
-    reach_x = radius * (abs(warp[0, 0]) + abs(warp[0, 1]))
-    reach_y = radius * (abs(warp[1, 0]) + abs(warp[1, 1]))
-    if not (at[0] - reach_x >= 0.0 and at[0] + reach_x < image.shape[1] - 1):
-        return -1.0
-    if not (at[1] - reach_y >= 0.0 and at[1] + reach_y < image.shape[0] - 1):
+    reach_x = radius * math.hypot(warp[0, 0], warp[0, 1])
+    reach_y = radius * math.hypot(warp[1, 0], warp[1, 1])
+    if not _inside(image, at[0], at[1], reach_x, reach_y):
         return -1.0
     mean, square, product = 0.0, 0.0, 0.0
-    s0, s1, s2, s3, s4, s5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for row in range(size):
-        x = at[0] - warp[0, 0] * radius + warp[0, 1] * (row - radius)
-        y = at[1] - warp[1, 0] * radius + warp[1, 1] * (row - radius)
-        for column in range(size):
-            value = _bilinear(image, x + warp[0, 0] * column, y + warp[1, 0] * column)
-            weighed = value * basis[row, column, 0]
-            mean += weighed
-            square += weighed * value
-            product += value * basis[row, column, 1]
-            s0 += value * basis[row, column, 2]
-            s1 += value * basis[row, column, 3]
-            s2 += value * basis[row, column, 4]
-            s3 += value * basis[row, column, 5]
-            s4 += value * basis[row, column, 6]
-            s5 += value * basis[row, column, 7]
+    s0, s1, s2, s3, s4, s5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # registers, not memory
+    for q in range(len(basis)):
+        dx, dy = offsets[q, 0], offsets[q, 1]
+        x = at[0] + warp[0, 0] * dx + warp[0, 1] * dy
+        y = at[1] + warp[1, 0] * dx + warp[1, 1] * dy
+        value = _bilinear(image, x, y)
+        mean += value * basis[q, 0]
+        square += value * value * basis[q, 0]
+        product += value * basis[q, 1]
+        s0 += value * basis[q, 2]
+        s1 += value * basis[q, 3]
+        s2 += value * basis[q, 4]
+        s3 += value * basis[q, 5]
+        s4 += value * basis[q, 6]
+        s5 += value * basis[q, 7]
     variance = square - mean * mean
     if not variance > _FLAT**2:
         return -1.0
-    products[1] = product
-    products[2], products[3], products[4] = s0, s1, s2
-    products[5], products[6], products[7] = s3, s4, s5
     scale = 1.0 / math.sqrt(variance)
-    for k in range(1, _FIRST + _AFFINE):
-        products[k] *= scale
-    correlation: float = products[1]
-    return correlation
+    products[2], products[3], products[4] = s0 * scale, s1 * scale, s2 * scale
+    products[5], products[6], products[7] = s3 * scale, s4 * scale, s5 * scale
+    return product * scale
 
 
 @helper()

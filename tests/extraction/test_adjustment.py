@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data import (
     Features,
     MappingProblem,
@@ -16,7 +15,6 @@ from mpsfm_core.data import (
     VerifiedPair,
     View,
 )
-from mpsfm_core.extraction import adjustment
 from mpsfm_core.extraction.adjustment import (
     AlignedPair,
     Side,
@@ -27,7 +25,6 @@ from mpsfm_core.extraction.adjustment import (
     solve_shifts,
     with_best_matches,
 )
-from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.options import AdjustmentOptions
 from mpsfm_core.extraction.runner import adjust, extract, extract_more
 from mpsfm_core.geometry import compose, invert, project, transform, unproject
@@ -259,16 +256,6 @@ def test_the_order_of_pairs_does_not_matter(rounded) -> None:
     back = adjust(images, config, rounded.registry, replace(off, pairs=off.pairs[::-1]))
     for a, b in zip(forth.images, back.images, strict=True):
         assert np.abs(a.keypoints - b.keypoints).max() < 1e-6
-
-
-def test_alignments_are_cached(rounded, monkeypatch: pytest.MonkeyPatch) -> None:
-    use = {**ROUNDED, "runtime": RuntimeOptions(cache_dir=rounded.cache, workers=1)}
-    first = rounded.extract(**use).problem
-    monkeypatch.setattr(adjustment, "align_patches", None)
-    again = rounded.extract(**use).problem
-    assert [digest(image) for image in again.images] == [digest(image) for image in first.images]
-    with pytest.raises(TypeError):
-        rounded.extract(**{**use, "adjustment": AdjustmentOptions(radius=6)})
 
 
 def test_imported_keypoints_stay(rounded) -> None:
