@@ -28,7 +28,7 @@ _FIRST_GUESS = {
     "results": 0.3,
     "report": 0.1,
 }
-"""Steps in their order, with seconds a unit (an image, of matching and verification a pair) on two
+"""Steps in their order, with seconds a unit (an image, of pairwise steps a pair) on two
 cores, with the default configuration (measured with 28 photos of a room; dense with 16 of a
 rendered kitchen). Where a run went before, its own are taken."""
 _PAIRWISE = {"matching", "verification", "adjustment"}

@@ -115,7 +115,7 @@ def _align(
     basis = np.empty((len(window), _FIRST + _AFFINE))
     hessian = np.empty((_AFFINE, _AFFINE))
     inverse = np.empty((_AFFINE, _AFFINE))
-    products = np.empty(_FIRST + _AFFINE)
+    slopes = np.empty(_AFFINE)
     step = np.empty(_AFFINE)
     for n in range(count):
         if not _derive(template, in_template[n], radius, offsets, window, basis, hessian):
@@ -125,13 +125,13 @@ def _align(
         parameters, rounds, fresh = _TRANSLATION, 0, True
         correlation = 1.0
         while correlation >= 0.0:
-            correlation = _compare(searched, at, warp, radius, offsets, basis, products)
+            correlation = _compare(searched, at, warp, radius, offsets, basis, slopes)
             if rounds == _ROUNDS and parameters == _AFFINE:
                 break
             if fresh:
                 _invert(hessian, parameters, inverse)
                 fresh = False
-            _solve(inverse, products, parameters, radius, step)
+            _solve(inverse, slopes, parameters, radius, step)
             _compose(warp, at, step)
             rounds += 1
             if math.hypot(step[0], step[1]) < _CONVERGED_PX[int(parameters == _AFFINE)]:
@@ -236,10 +236,10 @@ def _compare(
     radius: int,
     offsets: Float64,
     basis: Float64,
-    products: Float64,
+    slopes: Float64,
 ) -> float:
     """Correlation of the template with the patch at a place under a warp, -1 where that leaves the
-    image or is flat; ``products``: of the basis and the patch at unit contrast."""
+    image or is flat; ``slopes``: products of the template's derivatives and that patch."""
     reach_x = radius * math.hypot(warp[0, 0], warp[0, 1])
     reach_y = radius * math.hypot(warp[1, 0], warp[1, 1])
     if not _inside(image, at[0], at[1], reach_x, reach_y):
@@ -264,8 +264,8 @@ def _compare(
     if not variance > _FLAT**2:
         return -1.0
     scale = 1.0 / math.sqrt(variance)
-    products[2], products[3], products[4] = s0 * scale, s1 * scale, s2 * scale
-    products[5], products[6], products[7] = s3 * scale, s4 * scale, s5 * scale
+    slopes[0], slopes[1], slopes[2] = s0 * scale, s1 * scale, s2 * scale
+    slopes[3], slopes[4], slopes[5] = s3 * scale, s4 * scale, s5 * scale
     return product * scale
 
 
@@ -293,14 +293,12 @@ def _invert(matrix: Float64, size: int, inverse: Float64) -> None:
 
 
 @helper()
-def _solve(
-    inverse: Float64, products: Float64, parameters: int, radius: int, step: Float64
-) -> None:
+def _solve(inverse: Float64, slopes: Float64, parameters: int, radius: int, step: Float64) -> None:
     """The warp of the template that explains the difference of the patches best."""
     step[:] = 0.0
     for i in range(parameters):
         for j in range(parameters):
-            step[i] += inverse[i, j] * products[_FIRST + j]
+            step[i] += inverse[i, j] * slopes[j]
         if i >= _TRANSLATION:
             step[i] /= radius
 

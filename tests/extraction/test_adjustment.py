@@ -241,16 +241,15 @@ def test_rounded_keypoints_become_exact(rounded) -> None:
         for a, b in zip(on.images, off.images, strict=True)
     ]
     assert max(moved) <= AdjustmentOptions().max_shift
-    alone = MappingProblem(off.images, off.pairs)
-    images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml", None)
-    later = adjust(images, rounded.config(**ROUNDED), rounded.registry, alone)
+    images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml")
+    later = adjust(images, rounded.config(**ROUNDED), rounded.registry, off)
     for a, b in zip(later.images, on.images, strict=True):
         assert np.array_equal(a.keypoints, b.keypoints)
 
 
 def test_the_order_of_pairs_does_not_matter(rounded) -> None:
     off = rounded.extract(**{**ROUNDED, "adjustment": OFF}).problem
-    images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml", None)
+    images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml")
     config = rounded.config(**ROUNDED)
     forth = adjust(images, config, rounded.registry, off)
     back = adjust(images, config, rounded.registry, replace(off, pairs=off.pairs[::-1]))
