@@ -3,8 +3,9 @@
 Verified pairs know how their images are turned, and in which direction one lies from the other;
 depth priors say how far. Rotations are averaged over all pairs; with lengths known, the scales of
 the priors and the places of the images are linear in what the pairs say, and follow from least
-squares that pairs leave which disagree. Images that several agreeing pairs hold are placed so; the
-others are left to registration one by one.
+squares that pairs leave which disagree. A pair has a say as far as depth fits its points: where all
+matches lie in a plane, another pose explains them as well, and tells another plane. Images that
+circles of agreeing pairs hold are placed so; the others are left to registration one by one.
 """
 
 from __future__ import annotations
@@ -32,8 +33,6 @@ MIN_ANGLE_DEG = 1.5
 triangulated)."""
 MIN_MATCHES = 10
 """That say so, for their median to count (ours)."""
-MIN_HOLDS = 2
-"""Agreeing pairs that hold an image: one always agrees with itself."""
 MAX_TURN_DEG = 5.0
 """Between what a pair says and where its images are placed, to agree (ours)."""
 MAX_SHIFT = 0.3
@@ -54,7 +53,7 @@ class Placement(NamedTuple):
 
 class _Links(NamedTuple):
     """What pairs say: image ``b`` from ``a``, and the logarithm of their distance in terms of the
-    prior of each. ``weight``: number of matches."""
+    prior of each. ``weight``: number of matches, less where the prior bends their points."""
 
     a: Int64
     b: Int64
@@ -74,7 +73,7 @@ def place_all(scene: Scene, left: Bool) -> Placement | None:
 
     ``left``: (n,) bool, images that may be placed. The scene stays as it is.
     """
-    pairs = [p for p in scene.problem.pairs if p.calibrated and left[p.image_a] and left[p.image_b]]
+    pairs = [p for p in scene.problem.pairs if left[p.image_a] and left[p.image_b]]
     links = _links(scene, pairs)
     links = links.select(_well_held(links, scene.num_images))
     if not len(links.a):
@@ -199,25 +198,55 @@ def _links(scene: Scene, pairs: list[VerifiedPair]) -> _Links:
         )
     counts = np.bincount(of[use], minlength=len(pairs))
     lengths = np.stack([group_medians(values[use], of[use], len(pairs)) for values in logs], axis=1)
+    off = np.max(np.abs(logs - lengths[of].T), axis=0)
+    bend = group_medians(off[use], of[use], len(pairs))
     weight = np.array([len(pair) for pair in pairs], dtype=np.float64)
-    links = _Links(a, b, rotation, translation, lengths, weight)
-    return links.select(counts >= MIN_MATCHES)
+    enough = counts >= MIN_MATCHES
+    if enough.any():
+        weight[enough] *= _robust_weights(bend[enough])
+    return _Links(a, b, rotation, translation, lengths, weight).select(enough)
 
 
 def _well_held(links: _Links, count: int) -> Bool:
-    """(m,) bool, links of the largest group of images that :data:`MIN_HOLDS` links each hold."""
-    chosen = np.ones(len(links.a), dtype=np.bool_)
-    while True:
-        ends = np.concatenate([links.a[chosen], links.b[chosen]])
-        weak = np.bincount(ends, minlength=count) < MIN_HOLDS
-        gone = chosen & (weak[links.a] | weak[links.b])
-        if not gone.any():
-            break
-        chosen &= ~gone
+    """(m,) bool, links of the largest group of images that circles of links hold.
+
+    A link on no circle always agrees with itself, and nothing else says whether it is right.
+    """
+    chosen = on_circles(links.a, links.b, count)
     if chosen.any():
-        a, b = links.a[chosen], links.b[chosen]
-        matrix = coo_matrix((np.ones(len(a)), (a, b)), shape=(count, count))
-        group = connected_components(matrix, directed=False)[1]
-        sizes = np.bincount(group[np.unique(np.concatenate([a, b]))])
+        ends = np.concatenate([links.a[chosen], links.b[chosen]])
+        group = _groups(links.a[chosen], links.b[chosen], count)
+        sizes = np.bincount(group[np.unique(ends)])
         chosen &= group[links.a] == sizes.argmax()
     return chosen
+
+
+def on_circles(a: Int64, b: Int64, count: int) -> Bool:
+    """(m,) bool, links without which their images would still hang together.
+
+    ``a``, ``b``: (m,) images of each link, no pair twice. Labels drawn at random run through
+    circles of the links, each closed through a tree of them: a link of the tree that no label
+    passes is on no circle.
+    """
+    root = count  # of the trees of all groups
+    firsts = np.unique(_groups(a, b, count), return_index=True)[1]
+    one, other = np.concatenate([a, firsts]), np.concatenate([b, np.full(len(firsts), root)])
+    graph = coo_matrix((np.ones(len(one)), (one, other)), shape=(count + 1, count + 1))
+    order, parents = breadth_first_order(graph.tocsr(), root, directed=False)
+    down = parents[one] == other
+    in_tree = down | (parents[other] == one)
+    labels = np.random.default_rng(0).integers(1, np.iinfo(np.int64).max, len(one))
+    passing = np.zeros(count + 1, dtype=np.int64)
+    for ends in (one, other):
+        np.bitwise_xor.at(passing, ends[~in_tree], labels[~in_tree])
+    for image in order[:0:-1]:
+        passing[parents[image]] ^= passing[image]
+    on_circle: Bool = ~in_tree | (passing[np.where(down, one, other)] != 0)
+    return on_circle[: len(a)]
+
+
+def _groups(a: Int64, b: Int64, count: int) -> Int64:
+    """(count,) number of the group that links hold together, of each image."""
+    matrix = coo_matrix((np.ones(len(a)), (a, b)), shape=(count, count))
+    group: Int64 = connected_components(matrix, directed=False)[1]
+    return group

@@ -6,15 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from mpsfm_core.data import Float64, MappingProblem
+from mpsfm_core.data import Float64, Int64, MappingProblem
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_errors_deg
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.global_start import (
     Placement,
     agreed,
     averaged_rotations,
+    on_circles,
     place_all,
 )
 from mpsfm_core.mapping.mapper import reconstruct
@@ -72,6 +75,55 @@ def test_images_that_may_not_be_placed_are_left_out(hall: Hall) -> None:
 def test_a_chain_of_pairs_is_not_placed(hall: Hall) -> None:
     chain = [p for p in hall.problem.pairs if p.image_b == p.image_a + 1]
     assert place(MappingProblem(hall.problem.images, tuple(chain))) is None
+
+
+def test_a_bridge_holds_nothing(hall: Hall) -> None:
+    """The larger of two groups is placed that a single pair holds together."""
+    problem = hall.problem
+    first = [p for p in problem.pairs if p.image_b < 10]
+    second = [p for p in problem.pairs if p.image_a >= 10]
+    between = [p for p in problem.pairs if p.image_a < 10 <= p.image_b]
+    bridge = max(between, key=len)
+    placed = place(MappingProblem(problem.images, (*first, bridge, *second)))
+    assert placed is not None
+    assert max(placed.images) < 10
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_links_on_circles_are_those_that_can_be_spared(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = 20
+    possible = np.stack(np.triu_indices(count, 1), axis=1)
+    links = possible[rng.choice(len(possible), rng.integers(1, 30), replace=False)]
+    flip = rng.random(len(links)) < 0.5
+    links[flip] = links[flip][:, ::-1]
+
+    def groups(rows: Int64) -> int:
+        ends = rows[:, 0], rows[:, 1]
+        matrix = coo_matrix((np.ones(len(rows)), ends), shape=(count, count))
+        return int(connected_components(matrix, directed=False)[0])
+
+    whole = groups(links)
+    spared = [groups(np.delete(links, row, axis=0)) == whole for row in range(len(links))]
+    assert on_circles(links[:, 0], links[:, 1], count).tolist() == spared
+
+
+def test_pairs_whose_points_the_prior_bends_weigh_less(hall: Hall) -> None:
+    """Two of three pairs of an image turn it by 12 degrees, which bends what it sees."""
+    problem, image = hall.problem, 5
+    tilt = Rotation.from_rotvec([0.0, np.radians(12.0), 0.0]).as_matrix()
+    pairs = []
+    for number, pair in enumerate(problem.pairs):
+        if number % 3 and image == pair.image_a:
+            pair = replace(pair, rotation=pair.rotation @ tilt.T)
+        elif number % 3 and image == pair.image_b:
+            turned = tilt @ pair.rotation, tilt @ pair.translation
+            pair = replace(pair, rotation=turned[0], translation=turned[1])
+        pairs.append(pair)
+    placed = place(MappingProblem(problem.images, tuple(pairs)))
+    assert placed is not None
+    assert image in placed.images
+    assert worst_deg(placed, hall) < 3
 
 
 def test_values_agree_with_most_differences() -> None:
