@@ -13,6 +13,7 @@ import numpy as np
 from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.dense.view import PosedGrid
 from mpsfm_core.jit import kernel
+from mpsfm_core.statistics import ONE_SIGMA
 
 _STDS = 3.0
 """Difference of two depths in std that still agree."""
@@ -27,13 +28,14 @@ class Agreement:
     ``confirmed``: bool, where a view agrees: two wrong depths rarely do (of those that one of three
     views confirms 95 % are right to 2 % on rendered_kitchen, whatever the others say).
     ``mean_change``: float32, from our log depth to the mean of ours and those that agree.
-    ``noise``: std of log depth that differences between depths that agree speak for; errors of
-    poses are in it.
+    ``match_std_px``: std of a match that the differences of depths that agree speak for, NaN
+    without any. Right poses leave it to the photos; errors of poses are in it as far as views
+    differ by them.
     """
 
     confirmed: Bool
     mean_change: Float32
-    noise: float
+    match_std_px: float
 
 
 class PosedDepth(NamedTuple):
@@ -53,16 +55,21 @@ def depth_differences(own: PosedDepth, other: PosedDepth) -> Float32:
     return differences
 
 
-def agreement_of(shape: tuple[int, int], differences: Iterable[Float32]) -> Agreement:
-    """What :func:`depth_differences` of other views say together of a map (h, w)."""
-    views, change, total = np.zeros(shape, np.float32), np.zeros(shape, np.float32), 0.0
+def agreement_of(parallax: Float32, differences: Iterable[Float32]) -> Agreement:
+    """What :func:`depth_differences` of other views say together of a map (h, w).
+
+    ``parallax``: (h, w), pixels that a point moves when its log depth changes by one. A difference
+    has the errors of two matches.
+    """
+    views, change, moved = np.zeros_like(parallax), np.zeros_like(parallax), []
     for each in differences:
         agree = np.isfinite(each)
         views += agree
         change[agree] += each[agree]
-        total += float(np.sum(each[agree] ** 2, dtype=np.float64))
-    noise = math.sqrt(total / 2 / max(1.0, float(views.sum(dtype=np.float64))))
-    return Agreement(views > 0, change / (1 + views), noise)
+        moved.append(np.abs(each[agree]) * parallax[agree])
+    all_moved = np.concatenate([np.zeros(0, np.float32), *moved])
+    std = float(np.quantile(all_moved, ONE_SIGMA)) / math.sqrt(2) if len(all_moved) else math.nan
+    return Agreement(views > 0, change / (1 + views), std)
 
 
 def splat_depth(grid: PosedGrid, others: Iterable[tuple[PosedGrid, Float32, Bool]]) -> Float32:

@@ -34,7 +34,8 @@ class DenseOptions(Options):
     large_step: float = Field(1.6, ge=0)
     """Of neighbours further apart (P2); lower across edges of the photo."""
     match_std_px: float = Field(0.5, gt=0)
-    """Std of a match, in pixels of the map."""
+    """Std of a match in pixels of the map, by which views agree; how they differ then says what
+    it is."""
     correlation_px: float = Field(40.0, gt=0)
     """Distance over which errors of the refined depth hang together, pixels of the map."""
 

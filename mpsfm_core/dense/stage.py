@@ -20,7 +20,7 @@ from mpsfm_core.dense.consistency import (
     splat_depth,
 )
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.posterior import Observed, posterior, with_known
+from mpsfm_core.dense.posterior import MIN_STD, Observed, posterior, with_known
 from mpsfm_core.dense.scale_errors import Ties, scale_stds, ties_of_photo
 from mpsfm_core.dense.source_views import choose_sources
 from mpsfm_core.dense.stereo import StereoDepth, match_depth
@@ -32,8 +32,6 @@ from mpsfm_core.threads import allowed
 _T = TypeVar("_T", bound=np.generic)
 _MAX_COST = 0.9
 """Of depth that counts as measured: black photos agree on everything (ours)."""
-_NOISE_FACTOR = 1.25
-"""Of the noise that differences between views speak for: they share errors of poses (ours)."""
 _SEEN_STDS = 1.5
 """Depth seen from elsewhere counts up to so many std of the known depth from it: what is further
 may be seen past an edge (ours)."""
@@ -184,14 +182,19 @@ class _Found(NamedTuple):
     parallax: Float32
     supported: Bool
 
-    def log_std(self, options: DenseOptions) -> Float32:
+    def log_std(self, match_std_px: float) -> Float32:
         """Of a right match, (h, w)."""
-        parallax = resize_map(self.parallax, *self.grid.camera.size)
-        return (options.match_std_px / parallax).astype(np.float32)
+        std: Float32 = np.float32(match_std_px) / self.parallax_px
+        return std
+
+    @property
+    def parallax_px(self) -> Float32:
+        """Of each pixel, (h, w)."""
+        return resize_map(self.parallax, *self.grid.camera.size)
 
     def posed_depth(self, options: DenseOptions) -> PosedDepth:
         """What was found."""
-        return PosedDepth(self.grid, self.log_depth, self.log_std(options))
+        return PosedDepth(self.grid, self.log_depth, self.log_std(options.match_std_px))
 
 
 def _differences(
@@ -208,9 +211,10 @@ def _differences(
 
 def _agreement(own: _Found, differences: Mapping[int, Float32], keep: Keep) -> Agreement:
     """A map beside those of its sources."""
-    agreement = agreement_of(own.log_depth.shape, differences.values())
+    usable = (np.where(own.supported, each, np.nan) for each in differences.values())
+    agreement = agreement_of(own.parallax_px, usable)
     maps = keep(agreement.confirmed), keep(agreement.mean_change)
-    return Agreement(*maps, agreement.noise)
+    return Agreement(*maps, agreement.match_std_px)
 
 
 def _ties(
@@ -232,13 +236,12 @@ def _measured(
     """What the photos say of a view: its own depth where others agree, and where they do not the
     depth of others' confirmed pixels, if that is about what was known."""
     own, agreement = found[row], agreed[row]
-    confirmed = agreement.confirmed & own.supported
+    confirmed, match_std_px = agreement.confirmed, agreement.match_std_px
     log_depth = own.log_depth + agreement.mean_change
-    std = np.hypot(own.log_std(options), np.float32(_NOISE_FACTOR * agreement.noise))
+    std = own.log_std(match_std_px if confirmed.any() else options.match_std_px)
+    std = np.maximum(std, np.float32(MIN_STD))
     others = (
-        (found[j].grid, found[j].log_depth, agreed[j].confirmed & found[j].supported)
-        for j in sorted(near)
-        if j in found
+        (found[j].grid, found[j].log_depth, agreed[j].confirmed) for j in sorted(near) if j in found
     )
     seen = splat_depth(own.grid, others)
     usable = ~confirmed & (np.abs(seen - view.log_depth) < _SEEN_STDS * view.log_std)
