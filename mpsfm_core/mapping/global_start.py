@@ -38,6 +38,10 @@ MAX_TURN_DEG = 5.0
 MAX_SHIFT = 0.3
 """The same of their distance, in terms of it: priors are off by a few percent, directions of short
 baselines by several degrees (ours)."""
+PLANAR_WEIGHT = 0.1
+"""Of a match of a pair that planes explain as well: the pose may be the other one of two. Ours:
+with SIFT on rendered_kitchen 80 % of these are right and 98 % of the others, and all 54 images are
+placed within 0.2 degrees instead of 1.2; from 0.01 to 0.3 much the same."""
 ROUNDS = 20
 """Of least squares, each of which weighs pairs by how well the last one agreed with them (ours)."""
 
@@ -200,7 +204,7 @@ def _links(scene: Scene, pairs: list[VerifiedPair]) -> _Links:
     lengths = np.stack([group_medians(values[use], of[use], len(pairs)) for values in logs], axis=1)
     off = np.max(np.abs(logs - lengths[of].T), axis=0)
     bend = group_medians(off[use], of[use], len(pairs))
-    weight = np.array([len(pair) for pair in pairs], dtype=np.float64)
+    weight = np.array([len(p) * (1.0 if p.calibrated else PLANAR_WEIGHT) for p in pairs])
     enough = counts >= MIN_MATCHES
     if enough.any():
         weight[enough] *= _robust_weights(bend[enough])
