@@ -5,7 +5,7 @@ depth priors say how far. Rotations are averaged over all pairs; with lengths kn
 the priors and the places of the images are linear in what the pairs say, and follow from least
 squares that pairs leave which disagree. A pair has a say as far as depth fits its points: where all
 matches lie in a plane, another pose explains them as well, and tells another plane. Images that
-circles of agreeing pairs hold are placed so; the others are left to registration one by one.
+cycles of agreeing pairs hold are placed so; the others are left to registration one by one.
 """
 
 from __future__ import annotations
@@ -212,11 +212,11 @@ def _links(scene: Scene, pairs: list[VerifiedPair]) -> _Links:
 
 
 def _well_held(links: _Links, count: int) -> Bool:
-    """(m,) bool, links of the largest group of images that circles of links hold.
+    """(m,) bool, links of the largest group of images that cycles of links hold.
 
-    A link on no circle always agrees with itself, and nothing else says whether it is right.
+    A link on no cycle always agrees with itself, and nothing else says whether it is right.
     """
-    chosen = on_circles(links.a, links.b, count)
+    chosen = on_cycles(links.a, links.b, count)
     if chosen.any():
         ends = np.concatenate([links.a[chosen], links.b[chosen]])
         group = _groups(links.a[chosen], links.b[chosen], count)
@@ -225,12 +225,12 @@ def _well_held(links: _Links, count: int) -> Bool:
     return chosen
 
 
-def on_circles(a: Int64, b: Int64, count: int) -> Bool:
+def on_cycles(a: Int64, b: Int64, count: int) -> Bool:
     """(m,) bool, links without which their images would still hang together.
 
     ``a``, ``b``: (m,) images of each link, no pair twice. Labels drawn at random run through
-    circles of the links, each closed through a tree of them: a link of the tree that no label
-    passes is on no circle.
+    cycles of the links, each closed through a tree of them: a link of the tree that no label
+    passes is on no cycle.
     """
     root = count  # of the trees of all groups
     firsts = np.unique(_groups(a, b, count), return_index=True)[1]
@@ -245,8 +245,8 @@ def on_circles(a: Int64, b: Int64, count: int) -> Bool:
         np.bitwise_xor.at(passing, ends[~in_tree], labels[~in_tree])
     for image in order[:0:-1]:
         passing[parents[image]] ^= passing[image]
-    on_circle: Bool = ~in_tree | (passing[np.where(down, one, other)] != 0)
-    return on_circle[: len(a)]
+    on_cycle: Bool = ~in_tree | (passing[np.where(down, one, other)] != 0)
+    return on_cycle[: len(a)]
 
 
 def _groups(a: Int64, b: Int64, count: int) -> Int64:

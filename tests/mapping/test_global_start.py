@@ -17,7 +17,7 @@ from mpsfm_core.mapping.global_start import (
     Placement,
     agreed,
     averaged_rotations,
-    on_circles,
+    on_cycles,
     place_all,
 )
 from mpsfm_core.mapping.mapper import reconstruct
@@ -90,7 +90,7 @@ def test_a_bridge_holds_nothing(hall: Hall) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_links_on_circles_are_those_that_can_be_spared(seed: int) -> None:
+def test_links_on_cycles_are_those_that_can_be_spared(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count = 20
     possible = np.stack(np.triu_indices(count, 1), axis=1)
@@ -105,7 +105,7 @@ def test_links_on_circles_are_those_that_can_be_spared(seed: int) -> None:
 
     whole = groups(links)
     spared = [groups(np.delete(links, row, axis=0)) == whole for row in range(len(links))]
-    assert on_circles(links[:, 0], links[:, 1], count).tolist() == spared
+    assert on_cycles(links[:, 0], links[:, 1], count).tolist() == spared
 
 
 def test_pairs_whose_points_the_prior_bends_weigh_less(hall: Hall) -> None:
