@@ -43,7 +43,7 @@ def searched(seed: int = 0, noise: float = 0.0) -> np.ndarray:
 
 
 def aligned(
-    image: np.ndarray, off: np.ndarray | float = 0.0, count: int = 200
+    image: np.ndarray, off: np.ndarray | float = 0.0, count: int = 200, radius: int = RADIUS
 ) -> tuple[Alignment, np.ndarray]:
     """Patches of the texture in an image, looked for ``off`` pixels beside where they are; and
     what is left of that."""
@@ -51,7 +51,7 @@ def aligned(
     at = np.random.default_rng(2).uniform(40, 160, (count, 2))
     start = moved(at) + off
     found = align_patches(
-        template, image, at, start, np.tile(np.eye(2), (count, 1, 1)), RADIUS, NOISE_PX
+        template, image, at, start, np.tile(np.eye(2), (count, 1, 1)), radius, NOISE_PX
     )
     return found, start + found.shift - moved(at)
 
@@ -71,9 +71,9 @@ def test_the_covariance_is_that_of_the_errors() -> None:
 
 
 def test_another_patch_is_not_alike() -> None:
-    found, _ = aligned(searched(seed=7))
+    found, _ = aligned(searched(seed=7), radius=13)  # as many samples as 17 x 17 pixels
     assert np.median(found.correlation) < 0.6
-    assert (found.correlation > 0.8).mean() < 0.06
+    assert (found.correlation > 0.8).mean() < 0.02
 
 
 def test_an_edge_is_known_across_alone() -> None:
