@@ -57,6 +57,9 @@ limit (ours)."""
 SAMPLING = 2
 """Every so many columns and rows a pixel of a thinned map is carried over: thousands are left, and
 a share of 5 % of independent ones is known within 0.4 % (ours)."""
+CLEAR = 3.0
+"""A quarter of these pixels is enough where their share is so many of its stds off the limit (ours:
+most views that overlap agree in all of them)."""
 OVERLAP_GRID = 16
 """Columns and rows of the pixels by which overlap is judged (ours)."""
 MIN_OVERLAP = 0.05
@@ -82,13 +85,16 @@ class DepthCheck:
         self._options = options
         self._grids: dict[int, tuple[_MapState, _Grid]] = {}
 
-    def of_image(self, image: int, std_factor: float = 1.0) -> Inconsistency:
+    def of_image(
+        self, image: int, std_factor: float = 1.0, limit: float = math.nan
+    ) -> Inconsistency:
         """How much an image contradicts the registered views that it overlaps with most.
 
-        ``std_factor``: how many times its declaration the std of depth is on the whole.
+        ``std_factor``: how many times its declaration the std of depth is on the whole. ``limit``:
+        as of :meth:`between`.
         """
         found = [
-            Inconsistency(self.between(image, other, std_factor), other)
+            Inconsistency(self.between(image, other, std_factor, limit), other)
             for other in overlapping_views(self._scene, image, self._options.num_views)
         ]
         return max(found, default=Inconsistency(0.0, -1))
@@ -107,7 +113,7 @@ class DepthCheck:
         for image in map(int, images):
             for other in overlapping_views(scene, image, self._options.num_views):
                 if np.isnan(shares[image, other]):
-                    share = self.between(image, other, std_factor, once=True)
+                    share = self.between(image, other, std_factor, limit, once=True)
                     shares[image, other] = shares[other, image] = share
         shares = np.nan_to_num(shares)
         removed = []
@@ -118,20 +124,31 @@ class DepthCheck:
             shares[worst] = shares[:, worst] = 0
         return removed
 
-    def between(self, a: int, b: int, std_factor: float = 1.0, *, once: bool = False) -> float:
+    def between(
+        self,
+        a: int,
+        b: int,
+        std_factor: float = 1.0,
+        limit: float = math.nan,
+        *,
+        once: bool = False,
+    ) -> float:
         """Share of pixels of two views at which one sees empty space and the other a surface.
 
+        ``limit``: that it is held against; what is clearly below or above it is known less exactly.
         ``once``: those that fall into one pixel of the other view together count as one.
         """
-        scene, options, total = self._scene, self._options, 0.0
-        one, two = self._grid(a, std_factor), self._grid(b, std_factor)
-        for source, target, seen, by in ((a, b, one, two), (b, a, two, one)):
-            rotation = scene.rotations[target] @ scene.rotations[source].T
-            translation = scene.translations[target] - rotation @ scene.translations[source]
-            total += unexplained_share(
-                seen, by, rotation, translation, options.max_deviation, options.min_gap, once
-            )
-        return total
+        scene, options = self._scene, self._options
+        rotation = scene.rotations[b] @ scene.rotations[a].T
+        translation = scene.translations[b] - rotation @ scene.translations[a]
+        return unexplained_share(
+            self._grid(a, std_factor),
+            self._grid(b, std_factor),
+            rotation,
+            translation,
+            Terms(options.max_deviation, options.min_gap, once),
+            limit,
+        )
 
     def _grid(self, image: int, std_factor: float) -> _Grid:
         """The depth map of an image, thinned out, with what it was worth when it came about."""
@@ -228,37 +245,62 @@ class _MapState(NamedTuple):
     std_factor: float
 
 
+class Terms(NamedTuple):
+    """What a pixel that lies before what another view sees is held to.
+
+    ``max_deviation``: errors in terms of their std up to which they are likely. ``min_gap``: share
+    of the seen depth up to which before it is not in front of it. ``once``: those that fall into
+    one pixel of the other view together count as one."""
+
+    max_deviation: float
+    min_gap: float
+    once: bool
+
+
 @jit.kernel()
 def unexplained_share(
+    one: _Grid, two: _Grid, rotation: Float64, translation: Float64, terms: Terms, limit: float
+) -> float:
+    """Share of the pixels of two views that lie before what the other sees, whatever errors of
+    depth are likely; summed over both directions.
+
+    ``rotation`` (3, 3), ``translation`` (3,): ``two_from_one``. ``limit``: the answer may be that
+    of a quarter of the pixels where this says on which side of it the share is.
+    """
+    back, found = rotation.T.copy(), np.zeros((2, 2))
+    for quarter in range(4):
+        found[0] += _unexplained(one, two, rotation, translation, terms, quarter)
+        found[1] += _unexplained(two, one, back, -back @ translation, terms, quarter)
+        share, looked_at = (found[:, 0] / found[:, 1]).sum(), found[:, 1].mean()
+        if not quarter and abs(share - limit) > CLEAR * math.sqrt(2 * limit / looked_at):
+            break
+    return float(share)
+
+
+@jit.kernel()
+def _unexplained(
     source: _Grid,
     target: _Grid,
     rotation: Float64,
     translation: Float64,
-    limit: float,
-    min_gap: float,
-    once: bool,
-) -> float:
-    """Share of the pixels of one view that lie before what another sees, whatever errors of depth
-    are likely.
-
-    Args:
-        source, target: maps of the two. rotation, translation: ``target_from_source``. limit:
-            errors in terms of their std up to which they are likely.
-        min_gap: share of the seen depth up to which before it is not in front of it. once: those
-            that fall into one pixel of the other view together count as one.
-    """
+    terms: Terms,
+    quarter: int,
+) -> Float64:
+    """How many pixels do in one direction, and of how many: one of four lattices of them."""
     rows, columns = target.depth.shape
-    r, t, total, visited = rotation, translation, 0.0, 0
+    r, t, total, visited = rotation, translation, 0.0, 0.0
+    limit = terms.max_deviation
     zoom = target.params[0] / source.params[0]
     # 0, then nearer and farther in turn: most pixels need no error at all
     turns = np.arange(2 * STEPS + 1)
     errors = limit * ((turns + 1) // 2) / STEPS * (1 - 2 * (turns % 2))
     weights = np.exp(-errors * errors / 2) * limit / STEPS / math.sqrt(2 * math.pi)
     least = math.exp(-limit * limit / 2)
-    for row in range(SAMPLING // 2, source.depth.shape[0], SAMPLING):
+    top, left = SAMPLING // 2 + SAMPLING * (quarter // 2), SAMPLING // 2 + SAMPLING * (quarter % 2)
+    for row in range(top, source.depth.shape[0], 2 * SAMPLING):
         y = (row + 0.5 - source.params[3]) / source.params[1]
-        for column in range(SAMPLING // 2, source.depth.shape[1], SAMPLING):
-            visited += 1
+        for column in range(left, source.depth.shape[1], 2 * SAMPLING):
+            visited += 1.0
             if not source.valid[row, column]:
                 continue
             x = (column + 0.5 - source.params[2]) / source.params[0]
@@ -277,12 +319,12 @@ def unexplained_share(
                     if 0 <= u < columns and 0 <= v < rows:
                         i, j = int(v), int(u)
                         seen = target.nearest[i, j]
-                        if target.valid[i, j] and seen - z > min_gap * seen:
+                        if target.valid[i, j] and seen - z > terms.min_gap * seen:
                             other = math.log(seen / z) / target.log_std[i, j]
                 likelihood += weights[step] * math.exp(-other * other / 2)
                 if likelihood >= least:
                     break
             if likelihood < least:
                 pixels = (zoom * here / (here * along + t[2])) ** 2
-                total += min(1.0, pixels) if once else 1.0
-    return total / max(visited, 1)
+                total += min(1.0, pixels) if terms.once else 1.0
+    return np.array([total, max(visited, 1.0)])

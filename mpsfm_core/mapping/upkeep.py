@@ -116,9 +116,10 @@ class Upkeep:
         """
         if not self.options.consistency.enabled:
             return None
+        limit = self.ladder.max_violations(limit)
         with self.journal.timed("depth check"):
-            check = self._check.of_image(image, self.refiner.std_factor)
-        if check.share <= self.ladder.max_violations(limit):
+            check = self._check.of_image(image, self.refiner.std_factor, limit)
+        if check.share <= limit:
             return None
         self.attempts.blame(check.other, image)
         other = self.problem.images[check.other].name

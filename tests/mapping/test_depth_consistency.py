@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 
@@ -228,6 +230,24 @@ def test_a_view_in_the_twin_room_is_told_by_what_differs() -> None:
         scene.registered &= np.array(room) != 1
         wrong.append(DepthCheck(scene, OPTIONS).of_image(int(image)).share > OPTIONS.max_violations)
     assert np.mean(wrong) >= 0.75
+
+
+def test_what_a_quarter_of_the_pixels_tells_is_what_all_of_them_do() -> None:
+    """Of views in their room and in its twin: the same side of the limit, some by fewer pixels."""
+    rooms = twin_rooms()
+    poses, room = twin_room_poses(1)
+    maps = [rooms.render(CAMERA.resized(160, 120), pose).depth for pose in poses]
+    scene = posed_scene(maps, poses, CAMERA)
+    for image in np.flatnonzero(np.array(room) == 1)[::2]:
+        scene.translations[image] = moved(poses[image], 1)[:, 3]
+    check, limit = DepthCheck(scene, OPTIONS), OPTIONS.max_violations
+    pairs = list(combinations(range(len(poses)), 2))
+    every = np.array([check.between(a, b) for a, b in pairs])
+    enough = np.array([check.between(a, b, limit=limit) for a, b in pairs])
+    assert ((every > limit) == (enough > limit)).all()
+    assert 0.05 < (every > limit).mean() < 0.95
+    assert (every != enough).any()
+    assert np.abs(every - enough).max() < 0.1
 
 
 def test_the_image_with_most_conflicts_goes() -> None:
