@@ -23,6 +23,7 @@ from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.extraction.patch_alignment import align_patches
 from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.options import InitializationOptions, MapperOptions
 from mpsfm_core.optimize.bundle_kernels import step_points
 from mpsfm_core.optimize.depth_integration import DepthIntegrator
 from mpsfm_core.results.options import ResultOptions
@@ -67,7 +68,9 @@ def compile_kernels(end: str) -> None:
         depth, normals = problem.images[0].depth, problem.images[0].normals
         height, width = depth.shape
         DepthIntegrator(depth, normals, _CAMERA.resized(width, height)).refine()
-    mapping = mapper.reconstruct(problem)
+    for at_once in (True, False):
+        start = InitializationOptions(all_at_once=at_once)
+        mapping = mapper.reconstruct(problem, MapperOptions(initialization=start))
     views = {
         image.name: View(image.name, scene.render(_CAMERA, pose).rgb, _CAMERA)
         for image, pose in zip(problem.images, poses, strict=True)

@@ -14,12 +14,15 @@ import pytest
 from mpsfm_core import jit
 from mpsfm_core.precompile import Compilation
 
-MAPS_WITHOUT_COMPILING = """
+RUNS_WITHOUT_COMPILING = """
+import sys
+from pathlib import Path
 from numba.core import event
-from mpsfm_core.precompile import begin, compile_kernels
+from mpsfm_core.cli.demo import demo
+from mpsfm_core.precompile import begin
 assert begin() is None
 with event.install_recorder("numba:compile") as compiled:
-    compile_kernels("bundles")
+    demo(Path(sys.argv[1]), offline=True, quiet=True)
 assert not compiled.buffer, compiled.buffer
 """
 
@@ -52,7 +55,9 @@ def test_a_kernel_works_where_nothing_can_be_kept(
 
 
 @pytest.mark.slow
-def test_all_that_mapping_needs_is_compiled_before(tmp_path: Path) -> None:
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+def test_all_that_a_run_needs_is_compiled_before(tmp_path: Path) -> None:
+    """The sample scene, whose maps are thinned and read from a cache, as those of any photos."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
     subprocess.run([sys.executable, "-m", "mpsfm_core.precompile"], env=environment, check=True)
-    subprocess.run([sys.executable, "-c", MAPS_WITHOUT_COMPILING], env=environment, check=True)
+    run = [sys.executable, "-c", RUNS_WITHOUT_COMPILING, str(tmp_path / "demo")]
+    subprocess.run(run, env=environment, check=True)

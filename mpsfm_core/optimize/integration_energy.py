@@ -117,7 +117,9 @@ def normal_terms(
     terms = NormalTerms._make([*np.zeros((3, *shape), np.float32), link])
     usable = normals.valid & active
     assert normals.variance is not None
-    _fill_normal_terms(normals.normals, normals.variance, usable, camera.params, weight, terms)
+    # what may be written to and what may not would be compiled one after the other
+    maps = (np.require(map_, requirements="CW") for map_ in (normals.normals, normals.variance))
+    _fill_normal_terms(*maps, usable, camera.params, weight, terms)
     return terms
 
 

@@ -21,7 +21,8 @@ def thinning_step(columns: int, wanted: int) -> int:
 
 def thinned(values: NDArray[Scalar], step: int) -> NDArray[Scalar]:
     """(h, w, ...): every ``step``-th row and column, from the middle of the first ``step``."""
-    return values[step // 2 :: step, step // 2 :: step]
+    # in one piece, as kernels are compiled for
+    return np.ascontiguousarray(values[step // 2 :: step, step // 2 :: step])
 
 
 def thinned_prior(prior: Prior, step: int) -> Prior:
