@@ -117,9 +117,9 @@ def normal_terms(
     terms = NormalTerms._make([*np.zeros((3, *shape), np.float32), link])
     usable = normals.valid & active
     assert normals.variance is not None
-    # what may be written to and what may not would be compiled one after the other
-    maps = (np.require(map_, requirements="CW") for map_ in (normals.normals, normals.variance))
-    _fill_normal_terms(*maps, usable, camera.params, weight, terms)
+    # for arrays that may not be written to the kernel would be compiled anew
+    own, variance = (np.require(a, None, ("C", "W")) for a in (normals.normals, normals.variance))
+    _fill_normal_terms(own, variance, usable, camera.params, weight, terms)
     return terms
 
 
