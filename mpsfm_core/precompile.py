@@ -21,17 +21,18 @@ from mpsfm_core.data import PinholeCamera, View
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
-from mpsfm_core.extraction.patch_alignment import align_patches
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import InitializationOptions, MapperOptions
 from mpsfm_core.optimize.bundle_kernels import step_points
 from mpsfm_core.optimize.depth_integration import DepthIntegrator
+from mpsfm_core.patch_alignment import align_patches
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 
 _ENDS = ("bundles", "depth")
 _ROOMS = ("builtin", "extraction", "optimize", "scene", "mapping", "dense")
+_SOURCES = ("patch_alignment.py", *(f"{room}/*.py" for room in _ROOMS))
 _CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
@@ -89,7 +90,7 @@ def _stamp() -> Path | None:
         return None
     found = hashlib.sha256(f"{sys.version} {numba.__version__}".encode())
     package = Path(__file__).parent
-    for path in sorted(path for room in _ROOMS for path in (package / room).glob("*.py")):
+    for path in sorted(path for pattern in _SOURCES for path in package.glob(pattern)):
         stat = path.stat()
         found.update(f"{path} {stat.st_mtime_ns} {stat.st_size}".encode())
     return Path(folder) / f"precompiled-{found.hexdigest()[:16]}"

@@ -22,6 +22,7 @@ BELOW_NUMERICS = {
     "data",
     "geometry",
     "statistics",
+    "patch_alignment",
     *NUMERICS,
 }
 

@@ -29,8 +29,7 @@ class Agreement:
     views confirms 95 % are right to 2 % on rendered_kitchen, whatever the others say).
     ``mean_change``: float32, from our log depth to the mean of ours and those that agree.
     ``match_std_px``: std of a match that the differences of depths that agree speak for, NaN
-    without any. Right poses leave it to the photos; errors of poses are in it as far as views
-    differ by them.
+    without any. Errors of poses are in it as far as views differ by them.
     """
 
     confirmed: Bool

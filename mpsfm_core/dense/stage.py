@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -20,6 +21,7 @@ from mpsfm_core.dense.consistency import (
     splat_depth,
 )
 from mpsfm_core.dense.options import DenseOptions
+from mpsfm_core.dense.pose_errors import pose_error_px
 from mpsfm_core.dense.posterior import MIN_STD, Observed, posterior, with_known
 from mpsfm_core.dense.scale_errors import Ties, scale_stds, ties_of_photo
 from mpsfm_core.dense.source_views import choose_sources
@@ -119,7 +121,9 @@ def densify(
     def compared(row: int) -> tuple[Agreement, Ties | None]:
         own, differences = found[row], _differences(row, found, sources[row], options)
         ties = _ties(own, differences, images[row].depth, options) if posed_by_depth else None
-        return _agreement(own, differences, keep), ties
+        confirmed = ((views[j], own.supported & np.isfinite(d)) for j, d in differences.items())
+        of_poses = pose_error_px(views[row], own.log_depth, confirmed)
+        return _agreement(own, differences, of_poses, keep), ties
 
     def finished(row: int) -> tuple[RegisteredImage, Bool]:
         view = views[row]
@@ -209,12 +213,15 @@ def _differences(
     }
 
 
-def _agreement(own: _Found, differences: Mapping[int, Float32], keep: Keep) -> Agreement:
-    """A map beside those of its sources."""
+def _agreement(
+    own: _Found, differences: Mapping[int, Float32], of_poses: float, keep: Keep
+) -> Agreement:
+    """A map beside those of its sources; ``of_poses``: their error in pixels, which no difference
+    shows."""
     usable = (np.where(own.supported, each, np.nan) for each in differences.values())
     agreement = agreement_of(own.parallax_px, usable)
     maps = keep(agreement.confirmed), keep(agreement.mean_change)
-    return Agreement(*maps, agreement.match_std_px)
+    return Agreement(*maps, math.hypot(agreement.match_std_px, of_poses))
 
 
 def _ties(

@@ -20,10 +20,10 @@ from scipy.sparse.linalg import splu
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8, VerifiedPair
 from mpsfm_core.extraction.options import AdjustmentOptions
-from mpsfm_core.extraction.patch_alignment import align_patches
 from mpsfm_core.extraction.workbench import Workbench
 from mpsfm_core.geometry import rays
 from mpsfm_core.inputs.recent import Recent
+from mpsfm_core.patch_alignment import align_patches
 
 CACHED_BYTES = 256 << 20
 """Of grey images that are kept."""

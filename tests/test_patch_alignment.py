@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from mpsfm_core.extraction.patch_alignment import Alignment, align_patches
+from mpsfm_core.patch_alignment import Alignment, align_patches
 
 SIZE = 200
 CENTER = np.array([100.0, 100.0])

@@ -1,0 +1,74 @@
+"""What photos show of wrong poses: offsets beside the lines on which depth is searched."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mpsfm_core.data import View
+from mpsfm_core.dense.options import DenseOptions
+from mpsfm_core.dense.pose_errors import pose_error_px
+from mpsfm_core.dense.stage import densify
+from mpsfm_core.dense.view import DenseView
+from mpsfm_core.scene.reconstruction import RegisteredImage
+
+ACROSS, ALONG = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+"""Axes of a turn that moves pixels across the lines of a camera that moved sideways, or along."""
+
+
+def turned(image: RegisteredImage, axis: list[float], pixels: float) -> RegisteredImage:
+    """The image with a pose that is wrong by about so many pixels."""
+    turn = Rotation.from_rotvec(np.array(axis) * pixels / image.camera.fx).as_matrix()
+    return replace(image, rotation=turn @ image.rotation, translation=turn @ image.translation)
+
+
+def measured_error(room, axis: list[float], pixels: float) -> float:
+    """Between the first two photos of a room, of which the second stands wrong."""
+    first, second = room.reconstruction.images[:2]
+    one, other = (
+        DenseView.of(image, room.views[image.name], max(image.camera.size))
+        for image in (first, turned(second, axis, pixels))
+    )
+    depth = np.log(room.truth[first.name])
+    return pose_error_px(one, depth, [(other, np.ones(depth.shape, np.bool_))])
+
+
+@pytest.mark.parametrize(("axis", "pixels"), [(ACROSS, 0.0), (ALONG, 2.0)])
+def test_right_poses_and_what_depth_may_explain_leave_nothing(
+    room, axis: list[float], pixels: float
+) -> None:
+    assert measured_error(room, axis, pixels) < 0.25
+
+
+@pytest.mark.parametrize("pixels", [1.0, 3.0])
+def test_errors_across_the_lines_are_measured(room, pixels: float) -> None:
+    assert measured_error(room, ACROSS, pixels) == pytest.approx(pixels, rel=0.15)
+
+
+def test_depth_is_less_sure_where_poses_are_wrong(room) -> None:
+    def median_std(images: tuple[RegisteredImage, ...]) -> float:
+        result, report = densify(replace(room.reconstruction, images=images), view_of, options)
+        stated = []
+        for image in result.images:
+            assert image.depth.variance is not None
+            relative = np.sqrt(image.depth.variance) / image.depth.depth
+            stated.append(relative[report.measured[image.name]])
+        return float(np.median(np.concatenate(stated)))
+
+    def view_of(name: str) -> View:
+        return room.views[name]
+
+    images, options = room.reconstruction.images, DenseOptions()
+    wrong = tuple(turned(image, ACROSS, 1.5 * (-1) ** image.index) for image in images)
+    assert median_std(wrong) > 2 * median_std(images)
+
+
+def test_without_pixels_nothing_is_said(room) -> None:
+    image = room.reconstruction.images[0]
+    view = DenseView.of(image, room.views[image.name], max(image.camera.size))
+    depth = np.log(room.truth[image.name])
+    assert pose_error_px(view, depth, [(view, np.zeros(depth.shape, np.bool_))]) == 0.0
+    assert pose_error_px(view, depth, []) == 0.0
