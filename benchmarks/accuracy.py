@@ -29,6 +29,8 @@ SEEDS = 12
 errors that these happen to have by several points."""
 DEGRADED = ("degraded", *(f"degraded-{seed}" for seed in range(1, SEEDS)))
 """The priors of these seeds."""
+TABLE_START = "Pose AUC in percent"
+"""Of what is written anew below a note."""
 WINDOWS, FRAMES = 6, 5
 """Low parallax: so many windows, evenly spaced, of so many consecutive frames."""
 
@@ -38,7 +40,8 @@ class Comparison:
     """One table: a scene, its buckets (None: all) and priors, and the configuration.
 
     ``configuration``: its name, and what it says beside the prior. ``depth``: what it says of the
-    prior ``config``, None for FastDepth. ``note``: said above the table.
+    prior ``config``, None for FastDepth. ``note``: said above the first
+    table; what was written there by hand since stays.
     """
 
     scene: str
@@ -144,12 +147,23 @@ def main() -> int:
         missed += sum("missed" in line for line in held)
         every = CONVENTIONS["models"]
         of_every = f"## Every model\n\n{markdown(make_rows(pooled, every), every)}"
-        parts = [f"# {name}", comparison.note, markdown(rows), "\n".join(held), of_every]
+        file = RESULTS / f"accuracy-{name}.md"
+        note = _written_note(file) or comparison.note
+        parts = [f"# {name}", note, markdown(rows), "\n".join(held), of_every]
         text = "\n\n".join(part.strip() for part in parts if part)
         RESULTS.mkdir(exist_ok=True)
-        (RESULTS / f"accuracy-{name}.md").write_text(text.rstrip() + "\n", encoding="utf-8")
+        file.write_text(text.rstrip() + "\n", encoding="utf-8")
         print(text)
     return missed > 0
+
+
+def _written_note(file: Path) -> str:
+    """What was written by hand above the table of an earlier run."""
+    if not file.is_file():
+        return ""
+    _, _, below_title = file.read_text(encoding="utf-8").partition("\n")
+    note, table, _ = below_title.partition(TABLE_START)
+    return note if table else ""
 
 
 def _pooled(record: Record) -> Record:
