@@ -30,7 +30,7 @@ errors that these happen to have by several points."""
 DEGRADED = ("degraded", *(f"degraded-{seed}" for seed in range(1, SEEDS)))
 """The priors of these seeds."""
 TABLE_START = "Pose AUC in percent"
-"""Of what is written anew below a note."""
+"""How what is written anew begins, below the note."""
 WINDOWS, FRAMES = 6, 5
 """Low parallax: so many windows, evenly spaced, of so many consecutive frames."""
 

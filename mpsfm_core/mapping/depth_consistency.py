@@ -78,11 +78,19 @@ class Inconsistency(NamedTuple):
 
 
 class DepthCheck:
-    """The check of one scene; remembers what maps are worth as long as they stay what they are."""
+    """The check of one scene; remembers what maps are worth as long as they stay what they are.
 
-    def __init__(self, scene: Scene, options: ConsistencyOptions) -> None:
+    ``fills_holes``: holes of a pixel or two, as sensors leave, are no gap in what is seen. A right
+    pose hides nothing there; one that is a little off may, and so does an image whose pose is not
+    settled (ours, hololens_room).
+    """
+
+    def __init__(
+        self, scene: Scene, options: ConsistencyOptions, *, fills_holes: bool = False
+    ) -> None:
         self._scene = scene
         self._options = options
+        self._fills_holes = fills_holes
         self._grids: dict[int, tuple[_MapState, _Grid]] = {}
 
     def of_image(
@@ -169,7 +177,11 @@ class DepthCheck:
             local = local_noise(self._scene, image, witnesses(self._scene, image), std_factor)
             std = thinned(depth_map.log_std, step) * thinned(local, step)
         # A pixel's error of place is one of depth at edges and where sight grazes a surface.
-        nearest = cv2.erode(np.where(valid, depth, np.float32(np.inf)), np.ones((3, 3)))
+        around = np.ones((3, 3))
+        nearest = cv2.erode(np.where(valid, depth, np.float32(np.inf)), around)
+        if self._fills_holes:
+            std = np.where(valid, std, cv2.dilate(np.where(valid, std, np.float32(0)), around))
+            depth, valid = np.where(valid, depth, nearest), np.isfinite(nearest)
         params = np.array(thinned_camera(depth_map.camera, step).params)
         return _Grid(depth, np.maximum(std, np.float32(1e-6)), valid, nearest, params)
 

@@ -14,6 +14,7 @@ from mpsfm_core.mapping.growth import Growth
 from mpsfm_core.mapping.initialization import Start, Starts, place_first
 from mpsfm_core.mapping.journal import Journal
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.pair_check import PairCheck
 from mpsfm_core.mapping.registration import PoseSearch
 from mpsfm_core.mapping.triangulation import complete_and_merge, triangulate_image
 from mpsfm_core.mapping.upkeep import Upkeep
@@ -53,6 +54,13 @@ class Group:
     def size(self) -> int:
         """Number of registered images."""
         return self.upkeep.size
+
+    def weighed_problem(self) -> MappingProblem:
+        """The problem with its pairs as far as depth allows them; for a group without images."""
+        # which poses are tried is no matter of chance that runs should differ by
+        options = self._options.model_copy(update={"seed": 0})
+        search = PoseSearch(self.scene, self.refiner, options)
+        return PairCheck(search, options).weighed(self.upkeep.problem)
 
     def start_from_known_poses(self, left: Bool) -> bool:
         """Register all images that came with a pose; False when fewer than two hold together."""

@@ -54,9 +54,12 @@ class Starts:
         if pair not in self._found:
             scene, options = search.scene, self._options
             if options.registration.lifting:
-                start = _start_from_depth(search, pair, options.registration)
-            else:
+                starts = starts_from_depth(search, pair, options.registration)
+                start = max(starts, key=lambda each: each.pose.support, default=None)
+            elif pair.calibrated:
                 start = start_from_rays(scene, pair, options.initialization)
+            else:
+                start = None
             self._found[pair] = start or "nothing gives a pose"
         return self._found[pair]
 
@@ -76,26 +79,27 @@ def rank_initial_pairs(scene: Scene) -> list[VerifiedPair]:
     return sorted(scene.problem.pairs, key=lambda pair: (not pair.calibrated, -len(pair)))
 
 
-def _start_from_depth(
+def starts_from_depth(
     search: PoseSearch, pair: VerifiedPair, options: RegistrationOptions
-) -> Start | None:
-    """Pose found as that of any next image, for each of both images."""
-    scene, starts = search.scene, []
+) -> list[Start]:
+    """Poses found as those of any next image, for each of both images."""
+    scene: Scene = search.scene
+    starts: list[Start] = []
     empty = scene.snapshot()
     for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
         place_first(scene, reference)
         found = correspondences(scene, image, [reference], options)
         starts += [Start(reference, image, p) for p in search.poses(image, found, attempt=0)]
         scene.restore(empty)
-    return max(starts, key=lambda start: start.pose.support, default=None)
+    return starts
 
 
 def start_from_rays(
     scene: Scene, pair: VerifiedPair, options: InitializationOptions
 ) -> Start | None:
-    """Pose of the essential matrix, its length chosen such that points agree with the prior."""
+    """The verified pose, its length chosen such that points agree with the prior."""
     length = np.linalg.norm(pair.translation)
-    if not pair.calibrated or length < 1e-12:
+    if length < 1e-12:
         return None
     rotation, translation = pair.rotation, pair.translation / length
     offsets = scene.graph.offsets
@@ -118,7 +122,7 @@ def start_from_rays(
     pose = AbsolutePose(
         rotation,
         translation * float(np.median(ratio)),
-        "essential matrix",
+        "verified pair",
         support=float(count),
         num_inliers=count,
         inlier_share=1.0,  # all verified matches agree with it

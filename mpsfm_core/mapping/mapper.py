@@ -44,10 +44,12 @@ def reconstruct(
     keeper = Keeper(checkpoints, problem, events)
     runs, unfinished = keeper.load()
     finished_before = bool(runs) and unfinished is None
+    weighed = None
     for number in range(len(runs), 0 if finished_before else options.max_runs):
         own = options.model_copy(update={"seed": options.seed + number})
-        mapper = unfinished or Mapper(problem, own, events)
+        mapper = unfinished or Mapper(problem, own, events, weighed)
         runs.append(mapper.run(partial(keeper.save, runs, mapper)))
+        weighed = mapper.weighed
         unfinished = None
         if mapper.keeps_poses or settled(runs, options.enough_explained):
             break
@@ -61,6 +63,7 @@ def reconstruct(
 
 class Mapper:
     """One run. ``models`` are the groups, ``left`` the images in none, ``group`` the last one.
+    ``weighed``: the problem with its pairs as far as depth allows them, once that was asked.
 
     All that decides how a run goes on is in its attributes: between two images it can be kept and
     taken up again.
@@ -70,9 +73,14 @@ class Mapper:
     group_type: type[Group] = Group
 
     def __init__(
-        self, problem: MappingProblem, options: MapperOptions, events: MappingEvents
+        self,
+        problem: MappingProblem,
+        options: MapperOptions,
+        events: MappingEvents,
+        weighed: MappingProblem | None = None,
     ) -> None:
         self.problem = problem
+        self.weighed = weighed
         self.options = options
         self.journal = Journal(problem, events)
         self.models: list[Reconstruction] = []
@@ -127,14 +135,25 @@ class Mapper:
         return not fixed
 
     def _new_group(self) -> Group:
-        return self.group_type(self.problem, self.options, self._starts, self.journal)
+        problem = self.weighed or self.problem
+        return self.group_type(problem, self.options, self._starts, self.journal)
 
     def _start(self) -> bool:
-        """Start from all images at once, or else from a pair."""
-        at_once = self.options.initialization.all_at_once
-        if at_once and self.group.start_from_all(self.left):
+        """Start from all images at once, or else from a pair; if not all pairs go together, with
+        those alone that depth allows."""
+        if self._start_from_all():
             return True
+        if self.weighed is None and self.options.checks_pairs:
+            with self.journal.timed("pair check"):
+                self.weighed = self.group.weighed_problem()
+            self.group = self._new_group()
+            if self._start_from_all():
+                return True
         return self.group.start_from_pair(self.left)
+
+    def _start_from_all(self) -> bool:
+        at_once = self.options.initialization.all_at_once
+        return at_once and self.group.start_from_all(self.left)
 
     def _start_from_known_poses(self) -> bool:
         if self._poses_hold and not self.group.start_from_known_poses(self.left):

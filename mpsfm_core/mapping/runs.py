@@ -1,6 +1,7 @@
 """Runs of the mapper with different random choices: which counts, and when no more are needed.
 
-They are compared by how many of the matches they explain.
+They are compared by how many of the matches they explain, and where that is much the same by how
+much of what images see lies in others at the same depth.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from mpsfm_core.data import MappingProblem
+from mpsfm_core.mapping.depth_agreement import agreeing_depth
 from mpsfm_core.scene.reconstruction import MappingReport, Reconstruction
 
 AGREEMENT = 0.01
@@ -43,11 +45,15 @@ def settled(runs: Sequence[Run], enough: float) -> bool:
 
 
 def best(runs: Sequence[Run]) -> Run:
-    """The run whose largest group explains most; of those that explain about as much, the one to
-    which most others came too."""
+    """The run whose largest group explains most; of those that explain about as much, one to which
+    most others came too, and of these the one in which most depth agrees."""
     most = max(run.of_largest for run in runs)
     equal = [run for run in runs if most - run.of_largest < AGREEMENT]
-    return max(equal, key=lambda run: (sum(_agree(run, other) for other in runs), run.of_largest))
+    times = [sum(_agree(run, other) for other in runs) for run in equal]
+    often = [run for run, count in zip(equal, times, strict=True) if count == max(times)]
+    if len(often) == 1 or not most:
+        return often[0]
+    return max(often, key=lambda run: agreeing_depth(run.models[0]))
 
 
 def _agree(one: Run, other: Run) -> bool:
