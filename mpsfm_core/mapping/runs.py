@@ -53,7 +53,7 @@ def best(runs: Sequence[Run]) -> Run:
     often = [run for run, count in zip(equal, times, strict=True) if count == max(times)]
     if len(often) == 1 or not most:
         return often[0]
-    return max(often, key=lambda run: agreeing_depth(run.models[0]))
+    return max(often, key=lambda run: (agreeing_depth(run.models[0]), run.of_largest))
 
 
 def _agree(one: Run, other: Run) -> bool:

@@ -10,6 +10,7 @@ import pytest
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.depth_agreement import agreeing_depth
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.runs import Run, best, explained_score, total_score
@@ -74,8 +75,11 @@ class Scripted:
 
     script: Sequence[Sequence[float]] = ()
     keeps_poses = False
+    weighed = None
 
-    def __init__(self, problem: MappingProblem, options: MapperOptions, events: object) -> None:
+    def __init__(
+        self, problem: MappingProblem, options: MapperOptions, events: object, weighed: object
+    ) -> None:
         self.explained = self.script[options.seed]
 
     def run(self, paused: object = None) -> Run:
@@ -134,3 +138,15 @@ def test_a_tie_goes_to_what_came_out_twice(problem: MappingProblem) -> None:
     assert best([alone, one]) is alone
     clearly = run(4, 0.68)
     assert best([clearly, one, other]) is clearly
+
+
+def test_of_runs_that_are_alike_that_counts_in_which_depth_agrees(problem: MappingProblem) -> None:
+    """Of two that explain as much, though one image of one sees past all others."""
+    (model,) = reconstruct(problem).reconstructions
+    *rest, last = model.images
+    turned = np.diag([-1.0, 1.0, -1.0])
+    away = replace(last, rotation=turned @ last.rotation, translation=turned @ last.translation)
+    elsewhere = replace(model, images=(*rest, away))
+    assert agreeing_depth(elsewhere) < agreeing_depth(model)
+    right, wrong = (Run([m], [e], MappingReport()) for m, e in ((model, 0.650), (elsewhere, 0.655)))
+    assert best([right, wrong]) is best([wrong, right]) is right
