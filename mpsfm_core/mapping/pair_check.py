@@ -9,7 +9,8 @@ A pair without a pose that depth allows may still be right: few or bad matches t
 exact. What other pairs say tells. Where those that depth allows tie its images together by more
 matches than it has, and turn them otherwise, the pair is refuted twice, and does not count. Of the
 others the matches count as far as the best pose that depth allows is supported, in terms of the
-best one of all.
+best one of all. Pairs of fewer matches than an image needs to be registered decide nothing, and
+stay.
 """
 
 from __future__ import annotations
@@ -67,8 +68,8 @@ class PairCheck:
         pairs = []
         for pair, verdict in zip(problem.pairs, verdicts, strict=True):
             a, b = pair.image_a, pair.image_b
-            if verdict.share > 0:
-                pairs.append(_times(pair, verdict.share))
+            if verdict.share > 0 or len(pair) < needed:
+                pairs.append(_times(pair, verdict.share or 1.0))
                 continue
             turn = rotation_angle_deg(rotations[b] @ rotations[a].T @ verdict.rotation.T)
             tied = maximum_flow(links, a, b).flow_value

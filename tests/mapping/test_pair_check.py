@@ -79,8 +79,8 @@ def test_what_depth_and_other_pairs_refute_does_not_count() -> None:
 
 @pytest.mark.parametrize(
     ("counts", "turn_deg"),
-    [([60, 50, 60], 10.0), ([60, 70, 60], 90.0), ([60, 40, 20], 90.0)],
-    ids=["others say the same", "tied by fewer matches", "tied by too few to register"],
+    [([60, 50, 60], 10.0), ([60, 70, 60], 90.0), ([60, 40, 20], 90.0), ([60, 20, 60], 90.0)],
+    ids=["others say the same", "tied by fewer", "tied by too few to register", "has too few"],
 )
 def test_a_pair_that_depth_alone_refutes_stays(counts: list[int], turn_deg: float) -> None:
     problem, left = weighed(counts, share=0.0, turn_deg=turn_deg)
