@@ -40,8 +40,8 @@ class Comparison:
     """One table: a scene, its buckets (None: all) and priors, and the configuration.
 
     ``configuration``: its name, and what it says beside the prior. ``depth``: what it says of the
-    prior ``config``, None for FastDepth. ``note``: said above the first
-    table; what was written there by hand since stays.
+    prior ``config``, None for FastDepth. ``note``: said above the first table;
+    what was written there by hand since stays.
     """
 
     scene: str
@@ -163,7 +163,7 @@ def _written_note(file: Path) -> str:
         return ""
     _, _, below_title = file.read_text(encoding="utf-8").partition("\n")
     note, table, _ = below_title.partition(TABLE_START)
-    return note if table else ""
+    return note.strip() if table else ""
 
 
 def _pooled(record: Record) -> Record:

@@ -219,7 +219,7 @@ def _well_held(links: _Links, count: int) -> Bool:
     chosen = on_cycles(links.a, links.b, count)
     if chosen.any():
         ends = np.concatenate([links.a[chosen], links.b[chosen]])
-        group = _groups(links.a[chosen], links.b[chosen], count)
+        group = linked_groups(links.a[chosen], links.b[chosen], count)
         sizes = np.bincount(group[np.unique(ends)])
         chosen &= group[links.a] == sizes.argmax()
     return chosen
@@ -233,7 +233,7 @@ def on_cycles(a: Int64, b: Int64, count: int) -> Bool:
     passes is on no cycle.
     """
     root = count  # of the trees of all groups
-    firsts = np.unique(_groups(a, b, count), return_index=True)[1]
+    firsts = np.unique(linked_groups(a, b, count), return_index=True)[1]
     one, other = np.concatenate([a, firsts]), np.concatenate([b, np.full(len(firsts), root)])
     graph = coo_matrix((np.ones(len(one)), (one, other)), shape=(count + 1, count + 1))
     order, parents = breadth_first_order(graph.tocsr(), root, directed=False)
@@ -249,7 +249,7 @@ def on_cycles(a: Int64, b: Int64, count: int) -> Bool:
     return on_cycle[: len(a)]
 
 
-def _groups(a: Int64, b: Int64, count: int) -> Int64:
+def linked_groups(a: Int64, b: Int64, count: int) -> Int64:
     """(count,) number of the group that links hold together, of each image."""
     matrix = coo_matrix((np.ones(len(a)), (a, b)), shape=(count, count))
     group: Int64 = connected_components(matrix, directed=False)[1]

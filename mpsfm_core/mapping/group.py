@@ -55,12 +55,13 @@ class Group:
         """Number of registered images."""
         return self.upkeep.size
 
-    def weighed_problem(self) -> MappingProblem:
-        """The problem with its pairs as far as depth allows them; for a group without images."""
+    def weighed_problem(self, left: Bool) -> MappingProblem:
+        """The problem with pairs of the images that are left as far as depth allows them; for a
+        group without images."""
         # which poses are tried is no matter of chance that runs should differ by
         options = self._options.model_copy(update={"seed": 0})
         search = PoseSearch(self.scene, self.refiner, options)
-        return PairCheck(search, options).weighed(self.upkeep.problem)
+        return PairCheck(search, options).weighed(self.upkeep.problem, left)
 
     def start_from_known_poses(self, left: Bool) -> bool:
         """Register all images that came with a pose; False when fewer than two hold together."""

@@ -145,7 +145,7 @@ class Mapper:
             return True
         if self.weighed is None and self.options.checks_pairs:
             with self.journal.timed("pair check"):
-                self.weighed = self.group.weighed_problem()
+                self.weighed = self.group.weighed_problem(self.left)
             self.group = self._new_group()
             if self._start_from_all():
                 return True

@@ -15,19 +15,19 @@ stay.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, maximum_flow
+from scipy.sparse.csgraph import maximum_flow
 
-from mpsfm_core.data import Float64, Int64, MappingProblem, VerifiedPair
+from mpsfm_core.data import Bool, Float64, MappingProblem, VerifiedPair
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.correspondences import correspondences
 from mpsfm_core.mapping.depth_consistency import DepthCheck
-from mpsfm_core.mapping.global_start import averaged_rotations
+from mpsfm_core.mapping.global_start import averaged_rotations, linked_groups
 from mpsfm_core.mapping.initialization import Start, place_first, start_from_rays, starts_from_depth
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.registration import PoseSearch
@@ -51,30 +51,31 @@ class PairCheck:
         self._search, self._scene, self._options = search, search.scene, options
         self._check = DepthCheck(search.scene, options.consistency, fills_holes=True)
 
-    def weighed(self, problem: MappingProblem) -> MappingProblem:
+    def weighed(self, problem: MappingProblem, left: Bool) -> MappingProblem:
         """The problem with the matches of pairs as far as depth allows them, and without the pairs
-        that depth and others refute."""
-        verdicts = [self.verdict(pair) for pair in problem.pairs]
+        that depth and others refute; pairs of images that are not ``left`` (n,) stay as they are.
+        """
         needed = self._options.registration.min_inliers
-        sure = [
-            verdict.share * len(pair) >= needed
-            for pair, verdict in zip(problem.pairs, verdicts, strict=True)
-        ]
-        links, rotations = _turned(
-            [pair for pair, yes in zip(problem.pairs, sure, strict=True) if yes],
-            np.array([v.rotation for v, yes in zip(verdicts, sure, strict=True) if yes]),
-            len(problem.images),
-        )
+        verdicts = {
+            pair: self.verdict(pair)
+            for pair in problem.pairs
+            if left[pair.image_a] and left[pair.image_b]
+        }
+        sure = {p: v.rotation for p, v in verdicts.items() if v.share * len(p) >= needed}
+        links, rotations = _turned(sure, len(problem.images))
         pairs = []
-        for pair, verdict in zip(problem.pairs, verdicts, strict=True):
-            a, b = pair.image_a, pair.image_b
-            if verdict.share > 0 or len(pair) < needed:
-                pairs.append(_times(pair, verdict.share or 1.0))
+        for pair in problem.pairs:
+            verdict = verdicts.get(pair)
+            if verdict is not None and verdict.share > 0:
+                pairs.append(_times(pair, verdict.share))
                 continue
-            turn = rotation_angle_deg(rotations[b] @ rotations[a].T @ verdict.rotation.T)
-            tied = maximum_flow(links, a, b).flow_value
-            if tied <= len(pair) or turn <= MAX_TURN_DEG:
-                pairs.append(pair)
+            if verdict is not None and len(pair) >= needed:
+                a, b = pair.image_a, pair.image_b
+                turn = rotation_angle_deg(rotations[b] @ rotations[a].T @ verdict.rotation.T)
+                tied = maximum_flow(links, a, b).flow_value
+                if tied > len(pair) and turn > MAX_TURN_DEG:
+                    continue
+            pairs.append(pair)
         return replace(problem, pairs=tuple(pairs))
 
     def verdict(self, pair: VerifiedPair) -> Verdict:
@@ -117,20 +118,21 @@ class PairCheck:
         return float(np.exp(np.median(ratios))) if use.any() else 1.0
 
 
-def _turned(pairs: Sequence[VerifiedPair], turns: Float64, count: int) -> tuple[csr_array, Float64]:
+def _turned(turns: Mapping[VerifiedPair, Float64], count: int) -> tuple[csr_array, Float64]:
     """``(links, rotations)``: (count, count) matches by which pairs tie images together, and
-    (count, 3, 3) how they are turned by what all pairs of a group say. ``turns`` (m, 3, 3):
-    ``b_from_a``."""
-    a = np.array([pair.image_a for pair in pairs], dtype=np.int64)
-    b = np.array([pair.image_b for pair in pairs], dtype=np.int64)
-    weights = np.array([len(pair) for pair in pairs], dtype=np.int32)
+    (count, 3, 3) how they are turned by what all pairs of a group say. ``turns``: ``b_from_a``
+    (3, 3) of each pair."""
+    a = np.array([pair.image_a for pair in turns], dtype=np.int64)
+    b = np.array([pair.image_b for pair in turns], dtype=np.int64)
+    weights = np.array([len(pair) for pair in turns], dtype=np.int32)
+    said = np.array(list(turns.values())).reshape(-1, 3, 3)
     ways = np.concatenate([a, b]), np.concatenate([b, a])
     links = csr_array((np.tile(weights, 2), ways), shape=(count, count))
-    group: Int64 = connected_components(links, directed=False)[1]
+    group = linked_groups(a, b, count)
     rotations = np.tile(np.eye(3), (count, 1, 1))
     for number in np.unique(group[a]):
         own = group[a] == number
-        found = averaged_rotations(a[own], b[own], turns[own], 1.0 * weights[own], count)
+        found = averaged_rotations(a[own], b[own], said[own], 1.0 * weights[own], count)
         rotations[group == number] = found[group == number]
     return links, rotations
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mpsfm_core.data import Float64, MappingProblem, PinholeCamera, VerifiedPair
+from mpsfm_core.data import Bool, Float64, MappingProblem, PinholeCamera, VerifiedPair
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.pair_check import PairCheck, Verdict
@@ -24,16 +25,19 @@ from mpsfm_core.testing.symmetric import twin_room_problem
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
-def checker(problem: MappingProblem) -> PairCheck:
+Check = TypeVar("Check", bound=PairCheck)
+
+
+def checker(problem: MappingProblem, kind: type[Check]) -> Check:
     options, scene = MapperOptions(), Scene(problem)
     refiner = Refiner(scene, options, pair_score_matrix(scene, "match-scores"))
-    return PairCheck(PoseSearch(scene, refiner, options), options)
+    return kind(PoseSearch(scene, refiner, options), options)
 
 
 def test_right_pairs_are_allowed_and_many_look_alikes_are_not() -> None:
     """Views of twin rooms, of which the pieces that differ tell."""
     case = twin_room_problem(0)
-    check, false = checker(case.problem), np.array(case.false)
+    check, false = checker(case.problem, PairCheck), np.array(case.false)
     shares = np.array([check.verdict(pair).share for pair in case.problem.pairs])
     assert (shares[~false] > 0).mean() > 0.97
     assert (shares[false] == 0).mean() > 0.5
@@ -60,16 +64,14 @@ def weighed(
     ]
     problem = replace(problem, pairs=tuple(pairs))
     assert [len(pair) for pair in pairs] == list(counts)
-    options, scene = MapperOptions(), Scene(problem)
-    refiner = Refiner(scene, options, pair_score_matrix(scene, "match-scores"))
-    check = Judged(PoseSearch(scene, refiner, options), options)
+    check = checker(problem, Judged)
     turn: Float64 = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
     check.verdicts = {
         (0, 1): Verdict(pairs[0].rotation, 1.0),
         (0, 2): Verdict(turn @ pairs[2].rotation @ pairs[0].rotation, share),
         (1, 2): Verdict(pairs[2].rotation, 1.0),
     }
-    return problem, check.weighed(problem)
+    return problem, check.weighed(problem, np.ones(3, dtype=np.bool_))
 
 
 def test_what_depth_and_other_pairs_refute_does_not_count() -> None:
@@ -94,8 +96,18 @@ def test_matches_count_as_far_as_an_allowed_pose_is_supported() -> None:
     assert left.pairs[0] is problem.pairs[0]
 
 
+def test_only_pairs_of_images_that_are_left_are_asked() -> None:
+    """What lies in groups before is settled, and may be most of what there is."""
+    problem = mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
+    check = checker(problem, Judged)
+    check.verdicts = {(1, 2): Verdict(np.eye(3), 0.5)}
+    left = check.weighed(problem, np.array([False, True, True]))
+    assert left.pairs[:2] == problem.pairs[:2]
+    np.testing.assert_allclose(left.pairs[2].scores, 0.5 * problem.pairs[2].scores)
+
+
 def test_well_connected_images_need_no_check(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(self: PairCheck, problem: MappingProblem) -> MappingProblem:
+    def refuse(self: PairCheck, problem: MappingProblem, left: Bool) -> MappingProblem:
         raise AssertionError("not to be asked")
 
     problem = mapping_problem(room_scene(), CAMERA, arc_poses(4, 10.0))
