@@ -6,17 +6,16 @@ import numpy as np
 
 from mpsfm_core.data import Float64
 from mpsfm_core.geometry import pixel_centers, project, transform, unproject
+from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
 
 GRID = 24
 """Columns and rows of the pixels of an image that are looked for in the others (ours)."""
-MAX_DEVIATION, MIN_LIMIT = 2.7, 0.05
-"""Of log depth that agrees: in stds of both maps, but at least this (as in the depth check)."""
 
 
-def agreeing_depth(model: Reconstruction) -> float:
+def agreeing_depth(model: Reconstruction, options: ConsistencyOptions) -> float:
     """Pixels of images that lie on the surface another image sees, summed over all pairs of images,
-    in terms of the pixels of one.
+    in terms of the pixels of one; as near as the depth check takes for the same.
 
     An image in a wrong place may contradict no other, seeing past what they see; but then little of
     it lies on their surfaces either.
@@ -27,7 +26,7 @@ def agreeing_depth(model: Reconstruction) -> float:
     for row, (points, log_std) in enumerate(samples):
         for other, image in enumerate(images):
             if other != row:
-                total += _num_agreeing(points, log_std, image)
+                total += _num_agreeing(points, log_std, image, options)
     return total / GRID**2
 
 
@@ -45,7 +44,9 @@ def _samples(image: RegisteredImage) -> tuple[Float64, Float64]:
     return (local - image.translation) @ image.rotation, std[known]
 
 
-def _num_agreeing(points: Float64, log_std: Float64, image: RegisteredImage) -> int:
+def _num_agreeing(
+    points: Float64, log_std: Float64, image: RegisteredImage, options: ConsistencyOptions
+) -> int:
     depth = image.depth
     rows, columns = depth.shape
     seen = transform(image.rotation, image.translation, points)
@@ -59,5 +60,5 @@ def _num_agreeing(points: Float64, log_std: Float64, image: RegisteredImage) -> 
     with np.errstate(divide="ignore", invalid="ignore"):
         off = np.abs(np.log(z / there))
         std = np.hypot(log_std, np.sqrt(depth.variance[row, column]) / there)
-    near = off < np.maximum(MAX_DEVIATION * std, MIN_LIMIT)
+    near = off < np.maximum(options.max_deviation * std, options.min_gap)
     return int(np.count_nonzero(near & depth.valid[row, column]))

@@ -80,16 +80,17 @@ def rank_initial_pairs(scene: Scene) -> list[VerifiedPair]:
 
 
 def starts_from_depth(
-    search: PoseSearch, pair: VerifiedPair, options: RegistrationOptions
+    search: PoseSearch, pair: VerifiedPair, options: RegistrationOptions, *, rough: bool = False
 ) -> list[Start]:
-    """Poses found as those of any next image, for each of both images."""
+    """Poses found as those of any next image, for each of both images; ``rough``: not refined."""
+    find = search.rough_poses if rough else search.poses
     scene: Scene = search.scene
     starts: list[Start] = []
     empty = scene.snapshot()
     for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
         place_first(scene, reference)
         found = correspondences(scene, image, [reference], options)
-        starts += [Start(reference, image, p) for p in search.poses(image, found, attempt=0)]
+        starts += [Start(reference, image, p) for p in find(image, found, attempt=0)]
         scene.restore(empty)
     return starts
 

@@ -54,7 +54,7 @@ def reconstruct(
         if mapper.keeps_poses or settled(runs, options.enough_explained):
             break
     keeper.finish(runs)
-    chosen = best(runs)
+    chosen = best(runs, options.consistency)
     models = list(chosen.models)
     if models and options.place_unconfirmed:
         models[0] = with_unconfirmed(models[0], models[1:], problem, options)

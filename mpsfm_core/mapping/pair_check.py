@@ -10,7 +10,7 @@ exact. What other pairs say tells. Where those that depth allows tie its images 
 matches than it has, and turn them otherwise, the pair is refuted twice, and does not count. Of the
 others the matches count as far as the best pose that depth allows is supported, in terms of the
 best one of all. Pairs of fewer matches than an image needs to be registered decide nothing, and
-stay.
+are not asked.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class PairCheck:
         verdicts = {
             pair: self.verdict(pair)
             for pair in problem.pairs
-            if left[pair.image_a] and left[pair.image_b]
+            if len(pair) >= needed and left[pair.image_a] and left[pair.image_b]
         }
         sure = {p: v.rotation for p, v in verdicts.items() if v.share * len(p) >= needed}
         links, rotations = _turned(sure, len(problem.images))
@@ -69,7 +69,7 @@ class PairCheck:
             if verdict is not None and verdict.share > 0:
                 pairs.append(_times(pair, verdict.share))
                 continue
-            if verdict is not None and len(pair) >= needed:
+            if verdict is not None:
                 a, b = pair.image_a, pair.image_b
                 turn = rotation_angle_deg(rotations[b] @ rotations[a].T @ verdict.rotation.T)
                 tied = maximum_flow(links, a, b).flow_value
@@ -83,7 +83,7 @@ class PairCheck:
         verified = start_from_rays(self._scene, pair, self._options.initialization)
         if verified is not None and self._allows(verified):
             return Verdict(pair.rotation, 1.0)
-        found = starts_from_depth(self._search, pair, self._options.registration)
+        found = starts_from_depth(self._search, pair, self._options.registration, rough=True)
         starts = [start for start in found if start.pose.support > 0]
         starts.sort(key=lambda start: -start.pose.support)
         if not starts:

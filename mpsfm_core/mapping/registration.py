@@ -41,12 +41,19 @@ class PoseSearch:
         A lone one that nearly all matches support needs none: it is adjusted once registered.
         ``attempt`` counts how often the image was tried: see :func:`find_poses`.
         """
-        options, seed = self._options.registration, self._options.seed
-        poses = find_poses(self.scene, image, found, options, seed=seed, attempt=attempt)
+        options = self._options.registration
+        poses = self.rough_poses(image, found, attempt=attempt)
         if len(poses) == 1 and poses[0].inlier_share >= options.confident_share:
             return poses
         snapshot = self.scene.snapshot()
         return [self._polished(image, pose, found, snapshot) for pose in poses]
+
+    def rough_poses(
+        self, image: int, found: Correspondences, *, attempt: int
+    ) -> list[AbsolutePose]:
+        """The same without bundle adjustment, in half the time."""
+        options, seed = self._options.registration, self._options.seed
+        return find_poses(self.scene, image, found, options, seed=seed, attempt=attempt)
 
     def _polished(
         self, image: int, pose: AbsolutePose, found: Correspondences, snapshot: Snapshot

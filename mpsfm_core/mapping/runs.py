@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.mapping.depth_agreement import agreeing_depth
+from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.scene.reconstruction import MappingReport, Reconstruction
 
 AGREEMENT = 0.01
@@ -44,7 +45,7 @@ def settled(runs: Sequence[Run], enough: float) -> bool:
     return sum(last.explained) >= enough or any(_agree(run, last) for run in before)
 
 
-def best(runs: Sequence[Run]) -> Run:
+def best(runs: Sequence[Run], options: ConsistencyOptions) -> Run:
     """The run whose largest group explains most; of those that explain about as much, one to which
     most others came too, and of these the one in which most depth agrees."""
     most = max(run.of_largest for run in runs)
@@ -53,7 +54,7 @@ def best(runs: Sequence[Run]) -> Run:
     often = [run for run, count in zip(equal, times, strict=True) if count == max(times)]
     if len(often) == 1 or not most:
         return often[0]
-    return max(often, key=lambda run: (agreeing_depth(run.models[0]), run.of_largest))
+    return max(often, key=lambda run: (agreeing_depth(run.models[0], options), run.of_largest))
 
 
 def _agree(one: Run, other: Run) -> bool:

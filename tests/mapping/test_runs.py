@@ -12,11 +12,13 @@ from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.depth_agreement import agreeing_depth
 from mpsfm_core.mapping.mapper import reconstruct
-from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.options import ConsistencyOptions, MapperOptions
 from mpsfm_core.mapping.runs import Run, best, explained_score, total_score
 from mpsfm_core.scene.reconstruction import MappingReport, Reconstruction
 from mpsfm_core.testing.problems import Noise, mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
+
+OPTIONS = ConsistencyOptions()
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
@@ -134,10 +136,10 @@ def test_a_tie_goes_to_what_came_out_twice(problem: MappingProblem) -> None:
         return Run([replace(model, images=model.images[:size])], [explained], MappingReport())
 
     alone, one, other = run(4, 0.662), run(3, 0.655), run(3, 0.660)
-    assert best([alone, one, other]) is other
-    assert best([alone, one]) is alone
+    assert best([alone, one, other], OPTIONS) is other
+    assert best([alone, one], OPTIONS) is alone
     clearly = run(4, 0.68)
-    assert best([clearly, one, other]) is clearly
+    assert best([clearly, one, other], OPTIONS) is clearly
 
 
 def test_of_runs_that_are_alike_that_counts_in_which_depth_agrees(problem: MappingProblem) -> None:
@@ -147,6 +149,6 @@ def test_of_runs_that_are_alike_that_counts_in_which_depth_agrees(problem: Mappi
     turned = np.diag([-1.0, 1.0, -1.0])
     away = replace(last, rotation=turned @ last.rotation, translation=turned @ last.translation)
     elsewhere = replace(model, images=(*rest, away))
-    assert agreeing_depth(elsewhere) < agreeing_depth(model)
+    assert agreeing_depth(elsewhere, OPTIONS) < agreeing_depth(model, OPTIONS)
     right, wrong = (Run([m], [e], MappingReport()) for m, e in ((model, 0.650), (elsewhere, 0.655)))
-    assert best([right, wrong]) is best([wrong, right]) is right
+    assert best([right, wrong], OPTIONS) is best([wrong, right], OPTIONS) is right

@@ -1,0 +1,125 @@
+"""Halls that nothing was tuned on: other seeds, worse matches, fewer pairs, worse priors.
+
+    python -m benchmarks.other_halls [--views 49] [--seeds 1 2 3 4] [--matches NAME ...]
+        [--priors NAME ...] [--workers 2] [--output FILE]
+
+As :mod:`benchmarks.everyday`, whose halls all have the same matches of one kind, but for accuracy:
+our mapper beside COLMAP's incremental one on the same verified matches, images summed and pose AUC
+over the pairs of all seeds. CPU time is summed, of so many processes at a time as workers.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks._scenes import percent
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.evaluation.methods import OURS, Outcome, Task, run_tasks
+from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.testing.halls import HONEST, QUALITIES, Hall, PriorErrors, hall_problem
+
+PEER = "colmap"
+CONVENTION = CONVENTIONS["paper"]
+
+
+@dataclass(frozen=True)
+class Matches:
+    """What sets the matches of halls apart. ``options``: of :func:`hall_problem`. ``share``: of the
+    pairs that are kept, at random. ``reach``: views along the walk up to which pairs are kept."""
+
+    options: Mapping[str, float] = field(default_factory=dict)
+    share: float = 1.0
+    reach: int = 10**9
+
+    def hall(self, views: int, errors: PriorErrors, seed: int) -> Hall:
+        """A hall of this kind."""
+        hall = hall_problem(views, errors, seed=seed, **self.options)  # type: ignore[arg-type]
+        rng = np.random.default_rng(seed)
+        kept = [
+            pair
+            for pair in hall.problem.pairs
+            if rng.uniform() < self.share and pair.image_b - pair.image_a <= self.reach
+        ]
+        return hall._replace(problem=MappingProblem(hall.problem.images, tuple(kept)))
+
+
+MATCHES = {
+    "as everyday": Matches(),
+    "a fifth wrong": Matches({"wrong_matches": 0.2}),
+    "off by 1.5 px": Matches({"keypoint_noise_px": 1.5}),
+    "few points": Matches({"points_per_view": 25}),
+    "a third of the pairs": Matches(share=1 / 3),
+    "three neighbours": Matches(reach=3),
+}
+PRIORS = QUALITIES | {
+    "wrong by half in a tenth": replace(HONEST, patch=0.5),
+    "of a weak network": PriorErrors(scale=0.2, field=0.12, declared=0.2),
+}
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--views", type=int, default=49)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4])
+    parser.add_argument("--matches", nargs="+", choices=list(MATCHES), default=list(MATCHES))
+    parser.add_argument("--priors", nargs="+", choices=list(PRIORS), default=list(PRIORS))
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--output", type=Path, help="also write the table to this file")
+    arguments = parser.parse_args()
+    lines = [
+        "| matches | priors | images: COLMAP | ours | AUC@1/5/20: COLMAP | ours | CPU / COLMAP |",
+        "|---" * 7 + "|",
+    ]
+    print(*lines, sep="\n")
+    for matches in arguments.matches:
+        for priors in arguments.priors:
+            halls = [
+                MATCHES[matches].hall(arguments.views, PRIORS[priors], seed)
+                for seed in arguments.seeds
+            ]
+            lines.append(f"| {matches} | {priors} | {compared(halls, arguments.workers)} |")
+            print(lines[-1], flush=True)
+    if arguments.output:
+        arguments.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def compared(halls: Sequence[Hall], workers: int) -> str:
+    """Cells of a line: images, accuracy and time of both on some halls."""
+    tasks = [
+        Task(f"{number}", method, hall.problem, MapperOptions())
+        for number, hall in enumerate(halls)
+        for method in (PEER, OURS)
+    ]
+    found: dict[str, list[tuple[Hall, Outcome]]] = {PEER: [], OURS: []}
+    for task, outcome in run_tasks(tasks, workers):
+        found[task.method].append((halls[int(task.label)], outcome))
+    of_peer, of_ours = _summed(found[PEER]), _summed(found[OURS])
+    total = sum(len(hall.truth) for hall in halls)
+    cells = [f"{rows['images']} of {total}" for rows in (of_peer, of_ours)]
+    cells += [percent(rows["auc"]) for rows in (of_peer, of_ours)]
+    return " | ".join([*cells, f"{of_ours['seconds'] / of_peer['seconds']:.2f}x"])
+
+
+def _summed(outcomes: Sequence[tuple[Hall, Outcome]]) -> dict[str, Any]:
+    models = [outcome.models[0] if outcome.models else {} for _, outcome in outcomes]
+    errors = [
+        pose_errors_deg(model, hall.truth, CONVENTION)
+        for model, (hall, _) in zip(models, outcomes, strict=True)
+    ]
+    return {
+        "images": sum(map(len, models)),
+        "auc": pose_auc(np.concatenate(errors), CONVENTION),
+        "seconds": sum(outcome.cpu_seconds for _, outcome in outcomes),
+    }
+
+
+if __name__ == "__main__":
+    main()
