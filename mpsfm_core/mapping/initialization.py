@@ -6,6 +6,7 @@ is that of the verified pair's essential matrix.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -93,6 +94,21 @@ def starts_from_depth(
         starts += [Start(reference, image, p) for p in find(image, found, attempt=0)]
         scene.restore(empty)
     return starts
+
+
+def polished_starts(
+    search: PoseSearch, starts: Sequence[Start], options: RegistrationOptions
+) -> list[Start]:
+    """Rough starts with their poses bundle-adjusted, each if that finds more support."""
+    scene, polished = search.scene, []
+    empty = scene.snapshot()
+    for start in starts:
+        place_first(scene, start.reference)
+        found = correspondences(scene, start.image, [start.reference], options)
+        (pose,) = search.polished(start.image, [start.pose], found)
+        polished.append(start._replace(pose=pose))
+        scene.restore(empty)
+    return polished
 
 
 def start_from_rays(

@@ -15,7 +15,7 @@ are not asked.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -28,7 +28,13 @@ from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.correspondences import correspondences
 from mpsfm_core.mapping.depth_consistency import DepthCheck
 from mpsfm_core.mapping.global_start import averaged_rotations, linked_groups
-from mpsfm_core.mapping.initialization import Start, place_first, start_from_rays, starts_from_depth
+from mpsfm_core.mapping.initialization import (
+    Start,
+    place_first,
+    polished_starts,
+    start_from_rays,
+    starts_from_depth,
+)
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.registration import PoseSearch
 
@@ -83,16 +89,24 @@ class PairCheck:
         verified = start_from_rays(self._scene, pair, self._options.initialization)
         if verified is not None and self._allows(verified):
             return Verdict(pair.rotation, 1.0)
-        found = starts_from_depth(self._search, pair, self._options.registration, rough=True)
+        search, options = self._search, self._options.registration
+        found = starts_from_depth(search, pair, options, rough=True)
         starts = [start for start in found if start.pose.support > 0]
-        starts.sort(key=lambda start: -start.pose.support)
         if not starts:
             return Verdict(pair.rotation, 1.0)
-        best = starts[0]
-        for start in starts:
-            if self._allows(start):
-                return Verdict(_b_from_a(pair, start), start.pose.support / best.pose.support)
-        return Verdict(_b_from_a(pair, best), 0.0)
+        allowed = self._best_allowed(starts)
+        if allowed is None:
+            starts = polished_starts(search, starts, options)
+            allowed = self._best_allowed(starts)
+        best = max(starts, key=_support)
+        if allowed is None:
+            return Verdict(_b_from_a(pair, best), 0.0)
+        return Verdict(_b_from_a(pair, allowed), _support(allowed) / _support(best))
+
+    def _best_allowed(self, starts: Sequence[Start]) -> Start | None:
+        """The best supported pose that depth allows, if there is one."""
+        ranked = sorted(starts, key=_support, reverse=True)
+        return next((start for start in ranked if self._allows(start)), None)
 
     def _allows(self, start: Start) -> bool:
         """Whether depth does not contradict a pose."""
@@ -135,6 +149,10 @@ def _turned(turns: Mapping[VerifiedPair, Float64], count: int) -> tuple[csr_arra
         found = averaged_rotations(a[own], b[own], said[own], 1.0 * weights[own], count)
         rotations[group == number] = found[group == number]
     return links, rotations
+
+
+def _support(start: Start) -> float:
+    return start.pose.support
 
 
 def _b_from_a(pair: VerifiedPair, start: Start) -> Float64:

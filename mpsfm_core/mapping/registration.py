@@ -6,7 +6,7 @@ matches support them most.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -45,8 +45,7 @@ class PoseSearch:
         poses = self.rough_poses(image, found, attempt=attempt)
         if len(poses) == 1 and poses[0].inlier_share >= options.confident_share:
             return poses
-        snapshot = self.scene.snapshot()
-        return [self._polished(image, pose, found, snapshot) for pose in poses]
+        return self.polished(image, poses, found)
 
     def rough_poses(
         self, image: int, found: Correspondences, *, attempt: int
@@ -54,6 +53,13 @@ class PoseSearch:
         """The same without bundle adjustment, in half the time."""
         options, seed = self._options.registration, self._options.seed
         return find_poses(self.scene, image, found, options, seed=seed, attempt=attempt)
+
+    def polished(
+        self, image: int, poses: Sequence[AbsolutePose], found: Correspondences
+    ) -> list[AbsolutePose]:
+        """Poses bundle-adjusted beside the image's neighbours, each if that finds more support."""
+        snapshot = self.scene.snapshot()
+        return [self._polished(image, pose, found, snapshot) for pose in poses]
 
     def _polished(
         self, image: int, pose: AbsolutePose, found: Correspondences, snapshot: Snapshot
