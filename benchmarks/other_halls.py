@@ -19,14 +19,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks._scenes import percent
+from benchmarks.everyday import CONVENTION, PEER
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.evaluation.methods import OURS, Outcome, Task, run_tasks
-from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
+from mpsfm_core.evaluation.pose_auc import pose_auc, pose_errors_deg
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.halls import HONEST, QUALITIES, Hall, PriorErrors, hall_problem
-
-PEER = "colmap"
-CONVENTION = CONVENTIONS["paper"]
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,14 @@ is that of the verified pair's essential matrix.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from mpsfm_core.data import Bool, VerifiedPair
 from mpsfm_core.geometry import triangulation_angle_deg
-from mpsfm_core.mapping.correspondences import correspondences
+from mpsfm_core.mapping.correspondences import Correspondences, correspondences
 from mpsfm_core.mapping.options import InitializationOptions, MapperOptions, RegistrationOptions
 from mpsfm_core.mapping.pose_support import AbsolutePose
 from mpsfm_core.mapping.registration import PoseSearch
@@ -85,30 +85,35 @@ def starts_from_depth(
 ) -> list[Start]:
     """Poses found as those of any next image, for each of both images; ``rough``: not refined."""
     find = search.rough_poses if rough else search.poses
-    scene: Scene = search.scene
-    starts: list[Start] = []
-    empty = scene.snapshot()
-    for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
-        place_first(scene, reference)
-        found = correspondences(scene, image, [reference], options)
-        starts += [Start(reference, image, p) for p in find(image, found, attempt=0)]
-        scene.restore(empty)
-    return starts
+    return [
+        Start(reference, image, pose)
+        for reference, image, found in _each_way(search.scene, pair, options)
+        for pose in find(image, found, attempt=0)
+    ]
 
 
 def polished_starts(
-    search: PoseSearch, starts: Sequence[Start], options: RegistrationOptions
+    search: PoseSearch, pair: VerifiedPair, rough: Sequence[Start], options: RegistrationOptions
 ) -> list[Start]:
-    """Rough starts with their poses bundle-adjusted, each if that finds more support."""
-    scene, polished = search.scene, []
+    """Rough starts of a pair with their poses bundle-adjusted, each if that finds more support."""
+    return [
+        Start(reference, image, pose)
+        for reference, image, found in _each_way(search.scene, pair, options)
+        for pose in search.polished(
+            image, [start.pose for start in rough if start.reference == reference], found
+        )
+    ]
+
+
+def _each_way(
+    scene: Scene, pair: VerifiedPair, options: RegistrationOptions
+) -> Iterator[tuple[int, int, Correspondences]]:
+    """Either image of a pair alone in the scene, the other, and what that one is posed by."""
     empty = scene.snapshot()
-    for start in starts:
-        place_first(scene, start.reference)
-        found = correspondences(scene, start.image, [start.reference], options)
-        (pose,) = search.polished(start.image, [start.pose], found)
-        polished.append(start._replace(pose=pose))
+    for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
+        place_first(scene, reference)
+        yield reference, image, correspondences(scene, image, [reference], options)
         scene.restore(empty)
-    return polished
 
 
 def start_from_rays(

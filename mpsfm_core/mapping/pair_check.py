@@ -71,17 +71,15 @@ class PairCheck:
         links, rotations = _turned(sure, len(problem.images))
         pairs = []
         for pair in problem.pairs:
-            verdict = verdicts.get(pair)
-            if verdict is not None and verdict.share > 0:
+            verdict = verdicts.get(pair, Verdict(pair.rotation, 1.0))
+            if verdict.share > 0:
                 pairs.append(_times(pair, verdict.share))
                 continue
-            if verdict is not None:
-                a, b = pair.image_a, pair.image_b
-                turn = rotation_angle_deg(rotations[b] @ rotations[a].T @ verdict.rotation.T)
-                tied = maximum_flow(links, a, b).flow_value
-                if tied > len(pair) and turn > MAX_TURN_DEG:
-                    continue
-            pairs.append(pair)
+            a, b = pair.image_a, pair.image_b
+            turn = rotation_angle_deg(rotations[b] @ rotations[a].T @ verdict.rotation.T)
+            tied = maximum_flow(links, a, b).flow_value
+            if tied <= len(pair) or turn <= MAX_TURN_DEG:
+                pairs.append(pair)
         return replace(problem, pairs=tuple(pairs))
 
     def verdict(self, pair: VerifiedPair) -> Verdict:
@@ -96,7 +94,7 @@ class PairCheck:
             return Verdict(pair.rotation, 1.0)
         allowed = self._best_allowed(starts)
         if allowed is None:
-            starts = polished_starts(search, starts, options)
+            starts = polished_starts(search, pair, starts, options)
             allowed = self._best_allowed(starts)
         best = max(starts, key=_support)
         if allowed is None:

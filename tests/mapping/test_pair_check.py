@@ -24,7 +24,6 @@ from mpsfm_core.testing.symmetric import twin_room_problem
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
-
 Check = TypeVar("Check", bound=PairCheck)
 
 

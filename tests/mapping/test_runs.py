@@ -19,7 +19,6 @@ from mpsfm_core.testing.problems import Noise, mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
 
 OPTIONS = ConsistencyOptions()
-
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
