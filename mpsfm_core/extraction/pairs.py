@@ -36,15 +36,19 @@ def retrieval(descriptors: Sequence[Float32], options: PairOptions) -> list[Pair
     return most_alike(matrix @ matrix.T, options.top_k, least)
 
 
-def most_alike(likeness: Float64, count: int, least: float = _ABOVE_NOTHING) -> list[Pair]:
-    """Each image with the ``count`` others it is most like; ``likeness`` (n, n), those of a
-    smaller one than ``least`` are left out."""
+def most_alike(
+    likeness: Float64,
+    count: int,
+    least: float = _ABOVE_NOTHING,
+    images: Iterable[int] | None = None,
+) -> list[Pair]:
+    """Each of the ``images``, all if None, with the ``count`` others it is most like; ``likeness``
+    (n, n), those of a smaller one than ``least`` are left out."""
     others = likeness.copy()
     np.fill_diagonal(others, -np.inf)
     best = np.argsort(-others, axis=1, kind="stable")[:, :count]
-    return _unordered(
-        (a, int(b)) for a, row in enumerate(best) for b in row if others[a, b] >= least
-    )
+    chosen = range(len(others)) if images is None else images
+    return _unordered((a, int(b)) for a in chosen for b in best[a] if others[a, b] >= least)
 
 
 def neighbours(names: Sequence[str], options: PairOptions) -> list[Pair]:

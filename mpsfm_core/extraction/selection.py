@@ -24,7 +24,7 @@ from mpsfm_core.extraction.workbench import Workbench
 class PairSelection:
     """Chooses pairs for the matcher; ``proposed`` counts those before the filters of plugins.
 
-    ``loose``: images of which one must be in a pair, None for any pair.
+    ``loose``: images that are matched again, of which one must be in a pair; None for any pair.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class PairSelection:
         self._likeness = self._look()
         if self._likeness is None:
             return self._ask(pairs.exhaustive(count))
-        alike = pairs.most_alike(self._likeness, options.partners)
+        alike = pairs.most_alike(self._likeness, self._partners, images=self._loose)
         return self._ask(alike + pairs.neighbours(self._bench.images.names, options))
 
     def choose_again(self, verified: Sequence[Pair]) -> list[Pair]:
@@ -80,6 +80,14 @@ class PairSelection:
             untried.sort(key=lambda pair: (-self._like(pair), pair))
             more += untried[: self._bench.config.pairs.partners]
         return self._ask(more)
+
+    @property
+    def _partners(self) -> int:
+        """Of each photo that asks for them."""
+        config = self._bench.config
+        if self._loose is None or config.quick is None:
+            return config.pairs.partners
+        return config.quick.partners
 
     def _like(self, pair: Pair) -> float:
         return 0.0 if self._likeness is None else float(self._likeness[pair])

@@ -18,12 +18,11 @@ A pixel speaks for the second where ``L`` is below that of a deviation of ``max_
 (2.7: 38 times less likely than none); the share of such pixels decides. So all depends on what std
 is true at the place. A prior that is good on the whole may be far off in one spot, and only there.
 What a map is worth at a place is therefore measured: by the points around whose depth hangs on no
-prior and not on this image's pose alone, as three views or more hold them at wide angles
-(:func:`~mpsfm_core.mapping.depth_noise.local_noise`). Where they deny the prior, it is at fault,
-its std is what they say, and the pixel contradicts nothing. Where they confirm it, or where there
-are none, the std of the whole stands and so does the contradiction. This tells look-alikes from bad
-priors: an image that stands in the twin of its room has points only on what both rooms share, where
-depth is right; what differs has none to excuse it.
+prior, as rays hold them at wide angles (:func:`~mpsfm_core.mapping.depth_noise.local_noise`). Where
+they deny the prior, it is at fault, its std is what they say, and the pixel contradicts nothing.
+Where they confirm it, or where there are none, the std of the whole stands and so does the
+contradiction. This tells look-alikes from bad priors: an image that stands in the twin of its room
+has points only on what both rooms share, where depth is right; what differs has none to excuse it.
 
 What fills the picture of a near view may fall into few pixels of a far one, whose refined map is
 least sure of what is small. Images that hold already go on clear evidence only: there it counts as

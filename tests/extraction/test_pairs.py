@@ -73,6 +73,13 @@ def test_most_alike_leaves_out_what_is_not_alike_at_all() -> None:
     assert most_alike(likeness, 3) == [(0, 1), (1, 2)]
 
 
+def test_most_alike_of_some_images() -> None:
+    """Those that another one would choose are not asked for."""
+    likeness = np.array([[0, 3, 1, 0], [3, 0, 2, 0], [1, 2, 0, 5], [0, 0, 5, 0]], dtype=np.float64)
+    assert most_alike(likeness, 1, images=[0]) == [(0, 1)]
+    assert most_alike(likeness, 2, images=[3, 0]) == [(0, 1), (0, 2), (2, 3)]
+
+
 def test_neighbours_by_number() -> None:
     """Two sequences, one with a gap and not in the order of its numbers, and a name by itself."""
     names = ["a_9.png", "a_10.png", "a_3.png", "b1/7.jpg", "cover.png", "b1/8.jpg", "b2/9.jpg"]

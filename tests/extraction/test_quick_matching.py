@@ -7,6 +7,7 @@ import pytest
 
 from mpsfm_core.config import QuickMatching
 from mpsfm_core.data import Float64
+from mpsfm_core.extraction.options import PairOptions
 from mpsfm_core.extraction.runner import Extraction, extract_more
 from mpsfm_core.geometry import transform
 from mpsfm_core.inputs.images import load_images
@@ -66,6 +67,22 @@ def test_a_pair_that_quick_matching_dropped(world) -> None:
     assert [(pair.image_a, pair.image_b) for pair in both.problem.pairs] == [(0, 1), (0, 2), (0, 3)]
     kept = [pair["images"] for pair in both.report["pairs"] if "dropped" not in pair]
     assert kept == [[world.names[0], name] for name in world.names[1:]]
+
+
+def test_photos_that_are_held_ask_for_no_partners(world) -> None:
+    """The last photo is most like the one before it, which is its neighbour too."""
+    pairs = PairOptions(mode="auto", partners=2, overlap=1)
+    quick = TRUTH.model_copy(update={"partners": 1})
+    images = load_images(world.root / "images", world.root / "intrinsics.yaml")
+    first = world.extract()
+
+    def asked(image: int, **changes: object) -> int:
+        config = world.config(pairs=pairs, **changes)
+        both = extract_more(images, config, world.registry, first, {image})
+        return both.report["pairs_proposed"] - first.report["pairs_proposed"]
+
+    assert asked(3) == 2
+    assert asked(3, quick=quick) == 1
 
 
 @pytest.mark.parametrize(("quick", "asked"), [(TRUTH, 0), ("weak", 6)])
