@@ -221,7 +221,7 @@ def bench_speed(size: tuple[int, int], repeats: int) -> dict[str, float]:
 
 def bench_warm(problem: Problem, repeats: int) -> float:
     """Refining again after all points moved by their deviation, without skipping."""
-    integrator = problem.integrator(replace(DEFAULT_OPTIONS, skip_tolerance=0.0))
+    integrator = problem.integrator(replace(DEFAULT_OPTIONS, max_point_growth=0.0))
     before = integrator.refine(problem.anchors)
     moved = problem.anchors._replace(depth=1.01 * problem.anchors.depth)
     return median_time(partial(integrator.refine, moved, start=before), repeats)
@@ -338,7 +338,7 @@ def ablation(analytic: list[Problem], real: list[Problem]) -> dict[str, Any]:
         *({"point_scale": v} for v in (1.0, 3.0, 1e3)),
         *({"cg_iterations": v} for v in (1, 3, 5)),
         *({"over_relaxation": v} for v in (1.0, 1.2, 1.6)),
-        *({"tolerance": v} for v in (5e-2, 1e-2, 1e-3)),
+        *({"tolerance": v} for v in (1e-1, 2e-2, 1e-2, 1e-3)),
     ]
     confident = [
         replace(p, depth=replace(p.depth, variance=p.depth.variance / 16)) for p in analytic

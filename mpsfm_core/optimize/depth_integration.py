@@ -40,7 +40,7 @@ from mpsfm_core.optimize.thinning import (
 # it says next to nothing, but nothing is left undetermined.
 _FILLED_LOG_VARIANCE = 1.0
 # Maps of twice so many columns are refined on every second pixel first, and then at most so many
-# times re-weighted. Ours: at 768 x 512 an energy lower than without, at three quarters of the time.
+# times re-weighted. Ours: at 768 x 512 an energy and errors lower than without, in 0.8 of the time.
 _COARSE_COLUMNS = 300
 _FINE_ITERATIONS = 3
 # Depth that is continued along normals stays within this factor of what is known (ours): a normal
@@ -84,9 +84,9 @@ class IntegrationOptions:
     over_relaxation: float = 1.4
     """Steps after the first are this much longer than the minimum of the quadratic, which is
     pessimistic about a concave energy. Ours: a third fewer re-weightings; flat from 1.3 to 1.6."""
-    tolerance: float = 2e-2
-    """Stop when a re-weighting lowers the energy by less than this fraction. The reference has 5 %,
-    with full solves between; our steps are shorter."""
+    tolerance: float = 5e-2
+    """Stop when a re-weighting lowers the energy by less than this fraction (reference). Ours, as
+    above: with 2 % errors are the same within 2 %, and mapping 50 photos takes 1.2 times as long."""
     max_point_growth: float = 1.2
     """Refining again is skipped while the points' mean energy has not grown by more than this
     factor since the last solve: points that a map agrees with as well as with those before tell it

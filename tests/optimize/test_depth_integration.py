@@ -283,7 +283,8 @@ def test_large_maps_profit_from_a_coarse_start(monkeypatch):
     field = cv2.resize(rng.normal(0, 0.05, (8, 10)), camera.size, interpolation=cv2.INTER_CUBIC)
     tilt = cv2.resize(rng.normal(0, 0.1, (48, 64, 3)), camera.size, interpolation=cv2.INTER_CUBIC)
     normals = normals + tilt
-    parts = depth_prior(depth * np.exp(field)), normal_prior(normals, 0.1), camera
+    options = replace(depth_integration.DEFAULT_OPTIONS, tolerance=1e-2)
+    parts = depth_prior(depth * np.exp(field)), normal_prior(normals, 0.1), camera, options
     anchors = exact_anchors(depth, 200)
     started = DepthIntegrator(*parts).refine(anchors)
     monkeypatch.setattr(depth_integration, "_COARSE_COLUMNS", 10_000)
