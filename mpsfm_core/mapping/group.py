@@ -17,8 +17,8 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.pair_check import PairCheck
 from mpsfm_core.mapping.registration import PoseSearch
 from mpsfm_core.mapping.triangulation import complete_and_merge, triangulate_image
-from mpsfm_core.mapping.upkeep import Upkeep
-from mpsfm_core.mapping.weak_holds import WeakHold, pair_matches, weak_holds
+from mpsfm_core.mapping.upkeep import State, Upkeep
+from mpsfm_core.mapping.weak_holds import WeakHold, weak_holds
 
 _log = logging.getLogger(__name__)
 
@@ -201,28 +201,33 @@ class Group:
     def reseat(self, available: Bool) -> None:
         """Take out images that matches hold weakly, and register them elsewhere.
 
-        That counts if no image is lost, more matches tie them to the rest then, and no others want
-        them away; each such group of images is taken out once. Images that came with a pose stay,
-        unless that is a guess.
+        That counts if no image is lost, more matches than before see common points, and no others
+        want them away; each such group of images is taken out once. Images that came with a pose
+        stay, unless that is a guess.
         """
         tried: set[tuple[int, ...]] = set()
         holds = self._weak_holds()
         while hold := next((h for h in holds if h.images not in tried), None):
             tried.add(hold.images)
-            before, tied = self.upkeep.state(), self._tied(hold)
+            before, explained = self.upkeep.state(), self._num_explained()
             self._take_out(hold)
             self.grow(available, wide=True)
-            self.upkeep.refine_globally()
-            lost = np.flatnonzero(before.scene.registered & ~self.scene.registered)
-            left = self._weak_holds()
-            still = any(other.images == hold.images for other in left)
-            if not len(lost) and not still and self._tied(hold) > tied:
-                holds = left
-                continue
+            if not self._lost_since(before):
+                self.upkeep.refine_globally()
+            lost = self._lost_since(before)
+            if not lost and self._num_explained() > explained:
+                left = self._weak_holds()
+                if all(other.images != hold.images for other in left):
+                    holds = left
+                    continue
             self.upkeep.restore(before)
-            for image in map(int, lost):
+            for image in lost:
                 self._journal.registered(image, self.size)
             self._journal.scene_changed(self.scene)
+
+    def _lost_since(self, before: State) -> list[int]:
+        """Images that were registered then and are not now."""
+        return [int(i) for i in np.flatnonzero(before.scene.registered & ~self.scene.registered)]
 
     def _take_out(self, hold: WeakHold) -> None:
         """Take weakly held images out, not to be posed again beside those that hold them."""
@@ -239,11 +244,9 @@ class Group:
         holds = weak_holds(self.scene, self._options.registration.min_inliers)
         return [hold for hold in holds if guess or not stays[list(hold.images)].any()]
 
-    def _tied(self, hold: WeakHold) -> int:
-        """Matches that see common points in some images and in the rest."""
-        _, explained = pair_matches(self.scene)
-        inside = self.scene.mask(list(hold.images))
-        return int(explained[np.ix_(inside, ~inside)].sum())
+    def _num_explained(self) -> int:
+        """Matches of which both keypoints see the same point."""
+        return int(np.count_nonzero(self.scene.explained_edges()))
 
     def finish(self) -> None:
         """Last refinements, and the depth check once more for every image."""

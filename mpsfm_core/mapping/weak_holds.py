@@ -5,7 +5,8 @@ false, or one of the two stands where it does by others that are. What lies betw
 fewest explained matches that must go for the two to come apart (a minimum cut). If those are fewer
 than the matches that the two have with each other, the images on the smaller side of the cut may
 belong elsewhere. The same holds for two images that another one, which could not be registered,
-matches both: it can stand beside one of them only.
+matches both: it can stand beside one of them only. And a single image may belong elsewhere that no
+pair alone outweighs, but all of its pairs together.
 """
 
 from __future__ import annotations
@@ -22,6 +23,12 @@ from mpsfm_core.scene.scene import Scene
 MAX_EXPLAINED = 0.25
 """Share of the matches of two images that see the same point, up to which the two stand against
 each other (ours; of right pairs it is well above a half)."""
+
+
+CLEARLY_MORE = 0.5
+"""Of what the matches of so many pairs would come to by chance, if each pair spoke for one place or
+the other as it happens: by so much more must those against an image's place be. (Ours, two rooms:
+with 0 right images move too, whose false matches are a few more; ``benchmarks/symmetry.py``.)"""
 
 
 class WeakHold(NamedTuple):
@@ -41,11 +48,16 @@ def weak_holds(scene: Scene, min_matches: int) -> list[WeakHold]:
     """
     matches, explained = pair_matches(scene)
     held = explained > MAX_EXPLAINED * matches
-    apart = _apart(scene.registered, np.where(held | (matches < min_matches), 0, matches))
+    against = np.where(held | (matches < min_matches), 0, matches)
+    apart = _apart(scene.registered, against)
     if not apart.any():
         return []
     flows = csr_array(explained.astype(np.int32))
     found: dict[tuple[int, ...], WeakHold] = {}
+    for image, margin in _outweighed(scene.registered, against, explained):
+        inside = scene.mask([image])
+        links = np.argwhere(held & inside[:, None] & (scene.registered & ~inside))
+        found[image,] = WeakHold((image,), links, margin)
     for a, b in np.argwhere(np.triu(apart > widest_ways(explained))):
         flow = maximum_flow(flows, int(a), int(b))
         margin = int(apart[a, b] - flow.flow_value)
@@ -93,6 +105,20 @@ def widest_ways(held: Int64) -> Int64:
         for image in joined:
             group[image] = joined
     return widest
+
+
+def _outweighed(registered: Bool, against: Int64, explained: Int64) -> list[tuple[int, int]]:
+    """Registered images against whose place clearly more matches of all their pairs speak than for
+    it, and by how many more.
+
+    ``against``, ``explained`` (n, n): of each two images.
+    """
+    among = registered[:, None] & registered
+    against, explained = np.where(among, against, 0), np.where(among, explained, 0)
+    margin = (against - explained).sum(axis=1)
+    by_chance = np.sqrt((against**2 + explained**2).sum(axis=1))
+    clear = np.flatnonzero(margin > CLEARLY_MORE * by_chance)
+    return [(int(image), int(margin[image])) for image in clear]
 
 
 def _apart(registered: Bool, against: Int64) -> Int64:

@@ -71,6 +71,20 @@ def test_an_image_that_two_want_beside_them_stands_against_both(
     assert (hold.images, hold.margin) == ((3,), 40)
 
 
+def test_an_image_that_all_its_pairs_together_outweigh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """6 stands beside 0 to 2 by false matches; no pair alone has more than these."""
+    together = {(a, b): 200 for a in range(6) for b in range(a)}
+    explained = symmetric(7, together | {(6, 0): 100, (6, 1): 100, (6, 2): 100})
+    everything = np.ones(7, np.bool_)
+    torn = {(6, 3): 170, (6, 4): 170, (6, 5): 170}
+    (hold,) = holds(explained + symmetric(7, torn), explained, everything, monkeypatch)
+    assert (hold.images, hold.margin) == ((6,), 510 - 300)
+    assert hold.links.tolist() == [[6, 0], [6, 1], [6, 2]]
+
+    torn = {(6, 3): 120, (6, 4): 120, (6, 5): 120}  # more, but not clearly
+    assert holds(explained + symmetric(7, torn), explained, everything, monkeypatch) == []
+
+
 def test_widest_ways_are_those_of_all_ways() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
