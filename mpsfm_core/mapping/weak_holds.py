@@ -23,8 +23,6 @@ from mpsfm_core.scene.scene import Scene
 MAX_EXPLAINED = 0.25
 """Share of the matches of two images that see the same point, up to which the two stand against
 each other (ours; of right pairs it is well above a half)."""
-
-
 CLEARLY_MORE = 0.5
 """Of what the matches of so many pairs would come to by chance, if each pair spoke for one place or
 the other as it happens: by so much more must those against an image's place be. (Ours, two rooms:
@@ -54,10 +52,15 @@ def weak_holds(scene: Scene, min_matches: int) -> list[WeakHold]:
         return []
     flows = csr_array(explained.astype(np.int32))
     found: dict[tuple[int, ...], WeakHold] = {}
+
+    def add(inside: Bool, margin: int) -> None:
+        images = tuple(map(int, np.flatnonzero(inside)))
+        if images not in found or found[images].margin < margin:
+            links = np.argwhere(held & inside[:, None] & (scene.registered & ~inside))
+            found[images] = WeakHold(images, links, margin)
+
     for image, margin in _outweighed(scene.registered, against, explained):
-        inside = scene.mask([image])
-        links = np.argwhere(held & inside[:, None] & (scene.registered & ~inside))
-        found[image,] = WeakHold((image,), links, margin)
+        add(scene.mask([image]), margin)
     for a, b in np.argwhere(np.triu(apart > widest_ways(explained))):
         flow = maximum_flow(flows, int(a), int(b))
         margin = int(apart[a, b] - flow.flow_value)
@@ -69,10 +72,7 @@ def weak_holds(scene: Scene, min_matches: int) -> list[WeakHold]:
         inside = scene.mask(side)
         if 2 * inside.sum() > scene.registered.sum():
             inside = scene.registered & ~inside
-        images = tuple(map(int, np.flatnonzero(inside)))
-        if images not in found or found[images].margin < margin:
-            links = np.argwhere(held & inside[:, None] & (scene.registered & ~inside))
-            found[images] = WeakHold(images, links, margin)
+        add(inside, margin)
     return sorted(found.values(), key=lambda hold: (-hold.margin, hold.images))
 
 
