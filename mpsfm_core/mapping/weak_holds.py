@@ -111,10 +111,9 @@ def _outweighed(registered: Bool, against: Int64, explained: Int64) -> list[tupl
     """Registered images against whose place clearly more matches of all their pairs speak than for
     it, and by how many more.
 
-    ``against``, ``explained`` (n, n): of each two images.
+    ``against``, ``explained`` (n, n): of each two images; only registered ones explain any.
     """
-    among = registered[:, None] & registered
-    against, explained = np.where(among, against, 0), np.where(among, explained, 0)
+    against = np.where(registered[:, None] & registered, against, 0)
     margin = (against - explained).sum(axis=1)
     by_chance = np.sqrt((against**2 + explained**2).sum(axis=1))
     clear = np.flatnonzero(margin > CLEARLY_MORE * by_chance)
