@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float64, Int64, MappingProblem, PinholeCamera
-from mpsfm_core.geometry import camera_center, inside
+from mpsfm_core.geometry import camera_center, inside, pixel_centers
 from mpsfm_core.testing.degraded_depth import DepthErrors, degrade_depth
 from mpsfm_core.testing.problems import Noise, verified_pair, view_of
 from mpsfm_core.testing.scenes import AnalyticScene, Box, Sphere, Surface, look_at, project
@@ -25,6 +25,9 @@ SHIFT = np.array([5.2, 0.0, 0.0])
 CAMERA = PinholeCamera(640, 480, 400.0, 400.0, 320.0, 240.0)
 MIN_MATCHES = 15
 """Verified matches that make a pair (COLMAP)."""
+MIN_SIGHT = 0.3
+"""Metres that a view sees somewhere at least: of one that stands inside a piece of furniture all
+keypoints lie within a few pixels of the others."""
 
 
 class SymmetricProblem(NamedTuple):
@@ -67,6 +70,8 @@ def twin_rooms() -> AnalyticScene:
 def twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], list[int]]:
     """Views around both rooms, and a walk through the corridor; each seed stands a bit elsewhere.
 
+    Whoever would stand inside the furniture stands in front of it.
+
     Returns:
         Poses (3, 4) ``cam_from_world``, and the room of each view, -1 in the corridor.
     """
@@ -97,7 +102,20 @@ def twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], list[i
     room += [0, *[-1] * (len(walk) - 2), 1]
     jitter = rng.normal(0, 0.08, (2, len(eyes), 3))
     looks = zip(eyes + jitter[0], targets + jitter[1], strict=True)
-    return [look_at(eye, target) for eye, target in looks], room
+    scene = twin_rooms()
+    return [_in_the_open(scene, eye, target) for eye, target in looks], room
+
+
+def _in_the_open(scene: AnalyticScene, eye: Float64, target: Float64) -> Float64:
+    """A view (3, 4) from where it sees further than MIN_SIGHT, nearer to its target if need be."""
+    pixels = pixel_centers(*CAMERA.size)[::80, ::80].reshape(-1, 2)
+    step = 0.1 * (target - eye) / np.linalg.norm(target - eye)
+    while True:
+        pose = look_at(eye, target)
+        sights = scene.sample(CAMERA, pose, pixels).points - eye
+        if np.linalg.norm(sights, axis=1).max() > MIN_SIGHT:
+            return pose
+        eye = eye + step
 
 
 def twin_room_problem(
