@@ -7,10 +7,10 @@ depth) are kept in the output folder, so that only what comes after the mapper i
 ``--true-poses`` the mapper is given the true poses and holds them; scales of depth, points and
 refined maps are its own.
 
-Depth is compared in the scale of the cameras, the cloud after aligning the cameras' centres, with
-all true depth maps of the set as the scan. ``fountain`` has no true depth: there it is the share of
-matches, triangulated with the true poses, whose depth is right to 1 %. The last line of ``--json``
-is one JSON object.
+Depth is compared in the scale of the cameras, its std in the one that fits the depth of the set
+best, the cloud after aligning the cameras' centres, with all true depth maps of the set as the
+scan. ``fountain`` has no true depth: there it is the share of matches, triangulated with the true
+poses, whose depth is right to 1 %. The last line of ``--json`` is one JSON object.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
 
 from benchmarks._scenes import shared_folder
 from benchmarks.accuracy import FASTDEPTH, PRIORS
-from mpsfm_core.data import Bool, DepthPrior, Float64, MappingProblem, Pose
+from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, MappingProblem, Pose
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.sparse_depth import depth_of_points
@@ -233,10 +233,12 @@ def set_errors(
     if scene.depth is None:
         assert problem is not None
         return points_near(problem, scene.truth, maps, scale)
-    found = [
-        map_errors(depth, scale, read_depth(depth_file(scene.depth, name)), seen.get(name))
+    beside = [
+        MapBesideTruth.of(depth, read_depth(depth_file(scene.depth, name)), seen.get(name))
         for name, depth in maps.items()
     ]
+    own = own_scale(beside)
+    found = [map_errors(each, scale, own) for each in beside]
     cameras = {photo.name: photo.pinhole for photo in photos}
     accuracy = dense_accuracy(reconstruction, cloud, scene, cameras, TOLERANCES)
     assert accuracy is not None  # it has a scale and true depth
@@ -249,23 +251,45 @@ def set_errors(
     return result
 
 
-def map_errors(
-    depth: DepthPrior, scale: float, truth: Float64, seen: Bool | None
-) -> dict[str, float]:
-    """The share that is near of one map; of pixels that were ``seen`` and of the rest
-    the share within the stated std, and the part that the rest has in the AbsRel."""
-    assert depth.variance is not None  # of a refined map always
-    xy, found, true = depth_beside_truth(depth.depth, depth.valid, truth)
-    variance, _ = sample_bilinear(depth.variance, depth.valid, xy)
-    error = np.abs(scale * found - true)
-    std = np.sqrt(np.maximum(variance, 0))
-    within, relative = error <= scale * std, error / true
-    own = np.zeros(depth.shape, np.bool_) if seen is None else seen
-    measured = sample_nearest(own, xy)
+class MapBesideTruth(NamedTuple):
+    """Pixels (n,) where a map and the truth are known: depth and its std, the true depth, and
+    whether the photos told it."""
+
+    depth: Float64
+    std: Float64
+    truth: Float64
+    measured: Bool
+
+    @classmethod
+    def of(cls, depth: DepthPrior, truth: Float32, seen: Bool | None) -> MapBesideTruth:
+        """Of a map and the true one; ``seen`` (h, w): pixels that were measured in the photos."""
+        assert depth.variance is not None  # of a refined map always
+        xy, found, true = depth_beside_truth(depth.depth, depth.valid, truth)
+        variance, _ = sample_bilinear(depth.variance, depth.valid, xy)
+        own = np.zeros(depth.shape, np.bool_) if seen is None else seen
+        return cls(found, np.sqrt(np.maximum(variance, 0)), true, sample_nearest(own, xy))
+
+
+def own_scale(maps: Sequence[MapBesideTruth]) -> float:
+    """The scale in which most of what was measured in a set is right, or of all where nothing was:
+    centres of a few cameras tell it worse than depth does."""
+    ratios = [each.truth / each.depth for each in maps]
+    told = [ratio[each.measured] for ratio, each in zip(ratios, maps, strict=True)]
+    return float(np.median(np.concatenate(told if any(map(len, told)) else ratios)))
+
+
+def map_errors(of: MapBesideTruth, scale: float, own_scale: float) -> dict[str, float]:
+    """The share that is near of one map, and the part that what was not measured has in the
+    AbsRel, in the ``scale`` of the cameras; AbsRel and the share within the stated std, of pixels
+    that were measured and of the rest, in the scale of the depth itself."""
+    measured, relative = of.measured, np.abs(scale * of.depth - of.truth) / of.truth
+    error = np.abs(own_scale * of.depth - of.truth)
+    within = error <= own_scale * of.std
     return {
-        "near": float((error <= NEAR * true).mean()),
+        "near": float((relative <= NEAR).mean()),
         "measured": float(measured.mean()),
         "abs_rel_of_rest": float(relative[~measured].sum() / len(relative)),
+        "abs_rel_own_scale": float((error / of.truth).mean()),
         "within_std_measured": float(within[measured].mean()) if measured.any() else np.nan,
         "within_std_rest": float(within[~measured].mean()) if not measured.all() else np.nan,
     }
