@@ -10,7 +10,7 @@ from mpsfm_core.data import Bool
 from mpsfm_core.mapping.correspondences import Correspondences, correspondences
 from mpsfm_core.mapping.filtering import filter_points, lost_images
 from mpsfm_core.mapping.pose_support import AbsolutePose, rate_pose
-from mpsfm_core.mapping.registration import PoseSearch
+from mpsfm_core.mapping.registration import PoseSearch, distinct
 from mpsfm_core.mapping.triangulation import triangulate_image
 from mpsfm_core.mapping.upkeep import Upkeep
 from mpsfm_core.mapping.view_selection import local_bundle, rank_next_images
@@ -117,7 +117,7 @@ class Growth:
         search = not attempts.exhausted(image, references)
         if search:
             poses += self._search.poses(image, found, attempt=attempts.searches(image))
-        poses.sort(key=lambda pose: -pose.support)
+        poses = distinct(poses)
         attempts.remember(image, references, poses[0] if poses else None, searched=search)
         return poses
 

@@ -97,7 +97,7 @@ def find_poses(
         def add(estimates: Iterator[Estimate]) -> None:
             made = pool.map(lambda estimate: estimate(), estimates)
             rated = [rate_pose(scene, found, pose, options) for pose in made if pose]
-            chosen = _distinct(rated, options.num_improved)
+            chosen = distinct(rated, options.num_improved)
             improved = pool.map(partial(improve_pose, scene, found, options=options), chosen)
             poses.extend([*rated, *improved])
 
@@ -106,11 +106,12 @@ def find_poses(
         confident = best is not None and best.inlier_share >= options.confident_share
         if options.lifting and not confident and attempt < options.resampled_attempts:
             add(replace(hypotheses, seed=seed + attempt).of_halves())
-    return _distinct(poses, options.num_polished)
+    return distinct(poses, options.num_polished)
 
 
-def _distinct(poses: list[AbsolutePose], count: int) -> list[AbsolutePose]:
+def distinct(poses: Sequence[AbsolutePose], count: int | None = None) -> list[AbsolutePose]:
     """The best supported poses, at most ``count``, none turned little from a better one."""
+    count = len(poses) if count is None else count
     poses = sorted(poses, key=lambda pose: -pose.support)
     rotations = np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3)
     turns = rotation_angle_deg(rotations[:, None] @ rotations.transpose(0, 2, 1))
