@@ -16,6 +16,7 @@ from mpsfm_core.mapping.growth import Growth
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.pose_support import AbsolutePose
+from mpsfm_core.mapping.registration import distinct
 from mpsfm_core.mapping.upkeep import Upkeep
 from mpsfm_core.testing.problems import mapping_problem
 from mpsfm_core.testing.scenes import arc_poses, room_scene
@@ -84,6 +85,40 @@ def test_a_refused_pose_is_tried_again_only_in_another_scene(group: Group) -> No
     assert group.upkeep.attempts.refusal(1, pose) is None
     group.upkeep.drop([4], "to change the scene")
     assert group.upkeep.attempts.refusal(2, pose) is None
+
+
+def test_of_poses_turned_little_the_best_supported_one_counts() -> None:
+    def pose(degrees: float, support: float) -> AbsolutePose:
+        turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+        return AbsolutePose(turn, np.zeros(3), "PnP", support, 30, 1.0)
+
+    poses = [pose(0, 1.0), pose(2, 3.0), pose(90, 2.0), pose(91, 0.5), pose(45, 0.1)]
+    assert [found.support for found in distinct(poses)] == [3.0, 2.0, 0.1]
+    assert [found.support for found in distinct(poses, 2)] == [3.0, 2.0]
+    assert distinct([]) == []
+
+
+def test_a_pose_that_was_found_before_is_tried_once(
+    group: Group, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The best one of the last attempt is found again by the next search, but for rounding."""
+    scene, attempts = group.scene, group.upkeep.attempts
+    turn = Rotation.from_euler("y", 0.1, degrees=True).as_matrix()
+    known = AbsolutePose(
+        turn @ scene.rotations[4], turn @ scene.translations[4], "PnP", 1.0, 30, 1.0
+    )
+    take_out(group, 4)
+    attempts.forget()
+    attempts.remember(4, [3], known, searched=True)
+    tried: list[AbsolutePose] = []
+
+    def contradicted(image: int, pose: AbsolutePose, *rest: object, **more: object) -> str:
+        tried.append(pose)
+        return "it floats"
+
+    monkeypatch.setattr(group.growth, "_try_pose", contradicted)
+    assert group.growth._try_image(4, [3]) == "it floats"
+    assert len(tried) == 1
 
 
 def test_a_jump_that_contradicts_is_undone(group: Group) -> None:
