@@ -278,13 +278,13 @@ def own_scale(maps: Sequence[MapBesideTruth]) -> float:
     return float(np.median(np.concatenate(told if any(map(len, told)) else ratios)))
 
 
-def map_errors(of: MapBesideTruth, scale: float, own_scale: float) -> dict[str, float]:
+def map_errors(of: MapBesideTruth, scale: float, own: float) -> dict[str, float]:
     """The share that is near of one map, and the part that what was not measured has in the
     AbsRel, in the ``scale`` of the cameras; AbsRel and the share within the stated std, of pixels
-    that were measured and of the rest, in the scale of the depth itself."""
+    that were measured and of the rest, in the depth's ``own`` scale."""
     measured, relative = of.measured, np.abs(scale * of.depth - of.truth) / of.truth
-    error = np.abs(own_scale * of.depth - of.truth)
-    within = error <= own_scale * of.std
+    error = np.abs(own * of.depth - of.truth)
+    within = error <= own * of.std
     return {
         "near": float((relative <= NEAR).mean()),
         "measured": float(measured.mean()),

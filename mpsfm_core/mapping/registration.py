@@ -111,12 +111,11 @@ def find_poses(
 
 def distinct(poses: Sequence[AbsolutePose], count: int | None = None) -> list[AbsolutePose]:
     """The best supported poses, at most ``count``, none turned little from a better one."""
-    count = len(poses) if count is None else count
     poses = sorted(poses, key=lambda pose: -pose.support)
     rotations = np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3)
     turns = rotation_angle_deg(rotations[:, None] @ rotations.transpose(0, 2, 1))
     kept: list[int] = []
     for row in range(len(poses)):
-        if len(kept) < count and (turns[row, kept] > MIN_TURN_DEG).all():
+        if (turns[row, kept] > MIN_TURN_DEG).all():
             kept.append(row)
-    return [poses[row] for row in kept]
+    return [poses[row] for row in kept[:count]]

@@ -86,7 +86,7 @@ class IntegrationOptions:
     pessimistic about a concave energy. Ours: a third fewer re-weightings; flat from 1.3 to 1.6."""
     tolerance: float = 5e-2
     """Stop when a re-weighting lowers the energy by less than this fraction (reference). Ours, as
-    above: with 2 % errors are the same within 2 %, and mapping 50 photos takes 1.2 times longer."""
+    above: with 2 % errors are the same within 2 %, mapping 50 photos takes 1.2 times as long."""
     max_point_growth: float = 1.2
     """Refining again is skipped while the points' mean energy has not grown by more than this
     factor since the last solve: points that a map agrees with as well as with those before tell it
