@@ -8,6 +8,7 @@ are off as much, but there depth gives way: two views of the same pair agree on 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,21 +29,28 @@ _STEP = 1e-2
 """Of log depth, that tells the direction of the line."""
 
 
-def pose_error_px(
-    view: DenseView, log_depth: Float32, others: Iterable[tuple[DenseView, Bool]]
-) -> float:
-    """Std of the offsets beside the lines, pixels of the map; 0 where no patch tells.
+class PatchOffsets(NamedTuple):
+    """Patches of a photo, looked for in another one.
 
-    ``log_depth``: (h, w), found in the ``view``. ``others``: views, and (h, w) the pixels whose
-    depth they confirm.
+    ``beside_lines``: (n,) float64, pixels of the other map, of those that were found. ``found``:
+    their share, 0 to 1.
     """
-    offsets = [_beside_lines(view, log_depth, other, which) for other, which in others]
-    all_offsets = np.abs(np.concatenate([np.zeros(0), *offsets]))
-    return float(np.quantile(all_offsets, ONE_SIGMA)) if len(all_offsets) else 0.0
+
+    beside_lines: Float64
+    found: float
 
 
-def _beside_lines(view: DenseView, log_depth: Float32, other: DenseView, which: Bool) -> Float64:
-    """Offsets of patches that are found, evenly spread over the given pixels."""
+def pose_error_px(pairs: Iterable[PatchOffsets]) -> float:
+    """Std of the offsets beside the lines of a photo's pairs; 0 where no patch tells."""
+    offsets = np.abs(np.concatenate([np.zeros(0), *(pair.beside_lines for pair in pairs)]))
+    return float(np.quantile(offsets, ONE_SIGMA)) if len(offsets) else 0.0
+
+
+def patch_offsets(
+    view: DenseView, log_depth: Float32, other: DenseView, which: Bool
+) -> PatchOffsets:
+    """Look for patches of the ``view``, evenly spread over ``which`` (h, w), where their
+    ``log_depth`` (h, w) puts them in the ``other`` one."""
     rows, columns = np.nonzero(which)
     chosen = np.linspace(0, len(rows) - 1, min(PATCHES, len(rows))).astype(np.int64)
     rows, columns = rows[chosen], columns[chosen]
@@ -63,5 +71,5 @@ def _beside_lines(view: DenseView, log_depth: Float32, other: DenseView, which: 
     near = np.linalg.norm(found.shift, axis=1) < RADIUS
     tells = (found.correlation > MIN_CORRELATION) & near & (length > 0)
     x, y = found.shift[tells].T
-    offsets: Float64 = (y * along[tells, 0] - x * along[tells, 1]) / length[tells]
-    return offsets
+    beside = (y * along[tells, 0] - x * along[tells, 1]) / length[tells]
+    return PatchOffsets(beside, len(beside) / max(len(chosen), 1))

@@ -1,10 +1,11 @@
-"""How far the scale of what pairs of views measure may be off, beside that of the other pairs.
+"""How far the scale of what pairs of views measure may be off, beside that of the others.
 
 Two views tell depth up to the length of their baseline, and agree with each other whatever it is.
 Lengths are tied where two pairs have a photo in common: by the pixels that both confirm, and by the
-depth that was known of that photo before, which joins what either pair measured of it. Along a
-chain of such ties errors add up. The log scale of each pair is an unknown, a tie says that two are
-equal, and the std is that of an unknown beside the mean of all.
+depth that was known of that photo before, which joins what either pair measured of it. Known depth
+of one photo is tied to that of all by what it declares. Errors add up along a chain of such ties.
+The log scales of pairs, of known maps and of the world are unknowns, a tie says that two are equal,
+and the std is that of an unknown beside the mean of all pairs.
 Where the mapper had no depth, something else holds the scales, of which a model says nothing.
 """
 
@@ -20,9 +21,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64
-from mpsfm_core.dense.posterior import MIN_STD
 from mpsfm_core.statistics import ONE_SIGMA
 
+_LEAST_STD = 1e-6
+"""Of a tie: none is better."""
+_ALIKE = 0.5
+"""Correlation of the scales of known maps of photos that pairs join: network and scene are the same
+(with FastDepth 0.1 to 0.7 in rendered_kitchen and the fountain, as their true scales say; ours)."""
 _COLUMNS = 256
 """Of an inverse that are held at once."""
 
@@ -31,16 +36,24 @@ class Ties(NamedTuple):
     """What one photo says of the pairs that it makes with others.
 
     ``others`` (k,): those views. ``pixels`` (k,): how many of its pixels each confirms.
-    ``precision`` (k, k), symmetric: 1 / variance of the difference of two pairs' log scales.
+    ``shared`` (k, k), symmetric: 1 / variance of the difference of two pairs' log scales, of the
+    pixels that both confirm. ``known`` (k,): the same of the known depth and each pair.
+    ``known_std``: of the log scale of the known depth.
     """
 
     others: list[int]
     pixels: Int64
-    precision: Float64
+    shared: Float64
+    known: Float64
+    known_std: float
 
 
 def ties_of_photo(
-    differences: Mapping[int, Float32], usable: Bool, change: Float32, correlation_px: float
+    differences: Mapping[int, Float32],
+    usable: Bool,
+    change: Float32,
+    known_std: float,
+    correlation_px: float,
 ) -> Ties:
     """Compare what the pairs of a photo say of it, all (h, w) of its map.
 
@@ -49,76 +62,98 @@ def ties_of_photo(
             says of it.
         usable: pixels that count.
         change: from the log depth that was known before to the measured one.
+        known_std: declared, of that depth.
         correlation_px: distance over which errors hang together, in pixels of the map. So large a
             square is one observation.
 
-    The known depth ties two pairs with an error that is in each of the two regions as large as the
-    distance of known and measured depth there: errors of a map hang together over the region.
+    Of k pairs that confirm a pixel each is as sure as the others, and what they have in common, the
+    photo's own error, tells nothing. They differ by as much as shared pixels differ in the mean,
+    whatever their number. Known depth is as far off in the region of a pair as the distance of
+    known and measured depth there: errors of a map hang together over the region.
     """
     confirmed = {other: np.isfinite(map_) & usable for other, map_ in differences.items()}
     others = [other for other, which in confirmed.items() if which.any()]
-    square = [np.quantile(np.abs(change[confirmed[each]]), ONE_SIGMA) ** 2 for each in others]
-    precision = np.zeros((len(others), len(others)))
+    off = [np.quantile(np.abs(change[confirmed[each]]), ONE_SIGMA) for each in others]
+    known = np.maximum(np.array(off, np.float64), _LEAST_STD) ** -2
+    views = np.sum([confirmed[each] for each in others], axis=0)
+    shared = np.zeros((len(others), len(others)))
     for a, b in combinations(range(len(others)), 2):
         both = confirmed[others[a]] & confirmed[others[b]]
-        found = 1 / max(square[a] + square[b], MIN_STD**2)
         patches = np.count_nonzero(both) // correlation_px**2
         if patches:
             between = differences[others[a]][both] - differences[others[b]][both]
-            found += patches / max(float(np.mean(between**2)), MIN_STD**2)
-        precision[a, b] = precision[b, a] = found
+            variance = float(between.mean()) ** 2 + float(between.var()) / patches
+            share = float(np.mean(2 / views[both]))
+            shared[a, b] = shared[b, a] = share / max(variance, _LEAST_STD**2)
     pixels = np.array([np.count_nonzero(confirmed[each]) for each in others], np.int64)
-    return Ties(others, pixels, precision)
+    return Ties(others, pixels, shared, known, known_std)
 
 
 def scale_stds(photos: Mapping[int, Ties]) -> dict[int, float]:
     """Of each photo the std of the log scale of what was measured of it: that of its pairs, each as
-    far as it confirms pixels; 0 where none does.
+    far as it confirms pixels; that of its known depth where none does. 0 if there is no pair.
 
     ``photos``: by view, whose numbers are those of :attr:`Ties.others`.
     """
     numbers: dict[tuple[int, int], int] = {}
     pairs = {
-        view: [numbers.setdefault((min(view, j), max(view, j)), len(numbers)) for j in ties.others]
+        view: np.array(
+            [numbers.setdefault((min(view, j), max(view, j)), len(numbers)) for j in ties.others],
+            np.int64,
+        )
         for view, ties in photos.items()
     }
-    parts = [
-        (np.repeat(pairs[view], len(pairs[view])), np.tile(pairs[view], len(pairs[view])), ties)
-        for view, ties in photos.items()
-        if ties.others
-    ]
-    if not parts:
+    if not numbers:
         return dict.fromkeys(photos, 0.0)
-    rows, columns = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-    values = np.concatenate([part[2].precision.ravel() for part in parts])
-    shape = len(numbers), len(numbers)
-    variance = _variance_beside_mean(coo_array((values, (rows, columns)), shape=shape).tocsr())
+    maps = {view: len(numbers) + row for row, view in enumerate(photos)}
+    count = len(numbers) + len(maps)
+    rows, columns, values, weight = [], [], [], np.zeros(count)
+    for view, ties in photos.items():
+        own = pairs[view]
+        a, b = np.nonzero(np.triu(ties.shared))
+        rows += [own[a], own]
+        columns += [own[b], np.full(len(own), maps[view])]
+        values += [ties.shared[a, b], ties.known]
+        weight[own] += ties.pixels
+    one_way = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    half = coo_array(one_way, shape=(count, count)).tocsr()
+    to_world = _ties_to_world(
+        half, list(maps.values()), [each.known_std for each in photos.values()]
+    )
+    variance = _variance_beside_mean(csr_array(half + half.T), to_world, weight / weight.sum())
     return {
-        view: float(np.average(variance[pairs[view]], weights=ties.pixels) ** 0.5)
-        if ties.others
-        else 0.0
+        view: float(
+            np.average(variance[pairs[view]], weights=ties.pixels) ** 0.5
+            if ties.others
+            else variance[maps[view]] ** 0.5
+        )
         for view, ties in photos.items()
     }
 
 
-def _variance_beside_mean(precision: csr_array) -> Float64:
-    """Of n unknowns whose differences are known to be 0 with this ``precision`` (n, n): variance
-    (n,) of each less the mean of those that it is connected with."""
-    laplacian = csr_array(diags_array(precision.sum(axis=1)) - precision)
-    variance = np.zeros(precision.shape[0])
-    groups = connected_components(precision, directed=False)[1]
-    for group in range(groups.max() + 1):
-        members = np.flatnonzero(groups == group)
-        free = members[1:]  # beside the first one, whose row and column of the inverse are 0
-        if not len(free):
-            continue
-        solve = splu(laplacian[free][:, free].tocsc()).solve
-        own, sums = np.zeros(len(members)), np.zeros(len(members))
-        for start in range(0, len(free), _COLUMNS):
-            count = min(_COLUMNS, len(free) - start)
-            columns = solve(np.eye(len(free), count, -start))
-            own[1 + start : 1 + start + count] = columns[start : start + count].diagonal()
-            sums[1 + start : 1 + start + count] = columns.sum(axis=0)
-        mean = sums.sum() / len(members) ** 2
-        variance[members] = np.maximum(own - 2 * sums / len(members) + mean, 0)
+def _ties_to_world(precision: csr_array, maps: list[int], stds: list[float]) -> Float64:
+    """(n,) 1 / variance of each unknown beside the world, of which only ``maps`` tell.
+
+    ``stds``: of these. Errors of those that ties of this ``precision`` (n, n) join hang together.
+    """
+    groups = connected_components(precision, directed=False)[1][maps]
+    joined = np.bincount(groups)[groups]
+    to_world = np.zeros(precision.shape[0])
+    to_world[maps] = 1 / ((1 + _ALIKE * (joined - 1)) * np.square(stds))
+    return to_world
+
+
+def _variance_beside_mean(precision: csr_array, to_world: Float64, weight: Float64) -> Float64:
+    """Of n unknowns whose differences are known to be 0 with this ``precision`` (n, n), and
+    themselves with that ``to_world`` (n,): variance (n,) of each less their mean by ``weight``
+    (n,), which sums up to 1."""
+    system = diags_array(precision.sum(axis=1) + to_world) - precision
+    solve = splu(system.tocsc()).solve
+    count = len(weight)
+    sums, own = solve(weight), np.zeros(count)
+    for start in range(0, count, _COLUMNS):
+        width = min(_COLUMNS, count - start)
+        columns = solve(np.eye(count, width, -start))
+        own[start : start + width] = columns[start : start + width].diagonal()
+    variance: Float64 = np.maximum(own - 2 * sums + weight @ sums, 0)
     return variance

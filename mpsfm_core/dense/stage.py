@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -15,14 +14,21 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Bool, DepthPrior, Float32, View
 from mpsfm_core.dense.consistency import (
     Agreement,
+    Differences,
     PosedDepth,
     agreement_of,
     depth_differences,
     splat_depth,
 )
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.pose_errors import pose_error_px
-from mpsfm_core.dense.posterior import MIN_STD, Observed, posterior, with_known
+from mpsfm_core.dense.pose_errors import patch_offsets, pose_error_px
+from mpsfm_core.dense.posterior import (
+    MIN_STD,
+    UNKNOWN_LOG_STD,
+    Observed,
+    posterior,
+    with_known,
+)
 from mpsfm_core.dense.scale_errors import Ties, scale_stds, ties_of_photo
 from mpsfm_core.dense.source_views import choose_sources
 from mpsfm_core.dense.stereo import StereoDepth, match_depth
@@ -105,6 +111,7 @@ def densify(
     images = [reconstruction.images[row] for row in posed]
     near = choose_sources(images, max(options.num_sources, _SEEN_FROM))
     sources = [others[: options.num_sources] for others in near]
+    beside = _matched_with(sources)
     views = _Views(images, view_of, options)
 
     def matched(row: int) -> _Found:
@@ -119,11 +126,20 @@ def densify(
         return _Found(view.grid, keep(stereo.log_depth), stereo.parallax, keep(supported))
 
     def compared(row: int) -> tuple[Agreement, Ties | None]:
-        own, differences = found[row], _differences(row, found, sources[row], options)
-        ties = _ties(own, differences, images[row].depth, options) if posed_by_depth else None
-        confirmed = ((views[j], own.supported & np.isfinite(d)) for j, d in differences.items())
-        of_poses = pose_error_px(views[row], own.log_depth, confirmed)
-        return _agreement(own, differences, of_poses, keep), ties
+        own, differences = found[row], _differences(row, found, beside[row], options)
+        seen = {
+            j: patch_offsets(views[row], own.log_depth, views[j], each.agree)
+            for j, each in differences.items()
+        }
+        agreeing = {
+            j: each.log_depth
+            for j, each in differences.items()
+            if not each.by_chance(seen[j].found)
+        }
+        of_poses = pose_error_px(seen[j] for j in agreeing)
+        agreement = agreement_of(own.parallax_px, agreeing.values(), of_poses)
+        ties = _ties(own, agreeing, images[row].depth, options) if posed_by_depth else None
+        return _kept(agreement, keep), ties
 
     def finished(row: int) -> tuple[RegisteredImage, Bool]:
         view = views[row]
@@ -186,9 +202,9 @@ class _Found(NamedTuple):
     parallax: Float32
     supported: Bool
 
-    def log_std(self, match_std_px: float) -> Float32:
-        """Of a right match, (h, w)."""
-        std: Float32 = np.float32(match_std_px) / self.parallax_px
+    def log_std(self, std_px: float | Float32) -> Float32:
+        """Of a match that is as sure, (h, w)."""
+        std: Float32 = np.float32(std_px) / self.parallax_px
         return std
 
     @property
@@ -201,35 +217,40 @@ class _Found(NamedTuple):
         return PosedDepth(self.grid, self.log_depth, self.log_std(options.match_std_px))
 
 
+def _matched_with(sources: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Of each view its sources, and those whose source it is, in order."""
+    beside = [set(others) for others in sources]
+    for row, others in enumerate(sources):
+        for other in others:
+            beside[other].add(row)
+    return [sorted(others) for others in beside]
+
+
 def _differences(
-    row: int, found: Mapping[int, _Found], sources: Sequence[int], options: DenseOptions
-) -> dict[int, Float32]:
-    """From a map to those of its sources."""
+    row: int, found: Mapping[int, _Found], others: Sequence[int], options: DenseOptions
+) -> dict[int, Differences]:
+    """From a map to those of other views, where it is supported."""
     own = found[row].posed_depth(options)
     return {
-        other: depth_differences(own, found[other].posed_depth(options))
-        for other in sources
+        other: depth_differences(own, found[other].posed_depth(options)).where(found[row].supported)
+        for other in others
         if other in found
     }
 
 
-def _agreement(
-    own: _Found, differences: Mapping[int, Float32], of_poses: float, keep: Keep
-) -> Agreement:
-    """A map beside those of its sources; ``of_poses``: their error in pixels, which no difference
-    shows."""
-    usable = (np.where(own.supported, each, np.nan) for each in differences.values())
-    agreement = agreement_of(own.parallax_px, usable)
-    maps = keep(agreement.confirmed), keep(agreement.mean_change)
-    return Agreement(*maps, math.hypot(agreement.match_std_px, of_poses))
+def _kept(agreement: Agreement, keep: Keep) -> Agreement:
+    return replace(agreement, views=keep(agreement.views), mean_change=keep(agreement.mean_change))
 
 
 def _ties(
     own: _Found, differences: Mapping[int, Float32], depth: DepthPrior, options: DenseOptions
 ) -> Ties:
-    """A map beside those of its sources and the ``depth`` that was known."""
-    change = own.log_depth - known_depth(depth, *own.grid.camera.size)[0]
-    return ties_of_photo(differences, own.supported, change, options.correlation_px)
+    """A map beside those of others and the ``depth`` that was known."""
+    log_depth, log_std = known_depth(depth, *own.grid.camera.size)
+    known = log_std < UNKNOWN_LOG_STD
+    std = float(np.median(log_std[known])) if known.any() else UNKNOWN_LOG_STD
+    change = own.log_depth - log_depth
+    return ties_of_photo(differences, own.supported, change, std, options.correlation_px)
 
 
 def _measured(
@@ -243,9 +264,9 @@ def _measured(
     """What the photos say of a view: its own depth where others agree, and where they do not the
     depth of others' confirmed pixels, if that is about what was known."""
     own, agreement = found[row], agreed[row]
-    confirmed, match_std_px = agreement.confirmed, agreement.match_std_px
+    confirmed = agreement.confirmed
     log_depth = own.log_depth + agreement.mean_change
-    std = own.log_std(match_std_px if confirmed.any() else options.match_std_px)
+    std = own.log_std(agreement.std_px if confirmed.any() else options.match_std_px)
     std = np.maximum(std, np.float32(MIN_STD))
     others = (
         (found[j].grid, found[j].log_depth, agreed[j].confirmed) for j in sorted(near) if j in found

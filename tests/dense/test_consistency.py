@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mpsfm_core.data import Float32
-from mpsfm_core.dense.consistency import agreement_of
+from mpsfm_core.data import Float32, PinholeCamera
+from mpsfm_core.dense.consistency import Differences, PosedDepth, agreement_of, depth_differences
+from mpsfm_core.dense.view import PosedGrid
 
 SHAPE = 200, 300
 
@@ -42,3 +45,47 @@ def test_nobody_says_nothing() -> None:
     agreement = agreement_of(np.ones(SHAPE, np.float32), [])
     assert not agreement.confirmed.any()
     assert np.isnan(agreement.match_std_px)
+
+
+@pytest.mark.parametrize("views", [0, 1, 4])
+def test_errors_of_maps_hang_together(views: int) -> None:
+    """Maps with a correlation of 0.3: of the mean of all 68 % are within its std."""
+    rng, parallax, std_px = np.random.default_rng(0), np.full(SHAPE, 50, np.float32), 0.4
+    common = 0.3**0.5 * rng.normal(size=SHAPE)
+    errors = std_px * (common + 0.7**0.5 * rng.normal(size=(1 + max(views, 1), *SHAPE)))
+    found = [((each - errors[0]) / 50).astype(np.float32) for each in errors[1:]]
+    agreement = agreement_of(parallax, found)
+    if not views:  # where nobody agrees our own error is left
+        agreement = replace(agreement, views=np.zeros(SHAPE, np.uint8))
+    mean = errors[: 1 + views].mean(axis=0)
+    assert (np.abs(mean) < agreement.std_px).mean() == pytest.approx(0.683, abs=0.01)
+
+
+def test_errors_of_poses_are_in_every_map() -> None:
+    parallax, found = np.ones(SHAPE, np.float32), [np.zeros(SHAPE, np.float32)] * 4
+    np.testing.assert_allclose(agreement_of(parallax, found, pose_std_px=0.7).std_px, 0.7)
+
+
+def test_what_differs_by_more_than_agrees_is_beyond() -> None:
+    grid = PosedGrid(PinholeCamera(4, 1, 10.0, 10.0, 2.0, 0.5), np.eye(3), np.zeros(3))
+    std = np.full((1, 4), 0.01, np.float32)
+    own = PosedDepth(grid, np.zeros((1, 4), np.float32), std)
+    # three times the std of two maps, 0.042, agree
+    other = own._replace(log_depth=np.array([[0.0, 0.04, -0.08, 0.09]], np.float32))
+    found = depth_differences(own, other)
+    assert found.agree.tolist() == [[True, True, False, False]]
+    assert found.beyond.tolist() == [[False, False, True, False]]
+    usable = found.where(np.array([[False, True, False, True]]))
+    assert usable.agree.tolist() == [[False, True, False, False]] and not usable.beyond.any()
+
+
+@pytest.mark.parametrize(
+    ("beyond", "found", "chance"), [(0.9, 0.1, True), (0.9, 0.5, False), (0.1, 0.1, False)]
+)
+def test_what_agrees_by_chance_agrees_no_oftener_than_not(
+    beyond: float, found: float, chance: bool
+) -> None:
+    rng = np.random.default_rng(0)
+    agree = np.where(rng.random(SHAPE) < 0.2, 0, np.nan).astype(np.float32)
+    off = ~np.isfinite(agree) & (rng.random(SHAPE) < 0.25 * beyond)
+    assert Differences(agree, off).by_chance(found) == chance

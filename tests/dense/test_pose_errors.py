@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import View
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.pose_errors import pose_error_px
+from mpsfm_core.dense.pose_errors import PatchOffsets, patch_offsets, pose_error_px
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.dense.view import DenseView
 from mpsfm_core.scene.reconstruction import RegisteredImage
@@ -25,27 +25,28 @@ def turned(image: RegisteredImage, axis: list[float], pixels: float) -> Register
     return replace(image, rotation=turn @ image.rotation, translation=turn @ image.translation)
 
 
-def measured_error(room, axis: list[float], pixels: float) -> float:
-    """Between the first two photos of a room, of which the second stands wrong."""
+def looked_for(room, axis: list[float], pixels: float) -> PatchOffsets:
+    """Patches of the first photo of a room in the second one, which stands wrong."""
     first, second = room.reconstruction.images[:2]
     one, other = (
         DenseView.of(image, room.views[image.name], max(image.camera.size))
         for image in (first, turned(second, axis, pixels))
     )
     depth = np.log(room.truth[first.name])
-    return pose_error_px(one, depth, [(other, np.ones(depth.shape, np.bool_))])
+    return patch_offsets(one, depth, other, np.ones(depth.shape, np.bool_))
 
 
 @pytest.mark.parametrize(("axis", "pixels"), [(ACROSS, 0.0), (ALONG, 2.0)])
 def test_right_poses_and_what_depth_may_explain_leave_nothing(
     room, axis: list[float], pixels: float
 ) -> None:
-    assert measured_error(room, axis, pixels) < 0.25
+    seen = looked_for(room, axis, pixels)
+    assert pose_error_px([seen]) < 0.25 and seen.found > 0.5
 
 
 @pytest.mark.parametrize("pixels", [1.0, 3.0])
 def test_errors_across_the_lines_are_measured(room, pixels: float) -> None:
-    assert measured_error(room, ACROSS, pixels) == pytest.approx(pixels, rel=0.15)
+    assert pose_error_px([looked_for(room, ACROSS, pixels)]) == pytest.approx(pixels, rel=0.15)
 
 
 def test_depth_is_less_sure_where_poses_are_wrong(room) -> None:
@@ -70,5 +71,10 @@ def test_without_pixels_nothing_is_said(room) -> None:
     image = room.reconstruction.images[0]
     view = DenseView.of(image, room.views[image.name], max(image.camera.size))
     depth = np.log(room.truth[image.name])
-    assert pose_error_px(view, depth, [(view, np.zeros(depth.shape, np.bool_))]) == 0.0
-    assert pose_error_px(view, depth, []) == 0.0
+    nothing = patch_offsets(view, depth, view, np.zeros(depth.shape, np.bool_))
+    assert nothing.found == 0.0
+    assert pose_error_px([nothing]) == pose_error_px([]) == 0.0
+
+
+def test_patches_are_not_found_in_photos_of_something_else(room) -> None:
+    assert looked_for(room, ACROSS, 60.0).found < 0.1

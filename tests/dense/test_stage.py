@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -97,6 +98,18 @@ def test_maps_may_lie_on_disk(room, tmp_path: Path) -> None:
         np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
         np.testing.assert_array_equal(a.depth.variance, b.depth.variance)
         np.testing.assert_array_equal(report.measured[a.name], same.measured[a.name])
+
+
+def test_photos_that_agree_by_chance_measure_nothing(room) -> None:
+    def unrelated(index: int, image: np.ndarray) -> np.ndarray:
+        noise = np.random.default_rng(index).random(image.shape[:2]).astype(np.float32)
+        grey = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX)
+        return np.repeat(grey[:, :, None], 3, axis=2).astype(np.uint8)
+
+    dense, report = densify(room.reconstruction, changed(room, unrelated), OPTIONS)
+    for image, before in zip(dense.images, room.reconstruction.images, strict=True):
+        assert report.confirmed[image.name] == 0 and not report.measured[image.name].any()
+        np.testing.assert_allclose(image.depth.depth, before.depth.depth, rtol=1e-5)
 
 
 def test_exposure_may_change_from_photo_to_photo(room) -> None:
