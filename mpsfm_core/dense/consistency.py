@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mpsfm_core.data import Bool, Float32, Float64, UInt8
+from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.dense.view import PosedGrid
 from mpsfm_core.jit import kernel
 from mpsfm_core.statistics import ONE_SIGMA
@@ -20,9 +21,9 @@ _STDS = 3.0
 _MIN_TOLERANCE, _MAX_TOLERANCE = 0.005, 0.05
 """Of log depth: poses are not exact, and wide ranges agree with anything (ours)."""
 _ALIKE = 0.3
-"""Correlation of the errors of maps that agree: with it 71, 75 and 75 % of the measured pixels of
-rendered_kitchen (FastDepth, degraded and true depth) are within their std, 75 to 79 % if the mean
-of maps were no surer than one of them (ours)."""
+"""Correlation of the errors of maps that agree: with it 72, 76 and 76 % of the measured pixels of
+rendered_kitchen `all` (FastDepth, degraded and true depth) are within their std, 75, 79 and 77 % if
+the mean of maps were no surer than one of them (ours)."""
 _CHANCE = 0.5
 """Share of a pair's agreement above which chance may be all of it."""
 _MIN_FOUND = 0.25
@@ -34,14 +35,14 @@ pose of a pair is right to 5 degrees, 0 to 0.26 where it is wrong by more than 2
 class Agreement:
     """What other views say of a map, (h, w).
 
-    ``views``: uint8, how many agree; one is enough, as two wrong depths rarely do (of those that
+    ``views``: uint16, how many agree; one is enough, as two wrong depths rarely do (of those that
     one of three views confirms 95 % are right to 2 % on rendered_kitchen, whatever the others say).
     ``mean_change``: float32, from our log depth to the mean of ours and those that agree.
     ``match_std_px``: std of a match that the differences of depths that agree speak for, NaN
     without any. ``pose_std_px``: what errors of poses add, which no difference shows.
     """
 
-    views: UInt8
+    views: NDArray[np.uint16]
     mean_change: Float32
     match_std_px: float
     pose_std_px: float = 0.0
@@ -116,7 +117,7 @@ def agreement_of(
     ``parallax``: (h, w), pixels that a point moves when its log depth changes by one. A difference
     has the errors of two matches. ``pose_std_px``: see :class:`Agreement`.
     """
-    views, change, moved = np.zeros(parallax.shape, np.uint8), np.zeros_like(parallax), []
+    views, change, moved = np.zeros(parallax.shape, np.uint16), np.zeros_like(parallax), []
     for each in differences:
         agree = np.isfinite(each)
         views += agree

@@ -3,6 +3,7 @@
 A pixel with its depth lies in another view on a line, wherever its depth. What the patch around it
 lies beside that line is an error of the poses, and nothing else is as large. Along the line poses
 are off as much, but there depth gives way: two views of the same pair agree on the wrong depth.
+Where few patches are found at all, two views hardly show the same.
 """
 
 from __future__ import annotations

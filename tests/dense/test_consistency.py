@@ -56,7 +56,7 @@ def test_errors_of_maps_hang_together(views: int) -> None:
     found = [((each - errors[0]) / 50).astype(np.float32) for each in errors[1:]]
     agreement = agreement_of(parallax, found)
     if not views:  # where nobody agrees our own error is left
-        agreement = replace(agreement, views=np.zeros(SHAPE, np.uint8))
+        agreement = replace(agreement, views=np.zeros(SHAPE, np.uint16))
     mean = errors[: 1 + views].mean(axis=0)
     assert (np.abs(mean) < agreement.std_px).mean() == pytest.approx(0.683, abs=0.01)
 
