@@ -96,7 +96,7 @@ def measured(count: int) -> dict[str, float | None]:
             model,
             lambda name: photo_of(original[name]),
             DenseOptions(),
-            disk=DiskArrays(Path(folder)),
+            keep=DiskArrays(Path(folder)).keep,
         )
     return {
         "before_mb": before,
