@@ -111,7 +111,7 @@ def densify(
     images = [reconstruction.images[row] for row in posed]
     near = choose_sources(images, max(options.num_sources, _SEEN_FROM))
     sources = [others[: options.num_sources] for others in near]
-    beside = _matched_with(sources)
+    compared_with = _compared_with(sources)
     views = _Views(images, view_of, options)
 
     def matched(row: int) -> _Found:
@@ -126,17 +126,17 @@ def densify(
         return _Found(view.grid, keep(stereo.log_depth), stereo.parallax, keep(supported))
 
     def compared(row: int) -> tuple[Agreement, Ties | None]:
-        own, differences = found[row], _differences(row, found, beside[row], options)
-        seen = {
+        own, differences = found[row], _differences(row, found, compared_with[row], options)
+        patches = {
             j: patch_offsets(views[row], own.log_depth, views[j], each.agree)
             for j, each in differences.items()
         }
         agreeing = {
             j: each.log_depth
             for j, each in differences.items()
-            if not each.by_chance(seen[j].found)
+            if not each.by_chance(patches[j].found)
         }
-        of_poses = pose_error_px(seen[j] for j in agreeing)
+        of_poses = pose_error_px(patches[j] for j in agreeing)
         agreement = agreement_of(own.parallax_px, agreeing.values(), of_poses)
         ties = _ties(own, agreeing, images[row].depth, options) if posed_by_depth else None
         return _kept(agreement, keep), ties
@@ -217,7 +217,7 @@ class _Found(NamedTuple):
         return PosedDepth(self.grid, self.log_depth, self.log_std(options.match_std_px))
 
 
-def _matched_with(sources: Sequence[Sequence[int]]) -> list[list[int]]:
+def _compared_with(sources: Sequence[Sequence[int]]) -> list[list[int]]:
     """Of each view its sources, and those whose source it is, in order."""
     beside = [set(others) for others in sources]
     for row, others in enumerate(sources):
