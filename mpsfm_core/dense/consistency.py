@@ -25,10 +25,11 @@ _ALIKE = 0.3
 rendered_kitchen `all` (FastDepth, degraded and true depth) are within their std, 75, 79 and 77 % if
 the mean of maps were no surer than one of them (ours)."""
 _CHANCE = 0.5
-"""Share of a pair's agreement above which chance may be all of it."""
+"""Share of a pair's agreement above which chance may be all of it (ours)."""
 _MIN_FOUND = 0.25
 """Of the patches of such a pair, found in the other photo: in hololens_room 0.2 to 0.8 where the
-pose of a pair is right to 5 degrees, 0 to 0.26 where it is wrong by more than 20 (ours)."""
+pose of a pair is right to 5 degrees (but one of hardly any pixels, 0.14), 0 to 0.26 where it is
+wrong by more than 30 (ours)."""
 
 
 @dataclass(frozen=True, eq=False)

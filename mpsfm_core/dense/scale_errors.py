@@ -20,7 +20,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
-from mpsfm_core.data import Bool, Float32, Float64, Int64
+from mpsfm_core.data import Float32, Float64, Int64
 from mpsfm_core.statistics import ONE_SIGMA
 
 _LEAST_STD = 1e-6
@@ -50,7 +50,6 @@ class Ties(NamedTuple):
 
 def ties_of_photo(
     differences: Mapping[int, Float32],
-    usable: Bool,
     change: Float32,
     known_std: float,
     correlation_px: float,
@@ -60,7 +59,6 @@ def ties_of_photo(
     Args:
         differences: other view -> what :func:`~mpsfm_core.dense.consistency.depth_differences`
             says of it.
-        usable: pixels that count.
         change: from the log depth that was known before to the measured one.
         known_std: declared, of that depth.
         correlation_px: distance over which errors hang together, in pixels of the map. So large a
@@ -71,7 +69,7 @@ def ties_of_photo(
     whatever their number. Known depth is as far off in the region of a pair as the distance of
     known and measured depth there: errors of a map hang together over the region.
     """
-    confirmed = {other: np.isfinite(map_) & usable for other, map_ in differences.items()}
+    confirmed = {other: np.isfinite(map_) for other, map_ in differences.items()}
     others = [other for other, which in confirmed.items() if which.any()]
     off = [np.quantile(np.abs(change[confirmed[each]]), ONE_SIGMA) for each in others]
     known = np.maximum(np.array(off, np.float64), _LEAST_STD) ** -2

@@ -32,7 +32,7 @@ from mpsfm_core.dense.posterior import (
 from mpsfm_core.dense.scale_errors import Ties, scale_stds, ties_of_photo
 from mpsfm_core.dense.source_views import choose_sources
 from mpsfm_core.dense.stereo import StereoDepth, match_depth
-from mpsfm_core.dense.view import DenseView, PosedGrid, known_depth
+from mpsfm_core.dense.view import DenseView, PosedGrid
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.threads import allowed
@@ -138,7 +138,7 @@ def densify(
         }
         of_poses = pose_error_px(patches[j] for j in agreeing)
         agreement = agreement_of(own.parallax_px, agreeing.values(), of_poses)
-        ties = _ties(own, agreeing, images[row].depth, options) if posed_by_depth else None
+        ties = _ties(own, agreeing, views[row], options) if posed_by_depth else None
         return _kept(agreement, keep), ties
 
     def finished(row: int) -> tuple[RegisteredImage, Bool]:
@@ -243,14 +243,13 @@ def _kept(agreement: Agreement, keep: Keep) -> Agreement:
 
 
 def _ties(
-    own: _Found, differences: Mapping[int, Float32], depth: DepthPrior, options: DenseOptions
+    own: _Found, differences: Mapping[int, Float32], view: DenseView, options: DenseOptions
 ) -> Ties:
-    """A map beside those of others and the ``depth`` that was known."""
-    log_depth, log_std = known_depth(depth, *own.grid.camera.size)
-    known = log_std < UNKNOWN_LOG_STD
-    std = float(np.median(log_std[known])) if known.any() else UNKNOWN_LOG_STD
-    change = own.log_depth - log_depth
-    return ties_of_photo(differences, own.supported, change, std, options.correlation_px)
+    """A map beside those of others and the depth that was known of the ``view``."""
+    known = view.log_std < UNKNOWN_LOG_STD
+    std = float(np.median(view.log_std[known])) if known.any() else UNKNOWN_LOG_STD
+    change = own.log_depth - view.log_depth
+    return ties_of_photo(differences, change, std, options.correlation_px)
 
 
 def _measured(

@@ -11,7 +11,7 @@ SHAPE = 60, 80
 LEFT = np.broadcast_to(np.arange(80) < 40, SHAPE)
 
 
-WEAK = 1e-6
+WEAK = 1e-7
 """Precision of a tie that says hardly anything."""
 
 
@@ -45,10 +45,9 @@ def test_errors_add_up_along_a_chain() -> None:
     variance = np.array(
         [0.03**2 * 4 / 9 + 0.04**2 / 9, 0.03**2 / 9 + 0.04**2 / 9, 0.03**2 / 9 + 0.04**2 * 4 / 9]
     )
-    # a pair counts as much as pixels confirm it, from both sides
-    assert found[0] == pytest.approx(variance[0] ** 0.5, rel=1e-4)
-    assert found[1] == pytest.approx(variance[:2].mean() ** 0.5, rel=1e-4)
-    assert found[3] == pytest.approx(variance[2] ** 0.5, rel=1e-4)
+    assert found[0] == pytest.approx(variance[0] ** 0.5)
+    assert found[1] == pytest.approx(variance[:2].mean() ** 0.5)
+    assert found[3] == pytest.approx(variance[2] ** 0.5)
 
 
 def test_a_ring_is_surer_than_the_chain_and_long_ones_are_solved() -> None:
@@ -57,8 +56,8 @@ def test_a_ring_is_surer_than_the_chain_and_long_ones_are_solved() -> None:
     chain = ring | {0: end(1), count - 1: end(count - 2)}
     around, along = scale_stds(ring), scale_stds(chain)
     # variance of a closed random walk beside its mean: s^2 (n^2 - 1) / (12 n)
-    assert around[7] == pytest.approx(0.02 * ((count**2 - 1) / (12 * count)) ** 0.5, rel=1e-2)
-    assert np.ptp(list(around.values())) < 1e-6
+    assert around[7] == pytest.approx(0.02 * ((count**2 - 1) / (12 * count)) ** 0.5)
+    assert np.ptp(list(around.values())) < 1e-9
     assert along[0] > 1.9 * around[0]
 
 
@@ -81,35 +80,36 @@ def test_what_no_pair_joins_hangs_on_what_known_depth_declares() -> None:
 
 def test_known_depth_ties_regions_as_well_as_it_fits_there() -> None:
     change = np.random.default_rng(0).normal(0, np.where(LEFT, 0.03, 0.04), SHAPE)
-    usable = np.ones(SHAPE, np.bool_)
-    ties = ties_of_photo(differences(0, 0), usable, change.astype(np.float32), 0.25, 20)
+    ties = ties_of_photo(differences(0, 0), change.astype(np.float32), 0.25, 20)
     assert ties.others == [1, 2] and ties.pixels.tolist() == [2400, 2400]
     assert ties.known_std == 0.25 and not ties.shared.any()
     np.testing.assert_allclose(ties.known**-0.5, [0.03, 0.04], rtol=0.05)
 
 
 def test_shared_pixels_tie_pairs_no_better_than_both_agree_there() -> None:
-    change, usable = np.full(SHAPE, 0.1, np.float32), np.ones(SHAPE, np.bool_)
-    ties = ties_of_photo(differences(-0.001, 0.001, shared=10), usable, change, 0.25, 20)
+    change = np.full(SHAPE, 0.1, np.float32)
+    ties = ties_of_photo(differences(-0.001, 0.001, shared=10), change, 0.25, 20)
     # however many pixels: they all say that the two scales differ by 0.002
     assert ties.shared[0, 1] ** -0.5 == pytest.approx(0.002, rel=1e-4)
-    fewer = ties_of_photo(differences(-0.001, 0.001, shared=3), usable, change, 0.25, 20)
+    fewer = ties_of_photo(differences(-0.001, 0.001, shared=3), change, 0.25, 20)
     assert not fewer.shared.any()  # less than one square
-    masked = ties_of_photo(differences(0, 0), LEFT, change, 0.25, 20)
+    left = {j: np.where(LEFT, map_, np.nan) for j, map_ in differences(0, 0).items()}
+    masked = ties_of_photo(left, change, 0.25, 20)
     assert masked.others == [1]
 
 
 def test_pairs_that_confirm_the_same_pixels_are_as_sure_as_their_own_errors() -> None:
     rng, std, count = np.random.default_rng(2), 0.01, 5
-    own = rng.normal(0, std, SHAPE)
-    seen = {j: (rng.normal(0, std, SHAPE) - own).astype(np.float32) for j in range(1, count + 1)}
+    errors = rng.normal(0, std, (count + 1, *SHAPE))
+    errors -= errors.mean(axis=(1, 2), keepdims=True)  # scales that differ by nothing
+    seen = {j: (errors[j] - errors[0]).astype(np.float32) for j in range(1, count + 1)}
     none = np.zeros(SHAPE, np.float32)
-    ties = ties_of_photo(seen, np.ones(SHAPE, np.bool_), none, 0.25, 1)
+    ties = ties_of_photo(seen, none, 0.25, 1)
     # precision of count observations of one thing with a common error that tells nothing:
     # 1 / std^2 for each pixel, less their mean
     expected = SHAPE[0] * SHAPE[1] / std**2 / count
     off_diagonal = ties.shared[~np.eye(count, dtype=np.bool_)]
-    assert np.median(off_diagonal) == pytest.approx(expected, rel=0.6)
+    np.testing.assert_allclose(off_diagonal, expected, rtol=0.1)
 
 
 def test_simulated_scales_are_within_their_std_as_often_as_normal_ones() -> None:
