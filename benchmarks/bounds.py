@@ -24,7 +24,7 @@ from mpsfm_core.evaluation.benchmark import PairsOfSets, problem_of_sets
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.evaluation.scene_folder import read_scene
 from mpsfm_core.mapping.mapper import reconstruct
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 
 SCENE = "rendered_kitchen"
 CONVENTION = CONVENTIONS["paper"]

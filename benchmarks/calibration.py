@@ -3,13 +3,12 @@
     python -m benchmarks.calibration [--buckets minimal leq5 leq10] [--output DIR] [--workers 1]
 
 Two depth priors of the HoloLens room: FastDepth, and the sensor's depth with smooth errors
-(`mpsfm_core.testing.degraded_depth`). Each is calibrated on the images that no set holds, and then
-declared in four ways: calibrated, 5 times too certain, 5 times too uncertain, and uncalibrated
-(the defaults, which are those of another network). Coverage is on the images of the sets, poses
-are of the sets, with the mapper measuring the noise of depth itself (its default) and without.
-Resumable: --output keeps what is done. Writes benchmarks/results/calibration.md; scenes are in
-$MPSFM_SHARED or ../shared.
-"""
+(`mpsfm_core.testing.synthetic.degraded_depth`). Each is calibrated on the images that no set holds,
+and then declared in four ways: calibrated, 5 times too certain, 5 times too uncertain, and
+uncalibrated (the defaults, which are those of another network). Coverage is on the images of the
+sets, poses are of the sets, with the mapper measuring the noise of depth itself (its default) and
+without. Resumable: --output keeps what is done. Writes benchmarks/results/calibration.md; scenes
+are in $MPSFM_SHARED or ../shared. """
 
 from __future__ import annotations
 
@@ -28,10 +27,10 @@ from mpsfm_core.evaluation.pose_auc import CONVENTIONS
 from mpsfm_core.evaluation.prior_quality import prior_settings
 from mpsfm_core.evaluation.report import Row, make_rows
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
-from mpsfm_core.registry import Registry
-from mpsfm_core.uncertainty.file import load_calibration
-from mpsfm_core.uncertainty.model import DepthCalibration
-from mpsfm_core.yaml_text import write_yaml
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.uncertainty.file import load_calibration
+from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.support.yaml_text import write_yaml
 
 FACTOR = 5.0
 MEASURED = {"measured": True, "trusted": False}

@@ -56,9 +56,9 @@ from mpsfm_core.geometry import (
 from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.mapper import reconstruct
-from mpsfm_core.registry import Registry
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.results.options import ResultOptions
-from mpsfm_core.scene.reconstruction import Reconstruction
 
 TOLERANCES = (0.02, 0.05)
 """Metres, of the clouds."""

@@ -25,15 +25,15 @@ from benchmarks.dense import view_of
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
-from mpsfm_core.disk_arrays import DiskArrays
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.scene_folder import read_scene
 from mpsfm_core.evaluation.true_surface import depth_file
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.stages import peak_memory_mb
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.pipeline.stages import peak_memory_mb
+from mpsfm_core.support.disk_arrays import DiskArrays
 
 _STD = 0.05
 """Of the known depth, relative."""

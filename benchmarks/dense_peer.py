@@ -41,10 +41,10 @@ from mpsfm_core.evaluation.true_surface import depth_file
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.results.colmap_model import build_model, pinhole
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.ply import read_ply
-from mpsfm_core.scene.reconstruction import Reconstruction
 
 MODE = "moderate"
 """The peer's own default."""

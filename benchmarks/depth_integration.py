@@ -38,7 +38,7 @@ from mpsfm_core.optimize.depth_integration import (
 )
 from mpsfm_core.optimize.integration_energy import majorise
 from mpsfm_core.optimize.multigrid import Multigrid
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 from tests.optimize.integration_reference import ReferenceIntegration
 
 SIZES = ((387, 258), (768, 512))

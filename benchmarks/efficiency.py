@@ -22,8 +22,8 @@ from typing import NamedTuple
 from threadpoolctl import threadpool_limits
 
 from mpsfm_core.mapping import mapper
-from mpsfm_core.stages import peak_memory_mb
-from mpsfm_core.testing.halls import HONEST, hall_problem
+from mpsfm_core.pipeline.stages import peak_memory_mb
+from mpsfm_core.testing.synthetic.halls import HONEST, hall_problem
 
 MAP_WIDTH = 387
 """As the extraction room leaves maps (``extraction.integration_size``)."""

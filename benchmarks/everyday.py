@@ -3,14 +3,13 @@
     python -m benchmarks.everyday [--views 49 100 ...] [--priors exact honest "locally wrong"]
         [--only NAME ...] [--threads 1] [--repeats 1] [--json] [--output FILE]
 
-Analytic halls with boxes (:mod:`mpsfm_core.testing.halls`): each view overlaps well with those
-around it, keypoints have 0.7 px of noise and 5 % of the matches are wrong. Each run has a process
-of its own; compiled loops are loaded before. Times are medians of the repeats, in turn with
+Analytic halls with boxes (:mod:`mpsfm_core.testing.synthetic.halls`): each view overlaps well with
+those around it, keypoints have 0.7 px of noise and 5 % of the matches are wrong. Each run has a
+process of its own; compiled loops are loaded before. Times are medians of the repeats, in turn with
 COLMAP's; memory is the peak of the process, with the problem in it. With more than one of
-``--threads`` for both, what a user waits for is the wall time.
-``--only``: of :data:`VARIANTS`, settings below ``mapping`` that differ from the defaults. The last
-line is one JSON object with ``--json``.
-"""
+``--threads`` for both, what a user waits for is the wall time. ``--only``: of :data:`VARIANTS`,
+settings below ``mapping`` that differ from the defaults. The last line is one JSON object with
+``--json``. """
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ from benchmarks._scenes import percent
 from mpsfm_core.evaluation.methods import OURS, Outcome, Task, run_tasks
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.testing.halls import QUALITIES, Hall, hall_problem
+from mpsfm_core.testing.synthetic.halls import QUALITIES, Hall, hall_problem
 
 PEER = "colmap"
 VARIANTS: Mapping[str, Mapping[str, object]] = {

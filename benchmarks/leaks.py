@@ -20,11 +20,11 @@ import numpy as np
 from benchmarks._scenes import RESULTS
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.options import Backend
-from mpsfm_core.pipeline import reconstruct
-from mpsfm_core.registry import Registry
-from mpsfm_core.testing.held import Held, held_after_each
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.data.options import Backend
+from mpsfm_core.pipeline.run import reconstruct
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.testing.leak_probe import Held, held_after_each
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
 

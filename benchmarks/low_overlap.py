@@ -22,10 +22,10 @@ import numpy as np
 
 from benchmarks._scenes import percent, shared_folder
 from mpsfm_core.data import Pose
-from mpsfm_core.errors import ReconstructionError
+from mpsfm_core.data.errors import ReconstructionError
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
-from mpsfm_core.pipeline import reconstruct
+from mpsfm_core.pipeline.run import reconstruct
 
 SCENES = ("rendered_kitchen", "hololens_room")
 METHODS: Mapping[str, tuple[str, tuple[str, ...]]] = {

@@ -24,7 +24,7 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.evaluation.methods import OURS, Outcome, Task, run_tasks
 from mpsfm_core.evaluation.pose_auc import pose_auc, pose_errors_deg
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.testing.halls import HONEST, QUALITIES, Hall, PriorErrors, hall_problem
+from mpsfm_core.testing.synthetic.halls import HONEST, QUALITIES, Hall, PriorErrors, hall_problem
 
 
 @dataclass(frozen=True)

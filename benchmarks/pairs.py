@@ -3,15 +3,14 @@
     python -m benchmarks.pairs [--scenes rendered_kitchen ...] [--output DIR]
 
 The real scenes are those in $MPSFM_SHARED or ../shared, with XFeat as in `fast-cpu`; `hall` is an
-analytic one of 200 views (mpsfm_core/testing/halls.py) with random descriptors: a view finds half
-of the points it sees, with noise as long as half of the descriptor, and as many others that are
-its own; so at most a quarter of its keypoints is found again, as XFeat does on rendered_kitchen
-(18 to 25 %). A pair is true when its views overlap by more than a limit
+analytic one of 200 views (mpsfm_core/testing/synthetic/halls.py) with random descriptors: a view
+finds half of the points it sees, with noise as long as half of the descriptor, and as many others
+that are its own; so at most a quarter of its keypoints is found again, as XFeat does on
+rendered_kitchen (18 to 25 %). A pair is true when its views overlap by more than a limit
 (mpsfm_core/evaluation/overlap.py). *Matched*, the pairs that a reconstruction can miss: on real
 photos those that overlap by 0.15 and, given to LighterGlue, are verified with a rotation within 10
 degrees of the truth; in the hall those with 30 points that look alike from both. Writes
-benchmarks/results/pairs.md.
-"""
+benchmarks/results/pairs.md. """
 
 from __future__ import annotations
 
@@ -31,16 +30,16 @@ from mpsfm_core.data import Float32, Float64
 from mpsfm_core.evaluation.overlap import overlap_from_depth
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.scene_folder import read_scene
-from mpsfm_core.extraction import first_look
+from mpsfm_core.extraction.context import Workbench
 from mpsfm_core.extraction.events import Silent
 from mpsfm_core.extraction.features import FeatureTable
-from mpsfm_core.extraction.matching import PairMatcher, PairVerifier
+from mpsfm_core.extraction.matching.matching import PairMatcher, PairVerifier
 from mpsfm_core.extraction.options import PairOptions
-from mpsfm_core.extraction.pairs import Pair, most_alike, neighbours
-from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.extraction.pairs import similarity as first_look
+from mpsfm_core.extraction.pairs.candidates import Pair, most_alike, neighbours
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.registry import Registry
-from mpsfm_core.testing.halls import hall_problem
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.testing.synthetic.halls import hall_problem
 
 SCENES = ("rendered_kitchen", "hololens_room", "hall")
 OVERLAPS = (0.1, 0.25, 0.4)

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import psutil
 
-from mpsfm_core import DepthPrior, PinholeCamera, View, worker
-from mpsfm_core.environments.process import Worker
+from mpsfm_core import DepthPrior, PinholeCamera, View
+from mpsfm_core.providers.environments import worker
+from mpsfm_core.providers.environments.process import Worker
 
 _SIDE = 1000
 _CALLS, _ROUNDS = 100, 5

@@ -37,9 +37,9 @@ from mpsfm_core.data import Float64
 from mpsfm_core.evaluation.scene_folder import read_scene
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.providers import ProviderContext
-from mpsfm_core.registry import Registry
-from mpsfm_core.weights import WeightStore
-from mpsfm_core.yaml_text import write_yaml
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.weights import WeightStore
+from mpsfm_core.support.yaml_text import write_yaml
 
 SCENES = ("hololens_room", "rendered_kitchen", "fountain")
 _MILLIMETRE = {"scale": 0.001}

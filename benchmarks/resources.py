@@ -22,8 +22,8 @@ import numpy as np
 
 from benchmarks._scenes import MPSFM
 from mpsfm_core.data import Float64, PinholeCamera
-from mpsfm_core.testing.halls import hall
-from mpsfm_core.testing.scenes import AnalyticScene, arc_poses, room_scene
+from mpsfm_core.testing.synthetic.halls import hall
+from mpsfm_core.testing.synthetic.scenes import AnalyticScene, arc_poses, room_scene
 
 ARC_DEG = 120.0
 """Of the cameras in a room: all see its middle."""

@@ -28,7 +28,7 @@ import numpy as np
 import yaml
 
 from benchmarks._scenes import MPSFM, RESULTS, shared_folder
-from mpsfm_core.testing.result_files import content
+from tests.support.result_files import content
 
 SCENE = "hololens_room"
 NOISE = 4.0
@@ -79,7 +79,7 @@ def main() -> None:
     folder = arguments.output.resolve()
     shutil.rmtree(folder, ignore_errors=True)
     make_photos(folder, arguments.photos, arguments.width, arguments.seed)
-    subprocess.run([sys.executable, "-m", "mpsfm_core.precompile"], check=True)
+    subprocess.run([sys.executable, "-m", "mpsfm_core.pipeline.precompile"], check=True)
     rng = np.random.default_rng(arguments.seed)
     limits = (2 * arguments.gap * rng.random(arguments.kills)).tolist()
     with ThreadPoolExecutor(2) as pool:

@@ -22,15 +22,15 @@ from benchmarks._scenes import percent
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.geometry import camera_center
-from mpsfm_core.mapping.depth_consistency import DepthCheck
+from mpsfm_core.mapping.component import Group
+from mpsfm_core.mapping.consistency.depth_consistency import DepthCheck
 from mpsfm_core.mapping.events import Silent
-from mpsfm_core.mapping.group import Group
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.upkeep import Upkeep
-from mpsfm_core.scene.tracks import NO_POINT
-from mpsfm_core.testing.degraded_depth import DepthErrors
-from mpsfm_core.testing.symmetric import SymmetricProblem, moved, twin_room_problem
+from mpsfm_core.mapping.refinement.maintenance import Upkeep
+from mpsfm_core.mapping.scene.tracks import NO_POINT
+from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors
+from mpsfm_core.testing.synthetic.two_rooms import SymmetricProblem, moved, twin_room_problem
 
 PRIORS = {"exact, declared 1 %": None, "5 % + 5 % scale, declared 5 %": DepthErrors()}
 HEADER = "| priors | wrong rejected | correct rejected | check, ms |\n|---|---|---|---|"

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from mpsfm_core import ProviderContext
-from mpsfm_core.weights import WeightStore
+from mpsfm_core.providers.weights import WeightStore
 
 _DEFAULT = Path(__file__).resolve().parents[2] / "shared"
 

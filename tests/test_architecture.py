@@ -1,4 +1,4 @@
-"""The arrows between the rooms run one way, as docs/architecture.md draws them."""
+"""Packages import in one direction, in the order of the table in docs/architecture.md."""
 
 from __future__ import annotations
 
@@ -12,70 +12,73 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "mpsfm_core"
 FRONT_DOOR = "__init__"
-"""Imports the rooms when one of its functions is called, see there."""
-NUMERICS = {"optimize", "scene", "mapping", "dense"}
-BELOW_NUMERICS = {
-    "errors",
-    "options",
-    "jit",
-    "threads",
-    "data",
-    "geometry",
-    "statistics",
-    "patch_alignment",
-    *NUMERICS,
-}
+"""Exports the public functions of :mod:`mpsfm_core.api`."""
+NUMERICS = {"optimize", "mapping", "dense"}
+BELOW_NUMERICS = {"data", "support", "geometry", *NUMERICS}
 
 
-def documented_rooms() -> dict[str, int]:
-    """Each room with the number of its row in the table."""
+def documented_packages() -> dict[str, int]:
+    """Map each package of the table to its row; a dotted name is a subpackage of its own rank."""
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (`.*?) \|", text, re.MULTILINE)
-    return {name: row for row, cell in enumerate(rows) for name in re.findall(r"`(\w+)`", cell)}
+    return {name: row for row, cell in enumerate(rows) for name in re.findall(r"`([\w.]+)`", cell)}
+
+
+def package_of(module: str) -> str:
+    """Return the entry of the table that a module (relative to the core) belongs to."""
+    parts = module.split(".")
+    documented = documented_packages()
+    prefixes = [".".join(parts[:length]) for length in range(len(parts), 0, -1)]
+    return next((prefix for prefix in prefixes if prefix in documented), parts[0])
 
 
 def modules() -> Iterator[tuple[str, Path]]:
-    """Every module with its room."""
+    """Yield every module with its package."""
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
         if "templates" not in parts and parts != (FRONT_DOOR,):
-            yield parts[0], path
+            yield package_of(".".join(parts)), path
 
 
-def imported_rooms(path: Path) -> Iterator[str]:
-    """The rooms that a module imports from; the options of a room are settings, not the room."""
+def imported_packages(path: Path) -> Iterator[str]:
+    """Yield the packages that a module imports from, except the options of a package."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         names: list[str] = []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module == "mpsfm_core":
-            names = [f"mpsfm_core.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names = [node.module]
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
         for name in names:
             package, *parts = name.split(".")
             if package == "mpsfm_core" and parts:
-                yield "options" if parts[1:] == ["options"] else parts[0]
+                yield "data" if parts[1:2] == ["options"] else package_of(".".join(parts))
 
 
-def test_every_room_is_in_the_table() -> None:
-    assert {room for room, _ in modules()} == documented_rooms().keys()
+def test_the_table_lists_every_package() -> None:
+    assert {package for package, _ in modules()} == documented_packages().keys()
 
 
-@pytest.mark.parametrize("room", documented_rooms())
-def test_a_room_imports_only_what_stands_before_it(room: str) -> None:
-    rows = documented_rooms()
+def test_the_core_has_at_most_18_entries() -> None:
+    entries = {path.name for path in PACKAGE.iterdir() if not path.name.startswith("__")}
+    assert len(entries - {"py.typed"}) <= 18
+
+
+@pytest.mark.parametrize("package", documented_packages())
+def test_a_package_imports_only_what_stands_before_it(package: str) -> None:
+    rows = documented_packages()
     upwards = {
-        f"{path.relative_to(ROOT)} imports {other}"
+        f"{path.relative_to(ROOT)} imports {imported}"
         for name, path in modules()
-        if name == room
-        for other in imported_rooms(path)
-        if rows[other] > rows[room]
+        if name == package
+        for imported in imported_packages(path)
+        if rows[imported] > rows[package]
     }
     assert not upwards
 
 
-@pytest.mark.parametrize("room", sorted(NUMERICS))
-def test_the_numerics_know_no_plugin(room: str) -> None:
-    known = {other for name, path in modules() if name == room for other in imported_rooms(path)}
-    assert known <= BELOW_NUMERICS
+@pytest.mark.parametrize("package", sorted(NUMERICS))
+def test_numerics_import_no_plugin_file_or_configuration(package: str) -> None:
+    imported = {
+        other for name, path in modules() if name == package for other in imported_packages(path)
+    }
+    assert imported <= BELOW_NUMERICS

@@ -18,28 +18,28 @@ import numpy as np
 import pytest
 import yaml
 
-from mpsfm_core.checkpoints import read_checkpoint
 from mpsfm_core.cli.time_left import TimeLeft
 from mpsfm_core.config import load_config
 from mpsfm_core.data import DepthPrior, Features, NormalPrior, PairMatches
-from mpsfm_core.environments.store import Environment
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.records import read_records
 from mpsfm_core.evaluation.scene_folder import _read_sets
 from mpsfm_core.extraction.cache import Cache, digest
-from mpsfm_core.extraction.nothing import JointPrior
-from mpsfm_core.extraction.verification import TwoView
-from mpsfm_core.files import claimed
-from mpsfm_core.formats import VERSION, check_version
+from mpsfm_core.extraction.empty_results import JointPrior
+from mpsfm_core.extraction.matching.verification import TwoView
 from mpsfm_core.inputs import video
 from mpsfm_core.mapping.state import thaw
-from mpsfm_core.registry import core_version
+from mpsfm_core.pipeline.checkpoints import read_checkpoint
+from mpsfm_core.providers.environments.store import Environment
+from mpsfm_core.providers.registry import core_version
+from mpsfm_core.providers.uncertainty.file import load_calibration
+from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.report.page import render
 from mpsfm_core.report.result_folder import ResultFolder
 from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.exports.source import Source
-from mpsfm_core.uncertainty.file import load_calibration
-from mpsfm_core.weights import WeightStore
+from mpsfm_core.support.files import claimed
+from mpsfm_core.support.format_versions import VERSION, check_version
 
 ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = ROOT / "tests" / "golden"

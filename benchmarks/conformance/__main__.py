@@ -26,11 +26,11 @@ from benchmarks.conformance.netvlad import APART
 from benchmarks.conformance.networks import HOSTED, NETWORKS, Hosted, Network
 from benchmarks.conformance.shared import AUTHORS, photos
 from mpsfm_core import ProviderContext, View
-from mpsfm_core.environments.store import find_environment
-from mpsfm_core.errors import MpsfmError, ProviderError
-from mpsfm_core.model_export.run import compared, run_script
-from mpsfm_core.registry import Registry
-from mpsfm_core.weights import WeightStore
+from mpsfm_core.data.errors import MpsfmError, ProviderError
+from mpsfm_core.providers.environments.store import find_environment
+from mpsfm_core.providers.model_export.run import compared, run_script
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.weights import WeightStore
 
 Compared: TypeAlias = Callable[[Path], dict[str, float]]
 """The largest differences, for the folder of the checkouts."""

@@ -11,8 +11,8 @@ import numpy as np
 
 from benchmarks.conformance.shared import photos, run_authors
 from mpsfm_core import ProviderContext
-from mpsfm_core.environments.store import Environment
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.environments.store import Environment
+from mpsfm_core.providers.registry import Registry
 
 _CAMERAS = ((640, 480, 500.0), (333, 500, 500.0), (1601, 1203, 500.0), (900, 1300, 500.0))
 _LARGEST = 1024

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from benchmarks.conformance import netvlad, roma
 from mpsfm_core import DepthPrior, NormalPrior, PairMatches
 from mpsfm_core.data import Bool
-from mpsfm_core.environments.store import Environment
 from mpsfm_core.geometry import resize_map
+from mpsfm_core.providers.environments.store import Environment
 
 Arrays = Mapping[str, NDArray[Any]]
 Differences = dict[str, float]

@@ -15,8 +15,8 @@ import numpy as np
 
 from benchmarks.conformance.shared import photos, run_authors
 from mpsfm_core import ProviderContext
-from mpsfm_core.environments.store import Environment
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.environments.store import Environment
+from mpsfm_core.providers.registry import Registry
 
 
 def compare(environment: Environment, checkout: Path) -> dict[str, float]:

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from mpsfm_core import PinholeCamera, View
-from mpsfm_core.environments.store import Environment
-from mpsfm_core.errors import ProviderError
+from mpsfm_core.data.errors import ProviderError
+from mpsfm_core.providers.environments.store import Environment
 
 AUTHORS = Path(__file__).parent / "authors"
 _SAMPLES = Path(__file__).parents[2] / "examples" / "sample_scene" / "images"

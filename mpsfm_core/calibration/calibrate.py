@@ -1,7 +1,7 @@
 """Calibrate a provider on a folder of photos: with true maps, with a model, or with nothing.
 
 This stands above the pipeline, which it uses; the model of calibrations itself
-(:mod:`mpsfm_core.uncertainty.model`) is below all providers.
+(:mod:`mpsfm_core.providers.uncertainty.model`) is below all providers.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from mpsfm_core.calibration.model_truth import model_truth
 from mpsfm_core.calibration.samples import DepthTruth
 from mpsfm_core.calibration.study import Data, Study, StudyOptions, study
 from mpsfm_core.config import Config
-from mpsfm_core.errors import InputError
-from mpsfm_core.extraction.backends import ActiveProvider, thread_count
-from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.data.errors import InputError
+from mpsfm_core.data.options import Backend
+from mpsfm_core.extraction.active_provider import ActiveProvider, thread_count
+from mpsfm_core.extraction.context import Workbench
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.models import read_model
-from mpsfm_core.options import Backend
-from mpsfm_core.pipeline import reconstruct
-from mpsfm_core.provision import provide
-from mpsfm_core.registry import Registry, core_version
-from mpsfm_core.stages import Stages
-from mpsfm_core.uncertainty.file import CalibratedKind, CalibrationFile, Provenance
-from mpsfm_core.uncertainty.model import Calibration
+from mpsfm_core.pipeline.provider_resolution import provide
+from mpsfm_core.pipeline.run import reconstruct
+from mpsfm_core.pipeline.stages import Stages
+from mpsfm_core.providers.registry import Registry, core_version
+from mpsfm_core.providers.uncertainty.file import CalibratedKind, CalibrationFile, Provenance
+from mpsfm_core.providers.uncertainty.model import Calibration
 
 _log = logging.getLogger(__name__)
 

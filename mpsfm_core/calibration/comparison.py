@@ -20,12 +20,12 @@ from mpsfm_core.calibration.samples import (
 from mpsfm_core.calibration.study import Data, StudyOptions
 from mpsfm_core.calibration.truth import FileTruth
 from mpsfm_core.data import NormalPrior
-from mpsfm_core.errors import InputError
-from mpsfm_core.extraction.backends import ActiveProvider
-from mpsfm_core.extraction.raw_priors import RawPriors
-from mpsfm_core.extraction.workbench import Workbench
-from mpsfm_core.uncertainty.file import CalibratedKind
-from mpsfm_core.uncertainty.model import DepthCalibration
+from mpsfm_core.data.errors import InputError
+from mpsfm_core.extraction.active_provider import ActiveProvider
+from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.priors.raw_priors import RawPriors
+from mpsfm_core.providers.uncertainty.file import CalibratedKind
+from mpsfm_core.providers.uncertainty.model import DepthCalibration
 
 Samples = TypeVar("Samples", DepthSamples, NormalSamples)
 

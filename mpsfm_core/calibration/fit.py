@@ -24,7 +24,7 @@ from scipy.stats import t as student_t
 
 from mpsfm_core.calibration.samples import Residuals
 from mpsfm_core.data import Bool, Float64, Int64
-from mpsfm_core.statistics import MAD_TO_STD, weighted_quantile
+from mpsfm_core.geometry.statistics import MAD_TO_STD, weighted_quantile
 
 ONE_SIGMA = 0.6827
 """Share of normal errors within one std."""

@@ -11,7 +11,7 @@ from scipy.stats import t as student_t
 from mpsfm_core.calibration.fit import FREEDOM, ONE_SIGMA, STD_OF_T
 from mpsfm_core.calibration.samples import Residuals
 from mpsfm_core.data import Bool, Float64, Int64
-from mpsfm_core.statistics import MAD_TO_STD, weighted_quantile
+from mpsfm_core.geometry.statistics import MAD_TO_STD, weighted_quantile
 
 CURVE_POINTS = 50
 BINS = 10

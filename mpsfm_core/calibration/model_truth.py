@@ -20,11 +20,11 @@ from scipy.spatial import cKDTree
 from mpsfm_core.calibration.samples import DepthTruth
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.geometry import camera_center
+from mpsfm_core.geometry.statistics import MAD_TO_STD
 from mpsfm_core.inputs.images import ImageSet
+from mpsfm_core.mapping.scene.kernels import max_triangulation_angles
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
 from mpsfm_core.optimize.covariance import depth_variance_of_points, point_covariances
-from mpsfm_core.scene.kernels import max_triangulation_angles
-from mpsfm_core.statistics import MAD_TO_STD
 
 MIN_ANGLE_DEG = 2.0
 """Points of a smaller triangulation angle are no truth (reference: robust_triangles)."""

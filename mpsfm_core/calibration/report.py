@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from mpsfm_core.calibration.metrics import NORMAL_COVERAGE
-from mpsfm_core.files import write_file
-from mpsfm_core.formats import VERSION
+from mpsfm_core.support.files import write_file
+from mpsfm_core.support.format_versions import VERSION
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }

@@ -16,7 +16,7 @@ from mpsfm_core.geometry import (
     sample_nearest,
     scale_pixels,
 )
-from mpsfm_core.uncertainty.model import DepthCalibration, medians
+from mpsfm_core.providers.uncertainty.model import DepthCalibration, medians
 
 MIN_SAMPLES = 20
 """An image with fewer says nothing about its scale and is left out (ours)."""

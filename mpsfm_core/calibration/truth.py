@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core import validation
-from mpsfm_core.builtin.arrays import find_file
-from mpsfm_core.builtin.options import DepthFileOptions, FileOptions, NormalFileOptions
 from mpsfm_core.calibration.samples import DepthTruth, NormalTruth
 from mpsfm_core.data import Bool, Float64, Int64, View
-from mpsfm_core.errors import InputError
-from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.data.errors import InputError
+from mpsfm_core.data.options import Backend, parse_settings
+from mpsfm_core.extraction.context import Workbench
 from mpsfm_core.geometry import pixel_centers, sample_nearest, scale_pixels
-from mpsfm_core.options import Backend, parse_settings
+from mpsfm_core.providers import validation
+from mpsfm_core.providers.builtin.arrays import find_file
+from mpsfm_core.providers.builtin.options import DepthFileOptions, FileOptions, NormalFileOptions
 
 EXACT = 1e-4
 """Relative std of depth files for which none is given: exact for every prior, and positive."""

@@ -72,7 +72,7 @@ def build_app() -> typer.Typer:
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from mpsfm_core.registry import core_version
+        from mpsfm_core.providers.registry import core_version
 
         typer.echo(core_version())
         raise typer.Exit

@@ -51,7 +51,7 @@ def tolerances(distances: list[float] | None) -> tuple[float, ...]:
 
 def assigned(overrides: list[str] | None) -> dict[str, Any]:
     """The values that ``--set`` gives to the settings of one command; raises ConfigError."""
-    from mpsfm_core.yaml_text import parse_assignment
+    from mpsfm_core.support.yaml_text import parse_assignment
 
     values: dict[str, Any] = {}
     for text in overrides or ():

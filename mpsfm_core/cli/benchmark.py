@@ -68,7 +68,7 @@ def benchmark(
     Writes DIR/report.md, .json and .html. What DIR has already is not computed again.
     With gt_depth/ and --set dense.enabled=true also what depth maps and clouds are worth.
     """
-    from mpsfm_core.errors import InputError
+    from mpsfm_core.data.errors import InputError
 
     if compare is not None:
         _compare(*compare)
@@ -79,7 +79,7 @@ def benchmark(
     from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
     from mpsfm_core.evaluation.methods import OTHERS
     from mpsfm_core.evaluation.report import make_rows, markdown, write_report
-    from mpsfm_core.registry import Registry
+    from mpsfm_core.providers.registry import Registry
 
     plan = Plan(
         tuple(scenes),
@@ -110,7 +110,7 @@ def _named(text: str) -> tuple[str, Path]:
     """Name and folder of ``--result``."""
     import re
 
-    from mpsfm_core.errors import InputError
+    from mpsfm_core.data.errors import InputError
     from mpsfm_core.evaluation.methods import OTHERS, OURS
 
     name, _, folder = text.partition("=")

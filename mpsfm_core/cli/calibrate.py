@@ -12,7 +12,7 @@ from mpsfm_core.cli.arguments import Quiet
 if TYPE_CHECKING:
     from mpsfm_core.calibration.calibrate import Calibrated
     from mpsfm_core.calibration.fitting import Alignment
-    from mpsfm_core.uncertainty.file import CalibratedKind
+    from mpsfm_core.providers.uncertainty.file import CalibratedKind
 
 _OWN = ("options.", "wrap.", "calibration")
 _TRUTH = "ground_truth."
@@ -69,9 +69,9 @@ def calibrate(
     from mpsfm_core.calibration.study import StudyOptions
     from mpsfm_core.cli.progress import showing_progress
     from mpsfm_core.config import load_config
-    from mpsfm_core.errors import InputError
+    from mpsfm_core.data.errors import InputError
     from mpsfm_core.inputs.models import model_folder
-    from mpsfm_core.registry import Registry
+    from mpsfm_core.providers.registry import Registry
 
     calibrated_kind, alignments = _checked(kind, alignment or [])
     if output.suffix not in (".yaml", ".yml", ".json"):
@@ -111,8 +111,8 @@ def _checked(
 ) -> tuple[CalibratedKind, tuple[Alignment, ...] | None]:
     """The kind and the alignments if there are such."""
     from mpsfm_core.calibration.fitting import Alignment
-    from mpsfm_core.errors import InputError, did_you_mean
-    from mpsfm_core.uncertainty.file import CalibratedKind
+    from mpsfm_core.data.errors import InputError, did_you_mean
+    from mpsfm_core.providers.uncertainty.file import CalibratedKind
 
     kinds: dict[str, CalibratedKind] = {name: name for name in get_args(CalibratedKind)}
     known: dict[str, Alignment] = {name: name for name in get_args(Alignment)}
@@ -124,7 +124,7 @@ def _checked(
 
 def _sorted(kind: str, overrides: list[str]) -> tuple[list[str], dict[str, Any]]:
     """Settings of the configuration, and those of the true maps, from what ``--set`` says."""
-    from mpsfm_core.yaml_text import parse_yaml
+    from mpsfm_core.support.yaml_text import parse_yaml
 
     own, truth = [], {}
     for text in overrides:

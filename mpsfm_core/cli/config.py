@@ -31,9 +31,9 @@ def show(
     Comments at its end say which providers a run would take here and now; nothing is downloaded.
     """
     from mpsfm_core.config import load_config
-    from mpsfm_core.errors import InputError
-    from mpsfm_core.provision import look_up
-    from mpsfm_core.registry import Registry
+    from mpsfm_core.data.errors import InputError
+    from mpsfm_core.pipeline.provider_resolution import look_up
+    from mpsfm_core.providers.registry import Registry
 
     registry = Registry.discover()
     config = load_config(name, settings(overrides, offline), registry, complete=False)

@@ -28,9 +28,9 @@ def dense(
     The search starts from the maps in MODEL/depth if MODEL is an output folder of ours, else from
     the range of the model's points.
     """
+    from mpsfm_core.data.options import parse_settings
     from mpsfm_core.dense.options import DenseOptions
-    from mpsfm_core.options import parse_settings
-    from mpsfm_core.pipeline import densify_model
+    from mpsfm_core.pipeline.run import densify_model
 
     heed_termination()
     report = densify_model(model, images, output, parse_settings(DenseOptions, assigned(overrides)))

@@ -16,8 +16,8 @@ from mpsfm_core.cli.arguments import ConfigName, Offline, settings
 from mpsfm_core.cli.models import CacheDir
 
 if TYPE_CHECKING:
-    from mpsfm_core.provision import Provision
-    from mpsfm_core.registry import Registry
+    from mpsfm_core.pipeline.provider_resolution import Provision
+    from mpsfm_core.providers.registry import Registry
 
 
 def doctor(
@@ -31,11 +31,11 @@ def doctor(
     """
     from mpsfm_core.cli.cache import cache_size, size_text
     from mpsfm_core.config import load_config
-    from mpsfm_core.errors import InputError
+    from mpsfm_core.data.errors import InputError
     from mpsfm_core.extraction.cache import cache_folder
-    from mpsfm_core.provision import look_up
-    from mpsfm_core.registry import Registry, core_version
-    from mpsfm_core.threads import cores
+    from mpsfm_core.pipeline.provider_resolution import look_up
+    from mpsfm_core.providers.registry import Registry, core_version
+    from mpsfm_core.support.threads import cores
 
     registry = Registry.discover()
     _heading("this machine")
@@ -86,7 +86,7 @@ def _print_plugins(registry: Registry) -> bool:
 
 def _missing_plugins(registry: Registry) -> Iterator[str]:
     """Our own plugins that are not installed."""
-    from mpsfm_core.first_party import FIRST_PARTY
+    from mpsfm_core.providers.first_party import FIRST_PARTY
 
     installed = {line.distribution for line in registry.status()}
     for requirement, brings in FIRST_PARTY.items():

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from mpsfm_core.errors import MpsfmError
+from mpsfm_core.data.errors import MpsfmError
 
 INTERRUPTED = 130
 

@@ -44,7 +44,7 @@ def evaluate(
     from mpsfm_core.evaluation import CONVENTIONS, evaluate, read_poses
 
     if convention not in CONVENTIONS:
-        from mpsfm_core.errors import InputError, did_you_mean
+        from mpsfm_core.data.errors import InputError, did_you_mean
 
         raise InputError(f"no convention {convention!r}{did_you_mean(convention, CONVENTIONS)}")
     names = _names(images, image_list)
@@ -73,7 +73,7 @@ def evaluate(
 
 
 def _names(images: str | None, image_list: Path | None) -> list[str] | None:
-    from mpsfm_core.errors import InputError
+    from mpsfm_core.data.errors import InputError
 
     if images is not None and image_list is not None:
         raise InputError("--images and --image-list exclude each other")

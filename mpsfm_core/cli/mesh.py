@@ -29,9 +29,9 @@ def mesh(
 
     Needs pip install 'mpsfm-core[mesh]'.
     """
+    from mpsfm_core.data.options import parse_settings
     from mpsfm_core.dense.options import MeshOptions
-    from mpsfm_core.options import parse_settings
-    from mpsfm_core.pipeline import mesh_model
+    from mpsfm_core.pipeline.run import mesh_model
 
     heed_termination()
     made = mesh_model(folder, images, parse_settings(MeshOptions, assigned(overrides)))

@@ -17,7 +17,7 @@ from mpsfm_core.cli.arguments import Overrides
 
 if TYPE_CHECKING:
     from mpsfm_core.providers import WeightsFile
-    from mpsfm_core.weights import Progress, WeightStore
+    from mpsfm_core.providers.weights import Progress, WeightStore
 
 app = typer.Typer(no_args_is_help=True, help="Weights: list, download, check.")
 
@@ -50,7 +50,7 @@ def list_models(
 ) -> None:
     """List the default weights of all providers, and whether they are on this machine."""
     from mpsfm_core.cli.tables import print_table
-    from mpsfm_core.weights import WeightStore
+    from mpsfm_core.providers.weights import WeightStore
 
     store = WeightStore(cache)
     files = [(provider, file, store.locate(file.uri)) for provider, file in _known()]
@@ -90,7 +90,7 @@ def fetch(
     Of a configuration all that a run with it needs. What will be downloaded is shown first, with
     licences and the total size; weights that are not for commercial use are asked for by name.
     """
-    from mpsfm_core.weights import WeightStore
+    from mpsfm_core.providers.weights import WeightStore
 
     wanted = _wanted(targets, overrides or [])
     store = WeightStore(cache)
@@ -134,11 +134,11 @@ def export(
     Their code runs in a process of its own. The file is checked against what their network says,
     and its provider takes it by name from then on.
     """
-    from mpsfm_core.environments.store import find_environment
-    from mpsfm_core.errors import InputError, did_you_mean
-    from mpsfm_core.model_export.run import export_model
-    from mpsfm_core.registry import Registry
-    from mpsfm_core.weights import WeightStore
+    from mpsfm_core.data.errors import InputError, did_you_mean
+    from mpsfm_core.providers.environments.store import find_environment
+    from mpsfm_core.providers.model_export.run import export_model
+    from mpsfm_core.providers.registry import Registry
+    from mpsfm_core.providers.weights import WeightStore
 
     known = {
         n: r for found in Registry.discover().call_hook("mpsfm_exports") for n, r in found.items()
@@ -170,7 +170,7 @@ def verify(
     cache: CacheDir = None,
 ) -> None:
     """Hash weights and compare; without arguments, all default weights on this machine."""
-    from mpsfm_core.weights import WeightStore
+    from mpsfm_core.providers.weights import WeightStore
 
     store = WeightStore(cache)
     if targets:
@@ -184,8 +184,8 @@ def verify(
 @app.command()
 def path(targets: Targets, cache: CacheDir = None) -> None:
     """Print where weights are on this machine; fails if they are not."""
-    from mpsfm_core.errors import WeightsError
-    from mpsfm_core.weights import WeightStore
+    from mpsfm_core.data.errors import WeightsError
+    from mpsfm_core.providers.weights import WeightStore
 
     store = WeightStore(cache)
     for file in _select(targets):
@@ -197,8 +197,8 @@ def path(targets: Targets, cache: CacheDir = None) -> None:
 
 def _known() -> Iterator[tuple[str, WeightsFile]]:
     """Kind and name of each usable provider with each of its default weights files."""
-    from mpsfm_core.errors import InputError
-    from mpsfm_core.registry import Registry
+    from mpsfm_core.data.errors import InputError
+    from mpsfm_core.providers.registry import Registry
 
     registry = Registry.discover()
     for status in registry.status():
@@ -210,7 +210,7 @@ def _known() -> Iterator[tuple[str, WeightsFile]]:
 
 def _select(targets: list[str]) -> list[WeightsFile]:
     """The weights files that names and URIs stand for, each once."""
-    from mpsfm_core.errors import InputError, did_you_mean
+    from mpsfm_core.data.errors import InputError, did_you_mean
     from mpsfm_core.providers import WeightsFile
 
     known = [(provider.split("/")[1], provider, file) for provider, file in _known()]
@@ -231,8 +231,8 @@ def _wanted(targets: list[str], overrides: list[str]) -> list[tuple[str, Weights
     """The files that configurations, providers and URIs stand for, each once, with the name of a
     provider that loads it."""
     from mpsfm_core.config import load_config, shipped_configs
-    from mpsfm_core.provision import look_up
-    from mpsfm_core.registry import Registry
+    from mpsfm_core.pipeline.provider_resolution import look_up
+    from mpsfm_core.providers.registry import Registry
 
     chosen: dict[str, tuple[str, WeightsFile]] = {}
     for target in targets:
@@ -255,7 +255,7 @@ def _wanted(targets: list[str], overrides: list[str]) -> list[tuple[str, Weights
 def _show_plan(wanted: list[tuple[str, WeightsFile]], store: WeightStore) -> list[tuple[str, str]]:
     """Tell on stderr what will be downloaded; the providers whose licence forbids commercial use,
     with that licence."""
-    from mpsfm_core.weights import is_remote
+    from mpsfm_core.providers.weights import is_remote
 
     total, unknown, restricted = 0, 0, {}
     for name, file in wanted:
@@ -274,7 +274,7 @@ def _show_plan(wanted: list[tuple[str, WeightsFile]], store: WeightStore) -> lis
 
 def _ask_for(restricted: tuple[str, str], accepted: list[str]) -> None:
     """Raise unless the user accepts a licence that forbids commercial use."""
-    from mpsfm_core.errors import InputError
+    from mpsfm_core.data.errors import InputError
 
     name, license = restricted
     if name in accepted:

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mpsfm_core.discovery import same_path
-from mpsfm_core.errors import ProviderError
+from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.providers import Kind
+from mpsfm_core.providers.discovery import same_path
 
 if TYPE_CHECKING:
-    from mpsfm_core.registry import ProviderStatus
+    from mpsfm_core.providers.registry import ProviderStatus
     from mpsfm_core.testing import CheckResult
 
 _CHECKING = "MPSFM_CHECKING"
@@ -34,7 +34,7 @@ def list_plugins(
     as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
 ) -> None:
     """List all providers: where they come from, licences, and whether they can be used."""
-    from mpsfm_core.registry import Registry
+    from mpsfm_core.providers.registry import Registry
 
     status = Registry.discover(probe=True).status()
     if as_json:
@@ -64,7 +64,7 @@ def check(
         arguments += [part for value in options or () for part in ("--set", value)]
         arguments += [part for value in only or () for part in ("--only", value)]
         raise typer.Exit(_elsewhere(name, arguments))
-    from mpsfm_core.registry import Registry
+    from mpsfm_core.providers.registry import Registry
     from mpsfm_core.testing.contract import (
         find_plugin,
         find_providers,

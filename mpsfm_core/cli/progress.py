@@ -17,7 +17,7 @@ from rich.progress import (
 
 from mpsfm_core.cli.time_left import TimeLeft, in_words
 from mpsfm_core.providers import hookimpl
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 
 
 @contextmanager

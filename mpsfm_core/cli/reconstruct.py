@@ -12,7 +12,7 @@ from mpsfm_core.cli.arguments import ConfigName, Offline, Overrides, Quiet, View
 from mpsfm_core.cli.errors import heed_termination
 
 if TYPE_CHECKING:
-    from mpsfm_core.pipeline import ReconstructionResult
+    from mpsfm_core.pipeline.run import ReconstructionResult
 
 
 def reconstruct(
@@ -91,13 +91,13 @@ def run(
     """Reconstruct with progress bars and print what came out, neither if ``quiet``.
 
     ``viewer``: name of a viewer that shows the run as it goes on. ``further``: keyword arguments
-    of :func:`mpsfm_core.pipeline.reconstruct`.
+    of :func:`mpsfm_core.pipeline.run.reconstruct`.
     """
     from mpsfm_core.cli.progress import showing_progress
     from mpsfm_core.cli.view import showing_run
-    from mpsfm_core.errors import ReconstructionError
-    from mpsfm_core.pipeline import reconstruct
-    from mpsfm_core.registry import Registry
+    from mpsfm_core.data.errors import ReconstructionError
+    from mpsfm_core.pipeline.run import reconstruct
+    from mpsfm_core.providers.registry import Registry
 
     heed_termination()
     registry = Registry.discover()

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.extraction.cache import cache_folder
-from mpsfm_core.files import write_file
-from mpsfm_core.formats import VERSION, check_version
+from mpsfm_core.support.files import write_file
+from mpsfm_core.support.format_versions import VERSION, check_version
 
 TIMINGS = "timings.json"
 FORMAT = 1

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from mpsfm_core.registry import Registry
-    from mpsfm_core.viewing import Pictures
+    from mpsfm_core.providers.registry import Registry
+    from mpsfm_core.report.viewing import Pictures
 
 
 def view(
@@ -23,8 +23,8 @@ def view(
     ] = "viser",
 ) -> None:
     """Show cameras and points; viser serves a page until Ctrl-C, rerun writes DIR/scene.rrd."""
-    from mpsfm_core.registry import Registry
-    from mpsfm_core.viewing import read_scene
+    from mpsfm_core.providers.registry import Registry
+    from mpsfm_core.report.viewing import read_scene
 
     scene, cloud, pictures = read_scene(folder)
     opened = open_viewer(Registry.discover(), viewer, folder, pictures)
@@ -36,12 +36,12 @@ def view(
 def open_viewer(registry: Registry, name: str, output: Path, pictures: Pictures) -> Any:
     """A viewer by its name.
 
-    Raises :class:`~mpsfm_core.errors.InputError` when no plugin brings it, or it cannot be opened.
-    """
+    Raises :class:`~mpsfm_core.data.errors.InputError` when no plugin brings it, or it cannot be
+    opened. """
     from pkgutil import resolve_name
 
-    from mpsfm_core.errors import InputError, did_you_mean
-    from mpsfm_core.first_party import VIEWERS, install_hint
+    from mpsfm_core.data.errors import InputError, did_you_mean
+    from mpsfm_core.providers.first_party import VIEWERS, install_hint
 
     brought = registry.call_hook("mpsfm_viewers")
     known = {key: value for answer in brought for key, value in dict(answer).items()}
@@ -65,7 +65,7 @@ def showing_run(registry: Registry, name: str | None, photos: Path, output: Path
     if name is None:
         yield
         return
-    from mpsfm_core.viewing import photos_in, read_scene
+    from mpsfm_core.report.viewing import photos_in, read_scene
 
     viewer = open_viewer(registry, name, output, photos_in(photos))
     registry.register(viewer, name=f"viewer {name}")

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.dense.view import PosedGrid
-from mpsfm_core.jit import kernel
-from mpsfm_core.statistics import ONE_SIGMA
+from mpsfm_core.geometry.statistics import ONE_SIGMA
+from mpsfm_core.support.jit import kernel
 
 _STDS = 3.0
 """Difference of two depths in std that still agree."""

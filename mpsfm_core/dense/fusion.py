@@ -13,10 +13,10 @@ import numpy as np
 from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.dense.source_views import choose_sources
 from mpsfm_core.geometry import camera_center, pixel_centers, resize_map, unproject
-from mpsfm_core.jit import kernel
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.results.options import ResultOptions
-from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.threads import each
+from mpsfm_core.support.jit import kernel
+from mpsfm_core.support.threads import each
 
 _T = TypeVar("_T")
 

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from mpsfm_core.data import Float32, Float64, UInt8
-from mpsfm_core.jit import kernel
+from mpsfm_core.support.jit import kernel
 
 _FASTMATH = {"contract", "reassoc", "arcp"}
 """Sums in any order; NaN and infinity keep their meaning."""

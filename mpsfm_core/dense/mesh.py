@@ -17,9 +17,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.fusion import consistent_pixels
 from mpsfm_core.dense.options import MeshOptions
-from mpsfm_core.errors import InputError
 from mpsfm_core.geometry import (
     camera_center,
     inside,
@@ -30,9 +30,9 @@ from mpsfm_core.geometry import (
     transform,
     unproject,
 )
-from mpsfm_core.jit import kernel
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.results.options import ResultOptions
-from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.support.jit import kernel
 
 _BLOCK = 64
 """Voxels along a side of a block."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from mpsfm_core.options import Options
+from mpsfm_core.data.options import Options
 
 
 class DenseOptions(Options):

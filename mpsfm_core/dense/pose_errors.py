@@ -15,8 +15,8 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.dense.view import DenseView
-from mpsfm_core.patch_alignment import align_patches
-from mpsfm_core.statistics import ONE_SIGMA
+from mpsfm_core.geometry.patch_alignment import align_patches
+from mpsfm_core.geometry.statistics import ONE_SIGMA
 
 PATCHES = 100
 """Of a photo that are looked for in each other one (ours)."""

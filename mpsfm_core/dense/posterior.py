@@ -1,11 +1,10 @@
 """Joins what the photos say with what was known before, and says how sure that is.
 
-Known depth is moved everywhere as :mod:`mpsfm_core.dense.continuation` says. Its std is that of a
-smooth random field, the error of known log depth, which hangs together over some distance: the
+Known depth is moved everywhere as :mod:`mpsfm_core.dense.depth_completion` says. Its std is that of
+a smooth random field, the error of known log depth, which hangs together over some distance: the
 declared one where nothing was measured near, and less where measured depth observes it. The field
 is a Gaussian Markov random field (Lindgren et al., 2011): one sparse system on the pixels. That
-surfaces are flat lowers no std: what was not measured often lies behind an edge.
-"""
+surfaces are flat lowers no std: what was not measured often lies behind an edge. """
 
 from __future__ import annotations
 
@@ -14,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, Float32
-from mpsfm_core.dense.continuation import Blocks, continued, flatness
+from mpsfm_core.dense.depth_completion import Blocks, continued, flatness
 from mpsfm_core.geometry import resize_map
+from mpsfm_core.geometry.statistics import ONE_SIGMA
 from mpsfm_core.optimize.depth_variance import inverse_diagonal
-from mpsfm_core.statistics import ONE_SIGMA
 
 _REDUCTION = 8
 """Of the grid that the field lives on."""

@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from mpsfm_core.data import Float32, Float64, Int64
-from mpsfm_core.statistics import ONE_SIGMA
+from mpsfm_core.geometry.statistics import ONE_SIGMA
 
 _LEAST_STD = 1e-6
 """Of a tie: none is better."""

@@ -12,8 +12,8 @@ import numpy as np
 
 from mpsfm_core.data import Float64, Int64
 from mpsfm_core.geometry import camera_center, pixel_centers, sample_nearest, unproject
-from mpsfm_core.jit import kernel
-from mpsfm_core.scene.reconstruction import RegisteredImage
+from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
+from mpsfm_core.support.jit import kernel
 
 _ROWS = 16
 """Of the grid of pixels that overlap is measured on."""

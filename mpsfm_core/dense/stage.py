@@ -34,8 +34,8 @@ from mpsfm_core.dense.source_views import choose_sources
 from mpsfm_core.dense.stereo import StereoDepth, match_depth
 from mpsfm_core.dense.view import DenseView, PosedGrid
 from mpsfm_core.geometry import resize_map
-from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.threads import allowed
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.support.threads import allowed
 
 _T = TypeVar("_T", bound=np.generic)
 _MAX_COST = 0.9

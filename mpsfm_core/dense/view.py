@@ -10,7 +10,7 @@ import numpy as np
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, PinholeCamera, View
 from mpsfm_core.dense.posterior import UNKNOWN_LOG_STD
 from mpsfm_core.geometry import resize_map
-from mpsfm_core.scene.reconstruction import RegisteredImage
+from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 
 
 def dense_size(size: tuple[int, int], longer_side: int) -> tuple[int, int]:

@@ -17,9 +17,10 @@ import pycolmap
 
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import MappingProblem
-from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES
 from mpsfm_core.evaluation.dense_geometry import DenseTask
+from mpsfm_core.evaluation.external_results import records_of
 from mpsfm_core.evaluation.methods import (
     OTHERS,
     OURS,
@@ -30,16 +31,15 @@ from mpsfm_core.evaluation.methods import (
 )
 from mpsfm_core.evaluation.prior_quality import QUALITIES, error_seed, prior_settings
 from mpsfm_core.evaluation.records import Record, read_record, record_file, write_record
-from mpsfm_core.evaluation.results_of_others import records_of
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
 from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.runner import adjust, extract
-from mpsfm_core.files import write_file
 from mpsfm_core.inputs.images import ImageSet, load_images
+from mpsfm_core.pipeline.provider_resolution import provide
+from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers import hookimpl
-from mpsfm_core.provision import provide
-from mpsfm_core.registry import Registry, core_version
-from mpsfm_core.stages import Stages
+from mpsfm_core.providers.registry import Registry, core_version
+from mpsfm_core.support.files import write_file
 
 Done = Callable[[Record, bool], None]
 """Is told of each record, and whether it was there already."""
@@ -54,7 +54,7 @@ class Plan:
     each. ``peers``: of :data:`~mpsfm_core.evaluation.methods.OTHERS`. ``overrides``: settings
     ``KEY=VALUE`` of all configurations. ``workers``: sets that are mapped at the same time.
     ``results``: label -> folder of models that another program made
-    (:mod:`~mpsfm_core.evaluation.results_of_others`). ``distances``: metres, at which clouds are
+    (:mod:`~mpsfm_core.evaluation.external_results`). ``distances``: metres, at which clouds are
     judged where a configuration has the dense stage and a scene true depth.
     """
 
@@ -75,7 +75,7 @@ def run_benchmark(
     """Run a plan and return the records of all its runs, old and new.
 
     What a method raises is in its record. Raises :class:`InputError` (or another
-    :class:`~mpsfm_core.errors.MpsfmError` of the extraction) for what no run could do without.
+    :class:`~mpsfm_core.data.errors.MpsfmError` of the extraction) for what no run could do without.
     """
     registry = registry or Registry.discover()
     _check_names("prior", [p for p in plan.priors if error_seed(p) is None], QUALITIES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.overlap import Overlap, overlap_from_depth, overlap_from_model
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.sampling import SamplingOptions, sample_buckets

@@ -16,8 +16,8 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from mpsfm_core.data import Int64, MappingProblem, Pose, VerifiedPair
 from mpsfm_core.geometry import compose, invert
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.pose_hypotheses import estimate_absolute_pose
-from mpsfm_core.scene.scene import Scene
+from mpsfm_core.mapping.registration.pose_hypotheses import estimate_absolute_pose
+from mpsfm_core.mapping.scene.scene import Scene
 
 
 class _Link(NamedTuple):

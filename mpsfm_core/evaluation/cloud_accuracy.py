@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Float64, Int64
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 
 TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 """In the scan's unit (ETH3D, metres)."""

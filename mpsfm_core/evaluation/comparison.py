@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from mpsfm_core.data import Float64
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.pose_auc import (
     CONVENTIONS,
     THRESHOLDS_DEG,

@@ -17,9 +17,9 @@ from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.scene_folder import SceneFolder
 from mpsfm_core.evaluation.true_surface import depth_file, surface_of_depth
 from mpsfm_core.inputs.images import ImageSet
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos
-from mpsfm_core.scene.reconstruction import Reconstruction
 
 
 @dataclass(frozen=True, eq=False)

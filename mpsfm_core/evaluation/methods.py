@@ -22,11 +22,11 @@ from mpsfm_core.evaluation.dense_geometry import DenseTask
 from mpsfm_core.evaluation.peers import PEERS, run_peer
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.scene.reconstruction import Reconstruction
-from mpsfm_core.stages import peak_memory_mb
-from mpsfm_core.testing.problems import mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
-from mpsfm_core.threads import limited
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+from mpsfm_core.pipeline.stages import peak_memory_mb
+from mpsfm_core.support.threads import limited
+from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 OURS = "ours"
 CHAIN = "chained-pnp"

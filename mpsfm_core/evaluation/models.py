@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import Pose
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.alignment import TrajectoryErrors, trajectory_errors
 from mpsfm_core.evaluation.pose_auc import (
     CONVENTIONS,

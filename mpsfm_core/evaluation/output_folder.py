@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mpsfm_core.data import Float64, Pose
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES, cloud_accuracy
 from mpsfm_core.evaluation.depth_accuracy import DepthAccuracy, depth_accuracy, mean_accuracy

@@ -19,7 +19,7 @@ import pycolmap
 from mpsfm_core.data import Float64, MappingProblem, Pose, VerifiedPair
 from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.results.colmap_model import pinhole
-from mpsfm_core.threads import allowed
+from mpsfm_core.support.threads import allowed
 
 Models = Mapping[int, pycolmap.Reconstruction]
 

@@ -1,11 +1,10 @@
 """Depth of a stated quality for a scene whose true depth is known.
 
 ``sensor``: the true depth, declared good to 1 %: an upper bound. ``degraded``: the true depth with
-the errors of :mod:`mpsfm_core.testing.degraded_depth`, declared honestly, which means as large as
-they are after the best scale of each image: stands for a good monocular network; ``degraded-N`` is
-the same with the errors of seed N, which is 0 otherwise. ``config``: what the configuration's own
-provider predicts.
-"""
+the errors of :mod:`mpsfm_core.testing.synthetic.degraded_depth`, declared honestly, which means as
+large as they are after the best scale of each image: stands for a good monocular network;
+``degraded-N`` is the same with the errors of seed N, which is 0 otherwise. ``config``: what the
+configuration's own provider predicts. """
 
 from __future__ import annotations
 
@@ -18,12 +17,12 @@ import cv2
 import numpy as np
 
 from mpsfm_core.data import Float32
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.scene_folder import SceneFolder
-from mpsfm_core.files import write_file
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.pixels import check_size, read_bytes
-from mpsfm_core.testing.degraded_depth import DepthErrors, degrade_depth
+from mpsfm_core.support.files import write_file
+from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors, degrade_depth
 
 QUALITIES = ("sensor", "degraded", "config")
 SENSOR_STD = 0.01

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import Float64, Pose
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.pose_auc import PoseConvention, pose_errors_deg
-from mpsfm_core.files import write_file
-from mpsfm_core.formats import VERSION, check_version
+from mpsfm_core.support.files import write_file
+from mpsfm_core.support.format_versions import VERSION, check_version
 
 FORMAT = 1
 """Of the records."""

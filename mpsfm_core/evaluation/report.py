@@ -19,8 +19,8 @@ from mpsfm_core.evaluation.pose_auc import (
     pose_auc,
 )
 from mpsfm_core.evaluation.records import Record
-from mpsfm_core.files import write_file
-from mpsfm_core.formats import VERSION
+from mpsfm_core.support.files import write_file
+from mpsfm_core.support.format_versions import VERSION
 
 FORMAT = 1
 """Of ``report.json``."""

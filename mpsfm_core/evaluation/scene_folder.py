@@ -24,12 +24,12 @@ from typing import Any
 import yaml
 
 from mpsfm_core.data import Pose
-from mpsfm_core.errors import InputError
-from mpsfm_core.files import write_file
-from mpsfm_core.formats import VERSION, check_version
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import find_images
 from mpsfm_core.inputs.models import match_names, read_poses
-from mpsfm_core.yaml_text import write_yaml
+from mpsfm_core.support.files import write_file
+from mpsfm_core.support.format_versions import VERSION, check_version
+from mpsfm_core.support.yaml_text import write_yaml
 
 TESTSETS = "testsets.yaml"
 FORMAT = 1

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from mpsfm_core.data import Float64, PinholeCamera, Pose
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.cloud_accuracy import thinned
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.geometry import camera_center, pixel_centers, unproject

@@ -23,10 +23,10 @@ import numpy as np
 import platformdirs
 from numpy.typing import NDArray
 
-from mpsfm_core.errors import OutputError
-from mpsfm_core.files import remove_unfinished, write_file
-from mpsfm_core.npz import read_npz
-from mpsfm_core.weights import CACHE_VARIABLE
+from mpsfm_core.data.errors import OutputError
+from mpsfm_core.providers.weights import CACHE_VARIABLE
+from mpsfm_core.support.files import remove_unfinished, write_file
+from mpsfm_core.support.npz import read_npz
 
 _log = logging.getLogger(__name__)
 

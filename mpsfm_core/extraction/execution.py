@@ -18,21 +18,21 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.config import Config
-from mpsfm_core.errors import ConfigError, InputError, did_you_mean
-from mpsfm_core.extraction.backends import thread_count
+from mpsfm_core.data.errors import ConfigError, InputError, did_you_mean
+from mpsfm_core.extraction.active_provider import thread_count
 from mpsfm_core.extraction.cache import content_key
+from mpsfm_core.extraction.context import RUNS, Workbench
 from mpsfm_core.extraction.events import Silent
 from mpsfm_core.extraction.features import FeatureTable
-from mpsfm_core.extraction.matching import PairMatcher
-from mpsfm_core.extraction.multiview import GroupPriors
-from mpsfm_core.extraction.predictions import Predictions
-from mpsfm_core.extraction.selection import PairSelection
-from mpsfm_core.extraction.workbench import RUNS, Workbench
-from mpsfm_core.first_party import EXECUTORS
+from mpsfm_core.extraction.matching.matching import PairMatcher
+from mpsfm_core.extraction.pairs.selection import PairSelection
+from mpsfm_core.extraction.priors.multiview import GroupPriors
+from mpsfm_core.extraction.priors.predictions import Predictions
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.providers import Executor
-from mpsfm_core.registry import Registry
-from mpsfm_core.threads import limited
+from mpsfm_core.providers.first_party import EXECUTORS
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.support.threads import limited
 
 THREADS = "threads"
 

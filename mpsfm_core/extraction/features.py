@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core import validation
 from mpsfm_core.data import Bool, Features
+from mpsfm_core.data.options import Backend
 from mpsfm_core.extraction.cache import digest
-from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.extraction.context import Workbench
 from mpsfm_core.geometry import sample_nearest
-from mpsfm_core.inputs.recent import Recent
-from mpsfm_core.options import Backend
+from mpsfm_core.inputs.image_cache import Recent
+from mpsfm_core.providers import validation
 
 CACHED_BYTES = 512 << 20
 """Features that are kept while pairs are matched; 8192 SIFT features have 4 MB."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from mpsfm_core.options import Options
+from mpsfm_core.data.options import Options
 
 
 class PairOptions(Options):

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, MappingImage, MappingProblem
-from mpsfm_core.extraction.backends import ActiveProvider
-from mpsfm_core.extraction.matching import Candidates
-from mpsfm_core.extraction.verification import TwoView
-from mpsfm_core.extraction.workbench import Workbench
+from mpsfm_core.extraction.active_provider import ActiveProvider
+from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.matching.matching import Candidates
+from mpsfm_core.extraction.matching.verification import TwoView
 
 
 def describe(

@@ -17,12 +17,14 @@ from threadpoolctl import threadpool_limits
 
 from mpsfm_core.config import Config
 from mpsfm_core.data import Features, MappingImage, MappingProblem, SparseMatches, VerifiedPair
-from mpsfm_core.extraction.backends import thread_count
-from mpsfm_core.extraction.dense import NO_POINTS
+from mpsfm_core.data.options import FROM_MULTIVIEW
+from mpsfm_core.extraction.active_provider import thread_count
+from mpsfm_core.extraction.context import Workbench
 from mpsfm_core.extraction.events import ExtractionEvents, Silent
 from mpsfm_core.extraction.execution import workers_elsewhere
 from mpsfm_core.extraction.features import FeatureTable
-from mpsfm_core.extraction.matching import (
+from mpsfm_core.extraction.matching.dense_matches import NO_POINTS
+from mpsfm_core.extraction.matching.matching import (
     Candidates,
     PairMatcher,
     PairVerifier,
@@ -31,17 +33,15 @@ from mpsfm_core.extraction.matching import (
     assemble,
     joined,
 )
-from mpsfm_core.extraction.multiview import GroupPriors
-from mpsfm_core.extraction.predictions import Predictions, check_depth_source
+from mpsfm_core.extraction.matching.verification import TwoView
+from mpsfm_core.extraction.pairs.selection import PairSelection
+from mpsfm_core.extraction.priors.multiview import GroupPriors
+from mpsfm_core.extraction.priors.predictions import Predictions, check_depth_source
 from mpsfm_core.extraction.report import describe, describe_both
-from mpsfm_core.extraction.selection import PairSelection
-from mpsfm_core.extraction.verification import TwoView
-from mpsfm_core.extraction.workbench import Workbench
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.matches import ImportedMatches
-from mpsfm_core.options import FROM_MULTIVIEW
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 
 
 @dataclass(frozen=True, eq=False)

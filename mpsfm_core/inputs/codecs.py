@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import UInt8
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 
 HEIF = frozenset((".heic", ".heif", ".hif"))
 RAW = frozenset((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef"))

@@ -17,7 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Float64, Int64
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 
 _MAX_IMAGES = 2**31 - 1
 """Factor between the two image ids of a pair id (COLMAP: kMaxNumImages)."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import Float32, Float64, Int64
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 
 _TO_COLMAP = 0.5
 """hloc's first pixel has its centre at (0, 0)."""

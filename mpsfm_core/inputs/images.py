@@ -16,9 +16,10 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Bool, Float64, PinholeCamera, UInt8, View
-from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.inputs.gps import GpsPosition, read_gps
 from mpsfm_core.inputs.header import Header, read_header
+from mpsfm_core.inputs.image_cache import Recent
 from mpsfm_core.inputs.intrinsics import Intrinsics, read_intrinsics
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.pixels import (
@@ -30,7 +31,6 @@ from mpsfm_core.inputs.pixels import (
     read_mask,
     upright_size,
 )
-from mpsfm_core.inputs.recent import Recent
 from mpsfm_core.inputs.undistortion import (
     Warp,
     camera_key,
@@ -40,7 +40,7 @@ from mpsfm_core.inputs.undistortion import (
     to_original,
     to_view,
 )
-from mpsfm_core.threads import allowed
+from mpsfm_core.support.threads import allowed
 
 _log = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from typing import Any
 import pycolmap
 import yaml
 
-from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.inputs.colmap_database import read_database
 from mpsfm_core.inputs.models import match_names, read_model
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mpsfm_core.data import Float32, Float64, Int64, SparseMatches
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.geometry import inside
 from mpsfm_core.inputs.colmap_database import read_database
 from mpsfm_core.inputs.hloc import HlocFiles

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Pose
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.colmap_files import check_binary_model
 from mpsfm_core.inputs.nerfstudio import read_transforms
 
@@ -25,7 +25,7 @@ def read_poses(path: Path) -> dict[str, Pose]:
 def read_model(path: Path) -> pycolmap.Reconstruction:
     """The COLMAP model of a folder (see :func:`model_folder`), or a ``transforms.json``.
 
-    Raises :class:`~mpsfm_core.errors.InputError` when it is not there or cannot be read.
+    Raises :class:`~mpsfm_core.data.errors.InputError` when it is not there or cannot be read.
     """
     if path.suffix == ".json":
         return read_transforms(path)
@@ -43,7 +43,7 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
 def model_folder(folder: Path) -> Path:
     """Where a COLMAP model (binary or text) lies: here, in ``sparse`` or in ``sparse/0``.
 
-    Raises :class:`~mpsfm_core.errors.InputError` when there is none.
+    Raises :class:`~mpsfm_core.data.errors.InputError` when there is none.
     """
     for candidate in (folder, folder / "sparse", folder / "sparse" / "0"):
         if any((candidate / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):

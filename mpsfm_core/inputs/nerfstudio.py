@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Float64
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.header import read_header
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.pixels import EXTENSIONS, check_size, read_bytes, upright_size

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from mpsfm_core.options import Options
+from mpsfm_core.data.options import Options
 
 
 class VideoOptions(Options):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, Float64, UInt8
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.codecs import HEIF, RAW, decoder_of
 from mpsfm_core.inputs.header import Header, declared_pixels, is_cut_jpeg, read_header
 

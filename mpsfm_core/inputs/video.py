@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 
 from mpsfm_core.data import Float32, UInt8
-from mpsfm_core.errors import InputError
-from mpsfm_core.files import replacing
-from mpsfm_core.formats import VERSION, check_version
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.options import VideoOptions
-from mpsfm_core.weights import file_sha256
+from mpsfm_core.providers.weights import file_sha256
+from mpsfm_core.support.files import replacing
+from mpsfm_core.support.format_versions import VERSION, check_version
 
 EXTENSIONS = frozenset((".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".wmv"))
 """File names that count as videos."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 from mpsfm_core.data import MappingProblem
-from mpsfm_core.errors import DataError
+from mpsfm_core.data.errors import DataError
 from mpsfm_core.mapping.events import MappingEvents
-from mpsfm_core.mapping.runs import Run
+from mpsfm_core.mapping.model_selection import Run
 from mpsfm_core.mapping.state import Frozen, freeze, thaw
 
 if TYPE_CHECKING:

@@ -10,16 +10,16 @@ import numpy as np
 
 from mpsfm_core.data import Bool, MappingProblem
 from mpsfm_core.mapping.checkpoints import Checkpoints, Keeper
-from mpsfm_core.mapping.completion import with_unconfirmed
+from mpsfm_core.mapping.component import Group, nothing
+from mpsfm_core.mapping.event_log import Journal
 from mpsfm_core.mapping.events import MappingEvents, Silent
-from mpsfm_core.mapping.finishing import finished
-from mpsfm_core.mapping.group import Group, nothing
-from mpsfm_core.mapping.initialization import Starts
-from mpsfm_core.mapping.journal import Journal
+from mpsfm_core.mapping.initialization.initial_pair import Starts
+from mpsfm_core.mapping.model_selection import Run, best, explained_shares, settled, with_all_times
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.runs import Run, best, explained_shares, settled, with_all_times
+from mpsfm_core.mapping.registration.tentative import with_unconfirmed
+from mpsfm_core.mapping.scene.conversion import finished
+from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.mapping.state import canonical
-from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction
 
 CONTENDER_SHARE = 0.25
 """Of the number of images of the largest group, with which another contends for them (ours)."""

@@ -11,18 +11,19 @@ from typing import Literal
 
 from pydantic import Field
 
+from mpsfm_core.data.options import Options
 from mpsfm_core.optimize.bundle_adjustment import BundleOptions
 from mpsfm_core.optimize.depth_integration import IntegrationOptions
 from mpsfm_core.optimize.losses import Loss
-from mpsfm_core.options import Options
 
 
 class InitializationOptions(Options):
     """How a group of images starts."""
 
     all_at_once: bool = True
-    """Place all well connected images at once (:mod:`mpsfm_core.mapping.global_start`), and go on
-    from a first pair only where that does not hold."""
+    """Place all well connected images at once
+    (:mod:`mpsfm_core.mapping.initialization.global_initialization`), and go on from a first pair
+    only where that does not hold."""
     max_pairs: int = Field(50, ge=1)
     """How many pairs are tried, best first."""
     num_compared: int = Field(5, ge=1)
@@ -116,11 +117,11 @@ class RefinementOptions(Options):
     depth_regularization: bool = True
     """C_reg in bundle adjustment; off for ablation."""
     measure_depth_noise: bool = True
-    """Weigh depth by how well views agree (:mod:`mpsfm_core.mapping.depth_noise`); off: by the
-    declared variance alone."""
+    """Weigh depth by how well views agree (:mod:`mpsfm_core.mapping.refinement.depth_noise`); off:
+    by the declared variance alone."""
     measure_keypoint_noise: bool = True
     """Widen the reprojection loss where keypoints are clean
-    (:mod:`mpsfm_core.mapping.keypoint_noise`); off: as ``bundle`` says."""
+    (:mod:`mpsfm_core.mapping.refinement.keypoint_noise`); off: as ``bundle`` says."""
     free_scales: bool = True
     """Bundle adjustment estimates the scales of priors beside poses and points; off: they stay as
     estimated when the image was registered. (The reference estimates them in turn with it, which
@@ -170,10 +171,10 @@ class ConsistencyOptions(Options):
     enabled: bool = True
     weigh_evidence: bool = True
     """Take a prior's noise at a place from the points around that rays alone hold
-    (:func:`~mpsfm_core.mapping.depth_noise.local_noise`); off: from the whole scene."""
+    (:func:`~mpsfm_core.mapping.refinement.depth_noise.local_noise`); off: from the whole scene."""
     check_pairs: bool = True
     """Where not all images go together at once, hold pairs against depth before they count
-    (:mod:`~mpsfm_core.mapping.pair_check`)."""
+    (:mod:`~mpsfm_core.mapping.consistency.pair_consistency`)."""
     check_at_end: bool = True
     """Also check every image once at the end (paper)."""
     max_violations: float = Field(0.05, gt=0)

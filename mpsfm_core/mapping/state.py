@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from mpsfm_core.errors import DataError
+from mpsfm_core.data.errors import DataError
 
 Frozen: TypeAlias = Mapping[str, NDArray[Any]]
 """The arrays of a state by name; ``tree`` says how they belong together."""

@@ -11,7 +11,7 @@ import numpy as np
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.geometry import triangulation_angle_deg
 from mpsfm_core.mapping.options import TriangulationOptions
-from mpsfm_core.scene.scene import Scene
+from mpsfm_core.mapping.scene.scene import Scene
 
 
 def triangulate_image(scene: Scene, image: int, options: TriangulationOptions) -> None:

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core import jit
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.optimize.losses import evaluate
+from mpsfm_core.support import jit
 
 Int32 = NDArray[np.int32]
 

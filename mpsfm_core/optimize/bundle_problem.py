@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from mpsfm_core.data import Bool, Float64, Int64
-from mpsfm_core.errors import DataError
+from mpsfm_core.data.errors import DataError
+from mpsfm_core.data.options import Options
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.losses import Loss
-from mpsfm_core.options import Options
-from mpsfm_core.threads import allowed
+from mpsfm_core.support.threads import allowed
 
 RANGE_SIZE = 8000
 """Observations that are worth a thread of their own (our choice; about 2 ms a step)."""

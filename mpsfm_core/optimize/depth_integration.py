@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, NormalPrior, PinholeCamera
-from mpsfm_core.errors import DataError
+from mpsfm_core.data.errors import DataError
 from mpsfm_core.optimize.depth_variance import inverse_diagonal
 from mpsfm_core.optimize.integration_energy import (
     MAX_LOG_VARIANCE,

@@ -29,8 +29,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core import jit
 from mpsfm_core.data import Bool, Float32, Float64, Int64, NormalPrior, PinholeCamera
+from mpsfm_core.support import jit
 
 _kernel, _helper = jit.kernel(fastmath=True), jit.helper(fastmath=True)
 

@@ -19,7 +19,7 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from mpsfm_core import jit
+from mpsfm_core.support import jit
 
 
 class Loss(IntEnum):

@@ -27,8 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core import jit
 from mpsfm_core.data import Float32, Float64, Int64
+from mpsfm_core.support import jit
 
 _kernel, _helper = (
     jit.kernel(fastmath={"contract", "reassoc"}),

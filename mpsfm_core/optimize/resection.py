@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core import jit
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.optimize.bundle_kernels import MIN_DEPTH, rotation_of
+from mpsfm_core.support import jit
 
 DAMPING = 1e-6
 """Relative, of the normal equations: keeps few matches from being singular (ours)."""

@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Float64
-from mpsfm_core.errors import InputError, MpsfmError
-from mpsfm_core.files import write_file
+from mpsfm_core.data.errors import InputError, MpsfmError
 from mpsfm_core.report import pictures
 from mpsfm_core.report.findings import findings, partner_counts, verdict
 from mpsfm_core.report.points import PointSet, dense_points, sparse_points
 from mpsfm_core.report.reasons import explain
 from mpsfm_core.report.result_folder import PairLines, PriorMaps, RefinedMap, ResultFolder
 from mpsfm_core.results.writer import REPORT
-from mpsfm_core.threads import each
-from mpsfm_core.yaml_text import write_yaml
+from mpsfm_core.support.files import write_file
+from mpsfm_core.support.threads import each
+from mpsfm_core.support.yaml_text import write_yaml
 
 DENSE_POINTS = 280_000
 SPARSE_POINTS = 40_000
@@ -45,7 +45,7 @@ _USUAL_STD = 0.2
 def write_report(folder: Path) -> Path:
     """Make the page of a finished result folder anew; returns its path.
 
-    Raises :class:`~mpsfm_core.errors.InputError` when the folder holds no results or damaged
+    Raises :class:`~mpsfm_core.data.errors.InputError` when the folder holds no results or damaged
     ones, :class:`OSError` when the disk is full.
     """
     result = ResultFolder.open(folder)

@@ -13,15 +13,15 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import SUMMARY
 from mpsfm_core.inputs.models import read_model
-from mpsfm_core.npz import read_npz
 from mpsfm_core.results.depth_maps import load_depth_map
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.summary import read_summary
 from mpsfm_core.results.views import MATCHES
 from mpsfm_core.results.writer import DENSE, DEPTH, VIEWS
+from mpsfm_core.support.npz import read_npz
 
 _UNREADABLE = (ValueError, KeyError, TypeError, IndexError)
 

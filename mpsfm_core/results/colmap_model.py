@@ -13,7 +13,7 @@ from mpsfm_core.data import Float64, PinholeCamera, UInt8, View
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.inputs.colmap_files import check_binary_model
 from mpsfm_core.inputs.undistortion import camera_key
-from mpsfm_core.scene.reconstruction import Reconstruction
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 
 MIN_TRACK_LENGTH = 2
 """COLMAP and its users take a point for triangulated: one seen once, lifted from depth, is not."""

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import DepthPrior, PinholeCamera
-from mpsfm_core.errors import InputError
-from mpsfm_core.formats import VERSION, check_version
-from mpsfm_core.npz import read_npz, write_npz
-from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.threads import each
+from mpsfm_core.data.errors import InputError
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.support.format_versions import VERSION, check_version
+from mpsfm_core.support.npz import read_npz, write_npz
+from mpsfm_core.support.threads import each
 
 FORMAT = 1
 """Of the files."""

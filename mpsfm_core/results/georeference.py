@@ -12,8 +12,8 @@ import pycolmap
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.inputs.gps import GpsPosition, to_enu
+from mpsfm_core.mapping.scene.reconstruction import MetricScale, Reconstruction, transformed
 from mpsfm_core.results.orientation import estimate_gravity, rotation_to_z
-from mpsfm_core.scene.reconstruction import MetricScale, Reconstruction, transformed
 
 _FEWEST = 4
 """Positions: three fix a similarity, one more can deny it."""

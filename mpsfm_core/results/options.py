@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from mpsfm_core.options import Options
+from mpsfm_core.data.options import Options
 
 
 class ResultOptions(Options):

@@ -12,7 +12,7 @@ from mpsfm_core.inputs.header import read_header
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.inputs.pixels import read_bytes
 from mpsfm_core.inputs.undistortion import is_pinhole
-from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 _PORTABLE = frozenset((".jpg", ".jpeg", ".png"))
 

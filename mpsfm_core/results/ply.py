@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Float32, Float64, Int64, UInt8
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.fusion import Cloud
-from mpsfm_core.errors import InputError
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},

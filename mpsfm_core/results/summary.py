@@ -12,10 +12,10 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.errors import InputError
-from mpsfm_core.formats import check_version
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import ImageSet, SourceImage
-from mpsfm_core.scene.reconstruction import MappingResult, MetricScale, Reconstruction
+from mpsfm_core.mapping.scene.reconstruction import MappingResult, MetricScale, Reconstruction
+from mpsfm_core.support.format_versions import check_version
 
 FORMAT = 1
 """Of ``summary.json`` and of ``views/`` beside it."""

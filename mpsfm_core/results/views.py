@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Float64, MappingImage, MappingProblem, UInt8, View
-from mpsfm_core.npz import write_npz
-from mpsfm_core.threads import each
+from mpsfm_core.support.npz import write_npz
+from mpsfm_core.support.threads import each
 
 PICTURE_SIDE = 960
 """Longer side of the pictures in pixels: enough to judge a photo on a screen."""

@@ -30,16 +30,16 @@ import pycolmap
 
 from mpsfm_core.data import UInt8
 from mpsfm_core.dense.fusion import fuse_depth_maps
-from mpsfm_core.files import replacing, write_file
 from mpsfm_core.inputs.images import SUMMARY
 from mpsfm_core.inputs.nerfstudio import can_hold, write_transforms
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.results.colmap_model import build_model, pinhole, point_colors, write_model
 from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos, portable_name
 from mpsfm_core.results.ply import write_cloud, write_ply
 from mpsfm_core.results.views import write_views
-from mpsfm_core.scene.reconstruction import Reconstruction
+from mpsfm_core.support.files import replacing, write_file
 
 SPARSE = "sparse"
 DENSE = "dense.ply"
@@ -105,7 +105,7 @@ def write_results(
 
     ``components``: one at least, largest first. ``summarize``: gives the plain data of the
     summary, called when all else is written. ``seed``: of the choice of pixels for ``dense.ply``.
-    Raises what :func:`mpsfm_core.files.replacing` raises.
+    Raises what :func:`mpsfm_core.support.files.replacing` raises.
     """
     best, rest = components[0], components[1:]
     with replacing(output, ENTRIES) as folder:

@@ -13,16 +13,15 @@ from weakref import WeakKeyDictionary, WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core import validation
 from mpsfm_core.data import DepthPrior, Features, GroupPrior, View
-from mpsfm_core.errors import ProviderError
-from mpsfm_core.options import Backend
-from mpsfm_core.providers import Capability, Kind, ProviderContext, ProviderSpec
-from mpsfm_core.registry import Registry
+from mpsfm_core.data.errors import ProviderError
+from mpsfm_core.data.options import Backend
+from mpsfm_core.providers import Capability, Kind, ProviderContext, ProviderSpec, validation
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.testing.examples import Example, Look, indoor_example, outdoor_example
-from mpsfm_core.testing.oracle import ORACLE_SPECS, Oracle
+from mpsfm_core.testing.ground_truth_provider import ORACLE_SPECS, Oracle
 from mpsfm_core.testing.outcome import CheckSkipped
-from mpsfm_core.weights import WeightStore
 
 Knowledge = Literal["painted", "told", "seen", "nothing"]
 
@@ -283,7 +282,7 @@ class Case:
 def setup_of(spec: ProviderSpec, folder: Path) -> Setup:
     """The setup that the plugin gives for the contract kit, or one of defaults.
 
-    Raises :class:`~mpsfm_core.errors.ProviderError` when there is one and it cannot be made.
+    Raises :class:`~mpsfm_core.data.errors.ProviderError` when there is one and it cannot be made.
     """
     if spec.contract is None:
         return Setup()

@@ -10,21 +10,20 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
-from mpsfm_core.errors import InputError, MpsfmError, ProviderError, did_you_mean
+from mpsfm_core.data.errors import InputError, MpsfmError, ProviderError, did_you_mean
 from mpsfm_core.providers import Kind, ProviderSpec
-from mpsfm_core.registry import ProviderStatus, Registry
-from mpsfm_core.testing import (
-    checks_depth,
-    checks_features,
-    checks_mask,
-    checks_matcher,
-    checks_multiview,
-    checks_normals,
-    checks_retrieval,
-    checks_wrapper,
-)
+from mpsfm_core.providers.registry import ProviderStatus, Registry
+from mpsfm_core.support.yaml_text import parse_yaml
 from mpsfm_core.testing.case import Case, Setup, setup_of
-from mpsfm_core.testing.checks_common import (
+from mpsfm_core.testing.checks import depth as checks_depth
+from mpsfm_core.testing.checks import features as checks_features
+from mpsfm_core.testing.checks import mask as checks_mask
+from mpsfm_core.testing.checks import matcher as checks_matcher
+from mpsfm_core.testing.checks import multiview as checks_multiview
+from mpsfm_core.testing.checks import normals as checks_normals
+from mpsfm_core.testing.checks import retrieval as checks_retrieval
+from mpsfm_core.testing.checks import wrapper as checks_wrapper
+from mpsfm_core.testing.checks.common import (
     COMMON,
     STANDALONE,
     check_construction,
@@ -32,7 +31,6 @@ from mpsfm_core.testing.checks_common import (
     check_specification,
 )
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
-from mpsfm_core.yaml_text import parse_yaml
 
 Check = Callable[[Case], str | None]
 Status = Literal["pass", "fail", "skip", "xfail"]
@@ -87,9 +85,8 @@ class Contract:
     """All checks of one provider.
 
     ``setup``: how it is put under test, by default what its plugin says (``spec.contract``).
-    ``folder``: for the files of stand-ins. Raises :class:`~mpsfm_core.errors.ProviderError` when
-    there is no such provider or it is unavailable.
-    """
+    ``folder``: for the files of stand-ins. Raises :class:`~mpsfm_core.data.errors.ProviderError`
+    when there is no such provider or it is unavailable. """
 
     def __init__(
         self,
@@ -209,9 +206,9 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
     """Kind and name of the providers that ``name`` means: a provider (``onnx``), one of a kind
     (``depth/onnx``) or all of a distribution (``mpsfm-onnx``).
 
-    Raises :class:`~mpsfm_core.errors.InputError` when there is none, and
-    :class:`~mpsfm_core.errors.ProviderError` with the reason if the plugin is there and has none.
-    """
+    Raises :class:`~mpsfm_core.data.errors.InputError` when there is none, and
+    :class:`~mpsfm_core.data.errors.ProviderError` with the reason if the plugin is there and has
+    none. """
     known = [line for line in registry.status() if line.kind != "plugin"]
     found = [
         (line.kind, line.name)
@@ -240,7 +237,7 @@ def setup_from(assignments: Sequence[str]) -> Setup | None:
     """The setup of a provider with options given as ``key=value`` (or ``a.b=value``) with YAML
     values; None if there are none, which means what the plugin says.
 
-    Raises :class:`~mpsfm_core.errors.InputError` for what is no assignment.
+    Raises :class:`~mpsfm_core.data.errors.InputError` for what is no assignment.
     """
     options: dict[str, Any] = {}
     for text in assignments:
@@ -279,7 +276,8 @@ def check_of(id: str) -> Check:
 
 
 def known_checks(ids: Collection[str]) -> set[str]:
-    """The ids as a set; raises :class:`~mpsfm_core.errors.InputError` for one that is no check."""
+    """The ids as a set; raises :class:`~mpsfm_core.data.errors.InputError` for one that is no
+    check."""
     known = [id_of(check) for check in all_checks()]
     for name in ids:
         if name not in known:

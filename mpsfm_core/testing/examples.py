@@ -11,7 +11,7 @@ import numpy as np
 from mpsfm_core.data import Bool, Float64, Int64, PinholeCamera, UInt8, View
 from mpsfm_core.geometry import pixel_centers
 from mpsfm_core.testing.painting import MAX_SLOPE, paint
-from mpsfm_core.testing.scenes import (
+from mpsfm_core.testing.synthetic.scenes import (
     AnalyticScene,
     Box,
     Correspondences,

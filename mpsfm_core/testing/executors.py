@@ -16,15 +16,15 @@ import cv2
 
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.errors import ConfigError, DataError, ProviderRunError
+from mpsfm_core.data.errors import ConfigError, DataError, ProviderRunError
+from mpsfm_core.data.options import Backend
 from mpsfm_core.extraction.events import Silent
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.options import Backend
 from mpsfm_core.providers import Executor
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.case import difference
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 _CAMERA = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
 _INTRINSICS = "1: {params: [280, 280, 160, 120], images: all}"

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from mpsfm_core.errors import MpsfmError
-from mpsfm_core.registry import Registry
+from mpsfm_core.data.errors import MpsfmError
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.contract import Contract, Task, find_providers, setup_from
 from mpsfm_core.testing.pytest_tests import report
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mpsfm_core.providers import Kind
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.contract import CheckResult, Contract, SetupSource, Task, tasks_of
 
 

@@ -8,9 +8,9 @@ import re
 from pathlib import Path
 from string import Template
 
-from mpsfm_core.errors import InputError
-from mpsfm_core.files import write_file
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.providers import Kind
+from mpsfm_core.support.files import write_file
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
@@ -20,9 +20,8 @@ _OPENCV = ("features", "retrieval")
 def write_plugin(name: str, kind: Kind, folder: Path) -> list[Path]:
     """Write the package ``name`` with a provider of that name into ``folder / name``.
 
-    Returns the files. Raises :class:`~mpsfm_core.errors.InputError` when the name is no good, or
-    when there is something in that place.
-    """
+    Returns the files. Raises :class:`~mpsfm_core.data.errors.InputError` when the name is no good,
+    or when there is something in that place. """
     module = name.replace("-", "_")
     if not _NAME.fullmatch(name) or keyword.iskeyword(module):
         raise InputError(f"{name!r} is not made of lower-case letters, digits and single dashes")

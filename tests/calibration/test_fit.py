@@ -17,7 +17,7 @@ from mpsfm_core.calibration.samples import (
     tangent_errors,
 )
 from mpsfm_core.data import Float64
-from mpsfm_core.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
 from tests.calibration.simulation import Simulated, simulate
 
 PLAIN = Simulated()

@@ -12,7 +12,7 @@ from mpsfm_core.calibration.samples import DepthTruth
 from mpsfm_core.data import Float64
 from mpsfm_core.geometry import project
 from mpsfm_core.inputs.images import ImageSet, load_images
-from mpsfm_core.testing.scenes import arc_poses
+from mpsfm_core.testing.synthetic.scenes import arc_poses
 
 NOISE_PX = 0.5
 POINTS = 600

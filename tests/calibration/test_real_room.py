@@ -15,11 +15,11 @@ from mpsfm_core.config import Config, load_config
 from mpsfm_core.evaluation.peers import PEERS, write_database
 from mpsfm_core.extraction.runner import extract
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.provision import provide
-from mpsfm_core.registry import Registry
-from mpsfm_core.stages import Stages
-from mpsfm_core.threads import limited
-from mpsfm_core.uncertainty.model import DepthCalibration
+from mpsfm_core.pipeline.provider_resolution import provide
+from mpsfm_core.pipeline.stages import Stages
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.support.threads import limited
 
 pytest.importorskip("mpsfm_onnx")
 pytest.importorskip("mpsfm_kornia")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from mpsfm_core.builtin.plugin import mpsfm_providers
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.builtin.plugin import mpsfm_providers
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import contract_tests
 
 BUILTIN = Registry()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import DepthPrior, Float32, PinholeCamera, View
-from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
 STD = 0.15

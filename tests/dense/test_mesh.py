@@ -17,13 +17,13 @@ from typer.testing import CliRunner
 
 from mpsfm_core.cli import build_app
 from mpsfm_core.data import DepthPrior
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.mesh import Mesh, mesh_of_depth_maps
 from mpsfm_core.dense.options import MeshOptions
-from mpsfm_core.errors import InputError
 from mpsfm_core.geometry import pixel_centers, unproject
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.results.colmap_model import build_model, pinhole, write_model
 from mpsfm_core.results.depth_maps import write_depth_maps
-from mpsfm_core.scene.reconstruction import Reconstruction
 
 from .conftest import CAMERA, Room
 

@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 
 from mpsfm_core.cli import build_app
 from mpsfm_core.data import DepthPrior
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.sparse_depth import depth_of_points
-from mpsfm_core.errors import InputError
 from mpsfm_core.geometry import project, transform
-from mpsfm_core.pipeline import densify_model
+from mpsfm_core.pipeline.run import densify_model
 from mpsfm_core.results.colmap_model import build_model, pinhole, write_model
 from mpsfm_core.results.ply import read_ply
-from mpsfm_core.testing.scenes import room_scene
+from mpsfm_core.testing.synthetic.scenes import room_scene
 
 
 @pytest.fixture

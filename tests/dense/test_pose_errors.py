@@ -13,7 +13,7 @@ from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.pose_errors import PatchOffsets, patch_offsets, pose_error_px
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.dense.view import DenseView
-from mpsfm_core.scene.reconstruction import RegisteredImage
+from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 
 ACROSS, ALONG = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
 """Axes of a turn that moves pixels across the lines of a camera that moved sideways, or along."""

@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
-from mpsfm_core.checkpoints import DenseCheckpoints
 from mpsfm_core.data import DepthPrior, View
+from mpsfm_core.data.errors import OutputError
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stage import densify
 from mpsfm_core.dense.stereo import StereoDepth
 from mpsfm_core.dense.view import DenseView
-from mpsfm_core.disk_arrays import DiskArrays
-from mpsfm_core.errors import OutputError
 from mpsfm_core.extraction.cache import Cache
+from mpsfm_core.pipeline.checkpoints import DenseCheckpoints
+from mpsfm_core.support.disk_arrays import DiskArrays
 
 OPTIONS = DenseOptions(correlation_px=20)
 

@@ -10,7 +10,7 @@ import pytest
 
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.evaluation.prior_quality import write_depth
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
 POSES = arc_poses(5, 14.0)

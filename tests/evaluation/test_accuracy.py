@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mpsfm_core.cli import build_app
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation import read_poses
 from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy
 from mpsfm_core.evaluation.depth_accuracy import depth_accuracy, mean_accuracy

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mpsfm_core.cli import build_app
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation import methods
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
 from mpsfm_core.evaluation.methods import Task, run_method, run_tasks
@@ -19,8 +19,8 @@ from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.records import read_record, read_records
 from mpsfm_core.evaluation.report import CLOUD
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.testing.problems import mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 from tests.evaluation.conftest import CAMERA
 
 pytestmark = pytest.mark.slow  # starts processes that load or compile the mapper's loops

@@ -8,8 +8,8 @@ from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.evaluation import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.chained_pnp import chained_poses
 from mpsfm_core.evaluation.records import Record
-from mpsfm_core.testing.problems import mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(640, 480, 520.0, 515.0, 318.0, 242.0)
 POSES = arc_poses(5, 10.0)

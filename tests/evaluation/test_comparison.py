@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from mpsfm_core.cli import build_app
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.comparison import compare, read_side
 from mpsfm_core.evaluation.records import Record, write_record
 from mpsfm_core.evaluation.report import ALL_SCENES, make_rows, markdown, write_report

@@ -15,7 +15,7 @@ from mpsfm_core.evaluation.records import Record
 from mpsfm_core.evaluation.report import make_rows
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
 from mpsfm_core.evaluation.true_surface import surface_of_depth
-from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from tests.evaluation.conftest import CAMERA, NAMES
 
 CAMERAS = dict.fromkeys(NAMES, CAMERA)

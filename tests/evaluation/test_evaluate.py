@@ -8,7 +8,7 @@ from pathlib import Path
 import pycolmap
 import pytest
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.models import evaluate
 from mpsfm_core.inputs.models import read_poses
 

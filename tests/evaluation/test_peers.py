@@ -9,9 +9,9 @@ import pytest
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.evaluation import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.peers import PEERS, run_peer, write_database
-from mpsfm_core.testing.problems import Noise, mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
-from mpsfm_core.threads import limited
+from mpsfm_core.support.threads import limited
+from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(640, 480, 520.0, 515.0, 318.0, 242.0)
 POSES = arc_poses(6, 9.0)

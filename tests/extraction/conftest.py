@@ -23,13 +23,13 @@ from mpsfm_core.data import (
     PinholeCamera,
     View,
 )
+from mpsfm_core.data.options import Backend, Options
 from mpsfm_core.extraction.options import AdjustmentOptions
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.options import Backend, Options
 from mpsfm_core.providers import ProviderContext, ProviderSpec
-from mpsfm_core.registry import Registry
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
 COUNT = 4

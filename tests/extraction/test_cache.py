@@ -22,11 +22,11 @@ from mpsfm_core.data import (
     PairMatches,
     SparseMatches,
 )
-from mpsfm_core.errors import OutputError
+from mpsfm_core.data.errors import OutputError
 from mpsfm_core.extraction import cache as module
 from mpsfm_core.extraction.cache import Cache, content_key, digest, pack
-from mpsfm_core.extraction.raw_priors import JointPrior
-from mpsfm_core.extraction.verification import TwoView
+from mpsfm_core.extraction.matching.verification import TwoView
+from mpsfm_core.extraction.priors.raw_priors import JointPrior
 
 RNG = np.random.default_rng(0)
 KEY = content_key("entry")

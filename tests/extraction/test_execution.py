@@ -16,14 +16,14 @@ import pytest
 from mpsfm_core import hookimpl
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import DataError, PinholeCamera
-from mpsfm_core.errors import ConfigError, InputError, ProviderOutputError, ReconstructionError
+from mpsfm_core.data.errors import ConfigError, InputError, ProviderOutputError, ReconstructionError
+from mpsfm_core.data.options import Backend
 from mpsfm_core.extraction.execution import Step
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.options import Backend
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.case import difference
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
 

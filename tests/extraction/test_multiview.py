@@ -10,11 +10,11 @@ import pytest
 
 from mpsfm_core import DepthPrior, GroupPrior, View
 from mpsfm_core.data import DataError
-from mpsfm_core.errors import ConfigError
+from mpsfm_core.data.errors import ConfigError
+from mpsfm_core.data.options import Backend
 from mpsfm_core.extraction.cache import Cache, pack, unpack
-from mpsfm_core.extraction.multiview import choose_groups, in_turn
+from mpsfm_core.extraction.priors.multiview import choose_groups, in_turn
 from mpsfm_core.geometry import compose, invert
-from mpsfm_core.options import Backend
 from mpsfm_core.providers import ProviderSpec
 
 from .conftest import World

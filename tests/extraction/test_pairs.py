@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core.extraction.options import PairOptions
-from mpsfm_core.extraction.pairs import (
+from mpsfm_core.extraction.pairs.candidates import (
     apply_filters,
     exhaustive,
     most_alike,

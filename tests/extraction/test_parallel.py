@@ -8,8 +8,8 @@ import time
 import pytest
 
 from mpsfm_core.config import RuntimeOptions
-from mpsfm_core.extraction import backends
-from mpsfm_core.extraction.backends import thread_count, worker_count
+from mpsfm_core.extraction import active_provider as backends
+from mpsfm_core.extraction.active_provider import thread_count, worker_count
 from mpsfm_core.extraction.events import Silent
 from mpsfm_core.extraction.parallel import run_stage
 from mpsfm_core.providers import ProviderSpec

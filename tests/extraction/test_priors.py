@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera
-from mpsfm_core.extraction import priors
+from mpsfm_core.extraction.priors import prior_maps as priors
 from mpsfm_core.geometry import pixel_centers, rays
 
 FULL, GRID = (96, 64), (48, 32)

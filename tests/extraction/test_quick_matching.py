@@ -7,12 +7,12 @@ import pytest
 
 from mpsfm_core.config import QuickMatching
 from mpsfm_core.data import Float64
+from mpsfm_core.data.options import Backend
 from mpsfm_core.extraction.options import PairOptions
 from mpsfm_core.extraction.runner import Extraction, extract_more
 from mpsfm_core.geometry import transform
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.options import Backend
-from mpsfm_core.pipeline import reconstruct
+from mpsfm_core.pipeline.run import reconstruct
 
 TRUTH = QuickMatching(features=Backend(use="truth"), matcher=Backend(use="mutual-nearest"))
 DENSE = {"features": None, "matcher": None, "dense_matcher": Backend(use="dense")}

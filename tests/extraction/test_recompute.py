@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from mpsfm_core.config import RuntimeOptions
+from mpsfm_core.data.options import Backend
 from mpsfm_core.extraction.options import ExtractionOptions, VerificationOptions
-from mpsfm_core.options import Backend
 
 FULL = {"features": 4, "depth": 4, "normals": 4}
 

@@ -10,16 +10,17 @@ import pytest
 
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data import DepthPrior
-from mpsfm_core.errors import ConfigError, ProviderOutputError, ProviderRunError
-from mpsfm_core.extraction import first_look, pairs
+from mpsfm_core.data.errors import ConfigError, ProviderOutputError, ProviderRunError
+from mpsfm_core.data.options import Backend
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.options import AdjustmentOptions, ExtractionOptions, PairOptions
-from mpsfm_core.extraction.priors import EDGE_VARIANCE
+from mpsfm_core.extraction.pairs import candidates as pairs
+from mpsfm_core.extraction.pairs import similarity as first_look
+from mpsfm_core.extraction.priors.prior_maps import EDGE_VARIANCE
 from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_angle_deg
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.options import Backend
 from mpsfm_core.providers import ProviderSpec, hookimpl
-from mpsfm_core.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.model import DepthCalibration
 
 ALL_PAIRS = {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)}
 

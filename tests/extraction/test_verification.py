@@ -7,10 +7,10 @@ import pycolmap
 import pytest
 
 from mpsfm_core.data import PinholeCamera
+from mpsfm_core.extraction.matching.verification import verify
 from mpsfm_core.extraction.options import VerificationOptions
-from mpsfm_core.extraction.verification import verify
 from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_angle_deg
-from mpsfm_core.testing.scenes import AnalyticScene, Plane, arc_poses, room_scene
+from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Plane, arc_poses, room_scene
 
 CAMERA = PinholeCamera(640, 480, 500.0, 510.0, 318.0, 243.0)
 OTHER = PinholeCamera(480, 640, 450.0, 450.0, 240.0, 320.0)

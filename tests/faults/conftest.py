@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.testing.result_files import content
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+from tests.support.result_files import content
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import cv2
 
-from mpsfm_core.errors import MpsfmError
+from mpsfm_core.data.errors import MpsfmError
 
 LIMIT_S = 10
 """A file that keeps a reader busy for longer, in time of the processor, hangs it."""

@@ -19,25 +19,25 @@ from safetensors.torch import save as save_safetensors
 
 from mpsfm_core.cli.time_left import TimeLeft
 from mpsfm_core.data import Features
-from mpsfm_core.environments.codec import Packed, unpack
-from mpsfm_core.environments.store import Environment
 from mpsfm_core.evaluation.importers import import_scene
 from mpsfm_core.evaluation.overlap import overlap_from_model
 from mpsfm_core.evaluation.scene_folder import read_scene
-from mpsfm_core.files import claimed
 from mpsfm_core.inputs import video
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.matches import matches_from_database, matches_from_hloc
 from mpsfm_core.inputs.models import read_model, read_poses
 from mpsfm_core.inputs.options import InputOptions, VideoOptions
-from mpsfm_core.pipeline import _depths_of_points
+from mpsfm_core.pipeline.run import _depths_of_points
+from mpsfm_core.providers.environments.codec import Packed, unpack
+from mpsfm_core.providers.environments.store import Environment
+from mpsfm_core.providers.uncertainty.file import load_calibration
+from mpsfm_core.providers.weights import load_torch_state
 from mpsfm_core.report.page import write_report
+from mpsfm_core.report.viewing import read_scene as read_view
 from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.exports.formats import export
-from mpsfm_core.uncertainty.file import load_calibration
-from mpsfm_core.viewing import read_scene as read_view
-from mpsfm_core.weights import load_torch_state
+from mpsfm_core.support.files import claimed
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "0.1.0"
 _PHOTOS = ("0.png", "1.png")

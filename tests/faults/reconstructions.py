@@ -34,7 +34,8 @@ def disturbed(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def _reconstruct(request: dict[str, Any], report: Path) -> None:
-    from mpsfm_core import errors, pipeline
+    from mpsfm_core.data import errors
+    from mpsfm_core.pipeline import run as pipeline
 
     shim = ctypes.CDLL(None)
     shim.counted.restype = ctypes.c_long

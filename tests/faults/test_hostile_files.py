@@ -20,11 +20,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mpsfm_core import checkpoints, npz
-from mpsfm_core.builtin.arrays import read_arrays
 from mpsfm_core.config import load_config
 from mpsfm_core.data import DepthPrior, Features
-from mpsfm_core.errors import InputError, MpsfmError, WeightsError
+from mpsfm_core.data.errors import InputError, MpsfmError, WeightsError
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.records import read_record
 from mpsfm_core.evaluation.scene_folder import _read_sets
@@ -34,14 +32,17 @@ from mpsfm_core.inputs.images import load_images, read_image_list
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.models import read_model, read_poses
 from mpsfm_core.mapping.state import freeze, thaw
-from mpsfm_core.registry import Registry
+from mpsfm_core.pipeline import checkpoints
+from mpsfm_core.providers.builtin.arrays import read_arrays
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.uncertainty.file import read_values
+from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.report.page import write_report
 from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.exports.formats import export
 from mpsfm_core.results.ply import read_ply
-from mpsfm_core.uncertainty.file import read_values
-from mpsfm_core.weights import WeightStore
-from mpsfm_core.yaml_text import parse_yaml
+from mpsfm_core.support import npz
+from mpsfm_core.support.yaml_text import parse_yaml
 
 from .mutation import WELL_FORMED, failures
 from .readers import GOLDEN, TABLES, intrinsics, model_files, of_others, poses, used

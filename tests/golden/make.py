@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mpsfm_core import checkpoints, reconstruct
+from mpsfm_core import reconstruct
 from mpsfm_core.cli.time_left import TimeLeft
 from mpsfm_core.config import load_config
 from mpsfm_core.data import (
@@ -32,23 +32,24 @@ from mpsfm_core.data import (
     PinholeCamera,
     SparseMatches,
 )
-from mpsfm_core.environments import store
 from mpsfm_core.evaluation.records import Record, write_record
 from mpsfm_core.evaluation.scene_folder import write_sets
 from mpsfm_core.extraction.cache import Cache, digest
-from mpsfm_core.extraction.nothing import JointPrior
-from mpsfm_core.extraction.verification import TwoView
-from mpsfm_core.files import replacing
+from mpsfm_core.extraction.empty_results import JointPrior
+from mpsfm_core.extraction.matching.verification import TwoView
 from mpsfm_core.inputs import video
 from mpsfm_core.inputs.options import VideoOptions
 from mpsfm_core.mapping.state import freeze
-from mpsfm_core.registry import Registry, core_version
-from mpsfm_core.testing.file_server import serving
-from mpsfm_core.testing.scenes import arc_poses, room_scene
-from mpsfm_core.uncertainty.file import CalibrationFile, Provenance
-from mpsfm_core.uncertainty.model import DepthCalibration
-from mpsfm_core.weights import WeightStore
-from mpsfm_core.worker import _description
+from mpsfm_core.pipeline import checkpoints
+from mpsfm_core.providers.environments import store
+from mpsfm_core.providers.environments.worker import _description
+from mpsfm_core.providers.registry import Registry, core_version
+from mpsfm_core.providers.uncertainty.file import CalibrationFile, Provenance
+from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.weights import WeightStore
+from mpsfm_core.support.files import replacing
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+from tests.support.file_server import serving
 
 HERE = Path(__file__).parent
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)

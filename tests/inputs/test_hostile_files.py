@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.matches import matches_from_database, matches_from_hloc
@@ -26,9 +26,9 @@ from mpsfm_core.inputs.models import read_model
 from mpsfm_core.inputs.nerfstudio import read_transforms
 from mpsfm_core.inputs.options import InputOptions, VideoOptions
 from mpsfm_core.inputs.video import choose_frames
+from mpsfm_core.report.viewing import read_scene
 from mpsfm_core.results.exports.source import Source
 from mpsfm_core.results.ply import read_ply
-from mpsfm_core.viewing import read_scene
 
 NAMES = ("0.png", "1.png")
 Damage = Callable[[Path], object]

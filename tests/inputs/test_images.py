@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs import images as module
 from mpsfm_core.inputs.images import ImageSet, check_apart, find_images, load_images
 from mpsfm_core.inputs.options import InputOptions

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 
 SIZE = (640, 480)

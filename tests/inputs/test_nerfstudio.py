@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.models import read_poses
 from mpsfm_core.inputs.nerfstudio import read_transforms, write_transforms

@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.gps import read_gps
 from mpsfm_core.inputs.header import read_header
 from mpsfm_core.inputs.images import load_images

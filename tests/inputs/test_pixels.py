@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import UInt8
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.header import read_header
 from mpsfm_core.inputs.pixels import decode_rgb, orient, read_bytes, read_mask
 

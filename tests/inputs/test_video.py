@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import find_images
 from mpsfm_core.inputs.options import VideoOptions
 from mpsfm_core.inputs.video import choose_frames, extract_frames, is_video
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 SIZE = (160, 120)
 CAMERA = PinholeCamera(*SIZE, 130.0, 130.0, 80.0, 60.0)

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import DepthPrior, MappingProblem, PinholeCamera
-from mpsfm_core.errors import DataError
+from mpsfm_core.data.errors import DataError
 from mpsfm_core.mapping.events import Silent
 from mpsfm_core.mapping.mapper import Mapper, reconstruct
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.scene.reconstruction import MappingResult
 from mpsfm_core.mapping.state import Frozen, canonical, fingerprint, freeze, thaw
-from mpsfm_core.scene.reconstruction import MappingResult
-from mpsfm_core.testing.problems import Noise, mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
 
@@ -139,7 +139,9 @@ def test_a_damaged_state_is_a_new_start(problem: MappingProblem, undisturbed) ->
     assert same(thawed_poses(memory.states[1], problem), thawed_poses(states[0], problem))
 
 
-@pytest.mark.parametrize("path", ["os:system", "mpsfm_core.registry:Registry", "subprocess:Popen"])
+@pytest.mark.parametrize(
+    "path", ["os:system", "mpsfm_core.providers.registry:Registry", "subprocess:Popen"]
+)
 def test_no_other_classes_come_out_of_a_state(path: str) -> None:
     text = f'{{"format":1,"state":{{"id":0,"object":"{path}","attributes":{{}}}}}}'
     with pytest.raises(DataError, match="no class of the numerics"):

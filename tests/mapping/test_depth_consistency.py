@@ -16,15 +16,15 @@ from mpsfm_core.data import (
     NormalPrior,
     PinholeCamera,
 )
-from mpsfm_core.mapping.depth_consistency import DepthCheck, overlapping_views
+from mpsfm_core.mapping.consistency.depth_consistency import DepthCheck, overlapping_views
 from mpsfm_core.mapping.options import ConsistencyOptions, MapperOptions, TriangulationOptions
-from mpsfm_core.mapping.refinement import Refiner
+from mpsfm_core.mapping.refinement.refinement import Refiner
+from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.mapping.scene.tracks import Tracks
 from mpsfm_core.mapping.triangulation import complete_and_merge
-from mpsfm_core.scene.scene import Scene
-from mpsfm_core.scene.tracks import Tracks
-from mpsfm_core.testing.halls import LOCALLY_WRONG, PriorErrors, hall_problem
-from mpsfm_core.testing.scenes import AnalyticScene, Box, look_at
-from mpsfm_core.testing.symmetric import (
+from mpsfm_core.testing.synthetic.halls import LOCALLY_WRONG, PriorErrors, hall_problem
+from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Box, look_at
+from mpsfm_core.testing.synthetic.two_rooms import (
     CAMERA,
     moved,
     twin_room_poses,

@@ -10,15 +10,15 @@ import pytest
 
 from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.mapping.correspondences import correspondences
 from mpsfm_core.mapping.events import Silent
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
-from mpsfm_core.mapping.pose_hypotheses import Hypotheses, Hypothesis
-from mpsfm_core.mapping.registration import find_poses
-from mpsfm_core.scene.scene import Scene
-from mpsfm_core.testing.problems import Noise, mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.mapping.registration.correspondences import correspondences
+from mpsfm_core.mapping.registration.pose_hypotheses import Hypotheses, Hypothesis
+from mpsfm_core.mapping.registration.registration import find_poses
+from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 UNITS = (1.0, 3.0)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera
-from mpsfm_core.mapping.depth_noise import (
+from mpsfm_core.mapping.options import TriangulationOptions
+from mpsfm_core.mapping.refinement.depth_noise import (
     DepthNoise,
     local_noise,
     measure_depth_noise,
     witnesses,
 )
-from mpsfm_core.mapping.options import TriangulationOptions
+from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import complete_and_merge
-from mpsfm_core.scene.scene import Scene
-from mpsfm_core.testing.problems import mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 POSES = arc_poses(3, 14.0)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpsfm_core.mapping.keypoint_noise import (
+from mpsfm_core.mapping.refinement.keypoint_noise import (
     EFFICIENT,
     MAX_RESIDUAL,
     epipolar_residuals,
     measure_loss_scale,
 )
-from mpsfm_core.scene.scene import Scene
-from mpsfm_core.testing.halls import hall_problem
+from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.testing.synthetic.halls import hall_problem
 
 SCALE = 0.65
 

@@ -11,10 +11,10 @@ from mpsfm_core.data import Float64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.optimize import bundle_problem
-from mpsfm_core.scene.reconstruction import MappingResult, Reconstruction
-from mpsfm_core.testing.problems import Noise, mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, look_at, room_scene
+from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, look_at, room_scene
 
 CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
 

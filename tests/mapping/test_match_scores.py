@@ -9,15 +9,15 @@ import pytest
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
-from mpsfm_core.mapping.correspondences import Correspondences
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
-from mpsfm_core.mapping.pose_hypotheses import Hypothesis
-from mpsfm_core.mapping.pose_support import rate_pose
-from mpsfm_core.scene.graph import MIN_SCORE, CorrespondenceGraph
-from mpsfm_core.scene.scene import Scene
-from mpsfm_core.testing.problems import Noise, mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.mapping.registration.correspondences import Correspondences
+from mpsfm_core.mapping.registration.pose_hypotheses import Hypothesis
+from mpsfm_core.mapping.registration.pose_support import rate_pose
+from mpsfm_core.mapping.scene.graph import MIN_SCORE, CorrespondenceGraph
+from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 POSES = arc_poses(3, 14.0)

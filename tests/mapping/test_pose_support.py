@@ -8,13 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import Float64, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.mapping.correspondences import Correspondences, correspondences
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.pose_hypotheses import Hypothesis
-from mpsfm_core.mapping.pose_support import AbsolutePose, improve_pose, rate_pose
-from mpsfm_core.scene.scene import Scene
-from mpsfm_core.testing.problems import Noise, mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.mapping.registration.correspondences import Correspondences, correspondences
+from mpsfm_core.mapping.registration.pose_hypotheses import Hypothesis
+from mpsfm_core.mapping.registration.pose_support import AbsolutePose, improve_pose, rate_pose
+from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 POSES = arc_poses(3, 14.0)

@@ -10,16 +10,16 @@ from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import Bool, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.mapping.component import Group
 from mpsfm_core.mapping.events import Silent
-from mpsfm_core.mapping.group import Group
-from mpsfm_core.mapping.growth import Growth
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.pose_support import AbsolutePose
-from mpsfm_core.mapping.registration import distinct
-from mpsfm_core.mapping.upkeep import Upkeep
-from mpsfm_core.testing.problems import mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.mapping.refinement.maintenance import Upkeep
+from mpsfm_core.mapping.registration.incremental import Growth
+from mpsfm_core.mapping.registration.pose_support import AbsolutePose
+from mpsfm_core.mapping.registration.registration import distinct
+from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 

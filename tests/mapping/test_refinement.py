@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import Float64, PinholeCamera
-from mpsfm_core.mapping.depth_noise import DepthNoise
+from mpsfm_core.mapping.component import Group
 from mpsfm_core.mapping.events import Silent
-from mpsfm_core.mapping.group import Group
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.testing.problems import mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.mapping.refinement.depth_noise import DepthNoise
+from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 

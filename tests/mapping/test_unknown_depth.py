@@ -9,14 +9,18 @@ import numpy as np
 
 from mpsfm_core.data import DepthPrior, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.mapping.correspondences import WORTH_OF_RAY, Correspondences, correspondences
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.pose_hypotheses import Hypothesis
-from mpsfm_core.mapping.pose_support import rate_pose
-from mpsfm_core.mapping.registration import find_poses
-from mpsfm_core.scene.scene import Scene
-from mpsfm_core.testing.problems import Noise, mapping_problem
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.mapping.registration.correspondences import (
+    WORTH_OF_RAY,
+    Correspondences,
+    correspondences,
+)
+from mpsfm_core.mapping.registration.pose_hypotheses import Hypothesis
+from mpsfm_core.mapping.registration.pose_support import rate_pose
+from mpsfm_core.mapping.registration.registration import find_poses
+from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 POSES = arc_poses(2, 14.0)

@@ -4,7 +4,7 @@ import numpy as np
 
 from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera
 from mpsfm_core.optimize.depth_integration import Anchors
-from mpsfm_core.testing.scenes import AnalyticScene
+from mpsfm_core.testing.synthetic.scenes import AnalyticScene
 
 CAMERA = PinholeCamera(33, 26, 30.0, 31.0, 16.2, 13.1)
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mpsfm_core.data import Float64
-from mpsfm_core.errors import DataError
+from mpsfm_core.data.errors import DataError
 from mpsfm_core.optimize.bundle_adjustment import (
     BundleOptions,
     BundleProblem,

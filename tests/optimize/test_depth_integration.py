@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera
-from mpsfm_core.errors import DataError
+from mpsfm_core.data.errors import DataError
 from mpsfm_core.optimize import depth_integration
 from mpsfm_core.optimize.depth_integration import (
     NO_ANCHORS,
@@ -20,7 +20,7 @@ from mpsfm_core.optimize.depth_integration import (
     IntegrationOptions,
 )
 from mpsfm_core.optimize.integration_energy import majorise
-from mpsfm_core.testing.scenes import AnalyticScene, Plane, arc_poses, look_at, room_scene
+from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Plane, arc_poses, look_at, room_scene
 from tests.optimize.integration_problems import (
     CAMERA,
     camera_of,

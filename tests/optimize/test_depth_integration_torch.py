@@ -6,7 +6,7 @@ from scipy.ndimage import gaussian_filter
 
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.optimize.depth_integration import NO_ANCHORS, DepthIntegrator
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 from tests.optimize.integration_problems import (
     camera_of,
     depth_prior,

@@ -13,8 +13,8 @@ import pytest
 
 import mpsfm_core
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.errors import ReconstructionError
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.data.errors import ReconstructionError
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
 HOSTILE = "a</script><b onload='x'>&amp; \"{{DATA}}\u2028.png"

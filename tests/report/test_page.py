@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.report.page import render, write_report
 from mpsfm_core.report.result_folder import ResultFolder
 from mpsfm_core.results.writer import REPORT

@@ -15,14 +15,14 @@ from mpsfm_core.data import (
     PinholeCamera,
     View,
 )
-from mpsfm_core.scene.reconstruction import (
+from mpsfm_core.mapping.scene.reconstruction import (
     MappingReport,
     MappingResult,
     MetricScale,
     Reconstruction,
     RegisteredImage,
 )
-from mpsfm_core.testing.scenes import arc_poses, project, room_scene
+from mpsfm_core.testing.synthetic.scenes import arc_poses, project, room_scene
 
 CAMERA = PinholeCamera(160, 120, 140.0, 141.0, 80.5, 59.0)
 GRID = (80, 60)

@@ -12,7 +12,7 @@ from mpsfm_core.data import DepthPrior
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.geometry import camera_center, pixel_centers, unproject
 from mpsfm_core.results.options import ResultOptions
-from mpsfm_core.testing.scenes import project, room_scene
+from mpsfm_core.testing.synthetic.scenes import project, room_scene
 
 
 def with_depth(solved, row: int, depth: np.ndarray, variance: np.ndarray | None = None):

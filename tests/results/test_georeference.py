@@ -11,8 +11,8 @@ import pytest
 from mpsfm_core.data import DepthPrior, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, camera_center
 from mpsfm_core.inputs.gps import GpsPosition, to_enu
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage, transformed
 from mpsfm_core.results.georeference import georeference
-from mpsfm_core.scene.reconstruction import Reconstruction, RegisteredImage, transformed
 
 ORIGIN = GpsPosition(47.3764, 8.5476, 410.0)
 CAMERA = PinholeCamera(40, 30, 40.0, 40.0, 20.0, 15.0)

@@ -16,6 +16,7 @@ from mpsfm_core.geometry import project, transform
 from mpsfm_core.inputs.images import FocalSource, ImageSet, SourceImage
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.undistortion import pinhole_camera
+from mpsfm_core.mapping.scene.reconstruction import MappingReport, MappingResult, Reconstruction
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos
 from mpsfm_core.results.summary import (
@@ -24,7 +25,6 @@ from mpsfm_core.results.summary import (
     describe_reconstructions,
 )
 from mpsfm_core.results.writer import Component, write_failure, write_results
-from mpsfm_core.scene.reconstruction import MappingReport, MappingResult, Reconstruction
 
 PINHOLE = pycolmap.Camera(
     model="PINHOLE", width=160, height=120, params=[140, 141, 80.5, 59], camera_id=1

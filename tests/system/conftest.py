@@ -16,7 +16,7 @@ import pycolmap
 import pytest
 
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 CAMERA = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)

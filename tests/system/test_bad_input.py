@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mpsfm_core.files import claimed
+from mpsfm_core.support.files import claimed
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pytest
 import mpsfm_core
 from mpsfm_core.evaluation import read_poses
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
-from mpsfm_core.testing.result_files import content
+from tests.support.result_files import content
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ import pytest
 
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.evaluation import evaluate, read_poses
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 
 def test_matches_come_back_from_a_database_of_ours(photo_scene, mpsfm, tmp_path: Path) -> None:

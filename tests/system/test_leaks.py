@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mpsfm_core
-from mpsfm_core.testing.held import Held, held_after_each
+from mpsfm_core.testing.leak_probe import Held, held_after_each
 
 RUNS = 20
 MOST_MB = 15.0

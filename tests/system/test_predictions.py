@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mpsfm_core.resources import TOLERANCE
-from mpsfm_core.testing.scenes import arc_poses, room_scene
+from mpsfm_core.pipeline.resources import TOLERANCE
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 from .conftest import CAMERA
 

@@ -12,11 +12,11 @@ import pytest
 
 import mpsfm_core
 from mpsfm_core.cli.reconstruct import _refined_focal_lengths
+from mpsfm_core.data.errors import ReconstructionError
 from mpsfm_core.dense.stage import densify
-from mpsfm_core.errors import ReconstructionError
 from mpsfm_core.evaluation import evaluate, read_poses, reconstruction_poses
 from mpsfm_core.inputs.nerfstudio import write_transforms
-from mpsfm_core.scene.reconstruction import MappingReport, MappingResult
+from mpsfm_core.mapping.scene.reconstruction import MappingReport, MappingResult
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +158,7 @@ def test_the_seed_of_the_run_is_that_of_the_mapper(
         seeds.append(options.seed)
         return MappingResult((), MappingReport())
 
-    monkeypatch.setattr("mpsfm_core.pipeline.mapper.reconstruct", observed)
+    monkeypatch.setattr("mpsfm_core.pipeline.run.mapper.reconstruct", observed)
     with pytest.raises(ReconstructionError):
         mpsfm_core.reconstruct(
             photo_scene.images, config=photo_scene.config, overrides=["runtime.seed=11"]
@@ -248,7 +248,7 @@ def test_fixed_poses_are_taken_to_be_right(
         told.append(posed_by_depth)
         return densify(*arguments, posed_by_depth=posed_by_depth)
 
-    monkeypatch.setattr("mpsfm_core.pipeline.densify", observed)
+    monkeypatch.setattr("mpsfm_core.pipeline.run.densify", observed)
     listed = tmp_path / "list.txt"
     listed.write_text("0.png\n1.png\n2.png\n")
     mpsfm_core.reconstruct(

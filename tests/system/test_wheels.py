@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 
 ROOT = Path(__file__).resolve().parents[2]
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from mpsfm_core.builtin.plugin import mpsfm_providers as builtin_providers
 from mpsfm_core.providers import Kind, ProviderSpec
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.builtin.plugin import mpsfm_providers as builtin_providers
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import run_checks
 from mpsfm_core.testing.contract import SetupSource
 

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from mpsfm_core import ProviderContext, ProviderSpec, View
-from mpsfm_core.errors import InputError, ProviderError
+from mpsfm_core.data.errors import InputError, ProviderError
 from mpsfm_core.providers import KINDS
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import Setup, run_checks
 from mpsfm_core.testing.contract import (
     CHECKS_BY_KIND,
@@ -19,7 +19,7 @@ from mpsfm_core.testing.contract import (
     find_providers,
     id_of,
 )
-from mpsfm_core.testing.reference import PaintedDepth, depth_prior
+from tests.support.reference_providers import PaintedDepth, depth_prior
 
 PAINTED = Setup(knows="painted")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpsfm_core.testing.degraded_depth import DepthErrors, degrade_depth
+from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors, degrade_depth
 
 FLAT = np.full((90, 120), 2.0, dtype=np.float32)
 

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from mpsfm_core.geometry import project, transform
-from mpsfm_core.testing.halls import EXACT, HONEST, LOCALLY_WRONG, Hall, PriorErrors, hall_problem
+from mpsfm_core.testing.synthetic.halls import (
+    EXACT,
+    HONEST,
+    LOCALLY_WRONG,
+    Hall,
+    PriorErrors,
+    hall_problem,
+)
 
 VIEWS = 9
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from mpsfm_core import DepthPrior, Options, ProviderContext, ProviderSpec, View
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import Setup, run_checks
-from mpsfm_core.testing.checks_common import COMMON, STANDALONE
+from mpsfm_core.testing.checks.common import COMMON, STANDALONE
 from mpsfm_core.testing.contract import id_of
 from mpsfm_core.testing.painting import read_depth
-from mpsfm_core.testing.reference import PaintedDepth, depth_prior
+from tests.support.reference_providers import PaintedDepth, depth_prior
 
 PAINTED = Setup(knows="painted")
 
@@ -252,7 +252,8 @@ def test_a_plugin_that_imports_what_it_does_not_need(install_plugin: Callable[..
         from mpsfm_core import ProviderSpec, hookimpl
         @hookimpl
         def mpsfm_providers():
-            return [ProviderSpec("depth", "heavy", "mpsfm_core.testing.reference:PaintedDepth")]
+            factory = "tests.support.reference_providers:PaintedDepth"
+            return [ProviderSpec("depth", "heavy", factory)]
     """
     install_plugin("mpsfm-heavy", source)
     (result,) = run_checks(Registry.discover(), "depth", "heavy", PAINTED, only={"light-import"})

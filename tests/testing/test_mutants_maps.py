@@ -16,7 +16,7 @@ from mpsfm_core.testing import Setup
 from mpsfm_core.testing.contract import CHECKS_BY_KIND, id_of
 from mpsfm_core.testing.examples import outdoor_example
 from mpsfm_core.testing.painting import RELATIVE_STD, read_depth, read_normals
-from mpsfm_core.testing.reference import (
+from tests.support.reference_providers import (
     PaintedDepth,
     PaintedNormals,
     Wrapper,

@@ -20,19 +20,13 @@ from mpsfm_core import (
     SparseMatches,
     View,
 )
-from mpsfm_core.builtin.mutual_nearest import MutualNearest
-from mpsfm_core.builtin.options import MutualNearestOptions, SiftOptions
-from mpsfm_core.builtin.sift import Sift
+from mpsfm_core.providers.builtin.mutual_nearest import MutualNearest
+from mpsfm_core.providers.builtin.options import MutualNearestOptions, SiftOptions
+from mpsfm_core.providers.builtin.sift import Sift
 from mpsfm_core.testing import Setup
 from mpsfm_core.testing.contract import CHECKS_BY_KIND, id_of
 from mpsfm_core.testing.examples import Example
-from mpsfm_core.testing.reference import (
-    PaintedMask,
-    Thumbnail,
-    ToldMatcher,
-    ToldOptions,
-    tell,
-)
+from tests.support.reference_providers import PaintedMask, Thumbnail, ToldMatcher, ToldOptions, tell
 
 PAINTED = Setup(knows="painted")
 

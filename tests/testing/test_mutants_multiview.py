@@ -13,10 +13,10 @@ import pytest
 from mpsfm_core import DepthPrior, GroupPrior, View
 from mpsfm_core.geometry import invert, pixel_centers, rays
 from mpsfm_core.testing import Setup
-from mpsfm_core.testing import reference as ref
-from mpsfm_core.testing.checks_depth import OF_MAPS
+from mpsfm_core.testing.checks.depth import OF_MAPS
 from mpsfm_core.testing.contract import CHECKS_BY_KIND, id_of
-from mpsfm_core.testing.reference import ToldGroup, depth_prior
+from tests.support import reference_providers as ref
+from tests.support.reference_providers import ToldGroup, depth_prior
 
 EVERYTHING = ("metric", "variance", "proposes-poses", "proposes-intrinsics")
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from mpsfm_core.cli import build_app
 from mpsfm_core.config import load_config
 from mpsfm_core.providers import KINDS, Kind
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import run_checks
 from mpsfm_core.testing.scaffold import write_plugin
 

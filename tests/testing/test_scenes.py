@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.testing.scenes import (
+from mpsfm_core.testing.synthetic.scenes import (
     AnalyticScene,
     Box,
     Plane,

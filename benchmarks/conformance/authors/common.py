@@ -1,10 +1,9 @@
 """What the scripts beside it share: photos in, the authors' answers out.
 
-Each is run as a plugin's export script is, see :mod:`mpsfm_core.model_export.authors`, and exports
-the network as that does. In the folder of its output it finds ``photos.json`` and the photos that
-this names, and writes what the authors' own steps of inference give of the same network as
-``reference_N.npz``.
-"""
+Each is run as a plugin's export script is, see :mod:`mpsfm_core.providers.model_export.authors`,
+and exports the network as that does. In the folder of its output it finds ``photos.json`` and the
+photos that this names, and writes what the authors' own steps of inference give of the same network
+as ``reference_N.npz``. """
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mpsfm_core.model_export.authors import Job
+from mpsfm_core.providers.model_export.authors import Job
 
 
 def photos(job: Job) -> Iterator[tuple[Any, Mapping[str, float]]]:

@@ -8,7 +8,7 @@ from mpsfm_dsine.export import ENCODERS, export, network
 from torch.nn.functional import pad
 from utils import utils
 
-from mpsfm_core.model_export.authors import Job
+from mpsfm_core.providers.model_export.authors import Job
 
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 

@@ -12,7 +12,7 @@ from common import photos, save
 from mpsfm_mast3r.export import export, network
 from PIL import Image
 
-from mpsfm_core.model_export.authors import Job
+from mpsfm_core.providers.model_export.authors import Job
 
 for name in ("torchvision", "torchvision.transforms"):  # of it the authors' code uses these three
     sys.modules[name] = ModuleType(name)

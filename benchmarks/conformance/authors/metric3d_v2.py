@@ -7,7 +7,7 @@ import torch
 from common import photos, save
 from mpsfm_metric3d_onnx.export import SIZE, export, network
 
-from mpsfm_core.model_export.authors import Job
+from mpsfm_core.providers.model_export.authors import Job
 
 _PADDING = (123.675, 116.28, 103.53)
 

@@ -10,7 +10,7 @@ from moge.model.v2 import MoGeModel
 from moge.utils.geometry_torch import normalized_view_plane_uv
 from mpsfm_onnx.export_moge import TOKENS, export, small_with_normals
 
-from mpsfm_core.model_export.authors import Job
+from mpsfm_core.providers.model_export.authors import Job
 
 _SHIFT, _FOCAL = 0.7, 1.4
 

@@ -8,7 +8,7 @@ from common import photos, save
 from mpsfm_onnx.export_unidepth import SIZE, export, network
 from unidepth.utils.constants import IMAGENET_DATASET_MEAN, IMAGENET_DATASET_STD
 
-from mpsfm_core.model_export.authors import Job
+from mpsfm_core.providers.model_export.authors import Job
 
 job = Job.given()
 model = network(job.size)

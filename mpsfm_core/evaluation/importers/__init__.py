@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from mpsfm_core.errors import InputError, did_you_mean
+from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.evaluation.importers import (
     eth3d,
     realestate10k,

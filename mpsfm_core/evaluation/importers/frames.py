@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Float32, Float64, Int64
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.prior_quality import write_depth
 from mpsfm_core.geometry import inside, pixel_centers, sample_nearest
 from mpsfm_core.inputs.header import read_header

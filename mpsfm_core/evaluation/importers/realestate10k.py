@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.importers.frames import PHOTOS, Frame, photo_size, pinhole_camera
 
 _VALUES = 19

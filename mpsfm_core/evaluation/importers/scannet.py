@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Float32
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.importers.frames import (
     Frame,
     carried_depth,

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from mpsfm_core.data import Float32
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.importers.frames import Frame, inverted, photo_size, pinhole_camera
 
 _FOCAL_RATIO = 585 / 640

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.importers.colmap_model import model_frames
 from mpsfm_core.evaluation.importers.frames import Frame
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mpsfm_core.data import Float64
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.importers.colmap_model import model_frames
 from mpsfm_core.evaluation.importers.frames import (
     PHOTOS,

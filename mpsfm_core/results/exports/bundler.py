@@ -17,7 +17,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def write(source: Source, folder: Path) -> None:
-    """Write the folder. Raises :class:`~mpsfm_core.errors.InputError` without the photos.
+    """Write the folder. Raises :class:`~mpsfm_core.data.errors.InputError` without the photos.
 
     The format has one focal length a camera: the mean of both, which differ by little.
     """

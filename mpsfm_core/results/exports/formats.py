@@ -8,12 +8,10 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
-from mpsfm_core.errors import InputError, did_you_mean
-from mpsfm_core.files import replacing
-from mpsfm_core.first_party import EXPORTS, install_hint
-from mpsfm_core.formats import VERSION
+from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.providers import ExportFormat
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.first_party import EXPORTS, install_hint
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.results.exports import (
     bundler,
     colmap_database,
@@ -24,6 +22,8 @@ from mpsfm_core.results.exports import (
     nvm,
 )
 from mpsfm_core.results.exports.source import Source
+from mpsfm_core.support.files import replacing
+from mpsfm_core.support.format_versions import VERSION
 
 DESCRIPTION = "export.json"
 """Beside every export: what it holds, its unit, which way is up, and how it came from the run."""

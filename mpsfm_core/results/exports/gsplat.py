@@ -16,9 +16,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Float64, UInt8
-from mpsfm_core.npz import write_npz
 from mpsfm_core.results.colmap_model import write_model
 from mpsfm_core.results.exports.source import Source
+from mpsfm_core.support.npz import write_npz
 
 ENTRIES = ("images", "sparse", "gaussians.ply", "maps")
 _NEIGHBOURS = 3
@@ -31,7 +31,7 @@ _SH_0 = 0.28209479177387814
 
 
 def write(source: Source, folder: Path) -> None:
-    """Write the folder. Raises :class:`~mpsfm_core.errors.InputError` without the photos."""
+    """Write the folder. Raises :class:`~mpsfm_core.data.errors.InputError` without the photos."""
     source.write_photos(folder / "images")
     write_model(folder / "sparse" / "0", source.undistorted())
     write_maps(source, folder / "maps")

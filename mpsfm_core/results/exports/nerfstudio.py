@@ -29,7 +29,7 @@ _STORED_UNITS = 1000
 
 
 def write(source: Source, folder: Path) -> None:
-    """Write the folder. Raises :class:`~mpsfm_core.errors.InputError` without the photos."""
+    """Write the folder. Raises :class:`~mpsfm_core.data.errors.InputError` without the photos."""
     source.write_photos(folder / "images")
     write_maps(source, folder / "maps")
     write_ply(folder / "sparse_pc.ply", *source.points())

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.results.exports.source import Source
 from mpsfm_core.results.exports.tracks import describe_points, numbers, rows_of_images
 

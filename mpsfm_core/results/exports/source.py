@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from mpsfm_core.builtin.from_depth import fit_normals
-from mpsfm_core.builtin.options import FromDepthOptions
 from mpsfm_core.data import DepthPrior, Float64, NormalPrior, PinholeCamera, UInt8
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import SUMMARY, ImageSet, find_images, load_images
 from mpsfm_core.inputs.models import match_names, model_folder, read_model
 from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.providers.builtin.from_depth import fit_normals
+from mpsfm_core.providers.builtin.options import FromDepthOptions
 from mpsfm_core.results.colmap_model import pinhole
 from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.orientation import Gravity, estimate_gravity, rotation_to_z

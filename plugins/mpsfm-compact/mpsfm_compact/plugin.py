@@ -7,8 +7,8 @@ from pathlib import Path
 from mpsfm_compact.options import WEIGHTS, CompactOptions
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
 from mpsfm_core.providers import Capability, Kind, file_named_by
-from mpsfm_core.uncertainty.file import CalibratedKind, load_calibration
-from mpsfm_core.uncertainty.model import Calibration
+from mpsfm_core.providers.uncertainty.file import CalibratedKind, load_calibration
+from mpsfm_core.providers.uncertainty.model import Calibration
 
 _LICENSE = "Apache-2.0"
 _ACCURACY: dict[Kind, str] = {

@@ -16,8 +16,8 @@ from mpsfm_core import PinholeCamera, ProviderContext, View
 from mpsfm_core.data import Float32
 from mpsfm_core.geometry import angle_between_deg, resize_map
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.registry import Registry
-from mpsfm_core.weights import WeightStore
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.weights import WeightStore
 
 SCENE = Path(__file__).parents[3] / "examples" / "sample_scene"
 WEIGHTS = Path(__file__).parents[1] / "mpsfm_compact" / "compact.onnx"

@@ -9,8 +9,8 @@ from typing import Any
 from dask.distributed import Client, LocalCluster, WorkerPlugin, as_completed, get_worker
 from pydantic import Field
 
-from mpsfm_core.errors import ConfigError
-from mpsfm_core.options import Options, SettingsError, parse_settings
+from mpsfm_core.data.errors import ConfigError
+from mpsfm_core.data.options import Options, SettingsError, parse_settings
 
 MAX_TASKS = 50_000
 """Beyond, a task has several items: the scheduler holds all tasks of a stage (our choice)."""

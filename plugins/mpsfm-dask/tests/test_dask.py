@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mpsfm_dask.executor import DaskExecutor
 
-from mpsfm_core.errors import ConfigError
+from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.testing import executors
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of the cluster's own threads at its end

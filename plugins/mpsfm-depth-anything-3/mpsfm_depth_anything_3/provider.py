@@ -13,9 +13,9 @@ from safetensors.torch import load_model
 
 from mpsfm_core import DepthPrior, GroupPrior, ProviderContext, View
 from mpsfm_core.data import Float64
-from mpsfm_core.errors import WeightsError
+from mpsfm_core.data.errors import WeightsError
 from mpsfm_core.geometry import resize_map
-from mpsfm_core.torch_runtime import inference, use_threads
+from mpsfm_core.providers.torch_runtime import inference, use_threads
 from mpsfm_depth_anything_3.options import DepthAnything3Options
 
 _PATCH = 14

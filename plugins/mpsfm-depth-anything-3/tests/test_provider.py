@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core import PinholeCamera, ProviderContext, View
-from mpsfm_core.errors import WeightsError
+from mpsfm_core.data.errors import WeightsError
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("depth_anything_3", reason="pip install --no-deps depth-anything-3")

@@ -1,5 +1,5 @@
 """DSINE with concentration as ONNX, by its authors' code; run as a program, see
-:mod:`mpsfm_core.model_export`."""
+:mod:`mpsfm_core.providers.model_export`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import geffnet
 import torch
 from models.dsine import v02_kappa
 
-from mpsfm_core.model_export.authors import Job
+from mpsfm_core.providers.model_export.authors import Job
 
 ENCODERS = {"": 5, "b0": 0, "b5": 5}
 _SIDES = ((96, 128), (160, 96))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
 from mpsfm_core.providers import ModelExport, file_named_by
-from mpsfm_core.uncertainty.model import NormalCalibration
+from mpsfm_core.providers.uncertainty.model import NormalCalibration
 from mpsfm_dsine.options import DsineOptions
 
 

@@ -9,7 +9,7 @@ from mpsfm_dsine.provider import Dsine
 from mpsfm_onnx.decode import expected_angle
 
 from mpsfm_core import PinholeCamera, View
-from mpsfm_core.errors import ConfigError
+from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.geometry import pixel_centers, rays
 
 # DSINE's own rays: pixel centres at halves, principal point plus a half. The stand-in says that

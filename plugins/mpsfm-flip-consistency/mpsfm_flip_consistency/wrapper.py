@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from mpsfm_core import DepthPrior, NormalPrior, ProviderContext, View
-from mpsfm_core.errors import DataError
+from mpsfm_core.data.errors import DataError
 from mpsfm_flip_consistency.fusion import fuse_depth, fuse_normals
 from mpsfm_flip_consistency.mirror import mirror_depth, mirror_normals, mirror_view
 

@@ -9,10 +9,10 @@ from mpsfm_flip_consistency.mirror import mirror_normals, mirror_view
 from mpsfm_flip_consistency.wrapper import FlipConsistency
 
 from mpsfm_core import DepthPrior, NormalPrior, PinholeCamera, View
-from mpsfm_core.errors import DataError
+from mpsfm_core.data.errors import DataError
+from mpsfm_core.data.options import Backend
 from mpsfm_core.geometry import pixel_centers, rays
-from mpsfm_core.options import Backend
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 
 CAMERA = PinholeCamera(40, 30, 50.0, 52.0, 17.3, 15.8)
 RAMP = np.broadcast_to(np.arange(40, dtype=np.uint8)[:, None] * 5, (30, 40, 3)).copy()

@@ -9,9 +9,9 @@ import torch
 from kornia.feature.adalam.adalam import AdalamFilter, get_adalam_default_config
 
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
-from mpsfm_core.errors import ProviderError
+from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.providers import required_features
-from mpsfm_core.torch_runtime import inference, use_threads
+from mpsfm_core.providers.torch_runtime import inference, use_threads
 from mpsfm_kornia.options import AdalamOptions
 
 _FEWEST = 2

@@ -14,7 +14,7 @@ from kornia.color import rgb_to_grayscale
 from kornia.feature import ALIKED, DISK, DeDoDe, SIFTFeature, XFeat, get_laf_center
 
 from mpsfm_core import Features, ProviderContext, View
-from mpsfm_core.torch_runtime import inference, use_threads
+from mpsfm_core.providers.torch_runtime import inference, use_threads
 from mpsfm_kornia.options import (
     AlikedOptions,
     DedodeOptions,

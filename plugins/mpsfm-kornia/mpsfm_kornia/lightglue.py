@@ -9,9 +9,9 @@ import torch
 from kornia.feature import LightGlue
 
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
-from mpsfm_core.errors import ProviderError
+from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.providers import required_features
-from mpsfm_core.torch_runtime import inference, use_threads
+from mpsfm_core.providers.torch_runtime import inference, use_threads
 from mpsfm_kornia.attention import fuse_cross_attention
 from mpsfm_kornia.options import LightGlueOptions
 from mpsfm_kornia.runtime import fill, load_weights

@@ -11,7 +11,7 @@ from kornia.feature import LoFTR
 from kornia.feature.loftr.loftr import default_cfg
 
 from mpsfm_core import DenseMatches, Features, PairMatches, ProviderContext, View
-from mpsfm_core.torch_runtime import inference, use_threads
+from mpsfm_core.providers.torch_runtime import inference, use_threads
 from mpsfm_kornia.options import LoftrOptions
 from mpsfm_kornia.runtime import Grid, fill, load_weights, usable
 

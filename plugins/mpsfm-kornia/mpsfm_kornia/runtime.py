@@ -10,9 +10,9 @@ import torch
 
 from mpsfm_core import ProviderContext, View
 from mpsfm_core.data import Bool, Float64
-from mpsfm_core.errors import WeightsError
+from mpsfm_core.data.errors import WeightsError
 from mpsfm_core.geometry import inside, resize_map, sample_nearest, scale_pixels
-from mpsfm_core.weights import load_torch_state
+from mpsfm_core.providers.weights import load_torch_state
 from mpsfm_kornia.options import KNOWN_HASHES
 
 _SMALLEST_SIDE = 32

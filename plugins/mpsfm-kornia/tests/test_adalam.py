@@ -8,10 +8,10 @@ from mpsfm_kornia.adalam import AdalamMatcher
 from mpsfm_kornia.options import AdalamOptions
 
 from mpsfm_core import Features
-from mpsfm_core.builtin.mutual_nearest import MutualNearest
-from mpsfm_core.builtin.options import MutualNearestOptions, SiftOptions
-from mpsfm_core.builtin.sift import Sift
-from mpsfm_core.errors import ProviderError
+from mpsfm_core.data.errors import ProviderError
+from mpsfm_core.providers.builtin.mutual_nearest import MutualNearest
+from mpsfm_core.providers.builtin.options import MutualNearestOptions, SiftOptions
+from mpsfm_core.providers.builtin.sift import Sift
 
 COUNT = 300
 

@@ -10,9 +10,9 @@ from mpsfm_kornia.options import FeatureOptions, SiftOptions
 from scipy.spatial import cKDTree
 
 from mpsfm_core import PinholeCamera, View
-from mpsfm_core.errors import WeightsError
+from mpsfm_core.data.errors import WeightsError
 from mpsfm_core.geometry import pixel_centers
-from mpsfm_core.weights import WeightStore
+from mpsfm_core.providers.weights import WeightStore
 
 NAMES = ["xfeat", "aliked", "disk"]
 DIMENSION = {"xfeat": 64, "aliked": 128, "disk": 128}

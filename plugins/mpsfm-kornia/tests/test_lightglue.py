@@ -7,7 +7,7 @@ import pytest
 from kornia.feature import LightGlue
 
 from mpsfm_core import Features
-from mpsfm_core.errors import ProviderError
+from mpsfm_core.data.errors import ProviderError
 
 FAMILIES = {"xfeat": "lighterglue", "aliked": "lightglue-aliked", "disk": "lightglue-disk"}
 SHIFT = (32, 32)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from kornia.feature import LoFTR
 
-from mpsfm_core.errors import WeightsError
+from mpsfm_core.data.errors import WeightsError
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from mpsfm_core.registry import Registry
-from mpsfm_core.weights import WeightStore
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.weights import WeightStore
 
 
 def test_announcing_imports_nothing_heavy():

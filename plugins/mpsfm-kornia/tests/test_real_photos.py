@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpsfm_core.builtin.mutual_nearest import MutualNearest
-from mpsfm_core.builtin.options import MutualNearestOptions
+from mpsfm_core.providers.builtin.mutual_nearest import MutualNearest
+from mpsfm_core.providers.builtin.options import MutualNearestOptions
 
 FAMILIES = {"xfeat": "lighterglue", "aliked": "lightglue-aliked", "disk": "lightglue-disk"}
 

@@ -9,8 +9,8 @@ from mpsfm_lightglue_onnx.matcher import LightGlue
 from mpsfm_lightglue_onnx.options import DiskOptions, LightGlueOptions, SuperPointOptions
 
 from mpsfm_core import Features, PinholeCamera, View
-from mpsfm_core.errors import ConfigError, ProviderError
-from mpsfm_core.registry import Registry
+from mpsfm_core.data.errors import ConfigError, ProviderError
+from mpsfm_core.providers.registry import Registry
 
 # Keypoints at given pixels of the network's image; the descriptor is the colour of the first one.
 DETECTOR = """

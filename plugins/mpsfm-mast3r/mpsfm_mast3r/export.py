@@ -1,4 +1,5 @@
-"""MASt3R as ONNX, by its authors' code; run as a program, see :mod:`mpsfm_core.model_export`."""
+"""MASt3R as ONNX, by its authors' code; run as a program, see
+:mod:`mpsfm_core.providers.model_export`."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from typing import Any
 
 import torch
 
-from mpsfm_core.model_export.authors import Job, answers
+from mpsfm_core.providers.model_export.authors import Job, answers
 
 sys.modules["models.curope"] = None  # type: ignore[assignment]  # the rotations of torch instead
 

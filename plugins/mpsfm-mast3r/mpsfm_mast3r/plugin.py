@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
-from mpsfm_core.options import Options
+from mpsfm_core.data.options import Options
 from mpsfm_core.providers import Capability, ModelExport, file_named_by
 from mpsfm_mast3r.options import DenseOptions, SparseOptions
 

@@ -9,10 +9,10 @@ from mpsfm_mast3r.neighbours import mutual, nearest, reciprocal
 from mpsfm_mast3r.options import DenseOptions, SparseOptions
 
 from mpsfm_core import Features, PinholeCamera, View
-from mpsfm_core.errors import ConfigError, ProviderError
-from mpsfm_core.options import Backend
-from mpsfm_core.registry import Registry
-from mpsfm_core.uncertainty.model import DepthCalibration
+from mpsfm_core.data.errors import ConfigError, ProviderError
+from mpsfm_core.data.options import Backend
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.uncertainty.model import DepthCalibration
 
 SIZE = (80, 60)  # of the views; the network sees 64 x 48 of it, without a border
 

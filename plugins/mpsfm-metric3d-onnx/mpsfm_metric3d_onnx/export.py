@@ -1,5 +1,5 @@
 """Metric3D v2 as ONNX with all that it says, by its authors' code; run as a program, see
-:mod:`mpsfm_core.model_export`."""
+:mod:`mpsfm_core.providers.model_export`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from mpsfm_core.model_export.authors import Job
+from mpsfm_core.providers.model_export.authors import Job
 
 for _name in ("mmcv", "mmcv.utils", "timm", "timm.models", "timm.models.layers"):
     sys.modules[_name] = ModuleType(_name)  # of what follows nothing is called here

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from mpsfm_core import Options, WeightsFile
 from mpsfm_core.providers import file_named_by
-from mpsfm_core.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.model import DepthCalibration
 
 WEIGHTS_LICENSE = "CC0-1.0 (export; the authors name none for their weights)"
 

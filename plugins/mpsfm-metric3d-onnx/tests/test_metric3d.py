@@ -9,9 +9,9 @@ from mpsfm_metric3d_onnx.provider import Metric3dDepth, Metric3dNormals
 from mpsfm_onnx.decode import expected_angle
 
 from mpsfm_core import PinholeCamera, View
-from mpsfm_core.errors import ConfigError, WeightsError
-from mpsfm_core.options import Backend
-from mpsfm_core.registry import Registry
+from mpsfm_core.data.errors import ConfigError, WeightsError
+from mpsfm_core.data.options import Backend
+from mpsfm_core.providers.registry import Registry
 
 # Depth is the red channel as it is fed, confidence a 200th of the blue one.
 STAND_IN = """

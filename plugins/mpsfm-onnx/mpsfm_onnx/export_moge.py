@@ -1,5 +1,5 @@
 """MoGe-2 with normals as ONNX, by its authors' code; run as a program, see
-:mod:`mpsfm_core.model_export`."""
+:mod:`mpsfm_core.providers.model_export`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from moge.model.v2 import MoGeModel
 
-from mpsfm_core.model_export.authors import Job
+from mpsfm_core.providers.model_export.authors import Job
 
 _DIMS = [384, 64, 32, 16, 8]
 _NONE = {"res_block_in_norm": "none", "res_block_hidden_norm": "none"}

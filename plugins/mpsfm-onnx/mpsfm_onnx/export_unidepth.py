@@ -1,5 +1,5 @@
 """UniDepth V2 as ONNX, told the camera, by its authors' code; run as a program, see
-:mod:`mpsfm_core.model_export`."""
+:mod:`mpsfm_core.providers.model_export`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mpsfm_core.model_export.authors import Job
+from mpsfm_core.providers.model_export.authors import Job
 
 
 def _unused(name: str, **has: Any) -> None:

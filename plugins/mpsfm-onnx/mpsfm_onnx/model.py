@@ -12,7 +12,7 @@ import onnxruntime  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from mpsfm_core import ProviderContext
-from mpsfm_core.errors import ConfigError, WeightsError
+from mpsfm_core.data.errors import ConfigError, WeightsError
 
 _log = logging.getLogger(__name__)
 _ERRORS_ONLY = 3

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from mpsfm_core import DepthPrior, NormalPrior, PinholeCamera, ProviderContext, View
 from mpsfm_core.data import Bool
-from mpsfm_core.errors import ConfigError
+from mpsfm_core.data.errors import ConfigError
 from mpsfm_onnx.decode import angular_std, decode_depth, decode_normals
 from mpsfm_onnx.description import (
     DepthOutput,

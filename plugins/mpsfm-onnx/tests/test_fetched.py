@@ -9,18 +9,19 @@ from mpsfm_onnx import plugin, providers
 from mpsfm_onnx.contract import moge_stand_in
 from mpsfm_onnx.description import Weights, load_description
 
-from mpsfm_core import DepthPrior, ProviderSpec, weights
+from mpsfm_core import DepthPrior, ProviderSpec
 from mpsfm_core.config import load_config
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.extraction.runner import extract
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.pipeline import reconstruct
-from mpsfm_core.provision import provide
-from mpsfm_core.registry import Registry
-from mpsfm_core.testing.file_server import serving
-from mpsfm_core.testing.scenes import arc_poses, room_scene
-from mpsfm_core.uncertainty.model import DepthCalibration
-from mpsfm_core.weights import file_sha256
+from mpsfm_core.pipeline.provider_resolution import provide
+from mpsfm_core.pipeline.run import reconstruct
+from mpsfm_core.providers import weights
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.weights import file_sha256
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+from tests.support.file_server import serving
 
 CAMERA = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
 PATH = "/moge-2/model.onnx"

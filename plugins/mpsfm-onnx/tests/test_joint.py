@@ -14,7 +14,7 @@ from mpsfm_onnx.network import Network
 from mpsfm_core.config import load_config
 from mpsfm_core.extraction.runner import extract
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.examples import outdoor_example
 
 EXAMPLE = outdoor_example("painted")

@@ -13,11 +13,11 @@ from mpsfm_onnx.network import Network
 from mpsfm_onnx.options import OnnxOptions
 from mpsfm_onnx.providers import OnnxDepth, OnnxJoint, OnnxNormals
 
-from mpsfm_core.errors import ConfigError, WeightsError
+from mpsfm_core.data.errors import ConfigError, WeightsError
+from mpsfm_core.data.options import Backend
 from mpsfm_core.geometry import pixel_centers, rays, resize_map, unproject
-from mpsfm_core.options import Backend
-from mpsfm_core.registry import Registry
-from mpsfm_core.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.uncertainty.model import DepthCalibration
 
 IDENTITY_INPUT = {"size": {"mode": "longest", "side": 64, "enlarge": False}}
 RED = "tiny (float[1,3,h,w] image) => (float[1,1,h,w] out) { out = Gather <axis = 1> (image, red) }"

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from mpsfm_core import hookimpl
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 
 SCORES_VARIABLE = "MPSFM_PAIR_SCORES"
 """Environment variable: CSV file with image, image, score; without it every pair is kept."""

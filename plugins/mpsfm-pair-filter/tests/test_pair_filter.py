@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from mpsfm_pair_filter.plugin import mpsfm_filter_pairs, read_scores
 
-from mpsfm_core.errors import InputError
-from mpsfm_core.registry import Registry
+from mpsfm_core.data.errors import InputError
+from mpsfm_core.providers.registry import Registry
 
 PAIRS = [("a.jpg", "b.jpg"), ("a.jpg", "c, d.jpg"), ("b.jpg", "c, d.jpg")]
 SCORES = """# image, image, score

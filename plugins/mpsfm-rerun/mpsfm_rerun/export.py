@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from mpsfm_core.data import PosedImage, SceneState
+from mpsfm_core.report.viewing import Cloud, photos_in, scene_of, views_in
 from mpsfm_core.results.exports.source import Source
-from mpsfm_core.viewing import Cloud, photos_in, scene_of, views_in
 from mpsfm_rerun.viewer import RerunViewer
 
 

@@ -10,7 +10,7 @@ import rerun
 
 from mpsfm_core import hookimpl
 from mpsfm_core.data import DepthPrior, PosedImage, SceneState
-from mpsfm_core.viewing import Cloud, Pictures, certain, lifted
+from mpsfm_core.report.viewing import Cloud, Pictures, certain, lifted
 
 RECORDING = "scene.rrd"
 TIMELINE = "step"

@@ -16,9 +16,9 @@ from mpsfm_rerun.viewer import RECORDING, RerunViewer
 from rerun.chunk import RrdReader
 
 from mpsfm_core.data import DepthPrior, PinholeCamera, PosedImage, SceneState
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.report.viewing import Cloud
 from mpsfm_core.results.exports.formats import export
-from mpsfm_core.viewing import Cloud
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 32.0, 24.0)
 

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 
 from mpsfm_core import ProviderContext, View
-from mpsfm_core.builtin.options import SiftOptions
-from mpsfm_core.builtin.sift import Sift
 from mpsfm_core.data import Float32, Float64
 from mpsfm_core.geometry import sample_nearest
+from mpsfm_core.providers.builtin.options import SiftOptions
+from mpsfm_core.providers.builtin.sift import Sift
 from mpsfm_retrieval.options import AppearanceOptions
 
 _SIFT_DIMENSIONS = 128

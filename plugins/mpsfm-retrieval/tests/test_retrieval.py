@@ -10,10 +10,10 @@ from mpsfm_retrieval.network import GlobalNetwork
 from mpsfm_retrieval.options import AppearanceOptions, NetworkOptions
 
 from mpsfm_core import PinholeCamera, View
-from mpsfm_core.builtin.options import SiftOptions
-from mpsfm_core.builtin.sift import Sift
 from mpsfm_core.extraction.options import PairOptions
-from mpsfm_core.extraction.pairs import retrieval
+from mpsfm_core.extraction.pairs.candidates import retrieval
+from mpsfm_core.providers.builtin.options import SiftOptions
+from mpsfm_core.providers.builtin.sift import Sift
 
 FORMS = {
     "vector": ("float[b,d] out", "out = Flatten (mean)"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, hookimpl
-from mpsfm_core.options import Options
+from mpsfm_core.data.options import Options
 from mpsfm_core.providers import Capability, file_named_by
 from mpsfm_roma.options import DenseOptions, SparseOptions
 

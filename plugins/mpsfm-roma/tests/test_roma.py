@@ -8,7 +8,7 @@ from mpsfm_roma.matcher import DenseMatcher, SparseMatcher
 from mpsfm_roma.options import DenseOptions, SparseOptions
 
 from mpsfm_core import Features, PinholeCamera, View
-from mpsfm_core.errors import ConfigError, ProviderError
+from mpsfm_core.data.errors import ConfigError, ProviderError
 
 ROWS, COLUMNS = 28, 42
 """Of the network's input and of the warp."""

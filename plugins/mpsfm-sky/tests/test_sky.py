@@ -10,7 +10,7 @@ from mpsfm_sky.options import SimpleSkyOptions, SkyOptions
 from mpsfm_sky.simple import SimpleSky
 
 from mpsfm_core import PinholeCamera, View
-from mpsfm_core.errors import ConfigError
+from mpsfm_core.data.errors import ConfigError
 
 BLUE = (
     "sky (float[1,3,h,w] image) => (float[1,1,h,w] d0) "

@@ -10,11 +10,11 @@ from scipy.ndimage import distance_transform_edt
 from transformers import AutoModelForDepthEstimation
 
 from mpsfm_core import DepthPrior, ProviderContext, View
-from mpsfm_core.builtin.files import DepthFiles
-from mpsfm_core.builtin.options import DepthFileOptions
 from mpsfm_core.data import Float32, Float64
-from mpsfm_core.errors import ConfigError
-from mpsfm_core.torch_runtime import inference
+from mpsfm_core.data.errors import ConfigError
+from mpsfm_core.providers.builtin.files import DepthFiles
+from mpsfm_core.providers.builtin.options import DepthFileOptions
+from mpsfm_core.providers.torch_runtime import inference
 from mpsfm_transformers.hub import LoadedModel
 from mpsfm_transformers.options import DepthOptions, Output, PromptOptions, known
 from mpsfm_transformers.placement import Preparation, preparation_for

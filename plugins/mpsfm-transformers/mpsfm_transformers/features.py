@@ -7,7 +7,7 @@ from transformers import SuperPointForKeypointDetection
 
 from mpsfm_core import Features, ProviderContext, View
 from mpsfm_core.geometry import scale_pixels
-from mpsfm_core.torch_runtime import inference
+from mpsfm_core.providers.torch_runtime import inference
 from mpsfm_transformers.grid import gray_image, network_size, usable
 from mpsfm_transformers.hub import LoadedModel
 from mpsfm_transformers.options import SuperPointOptions

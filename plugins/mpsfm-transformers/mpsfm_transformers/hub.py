@@ -13,8 +13,8 @@ import torch
 from transformers.utils import logging as hub_logging
 
 from mpsfm_core import ProviderContext
-from mpsfm_core.errors import WeightsError
-from mpsfm_core.torch_runtime import use_threads
+from mpsfm_core.data.errors import WeightsError
+from mpsfm_core.providers.torch_runtime import use_threads
 from mpsfm_transformers.options import CONFIG, FILES, PROCESSOR, WEIGHTS, HubOptions
 
 

@@ -7,7 +7,7 @@ from transformers import AutoModel
 
 from mpsfm_core import ProviderContext, View
 from mpsfm_core.data import Float32
-from mpsfm_core.torch_runtime import inference
+from mpsfm_core.providers.torch_runtime import inference
 from mpsfm_transformers.grid import color_image, network_size
 from mpsfm_transformers.hub import LoadedModel
 from mpsfm_transformers.options import DinoOptions

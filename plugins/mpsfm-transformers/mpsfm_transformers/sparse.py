@@ -15,9 +15,9 @@ from transformers import LightGlueForKeypointMatching, SuperGlueForKeypointMatch
 
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
 from mpsfm_core.data import Float64
-from mpsfm_core.errors import ProviderError
+from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.providers import required_features
-from mpsfm_core.torch_runtime import inference
+from mpsfm_core.providers.torch_runtime import inference
 from mpsfm_transformers.hub import LoadedModel
 from mpsfm_transformers.options import LightGlueOptions, SparseOptions, SuperGlueOptions
 

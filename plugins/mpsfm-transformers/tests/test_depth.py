@@ -13,9 +13,9 @@ from mpsfm_transformers.placement import preparation_for
 from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
 from mpsfm_core import View
-from mpsfm_core.errors import ConfigError
+from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.geometry import resize_map
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 
 SIZES = [(149, 107), (107, 149), (320, 240)]
 

@@ -12,8 +12,8 @@ from mpsfm_transformers.options import DepthOptions, DinoOptions, known
 from mpsfm_transformers.retrieval import Dino
 
 from mpsfm_core import ProviderContext
-from mpsfm_core.errors import WeightsError
-from mpsfm_core.weights import WeightStore, file_sha256
+from mpsfm_core.data.errors import WeightsError
+from mpsfm_core.providers.weights import WeightStore, file_sha256
 
 REPOSITORY = "org/depth-model"
 REVISION = "0123456789abcdef0123456789abcdef01234567"

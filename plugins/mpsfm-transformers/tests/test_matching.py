@@ -20,7 +20,7 @@ from mpsfm_transformers.options import (
 from mpsfm_transformers.sparse import LightGlueMatcher, SuperGlueMatcher
 
 from mpsfm_core import Features, View
-from mpsfm_core.errors import ProviderError
+from mpsfm_core.data.errors import ProviderError
 
 MATCHERS = {
     "lightglue": (LightGlueMatcher, LightGlueOptions, hf.LightGlueForKeypointMatching),

@@ -16,7 +16,7 @@ import viser.transforms
 from mpsfm_core import hookimpl
 from mpsfm_core.data import PosedImage, SceneState
 from mpsfm_core.geometry import camera_center
-from mpsfm_core.viewing import Cloud, Pictures, lifted
+from mpsfm_core.report.viewing import Cloud, Pictures, lifted
 
 PORT_VARIABLE = "MPSFM_VIEWER_PORT"
 """Environment variable: where the page is served; if it is taken, the next free one."""

@@ -14,8 +14,8 @@ pytest.importorskip("viser", reason="viser is not installed")
 from mpsfm_viser.viewer import ViserViewer
 
 from mpsfm_core.data import DepthPrior, PinholeCamera, PosedImage, SceneState
-from mpsfm_core.registry import Registry
-from mpsfm_core.viewing import Cloud
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.report.viewing import Cloud
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 32.0, 24.0)
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")

@@ -7,15 +7,15 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from mpsfm_core import ProviderContext
-from mpsfm_core.errors import ConfigError, did_you_mean
-from mpsfm_core.torch_runtime import use_threads
+from mpsfm_core.data.errors import ConfigError, did_you_mean
+from mpsfm_core.providers.torch_runtime import use_threads
 
 
 def load(name: str, context: ProviderContext, max_keypoints: int = 2048) -> Any:
     """The matcher of a name, or of a class as ``package.module:Class``, on the context's device.
 
     The collection gets weights by itself and keeps them where its sources do (the Hub's cache,
-    torch's). Raises :class:`~mpsfm_core.errors.ConfigError` for what it does not know.
+    torch's). Raises :class:`~mpsfm_core.data.errors.ConfigError` for what it does not know.
     """
     use_threads(context)
     if ":" in name:

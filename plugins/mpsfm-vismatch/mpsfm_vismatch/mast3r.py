@@ -10,7 +10,7 @@ from mpsfm_mast3r.network import PairNetwork, Tensors
 
 from mpsfm_core import ProviderContext
 from mpsfm_core.data import Float32
-from mpsfm_core.torch_runtime import inference
+from mpsfm_core.providers.torch_runtime import inference
 from mpsfm_vismatch.collection import at_home, load, part
 
 

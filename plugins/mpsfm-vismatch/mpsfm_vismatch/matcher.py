@@ -17,7 +17,7 @@ from mpsfm_core import (
 from mpsfm_core.data import Float32, Float64
 from mpsfm_core.geometry import inside, resize_map, scale_pixels
 from mpsfm_core.providers import required_features
-from mpsfm_core.torch_runtime import inference
+from mpsfm_core.providers.torch_runtime import inference
 from mpsfm_vismatch.collection import load
 from mpsfm_vismatch.options import CollectionOptions, SnapOptions
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mpsfm_core import ProviderContext, View
-from mpsfm_core.torch_runtime import inference
+from mpsfm_core.providers.torch_runtime import inference
 from mpsfm_vismatch.collection import at_home, load, part
 from mpsfm_vismatch.options import RomaNetwork
 

@@ -8,8 +8,8 @@ pytest.importorskip("torch")
 
 from mpsfm_vismatch.plugin import mpsfm_providers
 
-from mpsfm_core.builtin import plugin as builtin
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.builtin import plugin as builtin
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import contract_tests
 
 registry = Registry()

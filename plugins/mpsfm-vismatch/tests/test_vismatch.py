@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core import Features, PinholeCamera, ProviderContext, View
-from mpsfm_core.errors import ConfigError
+from mpsfm_core.data.errors import ConfigError
 
 torch = pytest.importorskip("torch")
 

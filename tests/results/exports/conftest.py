@@ -15,11 +15,11 @@ from mpsfm_core.data import DepthPrior, MappingImage, MappingProblem, NormalPrio
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.undistortion import pinhole_camera
+from mpsfm_core.mapping.scene.reconstruction import MetricScale, Reconstruction, RegisteredImage
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.photos import Photos
 from mpsfm_core.results.writer import Component, write_results
-from mpsfm_core.scene.reconstruction import MetricScale, Reconstruction, RegisteredImage
-from mpsfm_core.testing.scenes import arc_poses, project, room_scene
+from mpsfm_core.testing.synthetic.scenes import arc_poses, project, room_scene
 
 CAMERA = pycolmap.Camera(
     model="OPENCV",

@@ -12,11 +12,11 @@ import pycolmap
 import pytest
 import trimesh
 
-from mpsfm_core.errors import InputError
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.geometry import angle_between_deg
 from mpsfm_core.inputs.nerfstudio import read_transforms
 from mpsfm_core.providers import ExportFormat
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 from mpsfm_core.results.exports.formats import FORMATS, export
 from mpsfm_core.results.ply import read_ply
 

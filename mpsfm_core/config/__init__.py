@@ -1,0 +1,23 @@
+"""The configuration of a run: typed options, read from YAML files and ``--set`` overrides."""
+
+from mpsfm_core.config.loading import (
+    check_backend,
+    combination_problems,
+    describe_shipped,
+    load_config,
+    shipped_configs,
+)
+from mpsfm_core.config.model import BLOCKS, FORMAT, Config, QuickMatching, RuntimeOptions
+
+__all__ = [
+    "BLOCKS",
+    "FORMAT",
+    "Config",
+    "QuickMatching",
+    "RuntimeOptions",
+    "check_backend",
+    "combination_problems",
+    "describe_shipped",
+    "load_config",
+    "shipped_configs",
+]

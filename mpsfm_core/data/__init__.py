@@ -1,0 +1,54 @@
+"""Types that cross a package boundary: frozen, validated containers of numpy arrays.
+
+Providers take and return these types, and the mapper takes a :class:`MappingProblem`. Constructors
+check shape, dtype and range, raise :class:`~mpsfm_core.data.errors.DataError`, and store arrays as
+read-only views.
+
+Conventions: camera x right, y down, z forward; depth is z; normals are unit vectors in the camera
+frame that face the camera (``n . ray < 0``); pixels follow COLMAP (the centre of the first pixel is
+(0.5, 0.5)); uncertainty is a variance.
+"""
+
+from mpsfm_core.data.arrays import Bool, Float32, Float64, Int64, Pose, UInt8
+from mpsfm_core.data.cameras import PinholeCamera, View, along_rays
+from mpsfm_core.data.features import DenseMatches, Features, PairMatches, SparseMatches
+from mpsfm_core.data.mapping_problem import (
+    MappingImage,
+    MappingProblem,
+    PosedImage,
+    SceneState,
+    VerifiedPair,
+)
+from mpsfm_core.data.priors import (
+    UNIT_NORMAL_TOLERANCE,
+    DepthPrior,
+    GroupPrior,
+    NormalPrior,
+    PairDepth,
+)
+
+__all__ = [
+    "UNIT_NORMAL_TOLERANCE",
+    "Bool",
+    "DenseMatches",
+    "DepthPrior",
+    "Features",
+    "Float32",
+    "Float64",
+    "GroupPrior",
+    "Int64",
+    "MappingImage",
+    "MappingProblem",
+    "NormalPrior",
+    "PairDepth",
+    "PairMatches",
+    "PinholeCamera",
+    "Pose",
+    "PosedImage",
+    "SceneState",
+    "SparseMatches",
+    "UInt8",
+    "VerifiedPair",
+    "View",
+    "along_rays",
+]

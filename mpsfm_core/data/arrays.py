@@ -1,0 +1,50 @@
+"""Array types of the package, and the checks that data classes run on their arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpsfm_core.data.errors import DataError
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+UInt8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+Pose = tuple[Float64, Float64]
+"""Rotation (3, 3) and translation (3,) float64: ``y = R x + t``; of an image ``cam_from_world``."""
+
+
+def require_array(owner: object, name: str, dtype: Any, shape: tuple[int | None, ...]) -> None:
+    value = getattr(owner, name)
+    if not isinstance(value, np.ndarray):
+        raise DataError(name, f"must be a numpy array, got {type(value).__name__}")
+    if value.dtype != np.dtype(dtype):
+        raise DataError(name, f"must have dtype {np.dtype(dtype)}, got {value.dtype}")
+    matches = value.ndim == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, value.shape, strict=False)
+    )
+    if not matches:
+        wanted = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
+        raise DataError(name, f"must have shape {wanted}, got {value.shape}")
+    view = value.view()
+    view.flags.writeable = False
+    object.__setattr__(owner, name, view)
+
+
+def require_finite(owner: object, name: str) -> None:
+    if not np.isfinite(getattr(owner, name)).all():
+        raise DataError(name, "must be finite")
+
+
+def require_positive_where_valid(values: Float32, valid: Bool, name: str) -> None:
+    if ((values <= 0) & valid).any():
+        raise DataError(name, "must be positive where valid")
+
+
+def require_unit_interval(values: Float32, name: str) -> None:
+    if values.size and not (values.min() >= 0 and values.max() <= 1):
+        raise DataError(name, "must lie in [0, 1]")

@@ -1,0 +1,161 @@
+"""The base of everything a user can set, and how a wrong setting is told.
+
+:class:`Options` is the base of a provider's options and of the options of each room;
+:class:`Backend` is the choice of one provider in a configuration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails
+
+from mpsfm_core.data.errors import ConfigError, did_you_mean
+
+
+class Options(BaseModel):
+    """Immutable settings; unknown keys are errors; each field has a default and its source."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", protected_namespaces=(), ser_json_inf_nan="constants"
+    )
+
+
+AS_DEPTH = "as-depth"
+"""As the normals provider: the depth network's own normals, of the same pass."""
+
+
+FROM_MATCHER = "matcher"
+"""As the depth provider: the depth that the matcher predicts."""
+
+FROM_MULTIVIEW = "multiview"
+"""As the depth provider: the depth of the multi-view network, which sees several photos at once."""
+
+
+class Backend(Options):
+    """The choice of one provider, or of several in the order of preference."""
+
+    use: str
+    """Name of the provider (see ``mpsfm plugins list``)."""
+    otherwise: tuple[str, ...] = ()
+    """Providers to take instead, in this order, where ``use`` cannot be had: its plugin or weights
+    are missing, or it does not know the given options."""
+    environment: str | None = None
+    """The environment that ``use`` lives in (``mpsfm env create``); ``use: NAME@ENVIRONMENT``,
+    as it is written from then on, says the same."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """The provider's own options."""
+    wrap: tuple[Backend, ...] = ()
+    """Wrappers around the provider, the innermost first."""
+    calibration: dict[str, Any] | str | None = None
+    """Uncertainty of a depth or normals provider: the values, a YAML or JSON file with them, or
+    null for what the plugin declares."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_environment(cls, values: Any) -> Any:
+        if isinstance(values, Mapping) and values.get("environment") and "use" in values:
+            if values["use"] == AS_DEPTH or "@" in str(values["use"]):
+                raise ValueError(f"environment: {values['use']!r} says where it is")
+            values = {**values, "use": f"{values['use']}@{values['environment']}"}
+            del values["environment"]
+        return values
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is yet to be found out which provider it is
+        (:mod:`mpsfm_core.pipeline.provider_resolution`)."""
+        return bool(self.otherwise) or self.use == AS_DEPTH
+
+
+SettingPath = tuple[str | int, ...]
+
+
+@dataclass(frozen=True)
+class SettingProblem:
+    """One wrong setting: its path (``("depth", "options", "scale")``) and what is wrong."""
+
+    path: SettingPath
+    text: str
+    missing: bool = False
+    """Whether a required setting is absent."""
+
+    def __str__(self) -> str:
+        return f"{dotted(self.path)}: {self.text}" if self.path else self.text
+
+
+class SettingsError(ConfigError):
+    """Settings that their options class refuses."""
+
+    def __init__(self, problems: tuple[SettingProblem, ...]) -> None:
+        super().__init__("; ".join(map(str, problems)))
+        self.problems = problems
+
+
+AnyModel = TypeVar("AnyModel", bound=BaseModel)
+
+
+def parse_settings(
+    model: type[AnyModel], values: Mapping[str, Any], path: SettingPath = ()
+) -> AnyModel:
+    """Validate ``values`` as ``model``.
+
+    Raises :class:`SettingsError`, whose message gives for each problem the path (below ``path``),
+    what is wrong and, for an unknown key, the nearest valid one.
+    """
+    try:
+        return model.model_validate(dict(values))
+    except SettingsError as error:  # of a model that is checked in another environment
+        raise SettingsError(
+            tuple(replace(problem, path=(*path, *problem.path)) for problem in error.problems)
+        ) from error
+    except ValidationError as error:
+        problems = tuple(
+            SettingProblem(
+                (*path, *_keys(details)), _explain(model, details), details["type"] == "missing"
+            )
+            for details in error.errors(include_url=False)
+        )
+        raise SettingsError(problems) from error
+
+
+def dotted(path: SettingPath) -> str:
+    """``("masks", 0, "use")`` as a user writes it: ``masks.0.use``."""
+    return ".".join(map(str, path))
+
+
+def _keys(details: ErrorDetails) -> SettingPath:
+    """The location without the union tags pydantic adds, e.g. ``dict[str,any]``."""
+    return tuple(part for part in details["loc"] if isinstance(part, int) or "[" not in part)
+
+
+def _explain(model: type[BaseModel], details: ErrorDetails) -> str:
+    if details["type"] == "missing":
+        return "is required"
+    if details["type"] == "extra_forbidden":
+        key = str(details["loc"][-1])
+        return f"unknown key{did_you_mean(key, _fields_at(model, details['loc'][:-1]))}"
+    message = details["msg"].removeprefix("Value error, ")
+    given = repr(details["input"])
+    return f"{message} (got {given if len(given) <= 60 else given[:57] + '...'})"
+
+
+def _fields_at(model: type[BaseModel], path: SettingPath) -> list[str]:
+    """Keys that are valid at ``path`` below ``model``."""
+    current = [model]
+    for part in path:
+        if isinstance(part, int):
+            continue
+        annotations = [m.model_fields[part].annotation for m in current if part in m.model_fields]
+        current = [inner for annotation in annotations for inner in _models_in(annotation)]
+    return [info.alias or name for inner in current for name, info in inner.model_fields.items()]
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _models_in(argument)

@@ -1,0 +1,1 @@
+"""Matching, geometric verification and keypoint adjustment of image pairs."""

@@ -1,0 +1,309 @@
+"""Matches of image pairs: by features, dense, or both; verified."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import (
+    DenseMatches,
+    DepthPrior,
+    Features,
+    Float64,
+    MappingImage,
+    MappingProblem,
+    PairMatches,
+    SparseMatches,
+    VerifiedPair,
+)
+from mpsfm_core.extraction.active_provider import ActiveProvider
+from mpsfm_core.extraction.cache import content_key, digest
+from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.empty_results import NOTHING
+from mpsfm_core.extraction.features import FeatureTable
+from mpsfm_core.extraction.matching.dense_matches import NO_POINTS, PointMatches, sample, snap
+from mpsfm_core.extraction.matching.keypoint_adjustment import KeypointAdjuster
+from mpsfm_core.extraction.matching.verification import CALIBRATED, TwoView, verify
+from mpsfm_core.extraction.pairs.candidates import Pair
+from mpsfm_core.geometry import sample_nearest
+from mpsfm_core.providers import validation
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Matches of a pair before verification: rows of the features, then free points.
+
+    ``std_px``: localisation noise of the free points. ``precision``: mean inverse variance of the
+    pair depth of both images, 0 where there is none.
+    """
+
+    pair: Pair
+    sparse: SparseMatches
+    points: PointMatches
+    std_px: float
+    precision: tuple[float, float] = (0.0, 0.0)
+
+    def __len__(self) -> int:
+        return len(self.sparse) + len(self.points.scores)
+
+
+class PairMatcher:
+    """The chosen matchers on pairs of images."""
+
+    def __init__(self, bench: Workbench, table: FeatureTable | None) -> None:
+        self._bench = bench
+        self._table = table
+        config = bench.config
+        chosen = (config.matcher, config.dense_matcher)
+        self._providers = [bench.provider("matcher", b) for b in chosen if b is not None]
+        self._snaps = config.matcher is None and table is not None
+
+    def match(self, pairs: list[Pair], located: list[Features]) -> list[Candidates]:
+        """Run the stage. ``located``: features of all images, descriptors not needed."""
+
+        def work(pair: Pair) -> Candidates:
+            return self._candidates(pair, located[pair[0]], located[pair[1]])
+
+        return self._bench.each("matching", pairs, work, *self._providers)
+
+    def results(self, pair: Pair) -> list[PairMatches]:
+        """What each matcher returns for a pair, cached."""
+        return [self._run(provider, pair) for provider in self._providers]
+
+    def pair_depth(self, pair: Pair, side: int) -> DepthPrior:
+        """Depth of one image of a pair (0 or 1) as the matcher saw it."""
+        for provider in self._providers:
+            depth = self._run(provider, pair).depth
+            if depth is not None:
+                return (depth.depth_a, depth.depth_b)[side]
+        raise LookupError(f"no matcher gave depth for pair {pair}")
+
+    def _candidates(self, pair: Pair, a: Features, b: Features) -> Candidates:
+        options = self._bench.config.extraction
+        results = self.results(pair)
+        no_scores = np.empty(0, dtype=np.float32)
+        sparse = SparseMatches(np.empty((0, 2), dtype=np.int64), no_scores)
+        points, std_px = NO_POINTS, 1.0
+        for result in results:
+            if result.sparse is not None:
+                sparse = result.sparse
+            if result.dense is None:
+                continue
+            dense = self._allowed(pair, result.dense)
+            if self._snaps:
+                sparse = snap(dense, a.keypoints, b.keypoints, options.dense_snap_px)
+            points = sample(dense, a.keypoints, b.keypoints, options)
+            std_px = dense.std_px
+        return Candidates(pair, sparse, points, std_px, _precision(results))
+
+    def _run(self, provider: ActiveProvider, pair: Pair) -> PairMatches:
+        bench, table = self._bench, self._table
+        if bench.failed(pair):
+            return cast(PairMatches, NOTHING[PairMatches]())
+
+        def compute(instance: Any) -> PairMatches:
+            views = bench.view(pair[0]), bench.view(pair[1])
+            features = None if table is None else (table[pair[0]], table[pair[1]])
+            return validation.run_matcher(provider.spec, instance, views, features)
+
+        inputs: list[object] = [bench.view_inputs(index, provider) for index in pair]
+        if table is not None and provider.can("sparse"):
+            inputs += [table.key(index) for index in pair]
+        return bench.result(provider, PairMatches, inputs, compute, pair)
+
+    def _allowed(self, pair: Pair, dense: DenseMatches) -> DenseMatches:
+        """The matches that no mask forbids."""
+        keep = np.ones(len(dense), dtype=np.bool_)
+        for index, points in zip(pair, (dense.points_a, dense.points_b), strict=True):
+            mask = self._bench.mask(index)
+            if mask is not None:
+                keep &= sample_nearest(mask, points)
+        return DenseMatches(
+            dense.points_a[keep], dense.points_b[keep], dense.scores[keep], dense.std_px
+        )
+
+
+class PairVerifier:
+    """Two-view geometry of candidate matches."""
+
+    def __init__(self, bench: Workbench, located: list[Features]) -> None:
+        self._bench = bench
+        self._located = located
+
+    def verify(self, candidates: list[Candidates]) -> list[TwoView]:
+        """Run the stage."""
+        return self._bench.each("verification", candidates, self._verify)
+
+    def _verify(self, matches: Candidates) -> TwoView:
+        options, seed = self._bench.config.verification, self._bench.config.runtime.seed
+        a, b = matches.pair
+        rows = matches.sparse.indices
+        xy_a = np.concatenate([self._located[a].keypoints[rows[:, 0]], matches.points.xy_a])
+        xy_b = np.concatenate([self._located[b].keypoints[rows[:, 1]], matches.points.xy_b])
+        std_px = max(
+            max(self._located[a].std_px, self._located[b].std_px) if len(rows) else 0.0,
+            matches.std_px if len(matches.points.scores) else 0.0,
+        )
+        cameras = self._bench.images[a].pinhole, self._bench.images[b].pinhole
+        parts = [
+            options.model_dump(mode="json"),
+            *map(asdict, cameras),
+            std_px,
+            seed,
+            pycolmap.__version__,
+        ]
+        key = content_key(parts, digest(xy_a), digest(xy_b))
+        found = self._bench.cache.load("two-view", key, TwoView)
+        if found is None:
+            found = verify(*cameras, xy_a, xy_b, options, std_px=std_px, seed=seed)
+            self._bench.cache.store("two-view", key, found)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Assembled:
+    """Verified pairs, and the keypoints (n, 2) of each image they refer to, and their noise as they
+    were found.
+
+    ``std_factor``: (n,) for each image, what adjustment left of that noise.
+    """
+
+    pairs: tuple[VerifiedPair, ...]
+    keypoints: list[Float64]
+    std_px: list[float]
+    std_factor: list[Float64]
+
+
+def assemble(
+    candidates: list[Candidates], outcomes: list[TwoView], located: list[Features]
+) -> Assembled:
+    """Number the keypoints: each image's features, then the free points of its verified pairs."""
+    keypoints = [[features.keypoints] for features in located]
+    counts = [len(features) for features in located]
+    noise = [[(len(features), features.std_px)] for features in located]
+    verified = []
+    for matches, outcome in zip(candidates, outcomes, strict=True):
+        if outcome.reason:
+            continue
+        sparse = outcome.inliers[outcome.inliers < len(matches.sparse)]
+        free = outcome.inliers[outcome.inliers >= len(matches.sparse)] - len(matches.sparse)
+        columns = []
+        for side, image in enumerate(matches.pair):
+            points = (matches.points.xy_a, matches.points.xy_b)[side][free]
+            new_rows = counts[image] + np.arange(len(points), dtype=np.int64)
+            columns.append(np.concatenate([matches.sparse.indices[sparse, side], new_rows]))
+            keypoints[image].append(points)
+            counts[image] += len(points)
+            noise[image].append((len(points), matches.std_px))
+        verified.append(
+            VerifiedPair(
+                *matches.pair,
+                np.stack(columns, axis=1),
+                np.concatenate([matches.sparse.scores[sparse], matches.points.scores[free]]),
+                outcome.rotation,
+                outcome.translation,
+                outcome.configuration == CALIBRATED,
+            )
+        )
+    return Assembled(
+        tuple(verified),
+        [np.concatenate(parts) for parts in keypoints],
+        [_typical(parts) for parts in noise],
+        [np.ones(count) for count in counts],
+    )
+
+
+def adjusted(bench: Workbench, assembled: Assembled) -> Assembled:
+    """With keypoints moved to where the patches of their matches are alike."""
+    options = bench.config.adjustment
+    if not (options.enabled and assembled.pairs):
+        return assembled
+    adjuster = KeypointAdjuster(bench, assembled.keypoints, assembled.std_px)
+    found = adjuster.run(assembled.pairs)
+    return replace(
+        assembled,
+        keypoints=[image.keypoints for image in found],
+        std_factor=[np.where(image.measured, options.std_factor, 1.0) for image in found],
+    )
+
+
+def adjusted_problem(bench: Workbench, problem: MappingProblem) -> MappingProblem:
+    """A problem that was assembled without adjustment, with keypoints that are adjusted."""
+    images = problem.images
+    found = adjusted(
+        bench,
+        Assembled(
+            problem.pairs,
+            [image.keypoints for image in images],
+            [image.keypoint_std_px for image in images],
+            [_std_factor(image) for image in images],
+        ),
+    )
+    moved = (
+        replace(image, keypoints=keypoints, keypoint_std_factor=factor)
+        for image, keypoints, factor in zip(images, found.keypoints, found.std_factor, strict=True)
+    )
+    return replace(problem, images=tuple(moved))
+
+
+def joined(problem: MappingProblem, more: Assembled) -> MappingProblem:
+    """The problem with more matches between its images, on keypoints that come after its own."""
+    offsets = [len(image.keypoints) for image in problem.images]
+    images = tuple(
+        replace(
+            image,
+            keypoints=np.concatenate([image.keypoints, xy]),
+            keypoint_std_px=_typical(
+                [(len(image.keypoints), image.keypoint_std_px), (len(xy), std)]
+            ),
+            keypoint_std_factor=np.concatenate([_std_factor(image), factor]),
+        )
+        for image, xy, std, factor in zip(
+            problem.images, more.keypoints, more.std_px, more.std_factor, strict=True
+        )
+    )
+    pairs = {(pair.image_a, pair.image_b): pair for pair in problem.pairs}
+    for pair in more.pairs:
+        key = pair.image_a, pair.image_b
+        rows = pair.matches + np.array([offsets[index] for index in key])
+        pairs[key] = _both(pairs.get(key), replace(pair, matches=rows))
+    return MappingProblem(images, tuple(pairs[key] for key in sorted(pairs)))
+
+
+def _std_factor(image: MappingImage) -> Float64:
+    factor = image.keypoint_std_factor
+    return np.ones(len(image.keypoints)) if factor is None else factor
+
+
+def _both(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:
+    """All matches of a pair, with the geometry that more of them fit."""
+    if a is None:
+        return b
+    return replace(
+        max(a, b, key=len),
+        matches=np.concatenate([a.matches, b.matches]),
+        scores=np.concatenate([a.scores, b.scores]),
+    )
+
+
+def _typical(parts: list[tuple[int, float]]) -> float:
+    """Median noise of keypoints that come in groups of (number, std)."""
+    values = np.repeat([std for _, std in parts], [count for count, _ in parts])
+    return float(np.median(values)) if len(values) else 1.0
+
+
+def _precision(results: list[PairMatches]) -> tuple[float, float]:
+    for result in results:
+        if result.depth is not None:
+            return _mean_precision(result.depth.depth_a), _mean_precision(result.depth.depth_b)
+    return 0.0, 0.0
+
+
+def _mean_precision(depth: DepthPrior) -> float:
+    """Mean inverse variance of the valid pixels (reference: how the best pair is chosen)."""
+    if depth.variance is None or not depth.valid.any():
+        return 0.0
+    return float((1.0 / depth.variance[depth.valid].astype(np.float64)).mean())

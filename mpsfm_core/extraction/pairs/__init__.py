@@ -1,0 +1,1 @@
+"""Selection of the image pairs that are matched."""

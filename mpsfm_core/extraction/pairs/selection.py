@@ -1,0 +1,159 @@
+"""Which pairs of a set of photos are matched: chosen before, and again where photos stay apart."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from mpsfm_core.data import Float64
+from mpsfm_core.data.errors import ConfigError
+from mpsfm_core.extraction.active_provider import ActiveProvider
+from mpsfm_core.extraction.cache import content_key
+from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.features import FeatureTable
+from mpsfm_core.extraction.pairs import candidates as pairs
+from mpsfm_core.extraction.pairs import similarity as first_look
+from mpsfm_core.extraction.pairs.candidates import Pair
+from mpsfm_core.providers import validation
+
+
+class PairSelection:
+    """Chooses pairs for the matcher; ``proposed`` counts those before the filters of plugins.
+
+    ``loose``: images that are matched again, of which one must be in a pair; None for any pair.
+    """
+
+    def __init__(
+        self,
+        bench: Workbench,
+        table: FeatureTable | None,
+        loose: Collection[int] | None = None,
+    ) -> None:
+        self.proposed = 0
+        self._loose = loose
+        self._bench = bench
+        self._table = table
+        self._likeness: Float64 | None = None
+        self._asked: set[Pair] = set()
+
+    def choose(self) -> list[Pair]:
+        """The pairs to match.
+
+        Raises :class:`ConfigError` when retrieval is asked for without a provider.
+        """
+        options, count = self._bench.config.pairs, len(self._bench.images)
+        if options.mode == "sequential":
+            return self._ask(pairs.sequential(count, options))
+        if options.mode == "retrieval":
+            return self._ask(pairs.retrieval(self._descriptors(), options))
+        if options.mode == "exhaustive" or count - 1 <= options.partners:
+            return self._ask(pairs.exhaustive(count))
+        self._likeness = self._look()
+        if self._likeness is None:
+            return self._ask(pairs.exhaustive(count))
+        alike = pairs.most_alike(self._likeness, self._partners, images=self._loose)
+        return self._ask(alike + pairs.neighbours(self._bench.images.names, options))
+
+    def choose_again(self, verified: Sequence[Pair]) -> list[Pair]:
+        """More pairs where the verified ones leave photos apart: for each group but the largest,
+        those most like photos outside that were not tried. None where all was decided before."""
+        if self._likeness is None:
+            return []
+        count = len(self._likeness)
+        rows, columns = np.array(verified, dtype=np.int64).reshape(-1, 2).T
+        graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+        groups, group_of = connected_components(graph, directed=False)
+        sizes = np.bincount(group_of, minlength=groups)
+        more: list[Pair] = []
+        for group in np.flatnonzero(np.arange(groups) != sizes.argmax()):
+            inside = group_of == group
+            across = [
+                (min(a, b), max(a, b))
+                for a in np.flatnonzero(inside).tolist()
+                for b in np.flatnonzero(~inside).tolist()
+            ]
+            untried = [pair for pair in across if pair not in self._asked]
+            untried.sort(key=lambda pair: (-self._like(pair), pair))
+            more += untried[: self._bench.config.pairs.partners]
+        return self._ask(more)
+
+    @property
+    def _partners(self) -> int:
+        """Of each photo that asks for them."""
+        config = self._bench.config
+        if self._loose is None or config.quick is None:
+            return config.pairs.partners
+        return config.quick.partners
+
+    def _like(self, pair: Pair) -> float:
+        return 0.0 if self._likeness is None else float(self._likeness[pair])
+
+    def _ask(self, chosen: Sequence[Pair]) -> list[Pair]:
+        """The pairs that plugins let pass, sorted, each once."""
+        loose = self._loose
+        unique = sorted({(a, b) for a, b in chosen if loose is None or a in loose or b in loose})
+        self._asked.update(unique)
+        self.proposed += len(unique)
+        names = self._bench.images.names
+        named = [(names[a], names[b]) for a, b in unique]
+        answers = self._bench.registry.call_hook("mpsfm_filter_pairs", pairs=named)
+        return pairs.apply_filters(unique, names, answers)
+
+    def _look(self) -> Float64 | None:
+        """Likeness of all photos (n, n): by retrieval where it is configured, else by features;
+        None where there is neither."""
+        backend = self._bench.config.retrieval
+        if backend is not None:
+            descriptors = np.stack(self._descriptors()).astype(np.float64)
+            similarity: Float64 = np.maximum(descriptors @ descriptors.T, 0)
+            return similarity
+        if self._table is None:
+            return None
+        return first_look.likeness(self._evidence(self._table))
+
+    def _evidence(self, table: FeatureTable) -> Float64:
+        bench, count = self._bench, len(self._bench.images)
+        key = content_key(first_look.STRONGEST, [table.key(index) for index in range(count)])
+        cached: Float64 | None = bench.cache.load("first-look", key, np.ndarray)
+        if cached is not None:
+            return cached
+        strongest = [first_look.strongest(table[index]) for index in range(count)]
+        found = np.zeros((count, count))
+
+        def compare(first: int) -> None:
+            for other in range(first + 1, count):
+                found[first, other] = first_look.evidence(strongest[first], strongest[other])
+
+        bench.each("first look", range(count), compare)
+        found += found.T
+        bench.cache.store("first-look", key, found)
+        return found
+
+    def describe(self, index: int) -> Any:
+        """The global descriptor (d,) of an image, cached.
+
+        Raises :class:`ConfigError` without a retrieval provider.
+        """
+        bench, provider = self._bench, self._retrieval
+        return bench.result(
+            provider,
+            np.ndarray,
+            bench.view_inputs(index, provider),
+            lambda instance: validation.run_retrieval(provider.spec, instance, bench.view(index)),
+        )
+
+    def _descriptors(self) -> list[Any]:
+        images = range(len(self._bench.images))
+        return self._bench.each("retrieval", images, self.describe, self._retrieval)
+
+    @cached_property
+    def _retrieval(self) -> ActiveProvider:
+        backend = self._bench.config.retrieval
+        if backend is None:
+            raise ConfigError("pairs.mode: 'retrieval' needs a provider: set retrieval.use")
+        return self._bench.provider("retrieval", backend)

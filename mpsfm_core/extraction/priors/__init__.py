@@ -1,0 +1,1 @@
+"""Depth and normal priors on the grid of the mapper."""

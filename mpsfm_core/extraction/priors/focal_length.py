@@ -1,0 +1,65 @@
+"""Focal lengths that the photos do not tell, from a depth provider that sees them."""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from mpsfm_core.config import Config
+from mpsfm_core.data import Float64
+from mpsfm_core.extraction.active_provider import thread_count
+from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.events import ExtractionEvents, Silent
+from mpsfm_core.inputs.images import ImageSet
+from mpsfm_core.providers import validation
+from mpsfm_core.providers.registry import Registry
+
+_log = logging.getLogger(__name__)
+
+
+def estimate_focals(
+    images: ImageSet, config: Config, registry: Registry, events: ExtractionEvents | None = None
+) -> ImageSet:
+    """The images with the depth provider's focal lengths, where they were the default.
+
+    Images of one camera get the median of their estimates. It stays a guess, which the mapper
+    refines. The images are returned as they are when all focal lengths are known, or when the
+    provider does not declare ``estimates-focal``.
+
+    Raises:
+        InputError: the provider or its weights are missing.
+        ProviderRunError, ProviderOutputError: it failed or broke its contract.
+    """
+    guessed = [index for index, image in enumerate(images) if image.focal_source == "default"]
+    if not guessed:
+        return images
+    bench = Workbench(images, config, registry, events or Silent())
+    provider = bench.provider("depth", config.depth.model_copy(update={"wrap": ()}))
+    if not provider.can("estimates-focal"):
+        return images
+
+    def estimate(index: int) -> float:
+        view = images.view(index)
+
+        def compute(instance: Any) -> Float64:
+            found = validation.run_focal(provider.spec, instance, view)
+            return np.array(np.nan if found is None else found)
+
+        focal = bench.result(provider, np.ndarray, ["focal", images.pixel_key(index)], compute)
+        return float(focal * images[index].camera.width / view.camera.width)
+
+    with threadpool_limits(thread_count(config.runtime), user_api="blas"):
+        estimates = bench.each("focal", guessed, estimate, provider, here=True)
+    by_camera: dict[int, list[float]] = defaultdict(list)
+    for index, focal in zip(guessed, estimates, strict=True):
+        if np.isfinite(focal):
+            by_camera[images[index].camera.camera_id].append(focal)
+    medians = {number: float(np.median(found)) for number, found in by_camera.items()}
+    for number, focal in medians.items():
+        text = "camera %d: the depth provider %r sees a focal length of %.0f px"
+        _log.warning(text, number, provider.spec.name, focal)
+    return images.with_focals(medians)

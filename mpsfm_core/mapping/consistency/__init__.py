@@ -1,0 +1,1 @@
+"""Detection of wrong poses and pairs by depth and matches."""

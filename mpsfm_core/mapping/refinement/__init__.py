@@ -1,0 +1,1 @@
+"""Bundle adjustment, depth integration, filtering, and the noise they assume."""

@@ -1,0 +1,1 @@
+"""Registration of images by absolute pose estimation."""

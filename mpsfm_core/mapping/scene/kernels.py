@@ -1,0 +1,69 @@
+"""Compiled loops over tracks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mpsfm_core.data import Float64, Int64
+from mpsfm_core.support import jit
+
+
+@jit.kernel()
+def sorted_by_point(point_of: Int64, num_points: int) -> Int64:
+    """Keypoints that observe a point, sorted by point, then keypoint (counting sort).
+
+    ``point_of``: (k,) point of each keypoint or negative, below ``num_points``.
+    """
+    first = np.zeros(num_points + 1, np.int64)
+    for point in point_of:
+        if point >= 0:
+            first[point + 1] += 1
+    first = np.cumsum(first)
+    keypoints = np.empty(first[num_points], np.int64)
+    for keypoint in range(len(point_of)):
+        point = point_of[keypoint]
+        if point >= 0:
+            keypoints[first[point]] = keypoint
+            first[point] += 1
+    return keypoints
+
+
+@jit.kernel()
+def max_triangulation_angles(
+    points: Float64, observation_points: Int64, centers: Float64
+) -> Float64:
+    """Largest angle in degrees between any two rays of each point's track.
+
+    Args:
+        points: (p, 3). observation_points: (o,) row of each observation, sorted. centers: (o, 3)
+            camera centre of each observation.
+
+    Returns:
+        (p,) float64 in [0, 90]; 0 for points with fewer than two observations.
+    """
+    angles = np.zeros(len(points))
+    count = len(observation_points)
+    start = 0
+    while start < count:
+        point = observation_points[start]
+        end = start + 1
+        while end < count and observation_points[end] == point:
+            end += 1
+        best = 0.0
+        for a in range(start, end):
+            ax = points[point, 0] - centers[a, 0]
+            ay = points[point, 1] - centers[a, 1]
+            az = points[point, 2] - centers[a, 2]
+            for b in range(a + 1, end):
+                bx = points[point, 0] - centers[b, 0]
+                by = points[point, 1] - centers[b, 1]
+                bz = points[point, 2] - centers[b, 2]
+                cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+                sine = math.sqrt(cx * cx + cy * cy + cz * cz)
+                angle = math.atan2(sine, abs(ax * bx + ay * by + az * bz))
+                best = max(best, angle)
+        angles[point] = math.degrees(best)
+        start = end
+    return angles

@@ -1,0 +1,1 @@
+"""Run a reconstruction: the only package that uses all others."""

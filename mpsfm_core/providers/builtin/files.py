@@ -1,0 +1,145 @@
+"""Depth, normals and masks from files: sensor data and priors computed elsewhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mpsfm_core.data import Bool, DepthPrior, NormalPrior, View
+from mpsfm_core.data.errors import InputError
+from mpsfm_core.providers import ProviderContext
+from mpsfm_core.providers.builtin.arrays import check_map, find_file, read_arrays
+from mpsfm_core.providers.builtin.options import (
+    DepthFileOptions,
+    MaskFileOptions,
+    NormalFileOptions,
+)
+
+_MIN_ENCODED_LENGTH = 0.5
+"""A decoded normal is unit up to rounding; mid-grey, which means unknown, has nearly no length."""
+
+
+class DepthFiles:
+    """Depth maps from files, with the declared or stored uncertainty."""
+
+    def __init__(self, options: DepthFileOptions, context: ProviderContext) -> None:
+        self._options = options
+
+    def predict(self, view: View) -> DepthPrior:
+        """The view's depth on the file's grid.
+
+        Raises :class:`InputError` when the file is missing, unreadable, does not cover the view,
+        or has no variance and none is declared.
+        """
+        path = find_file(self._options, view, "depth")
+        arrays = read_arrays(path, "depth")
+        stored = _grayscale(path, arrays["depth"])
+        check_map(path, stored, view, 1)
+        depth = stored.astype(np.float64) * self._options.scale
+        valid = _optional(path, arrays, "valid", view)
+        variance = self._variance(path, depth, arrays, view)
+        return DepthPrior.from_arrays(depth, variance, valid, metric=self._options.metric)
+
+    def _variance(
+        self, path: Path, depth: NDArray[Any], arrays: dict[str, NDArray[Any]], view: View
+    ) -> NDArray[Any]:
+        options = self._options
+        stored = _optional(path, arrays, "variance", view)
+        if options.variance is not None:
+            path = find_file(options.variance, view, "depth variance")
+            stored = read_arrays(path, "variance")["variance"]
+            check_map(path, stored, view, 1)
+        if stored is None and options.relative_std is None and options.std_floor == 0:
+            raise InputError(
+                f"{path} has no variance: declare how good the depth is, for example with "
+                f"depth.options.relative_std=0.02"
+            )
+        if stored is not None and stored.shape != depth.shape:
+            raise InputError(f"{path}: variance {stored.shape} and depth {depth.shape} differ")
+        with np.errstate(invalid="ignore"):
+            variance = np.maximum(
+                ((options.relative_std or 0.0) * depth) ** 2, options.std_floor**2
+            )
+            if stored is not None:
+                variance = np.maximum(variance, stored.astype(np.float64) * options.scale**2)
+        return variance
+
+
+class NormalFiles:
+    """Normal maps from files."""
+
+    def __init__(self, options: NormalFileOptions, context: ProviderContext) -> None:
+        self._options = options
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        """The view's normals on the file's grid.
+
+        Raises :class:`InputError` when the file is missing, unreadable or does not cover the
+        view.
+        """
+        path = find_file(self._options, view, "normals")
+        arrays = read_arrays(path, "normals")
+        normals = _decoded(arrays["normals"])
+        check_map(path, normals, view, 3)
+        if self._options.frame == "opengl":
+            normals = normals * np.array([1.0, -1.0, -1.0])
+        with np.errstate(invalid="ignore"):
+            usable = np.linalg.norm(normals, axis=-1) > _MIN_ENCODED_LENGTH
+        valid = _optional(path, arrays, "valid", view)
+        if valid is not None:
+            usable &= valid.astype(np.bool_)
+        variance = _optional(path, arrays, "variance", view)
+        if variance is None and self._options.std_deg is not None:
+            variance = np.full(usable.shape, np.radians(self._options.std_deg) ** 2)
+        return NormalPrior.from_arrays(normals, variance, usable, camera=view.camera)
+
+
+class MaskFiles:
+    """Masks from files, on a grid of any size that covers the view."""
+
+    def __init__(self, options: MaskFileOptions, context: ProviderContext) -> None:
+        self._options = options
+
+    def mask(self, view: View) -> Bool:
+        """(H, W) bool, True where the pixel may be used; the nearest pixel of the file counts.
+
+        Raises :class:`InputError` when the file is missing, unreadable or does not cover the
+        view.
+        """
+        path = find_file(self._options, view, "mask")
+        values = read_arrays(path, "mask")["mask"]
+        allowed = (values.any(axis=-1) if values.ndim == 3 else values != 0) != self._options.invert
+        check_map(path, allowed, view, 1)
+        resized = cv2.resize(
+            allowed.astype(np.uint8), view.camera.size, interpolation=cv2.INTER_NEAREST_EXACT
+        )
+        return np.asarray(resized > 0)
+
+
+def _grayscale(path: Path, stored: NDArray[Any]) -> NDArray[Any]:
+    """A depth map that some program wrote as gray RGB; colours are no depth."""
+    if stored.ndim == 3 and stored.shape[2] == 3:
+        if (stored == stored[..., :1]).all():
+            return np.asarray(stored[..., 0])
+        raise InputError(f"{path} is a colour image; depth has one channel")
+    return stored
+
+
+def _optional(
+    path: Path, arrays: dict[str, NDArray[Any]], name: str, view: View
+) -> NDArray[Any] | None:
+    values = arrays.get(name)
+    if values is not None:
+        check_map(path, values, view, 1)
+    return values
+
+
+def _decoded(stored: NDArray[Any]) -> NDArray[Any]:
+    """Normals from their encoding as whole numbers; numbers with a fraction are not encoded."""
+    if np.issubdtype(stored.dtype, np.unsignedinteger):
+        return stored.astype(np.float64) / np.iinfo(stored.dtype).max * 2 - 1
+    return stored.astype(np.float64)

@@ -1,0 +1,160 @@
+"""Normals of planes fitted to the depth prior."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from mpsfm_core.data import Bool, DepthPrior, Float64, NormalPrior, PinholeCamera, View
+from mpsfm_core.data.errors import ProviderError
+from mpsfm_core.geometry import pixel_centers, rays
+from mpsfm_core.providers import ProviderContext
+from mpsfm_core.providers.builtin.options import FromDepthOptions
+
+_MIN_SUPPORT = 0.5
+"""Share of a window's pixels that must be valid."""
+_MIN_SPREAD = 1e-3
+"""Determinant over squared trace of the pixels' covariance: 1/4 for a square, 0 on a line."""
+_NOISE_MARGIN = 6.0
+"""Standard deviations of the map's own roughness that no edge hides in."""
+_VARIANCE_RANGE = (1e-12, np.pi**2)
+_MEDIAN_BEND = 1.052
+"""Median of the larger of two independent absolute errors of std 1."""
+_BEND_NOISE = np.sqrt(1.5)
+"""Std of ``w1 - (w0 + w2) / 2`` for independent errors of std 1."""
+
+
+class FromDepth:
+    """Least-squares planes in a window around each pixel, on the grid of the depth map.
+
+    The plane ``g . X = 1`` has the inverse depth ``1 / z = g . (x, y, 1)`` along the ray
+    ``(x, y, 1)``: it is linear, so ``g`` comes from a linear fit of the inverse depth, and the
+    normal is ``-g / |g|``. Windows shrink until they hold no depth edge.
+
+    Uncertainty. Errors of a depth map are smooth over many pixels (a network bends a wall, it does
+    not roughen it), so differences of neighbours are far better than independent errors of the
+    declared size would allow. An error of relative std ``s`` that varies over an angle of ``a``
+    radians tilts a surface by about ``s / a``; ``slope_std`` is ``1 / a``. The residuals of the
+    fit add what is rough, with one independent error a pixel.
+    """
+
+    def __init__(self, options: FromDepthOptions, context: ProviderContext) -> None:
+        self._options = options
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        """Normals with variance; invalid at depth edges, holes and the border of the map."""
+        if depth is None:
+            raise ProviderError("from-depth needs a depth prior with its variance")
+        return fit_normals(view.camera, depth, self._options)
+
+
+def fit_normals(camera: PinholeCamera, depth: DepthPrior, options: FromDepthOptions) -> NormalPrior:
+    """What :class:`FromDepth` predicts for a depth map that covers the view of a camera.
+
+    Raises :class:`ProviderError` when the map has no variance.
+    """
+    if depth.variance is None:
+        raise ProviderError("from-depth needs a depth prior with its variance")
+    rows, columns = depth.shape
+    xy = rays(camera.resized(columns, rows), pixel_centers(columns, rows))[..., :2]
+    inverse = 1.0 / np.where(depth.valid, depth.depth, 1.0).astype(np.float64)
+    bends = _relative_bends(inverse, depth.valid)
+    roughness = float(np.median(bends[depth.valid])) / _MEDIAN_BEND if depth.valid.any() else 0
+    edges = bends > max(options.edge, _NOISE_MARGIN * roughness)
+    noise = (roughness / _BEND_NOISE * inverse) ** 2
+    radius = max(1, round(options.radius * max(rows, columns)))
+    fit = _fit_without_edges(xy, inverse, noise, depth.valid & ~edges, edges, radius)
+    squared_length = np.maximum((fit.plane**2).sum(axis=-1), 1e-300)
+    relative = depth.variance / np.maximum(depth.depth.astype(np.float64), 1e-12) ** 2
+    # A surface seen at a grazing angle is tilted less by the same error along the ray.
+    tilt = options.slope_std**2 * relative * inverse**2
+    return NormalPrior.from_arrays(
+        -fit.plane / np.sqrt(squared_length)[..., None],
+        np.clip((tilt + fit.variance) / squared_length, *_VARIANCE_RANGE),
+        fit.solved,
+        camera=camera,
+    )
+
+
+class _Fit(NamedTuple):
+    """Planes (h, w, 3), variance (h, w) of their vectors across themselves, and where they are."""
+
+    plane: Float64
+    variance: Float64
+    solved: Bool
+
+
+def _relative_bends(inverse: Float64, valid: Bool) -> Float64:
+    """How much the inverse depth of a pixel deviates from the middle of its neighbours along its
+    row or column, relative: 0 on a plane, however slanted. 0 as well where a neighbour is
+    missing."""
+    largest = np.zeros(valid.shape)
+    for axis in (0, 1):
+        w, ok = np.moveaxis(inverse, axis, 0), np.moveaxis(valid, axis, 0)
+        bend = np.abs(w[1:-1] - (w[:-2] + w[2:]) / 2) / w[1:-1]
+        inner = np.moveaxis(largest, axis, 0)[1:-1]
+        np.maximum(inner, np.where(ok[:-2] & ok[1:-1] & ok[2:], bend, 0.0), out=inner)
+    return largest
+
+
+def _fit_without_edges(
+    xy: Float64, inverse: Float64, noise: Float64, usable: Bool, edges: Bool, radius: int
+) -> _Fit:
+    """The fit of each pixel's largest window of radius ``radius``, half of it, ... or 1 without an
+    edge."""
+    best = _fit_planes(xy, inverse, noise, usable, edges, radius)
+    while radius > 1:
+        radius //= 2
+        smaller = _fit_planes(xy, inverse, noise, usable, edges, radius)
+        best = _Fit(
+            np.where(best.solved[..., None], best.plane, smaller.plane),
+            np.where(best.solved, best.variance, smaller.variance),
+            best.solved | smaller.solved,
+        )
+    return best
+
+
+def _fit_planes(
+    xy: Float64, inverse: Float64, noise: Float64, usable: Bool, edges: Bool, radius: int
+) -> _Fit:
+    """Planes ``g`` with ``inverse = g . (x, y, 1)`` fitted to the usable pixels of windows.
+
+    ``noise``: (h, w), the least variance of the inverse depth of one pixel.
+    """
+    x, y = xy[..., 0], xy[..., 1]
+    weight = usable.astype(np.float64)
+    count = _window_sum(weight, radius)
+    safe = np.maximum(count, 1.0)
+
+    def mean(values: Float64) -> Float64:
+        return _window_sum(values * weight, radius) / safe
+
+    mx, my, mw = mean(x), mean(y), mean(inverse)
+    xx, xy_, yy = mean(x * x) - mx**2, mean(x * y) - mx * my, mean(y * y) - my**2
+    xw, yw = mean(x * inverse) - mx * mw, mean(y * inverse) - my * mw
+    determinant = xx * yy - xy_**2
+    window = (2 * radius + 1) ** 2
+    solved = (
+        usable
+        & (count >= max(_MIN_SUPPORT * window, 4))
+        & (_window_sum(np.ones_like(weight), radius) > window - 0.5)
+        & (_window_sum(edges.astype(np.float64), radius) < 0.5)
+        & (determinant > _MIN_SPREAD * (xx + yy) ** 2)
+    )
+    determinant = np.where(solved, determinant, 1.0)
+    p = (yy * xw - xy_ * yw) / determinant
+    q = (xx * yw - xy_ * xw) / determinant
+    residual = (mean(inverse**2) - mw**2 - p * xw - q * yw) * count / np.maximum(count - 3, 1)
+    variance = np.maximum(residual, noise) / safe * (xx + yy) / determinant / 2
+    return _Fit(np.stack([p, q, mw - p * mx - q * my], axis=-1), variance, solved)
+
+
+def _window_sum(values: Float64, radius: int) -> Float64:
+    side = 2 * radius + 1
+    return np.asarray(
+        cv2.boxFilter(
+            values, cv2.CV_64F, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT
+        )
+    )

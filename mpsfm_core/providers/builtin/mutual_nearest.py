@@ -1,0 +1,130 @@
+"""Matching by mutual nearest neighbours of descriptors."""
+
+# mypy: allow-untyped-decorators
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mpsfm_core.data import Features, Float32, Int64, PairMatches, SparseMatches, View
+from mpsfm_core.data.errors import ProviderError
+from mpsfm_core.providers import ProviderContext, required_features
+from mpsfm_core.providers.builtin.options import MutualNearestOptions
+from mpsfm_core.support.jit import kernel
+
+_BLOCK = 128
+"""Rows compared at once: 4 MB for 8192 features on the other side, which caches hold."""
+_ROUNDING = np.float32(1e-5)
+"""Squared distances that differ by less than this share of the descriptors' squared length count
+as equal: they are differences of squares in float32, a hundred times as exact, and the order of
+their sums depends on the processor."""
+
+
+class MutualNearest:
+    """For descriptors of any kind; compares them by Euclidean distance.
+
+    A match's score is ``1 - nearest / second nearest distance`` (the larger ratio of the two
+    directions), a measure of how distinct it is.
+    """
+
+    def __init__(self, options: MutualNearestOptions, context: ProviderContext) -> None:
+        self._options = options
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """Sparse matches, each feature in at most one."""
+        features_a, features_b = required_features(
+            "mutual-nearest matches features", features_a, features_b
+        )
+        a, b = features_a.descriptors, features_b.descriptors
+        if a.shape[1] != b.shape[1] and len(a) and len(b):
+            raise ProviderError(
+                f"descriptors of {view_a.name!r} and {view_b.name!r} differ in dimension"
+            )
+        pairs, nearest, ratio = mutual_nearest(a, b)
+        keep = ratio <= (1.0 if self._options.ratio is None else self._options.ratio)
+        if self._options.max_distance is not None:
+            keep &= nearest <= self._options.max_distance
+        scores = np.clip(1 - ratio, 0, 1).astype(np.float32)
+        return PairMatches(sparse=SparseMatches(pairs[keep], scores[keep]))
+
+
+def mutual_nearest(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
+    """Mutual nearest neighbours (m, 2), their distances (m,), and the larger of the ratios to the
+    second nearest in both directions (m,)."""
+    if not (len(a) and len(b)):
+        empty = np.empty(0, dtype=np.float32)
+        return np.empty((0, 2), dtype=np.int64), empty, empty
+    from_a, from_b = _Nearest.unknown(len(a)), _Nearest.unknown(len(b))
+    transposed = np.ascontiguousarray(np.float32(-2) * b.T)
+    norms_a, norms_b = (np.einsum("ij,ij->i", each, each) for each in (a, b))
+    for start in range(0, len(a), _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        products = a[rows] @ transposed
+        _compare(products, start, norms_a[rows], norms_b, *from_a.of(rows), *from_b)
+    rows_of_b = np.flatnonzero(from_a.best[from_b.best] == np.arange(len(b)))
+    pairs = np.stack([from_b.best[rows_of_b], rows_of_b], axis=1)
+    in_a, in_b = pairs.T
+    nearest = np.maximum(from_a.nearest[in_a], 0)
+    limit = np.maximum(np.minimum(from_a.second[in_a], from_b.second[in_b]), 0)
+    rounding = _ROUNDING * norms_a[in_a]  # equal ones have a ratio of 1
+    ratio = np.sqrt((nearest + rounding) / (limit + rounding))
+    return pairs, np.sqrt(nearest), ratio
+
+
+class _Nearest(NamedTuple):
+    """Of each row: the nearest row of the other side, the first of equal ones, its squared distance
+    and that of the second nearest (infinite where there is none)."""
+
+    best: Int64
+    nearest: Float32
+    second: Float32
+
+    @classmethod
+    def unknown(cls, count: int) -> _Nearest:
+        far = np.full(count, np.inf, np.float32)
+        return cls(np.zeros(count, np.int64), far, far.copy())
+
+    def of(self, rows: slice) -> _Nearest:
+        """Views of some rows."""
+        return _Nearest(self.best[rows], self.nearest[rows], self.second[rows])
+
+
+@kernel()
+def _compare(
+    products: Float32,
+    start: int,
+    norms_a: Float32,
+    norms_b: Float32,
+    best_of_a: Int64,
+    nearest_of_a: Float32,
+    second_of_a: Float32,
+    best_of_b: Int64,
+    nearest_of_b: Float32,
+    second_of_b: Float32,
+) -> None:
+    """Take a block of ``-2 a b`` (n, m), of rows of a from ``start`` on, into what is known of
+    these rows (n,) and of those of b (m,)."""
+    for i in range(len(norms_a)):
+        best, nearest, second = 0, np.float32(np.inf), np.float32(np.inf)
+        for j in range(len(norms_b)):
+            distance = products[i, j] + norms_a[i] + norms_b[j]
+            if distance < second:
+                if distance < nearest:
+                    best, nearest, second = j, distance, nearest
+                else:
+                    second = distance
+            if distance < second_of_b[j]:
+                if distance < nearest_of_b[j]:
+                    second_of_b[j] = nearest_of_b[j]
+                    best_of_b[j], nearest_of_b[j] = start + i, distance
+                else:
+                    second_of_b[j] = distance
+        best_of_a[i], nearest_of_a[i], second_of_a[i] = best, nearest, second

@@ -1,0 +1,134 @@
+"""What the core brings along: providers that need no weights. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from mpsfm_core.providers import ProviderSpec, hookimpl
+from mpsfm_core.providers.builtin.options import (
+    DepthFileOptions,
+    FromDepthOptions,
+    MaskFileOptions,
+    MutualNearestOptions,
+    NormalFileOptions,
+    SiftOptions,
+)
+from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+
+_LICENSE = "Apache-2.0"
+
+
+@hookimpl
+def mpsfm_providers() -> list[ProviderSpec]:
+    """SIFT, mutual nearest neighbours, priors from files, normals from depth."""
+    return [*_matching(), *_depth(), *_normals(), *_masks()]
+
+
+def _matching() -> list[ProviderSpec]:
+    return [
+        ProviderSpec(
+            kind="features",
+            name="sift",
+            factory="mpsfm_core.providers.builtin.sift:Sift",
+            options=SiftOptions,
+            summary="RootSIFT of COLMAP on the CPU",
+            code_license=_LICENSE,
+            tags=("sift",),
+        ),
+        ProviderSpec(
+            kind="matcher",
+            name="mutual-nearest",
+            factory="mpsfm_core.providers.builtin.mutual_nearest:MutualNearest",
+            options=MutualNearestOptions,
+            capabilities=frozenset({"sparse"}),
+            summary="mutual nearest descriptors with ratio test, for any features",
+            code_license=_LICENSE,
+        ),
+    ]
+
+
+def _depth() -> list[ProviderSpec]:
+    return [
+        ProviderSpec(
+            kind="depth",
+            name="files",
+            factory="mpsfm_core.providers.builtin.files:DepthFiles",
+            options=DepthFileOptions,
+            capabilities=frozenset({"uncached"}),
+            summary="depth maps of a sensor or any network, read from files",
+            code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:depth_files",
+            # The files' uncertainty is declared with them: nothing is added to it.
+            calibration=DepthCalibration(std_scale=1.0, relative_std=0.0, std_floor=0.0),
+        ),
+        ProviderSpec(
+            kind="depth",
+            name="flat",
+            factory="mpsfm_core.providers.builtin.flat:Flat",
+            summary="a plane parallel to the image: no prior at all, for photos with much overlap",
+            code_license=_LICENSE,
+            accuracy="none: it does not look at the photo (a network: pip install mpsfm-compact)",
+            # Ours: with 0.3 to 0.5 the sample scene's poses are the same, with 1.0 they are worse.
+            calibration=DepthCalibration(relative_std=0.5),
+        ),
+        ProviderSpec(
+            kind="depth",
+            name="matcher",
+            factory="mpsfm_core.providers.builtin.delegated_depth:MatcherDepth",
+            capabilities=frozenset({"uncached"}),
+            summary="the depth that the matcher predicts for its pairs (pair-depth)",
+            code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:depth_of_matcher",
+            # Reference: the scale of MASt3R's confidence, and no share of depth.
+            calibration=DepthCalibration(std_scale=0.862, relative_std=0.0),
+        ),
+        ProviderSpec(
+            kind="depth",
+            name="multiview",
+            factory="mpsfm_core.providers.builtin.delegated_depth:MultiViewDepth",
+            capabilities=frozenset({"uncached"}),
+            summary="the depth of the multi-view network, which sees several photos at once",
+            code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:depth_of_multiview",
+        ),
+    ]
+
+
+def _normals() -> list[ProviderSpec]:
+    return [
+        ProviderSpec(
+            kind="normals",
+            name="files",
+            factory="mpsfm_core.providers.builtin.files:NormalFiles",
+            options=NormalFileOptions,
+            capabilities=frozenset({"uncached"}),
+            summary="normal maps read from files",
+            code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:normal_files",
+            calibration=NormalCalibration(std_scale=1.0, std_floor_deg=0.0),
+        ),
+        ProviderSpec(
+            kind="normals",
+            name="from-depth",
+            factory="mpsfm_core.providers.builtin.from_depth:FromDepth",
+            options=FromDepthOptions,
+            capabilities=frozenset({"needs-depth", "variance", "intrinsics-aware"}),
+            summary="normals of planes fitted to the depth prior",
+            code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:from_depth",
+            calibration=NormalCalibration(std_scale=1.0, std_floor_deg=1.0),
+        ),
+    ]
+
+
+def _masks() -> list[ProviderSpec]:
+    return [
+        ProviderSpec(
+            kind="mask",
+            name="files",
+            factory="mpsfm_core.providers.builtin.files:MaskFiles",
+            options=MaskFileOptions,
+            capabilities=frozenset({"uncached"}),
+            summary="masks read from image files",
+            code_license=_LICENSE,
+            contract="mpsfm_core.testing.builtin_contracts:mask_files",
+        ),
+    ]

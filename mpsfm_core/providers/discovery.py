@@ -1,0 +1,247 @@
+"""Guarded loading of plugins: whatever one does wrong becomes a reason, never an exception.
+
+Importing a plugin and asking it for its providers runs foreign code, so both happen in a thread
+of their own with a time limit. A thread cannot be killed: a plugin that hangs stays behind as a
+daemon thread, and the process goes on without it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import json
+import logging
+import os
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Collection, Iterator
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any
+
+import pluggy
+
+from mpsfm_core.data.errors import did_you_mean
+from mpsfm_core.data.options import Options
+from mpsfm_core.providers import (
+    API_VERSION,
+    CAPABILITIES,
+    ENTRY_POINT_GROUP,
+    KINDS,
+    Hooks,
+    ProviderSpec,
+)
+
+_log = logging.getLogger(__name__)
+_NAME = re.compile(r"[a-z0-9]+([._-][a-z0-9]+)*")
+_REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """What an entry point gave: its object and what it returned, or why it gave nothing."""
+
+    name: str
+    distribution: str
+    version: str
+    module: object = None
+    specs: tuple[object, ...] = ()
+    hooks: tuple[str, ...] = ()
+    """Names of the hooks it implements, without the prefix ``mpsfm_``."""
+    fault: str = ""
+    hint: str = ""
+
+
+def new_manager() -> pluggy.PluginManager:
+    """A plugin manager that knows our hooks and no plugin."""
+    manager = pluggy.PluginManager("mpsfm")
+    manager.add_hookspecs(Hooks)
+    return manager
+
+
+def installed_plugins(
+    timeout_s: float, crashing: Collection[tuple[str, str]] = ()
+) -> Iterator[Plugin]:
+    """Load every entry point of the group ``mpsfm.plugins``, in the order of their names.
+
+    ``crashing``: (name, module) of those that are not loaded: see :func:`crashing_plugins`.
+    """
+    entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
+    for entry in sorted(entries, key=lambda e: (_distribution(e)[0], e.name)):
+        name, version = _distribution(entry)
+        if (entry.name, entry.value) in crashing:
+            hint = f"reinstall or uninstall {name}"
+            fault = "ends the whole process when it is loaded"
+            yield Plugin(entry.name, name, version, fault=fault, hint=hint)
+        else:
+            yield _load(entry, name, version, timeout_s)
+
+
+def crashing_plugins(timeout_s: float) -> set[tuple[str, str]]:
+    """(name, module) of the plugins that end the process in which they are loaded.
+
+    Another process says of each which it is about to load: the last is the one that ended it.
+    """
+    entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
+    left = {(entry.name, entry.value) for entry in entries}
+    crashing: set[tuple[str, str]] = set()
+    while left:
+        command = [sys.executable, "-c", _TRIAL, json.dumps(sorted(left)), str(timeout_s)]
+        ended = subprocess.run(
+            command, env=same_path(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=False
+        )
+        named = [line for line in ended.stdout.decode().splitlines() if line.startswith("[")]
+        if ended.returncode >= 0 or not named:
+            break
+        name, module = json.loads(named[-1])
+        left.discard((name, module))
+        crashing.add((name, module))
+    return crashing
+
+
+_TRIAL = """
+import json, os, sys
+from mpsfm_core import discovery
+wanted = [tuple(pair) for pair in json.loads(sys.argv[1])]
+for entry in discovery.metadata.entry_points(group=discovery.ENTRY_POINT_GROUP):
+    if (entry.name, entry.value) in wanted:
+        os.write(1, (json.dumps([entry.name, entry.value]) + chr(10)).encode())
+        discovery._load(entry, entry.name, "", float(sys.argv[2]))
+os._exit(0)
+"""
+
+
+def same_path() -> dict[str, str]:
+    """An environment in which another interpreter finds the modules that this one finds."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+def inspect_plugin(module: object, name: str, distribution: str, version: str) -> Plugin:
+    """Ask an imported plugin for what it has; raises what the plugin raises."""
+    manager = new_manager()
+    manager.register(module, name)
+    callers = manager.get_hookcallers(module) or []
+    if not callers:
+        raise TypeError(f"{name!r} is a {type(module).__name__} without any mpsfm hook")
+    answers = manager.hook.mpsfm_providers()
+    answer = answers[0] if answers else ()
+    if not isinstance(answer, (list, tuple)):
+        raise TypeError(f"mpsfm_providers returned {type(answer).__name__}, not a list")
+    known = [caller for caller in callers if caller.has_spec()]
+    unknown = [caller.name for caller in callers if not caller.has_spec()]
+    fault = ""
+    if unknown:
+        near = did_you_mean(unknown[0], (n for n in vars(Hooks) if n.startswith("mpsfm_")))
+        fault = f"implements the unknown hook {unknown[0]!r}, which nobody calls{near}"
+    hooks = tuple(caller.name.removeprefix("mpsfm_") for caller in known)
+    return Plugin(name, distribution, version, module, tuple(answer), hooks, fault)
+
+
+def spec_fault(spec: ProviderSpec) -> tuple[str, str]:
+    """Why a provider cannot be used, and what to do about it; two empty texts when it can."""
+    if not isinstance(spec.api_version, int) or spec.api_version > API_VERSION:
+        return (
+            f"is made for plugin API {spec.api_version}, this core has {API_VERSION}",
+            "pip install --upgrade mpsfm-core",
+        )
+    try:
+        fault = _malformed(spec)
+    except Exception as error:  # fields of types that nobody thought of
+        fault = str(error)
+    if fault:
+        return f"has a wrong specification: {fault}", "tell the plugin's author"
+    missing = [name for name in spec.requires if not _installed(name)]
+    if missing:
+        hint = spec.install_hint or f"pip install {' '.join(missing)}"
+        return f"needs {', '.join(missing)}, not installed", hint
+    return "", ""
+
+
+def _distribution(entry: metadata.EntryPoint) -> tuple[str, str]:
+    """Name and version; an entry point with damaged metadata still gets a row in the list."""
+    try:
+        if entry.dist is not None:
+            return str(entry.dist.name), str(entry.dist.version)
+    except Exception as error:
+        _log.info("no metadata for the entry point %s: %s", entry.name, error)
+    return "unknown distribution", "unknown"
+
+
+def _load(entry: metadata.EntryPoint, distribution: str, version: str, timeout_s: float) -> Plugin:
+    outcome: list[Plugin | BaseException] = []
+
+    def work() -> None:
+        try:
+            outcome.append(inspect_plugin(entry.load(), entry.name, distribution, version))
+        except BaseException as error:  # SystemExit in a plugin must not end the program either
+            outcome.append(error)
+
+    thread = threading.Thread(target=work, name=f"mpsfm plugin {entry.name}", daemon=True)
+    with redirect_stdout(sys.stderr):  # what a plugin prints must not get into a command's output
+        thread.start()
+        thread.join(timeout_s)
+    if not outcome:
+        fault = f"did not load within {timeout_s:g} s"
+        _log.warning("plugin %r of %s %s %s", entry.name, distribution, version, fault)
+        hint = f"pip uninstall {distribution}, or raise MPSFM_PLUGIN_TIMEOUT_S"
+        return Plugin(entry.name, distribution, version, fault=fault, hint=hint)
+    result = outcome[0]
+    if isinstance(result, Plugin):
+        return result
+    fault = f"fails to load: {type(result).__name__}: {result}"
+    hint = _hint(result, distribution)
+    return Plugin(entry.name, distribution, version, fault=fault, hint=hint)
+
+
+def _hint(error: BaseException, distribution: str) -> str:
+    """What to do about a plugin whose loading ended with an error."""
+    absent = (error.name or "") if isinstance(error, ImportError) else ""
+    if absent.partition(".")[0] == "mpsfm_core" or "ProviderSpec.__init__()" in str(error):
+        return f"pip install --upgrade mpsfm-core, or uninstall {distribution}"  # a newer API's
+    if absent and isinstance(error, ModuleNotFoundError):
+        return f"pip install the package of module {absent!r}, or uninstall {distribution}"
+    return f"reinstall or uninstall {distribution}"
+
+
+def _malformed(spec: ProviderSpec) -> str:
+    """The first rule the specification breaks, or an empty text."""
+    if spec.kind not in KINDS:
+        return f"unknown kind {spec.kind!r}{did_you_mean(str(spec.kind), KINDS)}"
+    name = spec.name
+    if isinstance(name, str) and callable(spec.factory):
+        name = name.partition("@")[0]  # what follows is the environment that it lives in
+    if not (isinstance(name, str) and _NAME.fullmatch(name)):
+        return f"name {spec.name!r} is not made of lower-case letters, digits and - . _"
+    if not (callable(spec.factory) or _is_reference(spec.factory)):
+        return f"factory {spec.factory!r} does not look like 'package.module:Class'"
+    is_model = inspect.isclass(spec.options) and issubclass(spec.options, Options)
+    if not (spec.options is None or is_model or _is_reference(spec.options)):
+        return "options is neither a subclass of Options nor 'package.module:Class'"
+    if not (spec.contract is None or callable(spec.contract) or _is_reference(spec.contract)):
+        return f"contract {spec.contract!r} does not look like 'package.module:function'"
+    for name in ("capabilities", "requires", "tags"):
+        values = getattr(spec, name)
+        if isinstance(values, str) or not all(isinstance(value, str) for value in values):
+            return f"{name} must be a tuple or set of texts"
+    weights: Any = spec.weights
+    if not (callable(weights) or isinstance(weights, (tuple, list))):
+        return "weights is neither a tuple of files nor a function of the options"
+    unknown = sorted(set(spec.capabilities) - set(CAPABILITIES))
+    if unknown:
+        return f"unknown capability {unknown[0]!r}{did_you_mean(unknown[0], CAPABILITIES)}"
+    return ""
+
+
+def _is_reference(value: Any) -> bool:
+    return isinstance(value, str) and _REFERENCE.fullmatch(value) is not None
+
+
+def _installed(name: str) -> bool:
+    """Whether a package can be found; only its top level is looked up, as that imports nothing."""
+    try:
+        return importlib.util.find_spec(name.partition(".")[0]) is not None
+    except (ImportError, ValueError):
+        return False

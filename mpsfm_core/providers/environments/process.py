@@ -1,0 +1,222 @@
+"""A worker process of another environment, and what is said when it is lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import tempfile
+import threading
+import weakref
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from mpsfm_core.data import errors
+from mpsfm_core.data.errors import DataError, MpsfmError, ProviderError
+from mpsfm_core.data.options import SettingProblem, SettingsError
+from mpsfm_core.providers import API_VERSION
+from mpsfm_core.providers.environments.channel import Channel, Closed, memory_folder
+
+PROTOCOL = 2
+"""Of the messages; both sides must have the same."""
+
+_MODULE = "mpsfm_core.providers.environments.worker"
+_START_S = 120.0
+"""For the process to begin and import the core, on a cold network disk."""
+_NEEDED_BYTES = 256 << 20
+"""Room in memory for the messages of a worker; else they go through the temporary folder."""
+_LENT = 2
+"""Answers that are looked into at once: one more is asked for while one is put away. They hold
+their memory as long as the worker lives."""
+_ENDING_S = 5.0
+_OURS: Mapping[str, type[MpsfmError]] = MappingProxyType(
+    {
+        name: getattr(errors, name)
+        for name in ("InputError", "ConfigError", "ProviderError", "WeightsError", "OutputError")
+    }
+)
+
+
+class WorkerLost(RuntimeError):
+    """The worker crashed or did not answer; the next call starts another one."""
+
+
+class Worker:
+    """A running worker process.
+
+    ``python``: the interpreter. ``label``: of the environment, for messages. Raises
+    :class:`~mpsfm_core.data.errors.ProviderError` when it does not start, or has another version of
+    the protocols. """
+
+    def __init__(self, python: Path, label: str) -> None:
+        self._label = label
+        self._folder = memory_folder(_NEEDED_BYTES)
+        folder = Path(self._folder.name)
+        self._log = folder / "stderr"
+        with self._log.open("wb") as log:
+            self._process = subprocess.Popen(
+                [str(python), "-m", _MODULE, str(folder)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env=_environment(),
+                start_new_session=os.name == "posix",
+            )
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._channel = Channel(
+            self._process.stdout, self._process.stdin, folder, "main", "worker", lent=_LENT
+        )
+        self._lock = threading.Lock()
+        self._end = weakref.finalize(self, _end, self._process, self._folder)
+        try:
+            greeting = self._receive(_START_S, "did not start")
+        except WorkerLost as error:
+            raise ProviderError(f"{error}; 'mpsfm env create' makes it anew") from error
+        versions = greeting["protocol"], greeting["api"]
+        if versions != (PROTOCOL, API_VERSION):
+            self.close()
+            raise ProviderError(
+                f"{label} has mpsfm-core {greeting['core']}, whose protocols are of another "
+                f"version ({versions} there, {(PROTOCOL, API_VERSION)} here): make it anew with "
+                f"'mpsfm env create'"
+            )
+
+    @property
+    def alive(self) -> bool:
+        """Whether it can still be asked."""
+        return self._process.poll() is None
+
+    def ask(
+        self,
+        request: Mapping[str, Any],
+        timeout_s: float,
+        resolve_weights: Callable[[str, str | None], Path] | None = None,
+    ) -> Any:
+        """The answer to a request.
+
+        ``resolve_weights``: asked for the files that the worker wants meanwhile. Raises what the
+        provider raises where that is an error of ours, RuntimeError with its type and text where
+        not, and :class:`WorkerLost` when there is no answer.
+        """
+        with self._lock:
+            self._send(dict(request))
+            while True:
+                answer = self._receive(timeout_s, f"did not answer within {timeout_s:g} s")
+                if "resolve" in answer:
+                    self._send(_resolved(resolve_weights, *answer["resolve"]))
+                elif "error" in answer:
+                    raise error_of(answer["error"])
+                else:
+                    return answer["value"]
+
+    def close(self) -> None:
+        """End the process."""
+        self._channel.close()
+        self._end()
+
+    def _send(self, message: Any) -> None:
+        try:
+            self._channel.send(message)
+        except Closed as error:
+            raise self._lost("") from error
+
+    def _receive(self, timeout_s: float, late: str) -> Any:
+        """The next message; a worker that takes too long is killed, which ends the wait."""
+        overdue: list[bool] = []
+
+        def kill() -> None:
+            overdue.append(True)
+            _kill(self._process)
+
+        timer = threading.Timer(timeout_s, kill)
+        timer.daemon = True
+        timer.start()
+        try:
+            return self._channel.receive()
+        except Closed as error:
+            raise self._lost(late if overdue else "") from error
+        finally:
+            timer.cancel()
+
+    def _lost(self, late: str) -> WorkerLost:
+        try:
+            code = self._process.wait(_ENDING_S)
+        except subprocess.TimeoutExpired:
+            _kill(self._process)
+            code = self._process.wait()
+        reason = late or _ended(code)
+        lines = self._log.read_text(errors="replace").strip().splitlines()
+        last = f"; its last words: {lines[-1].strip()}" if lines else ""
+        self.close()
+        return WorkerLost(f"{self._label} {reason}{last}")
+
+
+def _ended(code: int) -> str:
+    if code == -getattr(signal, "SIGKILL", 9):
+        return "was killed from outside, most likely because memory ran out"
+    if code < 0:
+        return f"crashed ({signal.Signals(-code).name})"
+    return f"ended by itself (exit code {code})"
+
+
+def _resolved(
+    resolve: Callable[[str, str | None], Path] | None, uri: str, sha256: str | None
+) -> dict[str, Any]:
+    try:
+        if resolve is None:
+            raise ProviderError(f"nobody here can fetch {uri}")
+        return {"value": resolve(uri, sha256)}
+    except MpsfmError as error:
+        return {"error": described(error)}
+
+
+def described(error: BaseException) -> dict[str, Any]:
+    """An error as a message of the protocol; :func:`error_of` makes one of it again."""
+    kind = next((k.__name__ for k in type(error).__mro__ if k.__name__ in _OURS), "")
+    if isinstance(error, SettingsError):
+        problems = [[list(p.path), p.text, p.missing] for p in error.problems]
+        return {"settings": problems, "text": str(error)}
+    if isinstance(error, DataError):
+        return {"field": error.field, "rule": error.rule, "text": str(error)}
+    text = str(error) if isinstance(error, MpsfmError) else f"{type(error).__name__}: {error}"
+    return {"kind": kind, "text": text}
+
+
+def error_of(message: Mapping[str, Any]) -> Exception:
+    """The error that a message describes."""
+    if "settings" in message:
+        problems = (
+            SettingProblem(tuple(p), text, missing) for p, text, missing in message["settings"]
+        )
+        return SettingsError(tuple(problems))
+    if "field" in message:
+        return DataError(message["field"], message["rule"])
+    return _OURS.get(message["kind"], RuntimeError)(message["text"])
+
+
+def _environment() -> dict[str, str]:
+    """The worker finds its own packages: what this process adds to its search path stays here."""
+    return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """The process, and what it may have started."""
+    if process.poll() is None:
+        if os.name == "posix":
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+
+
+def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]) -> None:
+    _kill(process)
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            try:
+                pipe.close()
+            except OSError:  # what could not be written any more
+                continue
+    folder.cleanup()

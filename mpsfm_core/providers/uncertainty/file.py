@@ -1,0 +1,120 @@
+"""Calibrations as files: the values, and where they come from.
+
+A file is YAML or JSON, either the bare values of a calibration or a :class:`CalibrationFile` as
+``mpsfm calibrate`` writes it. A configuration names it (``depth.calibration: FILE``); a plugin
+ships it and announces ``ProviderSpec(calibration=load_calibration(path))``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from mpsfm_core.data.errors import ConfigError
+from mpsfm_core.data.options import Options, SettingsError, parse_settings
+from mpsfm_core.providers.uncertainty.model import Calibration, DepthCalibration, NormalCalibration
+from mpsfm_core.support.files import write_file
+from mpsfm_core.support.format_versions import VERSION, check_version
+from mpsfm_core.support.yaml_text import parse_yaml, write_yaml
+
+FORMAT = 1
+"""Of calibration files."""
+
+CalibratedKind = Literal["depth", "normals"]
+CALIBRATIONS: Mapping[str, type[DepthCalibration] | type[NormalCalibration]] = {
+    "depth": DepthCalibration,
+    "normals": NormalCalibration,
+}
+
+
+class Provenance(Options):
+    """Where a calibration comes from."""
+
+    provider: str
+    distribution: str
+    """Package and version that the provider comes from."""
+    wrappers: tuple[str, ...] = ()
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Of the provider; of files only the names."""
+    weights: dict[str, str] = Field(default_factory=dict)
+    """SHA-256 of each file that the provider loaded, by name or URI."""
+    truth: str
+    """What the prior was compared with."""
+    data: str
+    """Which images."""
+    date: str
+    """Of the fit, ISO 8601."""
+    core: str
+    """Version of mpsfm-core."""
+    images: int
+    """Images that the values were fitted to."""
+    pixels: int
+    intervals_95: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    metrics: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """``before`` and ``after``: coverage, z_mad, nll and ause on images that were held out."""
+    warnings: tuple[str, ...] = ()
+
+
+class CalibrationFile(Options):
+    """A calibration with its provenance."""
+
+    kind: CalibratedKind
+    calibration: DepthCalibration | NormalCalibration
+    provenance: Provenance
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_kind(cls, values: Any) -> Any:
+        """The kind says which class the values have; both share names."""
+        if isinstance(values, Mapping) and isinstance(values.get("calibration"), Mapping):
+            model = CALIBRATIONS.get(values.get("kind", ""))
+            if model is not None:
+                values = {**values, "calibration": model.model_validate(values["calibration"])}
+        return values
+
+    def write(self, path: Path) -> None:
+        """Write the file: JSON if it is named so, else YAML."""
+        content = {VERSION: FORMAT, **self.model_dump(mode="json")}
+        is_json = path.suffix == ".json"
+        text = json.dumps(content, indent=2) + "\n" if is_json else write_yaml(content)
+        write_file(path, text)
+
+
+def read_values(path: Path, kind: str) -> Mapping[str, Any]:
+    """The unchecked values in a calibration file for a kind of provider.
+
+    Raises:
+        ConfigError: the file cannot be read, holds no mapping, is of a newer version, or is for
+            another kind.
+    """
+    try:
+        content = parse_yaml(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"calibration file {str(path)!r} cannot be read: {error}") from error
+    if not isinstance(content, Mapping):
+        raise ConfigError(f"{path} does not hold a mapping")
+    check_version(content, FORMAT, path, ConfigError)
+    if "provenance" not in content:
+        return {key: value for key, value in content.items() if key != VERSION}
+    if content.get("kind") != kind:
+        raise ConfigError(f"{path} is a calibration of {content.get('kind')}, not of {kind}")
+    values = content.get("calibration")
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{path}: calibration: must be a mapping")
+    return values
+
+
+def load_calibration(path: Path, kind: CalibratedKind = "depth") -> Calibration:
+    """The calibration in a file.
+
+    Raises:
+        ConfigError: as :func:`read_values`, or a value is wrong.
+    """
+    try:
+        return parse_settings(CALIBRATIONS[kind], read_values(path, kind))
+    except SettingsError as error:
+        raise ConfigError(f"{path}: {error}") from error

@@ -1,0 +1,71 @@
+"""What the checks of maps share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, NormalPrior
+from mpsfm_core.data.errors import DataError
+from mpsfm_core.geometry import resize_map
+from mpsfm_core.testing.case import Case
+from mpsfm_core.testing.examples import Example, Truth
+from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+
+STD_FACTOR = 1.25
+"""Between the std found and the one reported; a std of 0.25 m taken for a variance is 2 off."""
+VALIDITY_TOLERANCE = 0.05
+"""Share of pixels away from edges, for networks whose padding or blur costs some."""
+
+
+def accept_std(variance: Float32, expected_std: Float64) -> str:
+    """Raise ``CheckFailed`` unless the variance is the square of what was reported."""
+    factor = float(np.median(np.sqrt(variance.astype(np.float64)) / expected_std))
+    if 1 / STD_FACTOR < factor < STD_FACTOR:
+        return f"std {factor:.3f} times the reported one"
+    if 1 / STD_FACTOR < float(np.median(variance / expected_std)) < STD_FACTOR:
+        raise CheckFailed("the variance is the std itself: it has to be squared")
+    raise CheckFailed(f"the std is {factor:.2g} times what the stand-in reports")
+
+
+def accept_validity(valid: Bool, truth: Truth) -> str:
+    """Raise ``CheckFailed`` where valid pixels show no surface, or surfaces are not valid."""
+    empty, full = truth.edge_free & ~truth.valid, truth.smooth
+    if not (empty.any() and full.any()):
+        raise CheckSkipped("the map is too coarse to tell surfaces from sky")
+    wrong, lost = float(valid[empty].mean()), float(1 - valid[full].mean())
+    if wrong > VALIDITY_TOLERANCE:
+        raise CheckFailed(f"{wrong:.0%} of the pixels without any surface are called valid")
+    if lost > VALIDITY_TOLERANCE:
+        raise CheckFailed(f"{lost:.0%} of the pixels with a surface are not valid")
+    return f"{wrong:.1%} wrongly valid, {lost:.1%} lost"
+
+
+def accept_calibration(case: Case, prior: DepthPrior | NormalPrior) -> None:
+    """Raise ``CheckFailed`` if the declared calibration loses the variance or turns it round."""
+    calibration = case.calibration()
+
+    def total(given: DepthPrior | NormalPrior, scale: float = 1.0) -> Float32:
+        changed = {"std_scale": scale * calibration.std_scale}
+        try:
+            with np.errstate(over="ignore"):
+                applied = calibration.model_copy(update=changed).apply(given)
+        except DataError as error:
+            raise CheckFailed(f"after calibration, {error}") from error
+        values: Float32 = applied.variance[given.valid]
+        return values
+
+    if not (total(prior, 2.0) >= total(prior)).all():
+        raise CheckFailed("a larger std_scale gives a smaller variance")
+    if prior.variance is not None and calibration.use_network_variance and prior.valid.any():
+        larger = replace(prior, variance=prior.variance * np.float32(100))
+        if not (total(larger) > total(prior)).any():
+            raise CheckFailed("a ten times larger network std changes nothing after calibration")
+
+
+def painted_backwards(example: Example, shape: tuple[int, int]) -> NDArray[Any]:
+    """The painted image with its channels in the wrong order, on the grid of a map."""
+    return resize_map(example.view.image[..., ::-1], shape[1], shape[0])

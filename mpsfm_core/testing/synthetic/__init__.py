@@ -1,0 +1,1 @@
+"""Synthetic scenes with exact cameras, depth, normals and matches."""

@@ -1,0 +1,234 @@
+"""Halls with boxes, of any number of views: photo sets of the everyday kind, with many matches.
+
+Views stand on a grid and turn slowly from one to the next, so that each overlaps well with those
+around it. Keypoints are noisy and some matches are wrong, as they are after verification.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import (
+    Bool,
+    DepthPrior,
+    Float32,
+    Float64,
+    Int64,
+    MappingProblem,
+    PinholeCamera,
+    Pose,
+    VerifiedPair,
+)
+from mpsfm_core.geometry import camera_center
+from mpsfm_core.testing.synthetic.problems import Noise, verified_pair, view_of
+from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Box, Surface, look_at, project
+
+CAMERA = PinholeCamera(640, 480, 420.0, 420.0, 320.0, 240.0)
+SPACING = 1.5
+"""Metres between the views of the grid."""
+TURN_DEG = 20.0
+"""That a view is turned from its neighbours on the grid."""
+REACH = 2.6
+"""Metres between two views up to which they are matched."""
+MAX_MATCH_TURN_DEG, MAX_MATCH_ZOOM = 40.0, 1.8
+"""Between the rays of a point, and between its depths, up to which its keypoints look alike."""
+MIN_MATCHES = 30
+"""Common points that make a pair."""
+
+
+@dataclass(frozen=True)
+class PriorErrors:
+    """Relative errors of depth: ``depth * exp(scale * n + f(x, y) + patch)``.
+
+    ``scale``: std of the error that an image has as a whole. ``field``: std of independent errors
+    on a grid of ``grid`` (columns, rows), interpolated by cubic splines. ``patch``: error in one
+    ellipse of the map, of either sign; ``patch_area``: its share of the map. ``declared``:
+    relative std that the prior declares.
+    """
+
+    scale: float = 0.0
+    field: float = 0.0
+    grid: tuple[int, int] = (8, 6)
+    patch: float = 0.0
+    patch_area: float = 0.1
+    declared: float = 0.01
+
+
+EXACT = PriorErrors()
+HONEST = PriorErrors(scale=0.05, field=0.04, declared=0.06)
+LOCALLY_WRONG = replace(HONEST, patch=0.2)
+QUALITIES = {"exact": EXACT, "honest": HONEST, "locally wrong": LOCALLY_WRONG}
+
+
+class Hall(NamedTuple):
+    """A mapping problem with its true poses, ``cam_from_world`` by image name, and the numbers of
+    the surface points that the keypoints of each image belong to, (n,) each."""
+
+    problem: MappingProblem
+    truth: dict[str, Pose]
+    points: tuple[Int64, ...]
+
+
+def hall_problem(
+    views: int,
+    errors: PriorErrors = EXACT,
+    *,
+    points_per_view: int = 60,
+    map_width: int = 160,
+    keypoint_noise_px: float = 0.7,
+    wrong_matches: float = 0.05,
+    seed: int = 0,
+) -> Hall:
+    """A hall with so many views, whose priors have errors.
+
+    ``points_per_view``: surface points that each view adds; its keypoints are all points it sees.
+    ``wrong_matches``: share of the matches of each pair that join keypoints at random.
+    """
+    rng = np.random.default_rng(seed)
+    poses, scene = hall(views, rng)
+    eyes = np.array([camera_center(pose[:, :3], pose[:, 3]) for pose in poses])
+    parts = [_in_sight(scene, pose) for pose in poses]
+    numbers, pixels = _keypoints(parts, poses, eyes, points_per_view, rng)
+    noise = Noise(keypoints_px=keypoint_noise_px)
+    images = []
+    for i, (pose, xy) in enumerate(zip(poses, pixels, strict=True)):
+        noisy = xy + keypoint_noise_px * rng.normal(size=xy.shape)
+        name = f"view_{i:04d}.png"
+        image = view_of(name, parts[i], CAMERA, pose, noisy, map_width, 0.01, 2.0, noise, rng)
+        depth = _with_errors(image.depth.depth, errors, rng)
+        prior = DepthPrior.from_arrays(depth, (errors.declared * depth) ** 2)
+        images.append(replace(image, depth=prior))
+    pairs = []
+    for a, b in combinations(range(views), 2):
+        _, rows_a, rows_b = np.intersect1d(numbers[a], numbers[b], return_indices=True)
+        if len(rows_a) >= MIN_MATCHES:
+            matches = np.stack([rows_a, rows_b], axis=1)
+            pair = _spoilt(verified_pair(a, b, matches, poses), wrong_matches, rng)
+            pairs.append(_estimated(pair, images[a].keypoints, images[b].keypoints))
+    truth = {
+        image.name: (pose[:, :3], pose[:, 3]) for image, pose in zip(images, poses, strict=True)
+    }
+    return Hall(MappingProblem(tuple(images), tuple(pairs)), truth, tuple(numbers))
+
+
+def hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], AnalyticScene]:
+    """Views on a square grid, and a hall with boxes between them."""
+    side = int(np.ceil(np.sqrt(views)))
+    row, column = np.divmod(np.arange(views), side)
+    # the walk turns at the end of each row, so that consecutive views are neighbours
+    column = np.where(row % 2 == 0, column, side - 1 - column)
+    eyes = SPACING * np.column_stack([column, row, np.full(views, 1.5)])
+    eyes += rng.uniform(-0.1, 0.1, eyes.shape)
+    heading = np.radians(TURN_DEG) * (column + row) + rng.normal(0, 0.05, views)
+    ahead = np.column_stack([np.cos(heading), np.sin(heading), rng.normal(-0.1, 0.05, views)])
+    poses = [look_at(eye, eye + step) for eye, step in zip(eyes, ahead, strict=True)]
+    middle, half = SPACING * (side - 1) / 2, SPACING * (side - 1) / 2 + 2.5
+    surfaces: list[Surface] = [Box((middle, middle, 1.8), (half, half, 1.8))]
+    for x in range(-2, side + 1):
+        for y in range(-2, side + 1):
+            if rng.uniform() < 0.35:
+                size = rng.uniform(0.15, 0.4, 2)
+                height = rng.uniform(0.2, 1.1)
+                at = SPACING * (x + 0.5), SPACING * (y + 0.5), height
+                surfaces.append(Box(at, (*size, height), yaw_deg=float(rng.uniform(0, 90))))
+    return poses, AnalyticScene(tuple(surfaces))
+
+
+def _in_sight(scene: AnalyticScene, pose: Float64) -> AnalyticScene:
+    """The scene without the boxes that lie outside a view, which cannot be seen nor hide."""
+    shell, *boxes = scene.surfaces
+    centers = np.array([box.center for box in boxes if isinstance(box, Box)]).reshape(-1, 3)
+    radii = np.array([np.linalg.norm(box.half_size) for box in boxes if isinstance(box, Box)])
+    local = centers @ pose[:, :3].T + pose[:, 3]
+    slope = np.array(CAMERA.size) / (2 * np.array(CAMERA.params[:2]))
+    beside = np.abs(local[:, :2]) - slope * local[:, 2:]
+    outside = (beside > radii[:, None] * np.hypot(1, slope)).any(axis=1) | (local[:, 2] < -radii)
+    kept = [box for box, out in zip(boxes, outside, strict=True) if not out]
+    return AnalyticScene((shell, *kept))
+
+
+def _keypoints(
+    parts: Sequence[AnalyticScene],
+    poses: Sequence[Float64],
+    eyes: Float64,
+    points_per_view: int,
+    rng: np.random.Generator,
+) -> tuple[list[Int64], list[Float64]]:
+    """Numbers of the points that each view sees, and their pixels."""
+    size = np.array(CAMERA.size, dtype=np.float64)
+    numbers: list[list[Int64]] = [[] for _ in poses]
+    pixels: list[list[Float64]] = [[] for _ in poses]
+    for i, pose in enumerate(poses):
+        seen = parts[i].sample(CAMERA, pose, rng.uniform(2, size - 2, (points_per_view, 2)))
+        for j in map(int, np.flatnonzero(np.linalg.norm(eyes - eyes[i], axis=1) <= REACH)):
+            xy, depth = project(CAMERA, poses[j], seen.points)
+            visible = (depth > 0) & (xy > 0).all(axis=1) & (xy < size).all(axis=1)
+            visible &= _look_alike(seen.points - eyes[i], seen.points - eyes[j])
+            rows = np.flatnonzero(visible)
+            t, _, _ = parts[j].first_hit(eyes[j], seen.points[rows] - eyes[j])
+            rows = rows[np.abs(t - 1) < 1e-6]
+            numbers[j].append(i * points_per_view + rows)
+            pixels[j].append(xy[rows])
+    return [np.concatenate(n) for n in numbers], [np.concatenate(p) for p in pixels]
+
+
+def _look_alike(rays_a: Float64, rays_b: Float64) -> Bool:
+    """Whether points look alike along rays of two views, (m, 3) each."""
+    a, b = np.linalg.norm(rays_a, axis=1), np.linalg.norm(rays_b, axis=1)
+    cosine = (rays_a * rays_b).sum(axis=1) / (a * b)
+    alike: Bool = (cosine > np.cos(np.radians(MAX_MATCH_TURN_DEG))) & (
+        np.maximum(a, b) < MAX_MATCH_ZOOM * np.minimum(a, b)
+    )
+    return alike
+
+
+def _spoilt(pair: VerifiedPair, share: float, rng: np.random.Generator) -> VerifiedPair:
+    """A pair of which a share of the matches join their keypoints in another order."""
+    matches = pair.matches.copy()
+    wrong = rng.choice(len(matches), round(share * len(matches)), replace=False)
+    matches[wrong, 1] = np.roll(matches[wrong, 1], 1)
+    return replace(pair, matches=matches)
+
+
+def _estimated(pair: VerifiedPair, keypoints_a: Float64, keypoints_b: Float64) -> VerifiedPair:
+    """A pair with the relative pose that its noisy matches give."""
+    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=CAMERA.params)
+    found = pycolmap.estimate_essential_matrix(
+        keypoints_a[pair.matches[:, 0]],
+        keypoints_b[pair.matches[:, 1]],
+        camera,
+        camera,
+        pycolmap.RANSACOptions(
+            max_error=2.0, min_num_trials=50, max_num_trials=1000, random_seed=0
+        ),
+    )
+    pose = found["cam2_from_cam1"]
+    return replace(pair, rotation=pose.rotation.matrix(), translation=np.array(pose.translation))
+
+
+def _with_errors(depth: Float32, errors: PriorErrors, rng: np.random.Generator) -> Float32:
+    """A map (h, w) as a network predicts it."""
+    height, width = depth.shape
+    log_factor = errors.scale * rng.normal() + errors.field * _field(depth.shape, errors, rng)
+    axes = np.sqrt(errors.patch_area / np.pi) * np.array([width, height])
+    center = rng.uniform(axes, np.array([width, height]) - axes)
+    sign = rng.choice([-1.0, 1.0])
+    y, x = np.mgrid[:height, :width] + 0.5
+    inside = ((x - center[0]) / axes[0]) ** 2 + ((y - center[1]) / axes[1]) ** 2 < 1
+    log_factor += sign * np.log1p(errors.patch) * inside
+    wrong: Float32 = (depth * np.exp(log_factor)).astype(np.float32)
+    return wrong
+
+
+def _field(shape: tuple[int, ...], errors: PriorErrors, rng: np.random.Generator) -> Float64:
+    """Independent errors of std 1 on the grid of nodes, interpolated to a map's shape (h, w)."""
+    nodes = rng.normal(size=errors.grid[::-1])
+    field: Float64 = cv2.resize(nodes, shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return field

@@ -1,0 +1,221 @@
+"""Two rooms that look alike, joined by a corridor: what fools every matcher.
+
+The rooms lie side by side and have the same walls, door and furniture, but for one or two pieces.
+Each view of one room matches the views of the other as if they were of one room; only the corridor
+and the pieces that differ tell the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from mpsfm_core.data import Bool, DepthPrior, Float64, Int64, MappingProblem, PinholeCamera
+from mpsfm_core.geometry import camera_center, inside, pixel_centers
+from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors, degrade_depth
+from mpsfm_core.testing.synthetic.problems import Noise, verified_pair, view_of
+from mpsfm_core.testing.synthetic.scenes import (
+    AnalyticScene,
+    Box,
+    Sphere,
+    Surface,
+    look_at,
+    project,
+)
+
+SHIFT = np.array([5.2, 0.0, 0.0])
+"""From a point of the first room to its twin in the second, metres."""
+CAMERA = PinholeCamera(640, 480, 400.0, 400.0, 320.0, 240.0)
+MIN_MATCHES = 15
+"""Verified matches that make a pair (COLMAP)."""
+MIN_SIGHT = 0.3
+"""Metres that a view sees somewhere at least: of one that stands inside a piece of furniture all
+keypoints lie within a few pixels of the others."""
+
+
+class SymmetricProblem(NamedTuple):
+    """A mapping problem with true poses (3, 4); ``room``: 0, 1, or -1 in the corridor, per view.
+
+    ``false``: of each pair, whether it matches a view with the twin of what the other sees.
+    """
+
+    problem: MappingProblem
+    poses: list[Float64]
+    room: list[int]
+    false: list[bool]
+
+
+def twin_rooms() -> AnalyticScene:
+    """Rooms of 5 x 4 x 2.6 m, x in [0, 5] and [5.2, 10.2], and a corridor at y < 0."""
+    shell = Box((5.1, 1.2, 1.3), (5.1, 2.8, 1.3))
+    walls = [
+        _block((5.0, 0.0, 0.0), (5.2, 4.0, 2.6)),
+        _block((0.0, -0.1, 0.0), (1.0, 0.0, 2.6)),
+        _block((2.6, -0.1, 0.0), (6.2, 0.0, 2.6)),
+        _block((7.8, -0.1, 0.0), (10.2, 0.0, 2.6)),
+    ]
+    lintels = [_block((x, -0.1, 2.2), (x + 1.6, 0.0, 2.6)) for x in (1.0, 6.2)]
+    same: list[Surface] = []
+    for x in (0.0, SHIFT[0]):
+        same += [
+            Box((x + 2.6, 2.0, 0.35), (0.6, 0.4, 0.35), yaw_deg=20.0),  # table
+            Sphere((x + 2.5, 2.0, 0.9), 0.2),
+            _block((x + 4.4, 1.0, 0.0), (x + 5.0, 2.2, 1.9)),  # cupboard
+            _block((x, 2.8, 0.0), (x + 1.4, 4.0, 0.5)),  # bed
+        ]
+    different: list[Surface] = [
+        _block((2.0, 3.2, 0.0), (4.6, 4.0, 1.9)),  # wardrobe, first room only
+        _block((5.2, 0.6, 0.0), (6.0, 2.4, 2.1)),  # bookshelf, second room only
+    ]
+    return AnalyticScene((shell, *walls, *lintels, *same, *different))
+
+
+def twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], list[int]]:
+    """Views around both rooms, and a walk through the corridor; each seed stands a bit elsewhere.
+
+    Whoever would stand inside the furniture stands in front of it.
+
+    Returns:
+        Poses (3, 4) ``cam_from_world``, and the room of each view, -1 in the corridor.
+    """
+    rng = np.random.default_rng(seed)
+    eyes, targets, room = [], [], []
+    for number in (0, 1):
+        middle = np.array([2.5, 1.9, 1.4]) + number * SHIFT
+        turn = rng.uniform(0, 2 * np.pi / per_room)
+        for angle in turn + 2 * np.pi * np.arange(per_room) / per_room:
+            outward = np.array([1.7 * np.cos(angle), 1.3 * np.sin(angle), 0.0])
+            eyes.append(middle + outward)
+            targets.append(middle - 0.7 * outward - [0.0, 0.0, 0.4])
+            room.append(number)
+    walk = [
+        ((2.3, 0.9, 1.5), (1.7, -1.5, 1.3)),
+        ((1.8, -1.2, 1.5), (2.0, 3.0, 1.1)),
+        ((1.4, -1.2, 1.5), (3.2, 0.3, 1.3)),
+        ((1.0, -1.0, 1.5), (6.0, -0.7, 1.2)),
+        ((2.6, -0.9, 1.5), (7.5, -0.6, 1.2)),
+        ((4.4, -1.1, 1.5), (8.2, 0.2, 1.2)),
+        ((6.0, -1.2, 1.5), (7.6, 1.5, 1.2)),
+        ((7.0, -1.2, 1.5), (7.2, 3.0, 1.1)),
+        ((7.5, 0.9, 1.5), (6.9, -1.5, 1.3)),
+    ]
+    for eye, target in walk:
+        eyes.append(np.asarray(eye))
+        targets.append(np.asarray(target))
+    room += [0, *[-1] * (len(walk) - 2), 1]
+    jitter = rng.normal(0, 0.08, (2, len(eyes), 3))
+    looks = zip(eyes + jitter[0], targets + jitter[1], strict=True)
+    scene = twin_rooms()
+    return [_in_the_open(scene, eye, target) for eye, target in looks], room
+
+
+def _in_the_open(scene: AnalyticScene, eye: Float64, target: Float64) -> Float64:
+    """A view (3, 4) from where it sees further than MIN_SIGHT, nearer to its target if need be."""
+    pixels = pixel_centers(*CAMERA.size)[::80, ::80].reshape(-1, 2)
+    step = 0.1 * (target - eye) / np.linalg.norm(target - eye)
+    while True:
+        pose = look_at(eye, target)
+        sights = scene.sample(CAMERA, pose, pixels).points - eye
+        if np.linalg.norm(sights, axis=1).max() > MIN_SIGHT:
+            return pose
+        eye = eye + step
+
+
+def twin_room_problem(
+    seed: int = 0,
+    *,
+    errors: DepthErrors | None = None,
+    per_room: int = 7,
+    points_per_view: int = 60,
+    map_width: int = 160,
+    keypoint_noise_px: float = 0.5,
+) -> SymmetricProblem:
+    """Views of the twin rooms with priors, and the matches that survive verification.
+
+    A keypoint matches the same point in another view as well as its twin; verification by one
+    geometry leaves the more frequent of the two. ``errors``: of the depth priors, declared
+    honestly; None: exact, declared good to 1 %.
+    """
+    scene = twin_rooms()
+    poses, room = twin_room_poses(seed, per_room)
+    rng = np.random.default_rng([seed, 1])
+    numbers, keypoints = _keypoints(scene, poses, points_per_view, rng)
+    noise = Noise(keypoints_px=keypoint_noise_px)
+    images = []
+    for i, (pose, xy) in enumerate(zip(poses, keypoints, strict=True)):
+        noisy = xy + keypoint_noise_px * rng.normal(size=xy.shape)
+        image = view_of(
+            f"view_{i}.png", scene, CAMERA, pose, noisy, map_width, 0.01, 2.0, noise, rng
+        )
+        if errors:
+            depth = degrade_depth(image.depth.depth, image.name, errors, seed)
+            image = replace(image, depth=DepthPrior.from_arrays(depth, (errors.std * depth) ** 2))
+        images.append(image)
+    pairs, false = [], []
+    for a, b in combinations(range(len(poses)), 2):
+        # What b sees may be what a sees (shift 0) or its twin, in either direction.
+        found = [
+            (len(matches), abs(shift), shift, matches)
+            for shift in (0, 1, -1)
+            if len(matches := _matches(numbers[a], numbers[b], shift)) >= MIN_MATCHES
+        ]
+        if found:
+            _, _, shift, matches = max(found, key=lambda item: item[:2])
+            views = list(poses)
+            views[b] = moved(poses[b], shift)
+            pairs.append(verified_pair(a, b, matches, views))
+            false.append(shift != 0)
+    return SymmetricProblem(MappingProblem(tuple(images), tuple(pairs)), poses, room, false)
+
+
+def _keypoints(
+    scene: AnalyticScene, poses: Sequence[Float64], points_per_view: int, rng: np.random.Generator
+) -> tuple[list[Int64], list[Float64]]:
+    """Points that each view sees: pairs of sample number and copy (-1, 0, 1), and their pixels."""
+    size = np.array(CAMERA.size, dtype=np.float64)
+    numbers: list[list[Int64]] = [[] for _ in poses]
+    pixels: list[list[Float64]] = [[] for _ in poses]
+    for i, pose in enumerate(poses):
+        samples = scene.sample(CAMERA, pose, rng.uniform(2, size - 2, (points_per_view, 2)))
+        for copy in (-1, 0, 1):
+            points = samples.points + copy * SHIFT
+            twins = (samples.points[:, 1] > 0) & (points[:, 0] > 0) & (points[:, 0] < 10.2)
+            for j, other in enumerate(poses):
+                xy, seen = _seen(scene, other, points)
+                rows = np.flatnonzero(seen & (twins | (copy == 0)))
+                label = np.full(len(rows), copy)
+                numbers[j].append(np.stack([i * points_per_view + rows, label], axis=1))
+                pixels[j].append(xy[rows])
+    return [np.concatenate(n) for n in numbers], [np.concatenate(p) for p in pixels]
+
+
+def moved(pose: Float64, shift: int) -> Float64:
+    """The pose (3, 4) of a view that stands ``shift`` rooms further back than it does."""
+    return np.column_stack([pose[:, :3], pose[:, 3] + shift * pose[:, :3] @ SHIFT])
+
+
+def _seen(scene: AnalyticScene, pose: Float64, points: Float64) -> tuple[Float64, Bool]:
+    """Pixels of world points, and whether they lie on a surface that the view sees there."""
+    xy, depth = project(CAMERA, pose, points)
+    origin = camera_center(pose[:, :3], pose[:, 3])
+    t, _, _ = scene.first_hit(origin, points - origin)
+    return xy, (depth > 0) & inside(xy, CAMERA.size) & (np.abs(t - 1.0) < 1e-6)
+
+
+def _matches(numbers_a: Int64, numbers_b: Int64, shift: int) -> Int64:
+    """(m, 2) keypoints of the same point, or of one point and its twin ``shift`` rooms on."""
+    code_a = numbers_a[:, 0] * 8 + numbers_a[:, 1]
+    code_b = numbers_b[:, 0] * 8 + numbers_b[:, 1] - shift
+    _, rows_a, rows_b = np.intersect1d(code_a, code_b, return_indices=True)
+    return np.stack([rows_a, rows_b], axis=1)
+
+
+def _block(low: tuple[float, float, float], high: tuple[float, float, float]) -> Box:
+    """A box by its corners."""
+    a, b = np.array(low), np.array(high)
+    middle, half = (a + b) / 2, (b - a) / 2
+    return Box((middle[0], middle[1], middle[2]), (half[0], half[1], half[2]))

@@ -1,0 +1,203 @@
+"""The command line: plugins list, config list and show, and how commands end."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import typer
+import yaml
+from typer.testing import CliRunner
+
+import mpsfm_core
+from mpsfm_core.cli import build_app
+from mpsfm_core.data.errors import ConfigError, ReconstructionError
+
+HEAVY = ("torch", "onnxruntime", "kornia", "cv2", "numba", "pycolmap", "scipy")
+
+
+def mpsfm(*arguments: str) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of a command in this process."""
+    result = CliRunner().invoke(build_app(), arguments)
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_listing_plugins_imports_nothing_heavy(install_plugin: Callable[..., str]) -> None:
+    source = """
+        from mpsfm_core import ProviderSpec, hookimpl
+        @hookimpl
+        def mpsfm_providers():
+            return [ProviderSpec("depth", "needy", "torch:nn", requires=("torch", "no_such_pkg"))]
+    """
+    install_plugin("mpsfm-needy", source)
+    script = (
+        "import sys; from mpsfm_core.cli import build_app\n"
+        "build_app()(['plugins', 'list', '--json'], standalone_mode=False)\n"
+        f"print(*[name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
+    )
+    paths = [str(Path(mpsfm_core.__file__).parents[1]), *sys.path]
+    run = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert run.stderr.strip() == ""
+    (line,) = [p for p in json.loads(run.stdout) if p["distribution"] == "mpsfm-needy"]
+    assert line["available"] is False
+    assert "no_such_pkg" in line["reason"]
+
+
+def test_json_and_table_say_the_same(install_plugin: Callable[..., str]) -> None:
+    source = """
+        from mpsfm_core import ProviderSpec, hookimpl
+        @hookimpl
+        def mpsfm_providers():
+            return [ProviderSpec("depth", "tiny", "a:A", capabilities=frozenset({"metric"}),
+                                 summary="[bold] a tiny one", code_license="MIT",
+                                 weights_license="CC-BY-4.0")]
+    """
+    install_plugin("mpsfm-tiny", source, version="4.2")
+    install_plugin("mpsfm-broken", "import nothing_of_that_name")
+    code, text, _ = mpsfm("plugins", "list", "--json")
+    assert code == 0
+    found = {line["distribution"]: line for line in json.loads(text)}
+    assert found["mpsfm-tiny"] == {
+        "kind": "depth",
+        "name": "tiny",
+        "distribution": "mpsfm-tiny",
+        "version": "4.2",
+        "code_license": "MIT",
+        "weights_license": "CC-BY-4.0",
+        "capabilities": ["metric"],
+        "summary": "[bold] a tiny one",
+        "available": True,
+        "reason": "",
+        "install_hint": "",
+    }
+    assert not found["mpsfm-broken"]["available"]
+
+    code, table, _ = mpsfm("plugins", "list")
+    assert code == 0
+    (tiny,) = [row for row in table.splitlines() if "mpsfm-tiny" in row]
+    assert " ".join(tiny.split()) == ("depth tiny mpsfm-tiny 4.2 MIT / CC-BY-4.0 metric available")
+    (broken,) = [row for row in table.splitlines() if row.startswith("plugin") and "broken" in row]
+    assert "unavailable: fails to load: ModuleNotFoundError" in broken
+
+
+class TestConfig:
+    def test_list(self) -> None:
+        code, text, _ = mpsfm("config", "list")
+        assert code == 0
+        assert {"default", "fast-cpu", "sensor-depth"} <= {
+            row.split()[0] for row in text.split("\n") if row
+        }
+
+    @pytest.fixture
+    def tiny_config(self, tmp_path: Path, install_plugin: Callable[..., str]) -> str:
+        """A configuration whose providers come from one plugin of the test."""
+        source = """
+            from mpsfm_core import Options, ProviderSpec, hookimpl
+            class TinyOptions(Options):
+                far: float = 10.0
+            @hookimpl
+            def mpsfm_providers():
+                return [ProviderSpec("depth", "tiny", "a:A", TinyOptions),
+                        ProviderSpec("normals", "tiny", "a:A"),
+                        ProviderSpec("matcher", "tiny", "a:A", capabilities=frozenset({"dense"}))]
+        """
+        install_plugin("mpsfm-tiny", source)
+        path = tmp_path / "tiny.yaml"
+        path.write_text("depth: {use: tiny}\nnormals: {use: tiny}\ndense_matcher: {use: tiny}\n")
+        return str(path)
+
+    def test_show_fills_in_defaults(self, tiny_config: str) -> None:
+        code, text, _ = mpsfm("config", "show", tiny_config, "--set", "runtime.seed=5")
+        assert code == 0
+        shown = yaml.safe_load(text)
+        assert shown["depth"]["options"] == {"far": 10.0}
+        assert shown["runtime"]["seed"] == 5
+        assert shown["runtime"]["device"] == "auto"
+
+    def test_a_wrong_setting_is_one_line_and_exit_code_2(self, tiny_config: str) -> None:
+        code, text, error = mpsfm("config", "show", tiny_config, "--set", "depth.options.fra=5")
+        assert (code, text) == (2, "")
+        assert error == (
+            "mpsfm: --set depth.options.fra=5: depth.options.fra: "
+            "unknown key; did you mean 'far'?\n"
+        )
+
+
+class TestEndings:
+    @pytest.fixture
+    def app(self) -> typer.Typer:
+        """A command line whose command ``fail`` raises what the test puts into ``errors``."""
+        app = build_app()
+
+        @app.command()
+        def fail(name: str) -> None:
+            raise {
+                "config": ConfigError("x.yaml:3: wrong\nindeed"),
+                "nothing": ReconstructionError("no pair worked"),
+                "disk": OSError(28, "No space left on device", "out/points.ply"),
+                "bug": KeyError("surprise"),
+                "interrupt": KeyboardInterrupt(),
+                "exit": typer.Exit(7),
+                "usage": typer.BadParameter("not like this"),
+            }[name]
+
+        return app
+
+    @pytest.mark.parametrize(
+        ("name", "code", "line"),
+        [
+            ("config", 2, "mpsfm: x.yaml:3: wrong indeed\n"),
+            ("nothing", 3, "mpsfm: no pair worked\n"),
+            ("disk", 1, "mpsfm: [Errno 28] No space left on device: 'out/points.ply'\n"),
+            ("bug", 1, "mpsfm: internal error: KeyError: 'surprise' (mpsfm --debug ... shows wh"),
+            ("interrupt", 130, "mpsfm: interrupted\n"),
+            ("exit", 7, ""),
+            ("usage", 2, ""),
+        ],
+    )
+    def test_one_line_and_a_code(self, app: typer.Typer, name: str, code: int, line: str) -> None:
+        result = CliRunner().invoke(app, ["fail", name])
+        assert result.exit_code == code
+        assert result.stderr.startswith(line)
+        assert "Traceback" not in result.output
+
+    @pytest.mark.parametrize("variable", [None, "1"])
+    def test_debug_lets_the_error_through(self, app: typer.Typer, variable: str | None) -> None:
+        arguments = ["fail", "bug"] if variable else ["--debug", "fail", "bug"]
+        environment = {"MPSFM_DEBUG": variable} if variable else {}
+        result = CliRunner().invoke(app, arguments, env=environment)
+        assert isinstance(result.exception, KeyError)
+
+    def test_usage_errors(self) -> None:
+        assert mpsfm("plugin")[0] == 2
+        assert mpsfm("config", "show", "--sett", "a=1")[0] == 2
+
+    def test_version(self) -> None:
+        code, text, _ = mpsfm("--version")
+        assert code == 0 and text.strip()
+
+
+def test_checking_a_plugin_of_hooks_says_which(install_plugin: Callable[..., str]) -> None:
+    source = """
+        from mpsfm_core import hookimpl
+        @hookimpl
+        def mpsfm_notice(text):
+            pass
+    """
+    module = install_plugin("mpsfm-hooks", source)
+    entries = f"[mpsfm.plugins]\nlistener = {module}\n"
+    install_plugin("mpsfm-hooks", source, version="2.0", entry_points=entries)
+    code, out, _ = mpsfm("plugins", "check", "listener")
+    assert code == 0
+    assert "listener (mpsfm-hooks 2.0) loads and brings hooks, notice" in out

@@ -1,0 +1,181 @@
+"""All images placed at once, and when that does not hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
+
+from mpsfm_core.data import Float64, Int64, MappingProblem
+from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_errors_deg
+from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.mapping.initialization.global_initialization import (
+    Placement,
+    agreed,
+    averaged_rotations,
+    on_cycles,
+    place_all,
+)
+from mpsfm_core.mapping.mapper import reconstruct
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.testing.synthetic.halls import HONEST, Hall, hall_problem
+
+VIEWS = 16
+
+
+@pytest.fixture(scope="module")
+def hall() -> Hall:
+    return hall_problem(VIEWS, HONEST, seed=2)
+
+
+def place(problem: MappingProblem, left: Float64 | None = None) -> Placement | None:
+    everything = np.ones(len(problem.images), dtype=np.bool_)
+    return place_all(Scene(problem), everything if left is None else left)
+
+
+def worst_deg(placed: Placement, hall: Hall) -> float:
+    """Largest error of a placed pair in degrees, robustly: of nine tenths."""
+    names = [hall.problem.images[image].name for image in placed.images]
+    poses = zip(names, zip(placed.rotations, placed.translations, strict=True), strict=True)
+    truth = {name: hall.truth[name] for name in names}
+    return float(np.quantile(pose_errors_deg(dict(poses), truth, CONVENTIONS["paper"]), 0.9))
+
+
+def test_all_views_are_placed_near_their_poses(hall: Hall) -> None:
+    placed = place(hall.problem)
+    assert placed is not None
+    assert len(placed.images) >= VIEWS - 2
+    assert worst_deg(placed, hall) < 3
+    assert np.log(placed.scales).std() < 0.1
+
+
+def test_a_wrong_pair_is_outvoted(hall: Hall) -> None:
+    problem = hall.problem
+    turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    wrong = replace(problem.pairs[0], rotation=turn @ problem.pairs[0].rotation)
+    spoilt = MappingProblem(problem.images, (wrong, *problem.pairs[1:]))
+    placed = place(spoilt)
+    assert placed is not None
+    assert worst_deg(placed, hall) < 3
+
+
+def test_images_that_may_not_be_placed_are_left_out(hall: Hall) -> None:
+    left = np.ones(VIEWS, dtype=np.bool_)
+    left[3] = False
+    placed = place(hall.problem, left)
+    assert placed is not None
+    assert 3 not in placed.images
+
+
+def test_a_chain_of_pairs_is_not_placed(hall: Hall) -> None:
+    chain = [p for p in hall.problem.pairs if p.image_b == p.image_a + 1]
+    assert place(MappingProblem(hall.problem.images, tuple(chain))) is None
+
+
+def test_a_bridge_holds_nothing(hall: Hall) -> None:
+    """The larger of two groups is placed that a single pair holds together."""
+    problem = hall.problem
+    first = [p for p in problem.pairs if p.image_b < 10]
+    second = [p for p in problem.pairs if p.image_a >= 10]
+    between = [p for p in problem.pairs if p.image_a < 10 <= p.image_b]
+    bridge = max(between, key=len)
+    placed = place(MappingProblem(problem.images, (*first, bridge, *second)))
+    assert placed is not None
+    assert max(placed.images) < 10
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_links_on_cycles_are_those_that_can_be_spared(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = 20
+    possible = np.stack(np.triu_indices(count, 1), axis=1)
+    links = possible[rng.choice(len(possible), rng.integers(1, 30), replace=False)]
+    flip = rng.random(len(links)) < 0.5
+    links[flip] = links[flip][:, ::-1]
+
+    def groups(rows: Int64) -> int:
+        ends = rows[:, 0], rows[:, 1]
+        matrix = coo_matrix((np.ones(len(rows)), ends), shape=(count, count))
+        return int(connected_components(matrix, directed=False)[0])
+
+    whole = groups(links)
+    spared = [groups(np.delete(links, row, axis=0)) == whole for row in range(len(links))]
+    assert on_cycles(links[:, 0], links[:, 1], count).tolist() == spared
+
+
+def test_pairs_whose_points_the_prior_bends_weigh_less(hall: Hall) -> None:
+    """Two of three pairs of an image turn it by 12 degrees, which bends what it sees."""
+    problem, image = hall.problem, 5
+    tilt = Rotation.from_rotvec([0.0, np.radians(12.0), 0.0]).as_matrix()
+    pairs = []
+    for number, pair in enumerate(problem.pairs):
+        if number % 3 and image == pair.image_a:
+            pair = replace(pair, rotation=pair.rotation @ tilt.T)
+        elif number % 3 and image == pair.image_b:
+            turned = tilt @ pair.rotation, tilt @ pair.translation
+            pair = replace(pair, rotation=turned[0], translation=turned[1])
+        pairs.append(pair)
+    placed = place(MappingProblem(problem.images, tuple(pairs)))
+    assert placed is not None
+    assert image in placed.images
+    assert worst_deg(placed, hall) < 3
+
+
+def test_values_agree_with_most_differences() -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=(6, 3))
+    a, b = (np.array(ends) for ends in np.tril_indices(6, -1))
+    steps = truth[b] - truth[a]
+    steps[4] += 5
+    found = agreed(a, b, steps, np.ones(len(a)), 6)
+    np.testing.assert_allclose(found, truth - truth.mean(axis=0), atol=1e-3)
+
+
+def test_rotations_agree_with_those_that_agree() -> None:
+    """A third of the links are wrong, and have fewer matches; the others are off by a degree."""
+    rng = np.random.default_rng(0)
+    count = 16
+    truth = Rotation.random(count, rng).as_matrix()
+    a, b = np.array([(i, j) for i in range(count) for j in range(i)], dtype=np.int64).T
+    noise = Rotation.from_rotvec(np.radians(1.0) * rng.normal(size=(len(a), 3)))
+    turns = noise.as_matrix() @ truth[b] @ truth[a].transpose(0, 2, 1)
+    wrong = rng.random(len(a)) < 0.33
+    turns[wrong] = Rotation.random(int(wrong.sum()), rng).as_matrix()
+    found = averaged_rotations(a, b, turns, np.where(wrong, 30.0, 100.0), count)
+    world = found[0].T @ truth[0]
+    off = rotation_angle_deg(found @ world @ truth.transpose(0, 2, 1))
+    assert off.max() < 2.5
+
+
+def test_mapping_starts_from_all_images_and_ends_as_well_as_from_a_pair(hall: Hall) -> None:
+    errors = {}
+    for at_once in (True, False):
+        options = MapperOptions.model_validate({"initialization": {"all_at_once": at_once}})
+        result = reconstruct(hall.problem, options)
+        found = result.reconstructions[0].poses
+        assert len(found) == VIEWS
+        errors[at_once] = np.median(pose_errors_deg(found, hall.truth, CONVENTIONS["paper"]))
+        assert ("global start" in result.report.counts) == at_once
+        assert ("local refinement" in result.report.counts) != at_once
+    assert errors[True] < 1.1 * errors[False]
+
+
+def test_matches_that_no_points_explain_make_it_start_from_a_pair(hall: Hall) -> None:
+    rng = np.random.default_rng(0)
+    pairs = []
+    for pair in hall.problem.pairs:
+        matches = pair.matches.copy()
+        wrong = rng.choice(len(matches), len(matches) // 3, replace=False)
+        matches[wrong, 1] = np.roll(matches[wrong, 1], 1)
+        pairs.append(replace(pair, matches=matches))
+    result = reconstruct(
+        MappingProblem(hall.problem.images, tuple(pairs)),
+        MapperOptions(max_runs=1),
+    )
+    assert "initialization" in result.report.counts
+    assert len(result.reconstructions[0].images) >= VIEWS - 2

@@ -1,0 +1,105 @@
+"""The first two images: either may lend its depth, and few matches will do in the end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import Bool, MappingProblem, PinholeCamera
+from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
+from mpsfm_core.mapping.initialization.initial_pair import Starts, rank_initial_pairs
+from mpsfm_core.mapping.mapper import reconstruct
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.refinement.refinement import Refiner
+from mpsfm_core.mapping.registration.image_selection import pair_score_matrix
+from mpsfm_core.mapping.registration.registration import PoseSearch
+from mpsfm_core.mapping.scene.reconstruction import MappingResult
+from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+
+CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
+POSES = arc_poses(2, 14.0)
+
+
+def pair_problem(matches: int | None = None) -> MappingProblem:
+    """Two views, of whose matches only some are left."""
+    problem = mapping_problem(room_scene(), CAMERA, POSES)
+    (pair,) = problem.pairs
+    return replace(
+        problem,
+        pairs=(replace(pair, matches=pair.matches[:matches], scores=pair.scores[:matches]),),
+    )
+
+
+def without_depth(problem: MappingProblem, image: int, columns: slice) -> MappingProblem:
+    """The problem with a part of an image's depth unknown."""
+    images = list(problem.images)
+    valid: Bool = images[image].depth.valid.copy()
+    valid[:, columns] = False
+    images[image] = replace(images[image], depth=replace(images[image].depth, valid=valid))
+    return replace(problem, images=tuple(images))
+
+
+def error_deg(result: MappingResult) -> float:
+    """Of the pose of the second image beside the first."""
+    a, b = result.reconstructions[0].images
+    rotation = b.rotation @ a.rotation.T
+    translation = b.translation - rotation @ a.translation
+    true_rotation = POSES[1][:, :3] @ POSES[0][:, :3].T
+    true_translation = POSES[1][:, 3] - true_rotation @ POSES[0][:, 3]
+    turn = float(rotation_angle_deg(rotation @ true_rotation.T))
+    return max(turn, float(angle_between_deg(translation, true_translation)))
+
+
+@pytest.mark.parametrize("image", [0, 1])
+def test_the_image_with_more_depth_carries_the_other(image: int) -> None:
+    problem = without_depth(pair_problem(), image, slice(10, None))
+    assert error_deg(reconstruct(problem)) < 0.1
+
+
+def test_few_matches_start_when_nothing_better_does() -> None:
+    assert error_deg(reconstruct(pair_problem(15))) < 1.0
+    strict = MapperOptions.model_validate({"registration": {"max_relaxations": 0}})
+    result = reconstruct(pair_problem(15), strict)
+    assert not result.reconstructions
+    assert "30 are needed" in result.report.pair_reasons["view_0.png view_1.png"]
+
+
+def test_without_lifting_rays_make_the_start() -> None:
+    options = MapperOptions.model_validate({"registration": {"lifting": False}})
+    assert error_deg(reconstruct(pair_problem(), options)) < 0.1
+
+
+def test_images_that_do_not_fit_are_not_started_with() -> None:
+    problem = pair_problem()
+    (pair,) = problem.pairs
+    shuffled = np.random.default_rng(0).permutation(pair.matches[:, 1])
+    matches = np.stack([pair.matches[:, 0], shuffled], axis=1)
+    wrong = replace(problem, pairs=(replace(pair, matches=matches, calibrated=False),))
+    assert not reconstruct(wrong).reconstructions
+
+
+def test_the_best_supported_of_the_largest_pairs_comes_first() -> None:
+    problem = mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
+    rng = np.random.default_rng(0)
+    pairs = list(problem.pairs)
+    largest = max(range(3), key=lambda k: len(pairs[k]))
+    for k, pair in enumerate(pairs):
+        matches, count = pair.matches.copy(), len(pairs[largest]) * 2 // 3
+        if k == largest:
+            wrong = rng.permutation(len(matches))[: int(0.6 * len(matches))]
+            matches[wrong, 1] = rng.permutation(matches[wrong, 1])
+            count = len(matches)
+        pairs[k] = replace(pair, matches=matches[:count], scores=pair.scores[:count])
+    doubtful = pairs[largest]
+    options, starts = MapperOptions(), Starts(MapperOptions())
+    scene = Scene(replace(problem, pairs=tuple(pairs)))
+    refiner = Refiner(scene, options, pair_score_matrix(scene, "match-scores"))
+    search = PoseSearch(scene, refiner, options)
+    assert rank_initial_pairs(scene)[0] is doubtful
+    assert starts.ranked(search, np.ones(3, dtype=np.bool_))[-1] is doubtful
+    left = np.isin(np.arange(3), [doubtful.image_a, doubtful.image_b])
+    assert starts.ranked(search, left) == [doubtful]

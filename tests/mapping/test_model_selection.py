@@ -1,0 +1,153 @@
+"""Several runs with other random choices, of which the one that explains most counts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.consistency.depth_agreement import agreeing_depth
+from mpsfm_core.mapping.mapper import reconstruct
+from mpsfm_core.mapping.model_selection import Run, best, explained_score, total_score
+from mpsfm_core.mapping.options import ConsistencyOptions, MapperOptions
+from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
+from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+
+OPTIONS = ConsistencyOptions()
+CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
+
+
+@pytest.fixture(scope="module")
+def problem() -> MappingProblem:
+    """Four views on an arc."""
+    return mapping_problem(
+        room_scene(), CAMERA, arc_poses(4, 21.0), noise=Noise(keypoints_px=0.3, depth=0.01)
+    )
+
+
+def with_false_matches(problem: MappingProblem, share: float) -> MappingProblem:
+    """Of each pair so many matches, as a share, lead to wrong keypoints."""
+    pairs = []
+    for pair in problem.pairs:
+        matches = pair.matches.copy()
+        wrong = slice(int(share * len(matches)))
+        matches[wrong, 1] = matches[wrong, 1][::-1]
+        pairs.append(replace(pair, matches=matches))
+    return MappingProblem(problem.images, tuple(pairs))
+
+
+def test_right_poses_explain_right_matches(problem: MappingProblem) -> None:
+    (model,) = reconstruct(problem).reconstructions
+    total = total_score(problem)
+    assert total == pytest.approx(sum(pair.scores.sum() for pair in problem.pairs))
+    assert 0.85 * total < explained_score(model, problem) <= total
+    fewer = replace(model, images=model.images[:2])
+    first = next(pair for pair in problem.pairs if (pair.image_a, pair.image_b) == (0, 1))
+    assert 0 < explained_score(fewer, problem) <= first.scores.sum()
+    doubtful = with_false_matches(problem, 0.5)
+    assert explained_score(model, doubtful) < 0.6 * total
+
+
+def test_one_run_is_enough_where_matches_are_explained(problem: MappingProblem) -> None:
+    assert reconstruct(problem).report.runs == 1
+
+
+def test_runs_that_come_to_the_same_are_the_last(problem: MappingProblem) -> None:
+    doubtful = with_false_matches(problem, 0.35)
+    result = reconstruct(doubtful, MapperOptions(max_runs=5))
+    assert result.report.runs == 2
+    alone = [reconstruct(doubtful, MapperOptions(max_runs=1, seed=seed)) for seed in range(2)]
+    assert [run.report.runs for run in alone] == [1, 1]
+    scores = [explained_score(run.reconstructions[0], doubtful) for run in alone]
+    best = alone[int(np.argmax(scores))].reconstructions[0]
+    for image, same in zip(result.reconstructions[0].images, best.images, strict=True):
+        np.testing.assert_array_equal(image.rotation, same.rotation)
+        np.testing.assert_array_equal(image.translation, same.translation)
+        np.testing.assert_array_equal(image.depth.depth, same.depth.depth)
+
+
+class Scripted:
+    """A mapper whose runs are given: of each, what its groups explain."""
+
+    script: Sequence[Sequence[float]] = ()
+    keeps_poses = False
+    weighed = None
+
+    def __init__(
+        self, problem: MappingProblem, options: MapperOptions, events: object, weighed: object
+    ) -> None:
+        self.explained = self.script[options.seed]
+
+    def run(self, paused: object = None) -> Run:
+        # a group's only mark is here how much it explains
+        models = [Reconstruction((), np.full((1, 3), e), np.zeros(1)) for e in self.explained]
+        return Run(models, self.explained, MappingReport(seconds={"all": 2.0}, counts={"all": 1}))
+
+
+@pytest.mark.parametrize(
+    ("script", "kept", "runs"),
+    [
+        ([[0.5], [0.6], [0.55]], 0.6, 3),
+        ([[0.5], [0.6], [0.505], [0.9]], 0.6, 3),
+        ([[0.5], [0.5], [0.9]], 0.5, 2),
+        ([[0.5], [0.8], [0.9]], 0.8, 2),
+        ([[0.4, 0.4], [0.9]], 0.4, 1),
+        ([[], [0.3], [0.2]], 0.3, 3),
+        ([[], []], None, 2),
+    ],
+    ids=["most", "agreement-with-any", "same", "enough", "enough-in-groups", "none-first", "none"],
+)
+def test_which_run_counts(
+    monkeypatch: pytest.MonkeyPatch,
+    problem: MappingProblem,
+    script: list[list[float]],
+    kept: float | None,
+    runs: int,
+) -> None:
+    monkeypatch.setattr(Scripted, "script", script)
+    monkeypatch.setattr(mapper, "Mapper", Scripted)
+    result = reconstruct(problem, MapperOptions(max_runs=3))
+    assert result.report.runs == runs
+    assert result.report.seconds == ({"all": 2.0 * runs}) and result.report.counts == {"all": runs}
+    found = [float(model.points[0, 0]) for model in result.reconstructions]
+    assert found[:1] == ([] if kept is None else [kept])
+
+
+def test_poses_that_stay_leave_nothing_to_chance(
+    monkeypatch: pytest.MonkeyPatch, problem: MappingProblem
+) -> None:
+    monkeypatch.setattr(Scripted, "script", [[0.1], [0.2]])
+    monkeypatch.setattr(Scripted, "keeps_poses", True)
+    monkeypatch.setattr(mapper, "Mapper", Scripted)
+    assert reconstruct(problem).report.runs == 1
+
+
+def test_a_tie_goes_to_what_came_out_twice(problem: MappingProblem) -> None:
+    """A run that stands alone has to explain clearly more than two that came to the same."""
+    (model,) = reconstruct(problem).reconstructions
+
+    def run(size: int, explained: float) -> Run:
+        return Run([replace(model, images=model.images[:size])], [explained], MappingReport())
+
+    alone, one, other = run(4, 0.662), run(3, 0.655), run(3, 0.660)
+    assert best([alone, one, other], OPTIONS) is other
+    assert best([alone, one], OPTIONS) is alone
+    clearly = run(4, 0.68)
+    assert best([clearly, one, other], OPTIONS) is clearly
+
+
+def test_of_runs_that_are_alike_that_counts_in_which_depth_agrees(problem: MappingProblem) -> None:
+    """Of two that explain as much, though one image of one sees past all others."""
+    (model,) = reconstruct(problem).reconstructions
+    *rest, last = model.images
+    turned = np.diag([-1.0, 1.0, -1.0])
+    away = replace(last, rotation=turned @ last.rotation, translation=turned @ last.translation)
+    elsewhere = replace(model, images=(*rest, away))
+    assert agreeing_depth(elsewhere, OPTIONS) < agreeing_depth(model, OPTIONS)
+    right, wrong = (Run([m], [e], MappingReport()) for m, e in ((model, 0.650), (elsewhere, 0.655)))
+    assert best([right, wrong], OPTIONS) is best([wrong, right], OPTIONS) is right

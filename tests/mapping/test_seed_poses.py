@@ -1,0 +1,82 @@
+"""A reconstruction as the start of another with more matches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.mapping.initialization.seed_poses import held_images, starting_from
+from mpsfm_core.mapping.mapper import reconstruct
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.scene.reconstruction import MappingReport, MappingResult, Reconstruction
+from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+
+CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
+POSES = arc_poses(5, 14.0)
+
+
+@pytest.fixture(scope="module")
+def problem() -> MappingProblem:
+    return mapping_problem(room_scene(), CAMERA, POSES)
+
+
+@pytest.fixture(scope="module")
+def mapped(problem: MappingProblem) -> MappingResult:
+    """By four of the five images."""
+    return reconstruct(problem.subset([image.name for image in problem.images[:4]]))
+
+
+def in_part(mapping: MappingResult, ids: list[list[int]], **changes: object) -> MappingResult:
+    """The result with other points: for each image the point of each keypoint."""
+    images = tuple(
+        replace(image, point_ids=np.array(own, dtype=np.int64), **changes)
+        for image, own in zip(mapping.reconstructions[0].images, ids, strict=True)
+    )
+    part = Reconstruction(images, np.zeros((4, 3)), np.zeros(4))
+    return MappingResult((part,), MappingReport())
+
+
+def test_points_that_three_images_see_hold(mapped: MappingResult) -> None:
+    ids = [[0, 1, -1, 0], [1, 0, 2], [0, -1, 2, 3], [1, 3]]
+    few = in_part(mapped, ids)
+    assert few.reconstructions[0].num_multi_view_points().tolist() == [2, 2, 1, 1]
+    assert [image.index for image in held_images(few, 2)] == [0, 1]
+    assert not held_images(in_part(mapped, ids, confirmed=False), 1)
+    assert not held_images(MappingResult((), MappingReport()), 1)
+
+
+def test_it_goes_on_in_metres(problem: MappingProblem, mapped: MappingResult) -> None:
+    held = held_images(mapped, 30)
+    assert len(held) == 4
+    tenth = [replace(image, translation=image.translation / 10) for image in held]
+    guess = MapperOptions(known_poses="guess")
+    (found,) = reconstruct(starting_from(problem, tenth), guess).reconstructions
+    assert found.metric is not None and found.metric.trusted
+    assert [image.index for image in found.images] == [0, 1, 2, 3, 4]
+    first, *others = found.images
+    for image in others:
+        turn = image.rotation @ first.rotation.T
+        true = POSES[image.index][:, :3] @ POSES[0][:, :3].T
+        assert rotation_angle_deg(turn @ true.T) < 0.05
+        apart = np.linalg.norm(image.translation - turn @ first.translation)
+        truth = np.linalg.norm(POSES[image.index][:, 3] - true @ POSES[0][:, 3])
+        assert apart == pytest.approx(truth, rel=0.02)
+
+
+def test_refined_focal_lengths_are_those_of_all_images_of_a_camera(
+    problem: MappingProblem, mapped: MappingResult
+) -> None:
+    refined = replace(CAMERA, fx=540.0, fy=540.0)
+    images = mapped.reconstructions[0].images[:2]
+    known = replace(problem.images[4], known_pose=(np.eye(3), np.ones(3)))
+    problem = replace(problem, images=(*problem.images[:4], known))
+    started = starting_from(problem, [replace(image, camera=refined) for image in images])
+    assert {image.camera for image in started.images} == {refined}
+    given = [image.known_pose is not None for image in started.images]
+    assert given == [True, True, False, False, True]
+    assert started.images[4].known_pose is known.known_pose

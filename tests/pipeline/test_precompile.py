@@ -1,0 +1,65 @@
+"""Kernels are compiled once, in the background, and work where nothing can be kept on disk."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba.core.caching
+import pytest
+
+from mpsfm_core.pipeline.precompile import Compilation
+from mpsfm_core.support import jit
+
+RUNS_WITHOUT_COMPILING = """
+import sys
+from pathlib import Path
+from numba.core import event
+from mpsfm_core.cli.demo import demo
+from mpsfm_core.precompile import begin
+assert begin() is None
+with event.install_recorder("numba:compile") as compiled:
+    demo(Path(sys.argv[1]), offline=True, quiet=True)
+assert not compiled.buffer, compiled.buffer
+"""
+
+
+def finished(code: int) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", f"raise SystemExit({code})"])
+
+
+def test_what_failed_is_tried_again(tmp_path: Path) -> None:
+    stamp = tmp_path / "stamp"
+    Compilation((finished(0), finished(1)), stamp).wait()
+    assert not stamp.exists()
+    Compilation((finished(0), finished(0)), stamp).wait()
+    assert stamp.exists()
+
+
+def test_a_kernel_works_where_nothing_can_be_kept(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
+    jit._warn.cache_clear()
+
+    @jit.kernel()
+    def double(x: float) -> float:
+        return 2.0 * x
+
+    with caplog.at_level(logging.WARNING):
+        assert double(21.0) == 42.0
+    assert "NUMBA_CACHE_DIR" in caplog.text
+
+
+@pytest.mark.slow
+def test_all_that_a_run_needs_is_compiled_before(tmp_path: Path) -> None:
+    """The sample scene, whose maps are thinned and read from a cache, as those of any photos."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    subprocess.run(
+        [sys.executable, "-m", "mpsfm_core.pipeline.precompile"], env=environment, check=True
+    )
+    run = [sys.executable, "-c", RUNS_WITHOUT_COMPILING, str(tmp_path / "demo")]
+    subprocess.run(run, env=environment, check=True)

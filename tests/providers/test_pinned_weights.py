@@ -1,0 +1,49 @@
+"""What first-party plugins download is known by its hash, or at least by the commit it is of."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from mpsfm_core.data.errors import InputError
+from mpsfm_core.providers.first_party import FIRST_PARTY
+from mpsfm_core.providers.registry import Registry
+
+NOT_PINNED = {
+    # releases whose files nobody has given us a hash of: the first download is remembered
+    *("dedode", "lightglue-dedode"),
+    *("superpoint", "disk-onnx", "lightglue-superpoint", "lightglue-disk-onnx"),
+    # the newest version of a repository
+    *("sky", "transformers", "superpoint-hub", "lightglue-superpoint-hub", "superglue"),
+    *("efficient-loftr", "dino", "depth-anything-3"),
+}
+"""Providers that are still to be pinned; none is added."""
+
+
+def test_what_is_downloaded_is_pinned() -> None:
+    registry = Registry.discover()
+    ours = {name.partition("[")[0] for name in FIRST_PARTY}
+    found = set()
+    for line in registry.status():
+        if line.distribution not in ours or not line.available or line.kind == "plugin":
+            continue
+        try:
+            options = registry.default_options(line.kind, line.name)
+            files = registry.weights(line.kind, line.name, options)
+        except InputError:  # the user has to name a file
+            continue
+        for file in files:
+            remote = file.uri.startswith(("https://", "hf://"))
+            if remote and not file.sha256 and not re.search(r"@[0-9a-f]{40}/", file.uri):
+                found.add(line.name)
+    if not any(line.distribution == "mpsfm-kornia" for line in registry.status()):
+        pytest.skip("needs the first-party plugins")
+    assert found <= NOT_PINNED
+
+
+def test_what_is_not_pinned_is_told() -> None:
+    told = (Path(__file__).parents[2] / "SECURITY.md").read_text(encoding="utf-8")
+    assert [name for name in sorted(NOT_PINNED) if f"`{name}`" not in told] == []
+    assert f"for these {len(NOT_PINNED)} providers" in " ".join(told.split())

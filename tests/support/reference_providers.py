@@ -1,0 +1,210 @@
+"""A correct provider of every kind, without weights: what the kit's own tests break on purpose.
+
+Depth, normals and masks are read from painted views, as a stand-in network would.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import astuple, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpsfm_core.data import (
+    Bool,
+    DenseMatches,
+    DepthPrior,
+    Features,
+    Float32,
+    Float64,
+    GroupPrior,
+    NormalPrior,
+    PairDepth,
+    PairMatches,
+    PinholeCamera,
+    View,
+)
+from mpsfm_core.data.options import Options
+from mpsfm_core.geometry import pixel_centers, resize_map
+from mpsfm_core.providers import ProviderContext
+from mpsfm_core.testing.examples import Example, indoor_example
+from mpsfm_core.testing.painting import NORMALS_STD, RELATIVE_STD, read_depth, read_normals
+
+_THUMBNAIL = 8
+_GRID_PX = 12
+
+
+class PaintedDepth:
+    """Depth with variance on the grid of the view, and normals of the same pass."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        self.options = options
+
+    def predict(self, view: View) -> DepthPrior:
+        """What is painted in the view."""
+        return depth_prior(read_depth(view.image))
+
+    def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
+        """Both that is painted in the view."""
+        return self.predict(view), normal_prior(read_normals(view.image), view)
+
+    def estimate_focal(self, view: View) -> float:
+        """That of the painted examples, whatever the camera says."""
+        return 0.75 * view.camera.width
+
+
+class PaintedNormals:
+    """Normals with variance on the grid of the view."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        self.options = options
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        """What is painted in the view."""
+        return normal_prior(read_normals(view.image), view)
+
+
+class PaintedMask:
+    """Allows what has a surface."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        self.options = options
+
+    def mask(self, view: View) -> Bool:
+        """Where depth is painted."""
+        return np.asarray(read_depth(view.image) > 0)
+
+
+class Thumbnail:
+    """Describes a view by a reduced image of itself, less its mean, of length one."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        self.options = options
+
+    def describe(self, view: View) -> Float32:
+        """Thumbnail as a vector; of a view without content the zero vector."""
+        small = resize_map(view.image, _THUMBNAIL, _THUMBNAIL).ravel()
+        small = small - small.mean()
+        vector: Float32 = small / max(float(np.linalg.norm(small)), 1.0)
+        return vector
+
+
+class ToldOptions(Options):
+    """Where the truth is."""
+
+    folder: Path
+    """With what :func:`tell` writes."""
+
+
+def tell(folder: Path, example: Example) -> None:
+    """Write down an indoor example for :class:`ToldMatcher`."""
+    name = _name(example.view)
+    np.savez(folder / name, pose=example.pose, camera=astuple(example.camera))
+
+
+class ToldMatcher:
+    """Dense matches and depth of both views, of indoor examples that it is told."""
+
+    def __init__(self, options: ToldOptions, context: ProviderContext) -> None:
+        self.options = options
+
+    def match(
+        self,
+        view_a: View,
+        view_b: View,
+        features_a: Features | None = None,
+        features_b: Features | None = None,
+    ) -> PairMatches:
+        """Exact matches of a grid of pixels; none between views it was not told of."""
+        a, b = self.recall(view_a), self.recall(view_b)
+        if a is None or b is None:
+            nothing = DenseMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.float32))
+            return PairMatches(dense=nothing, depth=PairDepth(_unknown(), _unknown()))
+        points = pixel_centers(*a.camera.size)[::_GRID_PX, ::_GRID_PX].reshape(-1, 2)
+        found = a.correspondences(b, points)
+        points, true = points[found.visible], found.xy_b[found.visible]
+        return PairMatches(dense=self.matches(points, true), depth=self.depths(a, b))
+
+    def recall(self, view: View) -> Example | None:
+        """The example of a view, None for one that it was not told of."""
+        path = self.options.folder / f"{_name(view)}.npz"
+        if not path.exists():
+            return None
+        with np.load(path) as stored:
+            width, height, *intrinsics = stored["camera"].tolist()
+            camera = PinholeCamera(int(width), int(height), *intrinsics)
+            return replace(indoor_example("textured"), pose=stored["pose"], camera=camera)
+
+    def matches(self, points_a: Float64, points_b: Float64) -> DenseMatches:
+        """Matches between exact positions."""
+        return DenseMatches(points_a, points_b, np.ones(len(points_a), np.float32))
+
+    def depths(self, a: Example, b: Example) -> PairDepth:
+        """Depth of both examples."""
+        return PairDepth(*(depth_prior(example.truth().depth) for example in (a, b)))
+
+
+def tell_group(folder: Path, example: Example) -> None:
+    """Write down an example for :class:`ToldGroup`."""
+    truth = example.truth()
+    np.savez(
+        folder / f"group-{_name(example.view)}.npz",
+        depth=truth.depth,
+        pose=example.pose,
+        intrinsics=example.camera.params,
+    )
+
+
+class ToldGroup:
+    """Depth, poses and intrinsics of views that it is told."""
+
+    def __init__(self, options: ToldOptions, context: ProviderContext) -> None:
+        self.options = options
+
+    def predict_group(self, views: Sequence[View]) -> GroupPrior:
+        """The truth; a plane one metre before the origin for views it was not told of."""
+        depth, poses, intrinsics = zip(*(self.recall(view) for view in views), strict=True)
+        return GroupPrior(
+            tuple(depth_prior(values) for values in depth), np.array(poses), np.array(intrinsics)
+        )
+
+    def recall(self, view: View) -> tuple[Float64, Float64, Float64]:
+        """Depth (H, W), pose (3, 4) and intrinsics (4,) of a view."""
+        path = self.options.folder / f"group-{_name(view)}.npz"
+        if not path.exists():
+            return np.ones(view.image.shape[:2]), np.eye(3, 4), view.camera.params
+        with np.load(path) as stored:
+            return stored["depth"], stored["pose"], stored["intrinsics"]
+
+
+class Wrapper:
+    """Hands everything on as it is."""
+
+    def __init__(self, inner: Any, options: Any, context: ProviderContext) -> None:
+        self.inner = inner
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        """What the provider inside says."""
+        return self.inner.predict(view) if depth is None else self.inner.predict(view, depth)
+
+
+def depth_prior(depth: Float64) -> DepthPrior:
+    """Metric depth with the std that the kit expects of a stand-in."""
+    return DepthPrior.from_arrays(depth, (RELATIVE_STD * depth) ** 2)
+
+
+def normal_prior(normals: Float64, view: View) -> NormalPrior:
+    """Normals with the std that the kit expects of a stand-in."""
+    variance = np.full(normals.shape[:2], NORMALS_STD**2)
+    return NormalPrior.from_arrays(normals, variance, camera=view.camera)
+
+
+def _name(view: View) -> str:
+    return hashlib.sha256(view.image.tobytes() + str(view.image.shape).encode()).hexdigest()
+
+
+def _unknown() -> DepthPrior:
+    return DepthPrior.from_arrays(np.zeros((1, 1)), np.zeros((1, 1)))

@@ -1,0 +1,30 @@
+"""Arrays come back from files as they were."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from mpsfm_core.support.npz import read_npz, write_npz
+
+
+def test_arrays_come_back_and_numpy_reads_them_too(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "folder" / "arrays.npz"
+    arrays = {
+        "depth": np.full((40, 50), 1.5, np.float32),
+        "valid": np.arange(6).reshape(2, 3) % 2 == 0,
+        "names": np.array(["a.jpg", "\u00fc.jpg"]),
+        "version": np.array(3),
+        "none": np.zeros((0, 2)),
+    }
+    write_npz(path, **arrays)
+    ours = read_npz(path)
+    with np.load(path) as theirs:
+        for name, array in arrays.items():
+            for found in (ours[name], theirs[name]):
+                assert found.dtype == array.dtype
+                np.testing.assert_array_equal(found, array)
+    with zipfile.ZipFile(path) as archive:
+        assert archive.getinfo("depth.npy").compress_size < 1000
