@@ -9,7 +9,7 @@ process of its own; compiled loops are loaded before. Times are medians of the r
 COLMAP's; memory is the peak of the process, with the problem in it. With more than one of
 ``--threads`` for both, what a user waits for is the wall time. ``--only``: of :data:`VARIANTS`,
 settings below ``mapping`` that differ from the defaults. The last line is one JSON object with
-``--json``. """
+``--json``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks._scenes import percent
-from mpsfm_core.evaluation.methods import OURS, Outcome, Task, run_tasks
+from mpsfm_core.evaluation.methods import OURS, MethodRun, Outcome, run_tasks
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.synthetic.halls import QUALITIES, Hall, hall_problem
@@ -75,7 +75,7 @@ def measured(
     for _ in range(repeats):
         for label, (method, options) in methods.items():
             # one task at a time: the next one's memory is counted in a process of its own
-            tasks = [Task(label, method, hall.problem, options, threads=threads)]
+            tasks = [MethodRun(label, method, hall.problem, options, threads=threads)]
             outcomes[label] += [outcome for _, outcome in run_tasks(tasks, 1)]
             print(f"{views} {prior} {label}: {outcomes[label][-1].seconds:.1f} s", file=sys.stderr)
     base = _row(hall, outcomes[PEER])

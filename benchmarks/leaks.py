@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks._scenes import RESULTS
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.leak_probe import Held, held_after_each
@@ -69,10 +69,10 @@ def reconstruction(folder: Path) -> Callable[[], object]:
         cv2.imwrite(str(photos / f"{number}.png"), picture)
     (folder / "intrinsics.yaml").write_text("1: {params: [140, 140, 80, 60], images: all}\n")
     config = Config(
-        features=Backend(use="sift"),
-        matcher=Backend(use="mutual-nearest"),
-        depth=Backend(use="flat"),
-        normals=Backend(use="from-depth"),
+        features=ProviderConfig(use="sift"),
+        matcher=ProviderConfig(use="mutual-nearest"),
+        depth=ProviderConfig(use="flat"),
+        normals=ProviderConfig(use="from-depth"),
         runtime=RuntimeOptions(cache_dir=folder / "cache", workers=1),
     )
     config = config.model_copy(

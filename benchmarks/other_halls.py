@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks._scenes import percent
 from benchmarks.everyday import CONVENTION, PEER
 from mpsfm_core.data import MappingProblem
-from mpsfm_core.evaluation.methods import OURS, Outcome, Task, run_tasks
+from mpsfm_core.evaluation.methods import OURS, MethodRun, Outcome, run_tasks
 from mpsfm_core.evaluation.pose_auc import pose_auc, pose_errors_deg
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.synthetic.halls import HONEST, QUALITIES, Hall, PriorErrors, hall_problem
@@ -92,7 +92,7 @@ def main() -> None:
 def compared(halls: Sequence[Hall], workers: int) -> str:
     """Cells of a line: images, accuracy and time of both on some halls."""
     tasks = [
-        Task(f"{number}", method, hall.problem, MapperOptions())
+        MethodRun(f"{number}", method, hall.problem, MapperOptions())
         for number, hall in enumerate(halls)
         for method in (PEER, OURS)
     ]

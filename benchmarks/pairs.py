@@ -10,7 +10,7 @@ rendered_kitchen (18 to 25 %). A pair is true when its views overlap by more tha
 (mpsfm_core/evaluation/overlap.py). *Matched*, the pairs that a reconstruction can miss: on real
 photos those that overlap by 0.15 and, given to LighterGlue, are verified with a rotation within 10
 degrees of the truth; in the hall those with 30 points that look alike from both. Writes
-benchmarks/results/pairs.md. """
+benchmarks/results/pairs.md."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from mpsfm_core.data import Float32, Float64
 from mpsfm_core.evaluation.overlap import overlap_from_depth
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.scene_folder import read_scene
-from mpsfm_core.extraction.context import Workbench
-from mpsfm_core.extraction.events import Silent
+from mpsfm_core.extraction.context import ExtractionContext
+from mpsfm_core.extraction.events import NullExtractionEvents
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.matching.matching import PairMatcher, PairVerifier
 from mpsfm_core.extraction.options import PairOptions
@@ -121,7 +121,7 @@ def _real(name: str, output: Path) -> Case:
         lambda image: read_depth(depth / Path(image).with_suffix(".png")),
     ).two_view
     config = load_config("fast-cpu", [f"runtime.cache_dir={output}"])
-    bench = Workbench(images, config, Registry.discover(), Silent())
+    bench = ExtractionContext(images, config, Registry.discover(), NullExtractionEvents())
     assert config.features is not None
     table = FeatureTable(bench, config.features)
     located = table.extract()

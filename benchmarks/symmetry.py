@@ -24,7 +24,7 @@ from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_de
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.mapping.component import Group
 from mpsfm_core.mapping.consistency.depth_consistency import DepthCheck
-from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.maintenance import Upkeep
@@ -46,7 +46,7 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
     images = tuple(replace(i, known_pose=(p[:, :3].copy(), p[:, 3].copy())) for i, p in views)
     pairs = tuple(p for p, false in zip(case.problem.pairs, case.false, strict=True) if not false)
     options = MapperOptions(known_poses="fixed")
-    mapper = Mapper(MappingProblem(images, pairs), options, Silent())
+    mapper = Mapper(MappingProblem(images, pairs), options, NullMappingEvents())
     mapper.reconstruct_next()
     scene, std_factor = mapper.group.scene, mapper.group.refiner.std_factor
     room = np.array(case.room)
@@ -98,7 +98,7 @@ def mapped(case: SymmetricProblem, enabled: bool) -> tuple[np.ndarray, int, list
     """Pose errors of the largest component, its size, verdicts, and seconds."""
     options = MapperOptions.model_validate({"consistency": {"enabled": enabled}})
     verdicts: list[tuple[bool, bool]] = []
-    mapper = Mapper(case.problem, options, Silent())
+    mapper = Mapper(case.problem, options, NullMappingEvents())
     observed = type("Told", (Observed,), {"case": case, "verdicts": verdicts})
     mapper.group_type = type("ObservedGroup", (Group,), {"upkeep_type": observed})
     start = time.perf_counter()

@@ -23,9 +23,9 @@ from mpsfm_core.calibration.samples import DepthTruth
 from mpsfm_core.calibration.study import Data, Study, StudyOptions, study
 from mpsfm_core.config import Config
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.active_provider import ActiveProvider, thread_count
-from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.models import read_model
 from mpsfm_core.pipeline.provider_resolution import provide
@@ -143,10 +143,10 @@ class _Run:
         config = provide(config, registry, stages, needed).config
         self._photos, self._config, self._kind = photos, config, kind
         self._registry, self._options = registry, options
-        self._backend: Backend = getattr(config, kind)
+        self._backend: ProviderConfig = getattr(config, kind)
         self._declared: Calibration = registry.calibration(kind, self._backend)
         images = load_images(photos.folder, photos.intrinsics, photos.image_list, config.inputs)
-        self._bench = Workbench(images, config, registry, stages)
+        self._bench = ExtractionContext(images, config, registry, stages)
         self._comparison = Comparison(self._bench, kind, alignments, options)
 
     def prepare(self) -> None:

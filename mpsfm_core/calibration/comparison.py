@@ -22,7 +22,7 @@ from mpsfm_core.calibration.truth import FileTruth
 from mpsfm_core.data import NormalPrior
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.extraction.active_provider import ActiveProvider
-from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.priors.raw_priors import RawPriors
 from mpsfm_core.providers.uncertainty.file import CalibratedKind
 from mpsfm_core.providers.uncertainty.model import DepthCalibration
@@ -40,7 +40,7 @@ class Comparison:
 
     def __init__(
         self,
-        bench: Workbench,
+        bench: ExtractionContext,
         kind: CalibratedKind,
         alignments: Sequence[Alignment] | None,
         options: StudyOptions,

@@ -10,8 +10,8 @@ import numpy as np
 from mpsfm_core.calibration.samples import DepthTruth, NormalTruth
 from mpsfm_core.data import Bool, Float64, Int64, View
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.data.options import Backend, parse_settings
-from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.data.options import ProviderConfig, parse_settings
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.geometry import pixel_centers, sample_nearest, scale_pixels
 from mpsfm_core.providers import validation
 from mpsfm_core.providers.builtin.arrays import find_file
@@ -28,7 +28,7 @@ class FileTruth:
     """
 
     def __init__(
-        self, bench: Workbench, kind: str, options: Mapping[str, Any], count: int, seed: int
+        self, bench: ExtractionContext, kind: str, options: Mapping[str, Any], count: int, seed: int
     ) -> None:
         depth = kind == "depth"
         values = {"relative_std": EXACT, **options} if depth else dict(options)
@@ -36,7 +36,7 @@ class FileTruth:
         self._options: FileOptions = parse_settings(model, values, ("ground_truth",))
         if not self._options.directory.is_dir():
             raise InputError(f"ground truth folder {self._options.directory} does not exist")
-        backend = Backend(use="files", options=self._options.model_dump(mode="json"))
+        backend = ProviderConfig(use="files", options=self._options.model_dump(mode="json"))
         self._provider = bench.provider("depth" if depth else "normals", backend)
         self._count, self._seed = count, seed
 

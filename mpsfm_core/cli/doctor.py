@@ -16,7 +16,7 @@ from mpsfm_core.cli.arguments import ConfigName, Offline, settings
 from mpsfm_core.cli.models import CacheDir
 
 if TYPE_CHECKING:
-    from mpsfm_core.pipeline.provider_resolution import Provision
+    from mpsfm_core.pipeline.provider_resolution import ProviderResolution
     from mpsfm_core.providers.registry import Registry
 
 
@@ -94,7 +94,7 @@ def _missing_plugins(registry: Registry) -> Iterator[str]:
             yield f"pip install '{requirement}' brings {', '.join(brings)}"
 
 
-def _better_choices(provision: Provision) -> Iterator[str]:
+def _better_choices(provision: ProviderResolution) -> Iterator[str]:
     """What the configuration prefers, and why it cannot be had."""
     for choice in provision.choices:
         for name, why in choice.passed_over.items():

@@ -7,13 +7,13 @@ from mpsfm_core.config.loading import (
     load_config,
     shipped_configs,
 )
-from mpsfm_core.config.model import BLOCKS, FORMAT, Config, QuickMatching, RuntimeOptions
+from mpsfm_core.config.model import BLOCKS, FORMAT, Config, FastPass, RuntimeOptions
 
 __all__ = [
     "BLOCKS",
     "FORMAT",
     "Config",
-    "QuickMatching",
+    "FastPass",
     "RuntimeOptions",
     "check_backend",
     "combination_problems",

@@ -8,7 +8,7 @@ matcher or a multi-view network are named, the parent's quick matching is lost.
 
 A block may name providers to take ``otherwise``. Which of them it will be is not the
 configuration's to say: it depends on the machine, and
-:mod:`mpsfm_core.pipeline.provider_resolution` finds it out when a run starts. """
+:mod:`mpsfm_core.pipeline.provider_resolution` finds it out when a run starts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mpsfm_core.data.options import (
     AS_DEPTH,
     FROM_MATCHER,
     FROM_MULTIVIEW,
-    Backend,
+    ProviderConfig,
     SettingPath,
     SettingProblem,
     SettingsError,
@@ -220,7 +220,7 @@ def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complet
 
 
 def _check_open(
-    path: SettingPath, kind: Kind, backend: Backend, registry: Registry, complete: bool
+    path: SettingPath, kind: Kind, backend: ProviderConfig, registry: Registry, complete: bool
 ) -> None:
     """Raise if none of the candidates could be taken, whatever is on this machine later."""
     names = (backend.use, *backend.otherwise)
@@ -247,14 +247,18 @@ def _check_open(
 
 
 def check_backend(
-    path: SettingPath, kind: Kind, backend: Backend, registry: Registry, complete: bool = True
-) -> Backend:
+    path: SettingPath,
+    kind: Kind,
+    backend: ProviderConfig,
+    registry: Registry,
+    complete: bool = True,
+) -> ProviderConfig:
     """A backend that names one provider, with its options and its wrappers' filled in.
 
     ``path``: of the block, for messages. ``complete=False`` lets required options be absent.
 
     Raises :class:`~mpsfm_core.data.options.SettingsError` when there is no such provider or
-    wrapper, or an option is wrong. """
+    wrapper, or an option is wrong."""
     try:
         options = registry.validate_options(kind, backend.use, backend.options, (*path, "options"))
         filled = options.model_dump(mode="json") if options else {}
@@ -276,7 +280,7 @@ def check_backend(
 
 
 def _calibration(
-    path: SettingPath, kind: Kind, backend: Backend, layers: Sequence[_Layer]
+    path: SettingPath, kind: Kind, backend: ProviderConfig, layers: Sequence[_Layer]
 ) -> dict[str, Any] | None:
     """The calibration's values, read from its file if it names one."""
     values, path = backend.calibration, (*path, "calibration")

@@ -9,8 +9,8 @@ from typing import Any, Literal
 from pydantic import Field
 
 from mpsfm_core.data.options import (
-    Backend,
     Options,
+    ProviderConfig,
     SettingPath,
 )
 from mpsfm_core.dense.options import DenseOptions
@@ -69,11 +69,11 @@ class RuntimeOptions(Options):
     """Never download; a missing weights file is an error."""
 
 
-class QuickMatching(Options):
+class FastPass(Options):
     """Features and a sparse matcher that cost little."""
 
-    features: Backend
-    matcher: Backend
+    features: ProviderConfig
+    matcher: ProviderConfig
     min_points: int = Field(100, ge=1)
     """An image is held in place by so many points that three images see. (COLMAP's
     init_min_num_inliers, what it takes to begin a model. Ours: images of fountain and
@@ -92,21 +92,21 @@ class Config(Options):
     """One line for ``mpsfm config list``; not inherited."""
     inputs: InputOptions = Field(default_factory=InputOptions)
     pairs: PairOptions = Field(default_factory=PairOptions)
-    quick: QuickMatching | None = None
+    quick: FastPass | None = None
     """Matching that is tried first: photos that it holds in place are not given to ``features`` and
     ``matcher`` again, pairs with others are (:mod:`mpsfm_core.pipeline.run`)."""
-    features: Backend | None = None
-    matcher: Backend | None = None
+    features: ProviderConfig | None = None
+    matcher: ProviderConfig | None = None
     """Sparse matcher, needs ``features``."""
-    dense_matcher: Backend | None = None
+    dense_matcher: ProviderConfig | None = None
     """Detector-free matcher, instead of the sparse one or beside it."""
-    retrieval: Backend | None = None
-    multiview: Backend | None = None
+    retrieval: ProviderConfig | None = None
+    multiview: ProviderConfig | None = None
     """Network that sees several photos at once, needed by ``depth: {use: multiview}``."""
-    depth: Backend
-    normals: Backend
+    depth: ProviderConfig
+    normals: ProviderConfig
     """Of the depth network's own pass with ``use: as-depth``, if that gives normals."""
-    masks: tuple[Backend, ...] = ()
+    masks: tuple[ProviderConfig, ...] = ()
     """A pixel is used when all masks allow it."""
     verification: VerificationOptions = Field(default_factory=VerificationOptions)
     adjustment: AdjustmentOptions = Field(default_factory=AdjustmentOptions)
@@ -116,7 +116,7 @@ class Config(Options):
     results: ResultOptions = Field(default_factory=ResultOptions)
     runtime: RuntimeOptions = Field(default_factory=RuntimeOptions)
 
-    def backends(self) -> Iterator[tuple[SettingPath, Kind, Backend]]:
+    def backends(self) -> Iterator[tuple[SettingPath, Kind, ProviderConfig]]:
         """Every chosen provider: its path in the configuration, kind and block."""
         if self.quick is not None:
             yield ("quick", "features"), "features", self.quick.features
@@ -128,7 +128,7 @@ class Config(Options):
         for index, backend in enumerate(self.masks):
             yield ("masks", index), "mask", backend
 
-    def replaced(self, path: SettingPath, backend: Backend) -> Config:
+    def replaced(self, path: SettingPath, backend: ProviderConfig) -> Config:
         """The configuration with another backend at a path of :meth:`backends`."""
         block, *index = path
         value: Any = backend

@@ -1,7 +1,7 @@
 """The base of everything a user can set, and how a wrong setting is told.
 
 :class:`Options` is the base of a provider's options and of the options of each room;
-:class:`Backend` is the choice of one provider in a configuration.
+:class:`ProviderConfig` is the choice of one provider in a configuration.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ FROM_MULTIVIEW = "multiview"
 """As the depth provider: the depth of the multi-view network, which sees several photos at once."""
 
 
-class Backend(Options):
+class ProviderConfig(Options):
     """The choice of one provider, or of several in the order of preference."""
 
     use: str
@@ -48,7 +48,7 @@ class Backend(Options):
     as it is written from then on, says the same."""
     options: dict[str, Any] = Field(default_factory=dict)
     """The provider's own options."""
-    wrap: tuple[Backend, ...] = ()
+    wrap: tuple[ProviderConfig, ...] = ()
     """Wrappers around the provider, the innermost first."""
     calibration: dict[str, Any] | str | None = None
     """Uncertainty of a depth or normals provider: the values, a YAML or JSON file with them, or

@@ -25,8 +25,8 @@ from mpsfm_core.evaluation.methods import (
     OTHERS,
     OURS,
     USING_PRIORS,
+    MethodRun,
     Outcome,
-    Task,
     run_tasks,
 )
 from mpsfm_core.evaluation.prior_quality import QUALITIES, error_seed, prior_settings
@@ -210,11 +210,13 @@ class _SceneRuns:
                 if method in USING_PRIORS or number == 0
             }
             options, dense = prepared.config.mapper_options(), self._dense(prepared)
-            places: dict[Task, tuple[EvaluationSet, str]] = {}
+            places: dict[MethodRun, tuple[EvaluationSet, str]] = {}
             for item in self._sets:
                 subset = prepared.of(item)
                 for label, method in methods.items():
-                    task = Task(label, method, subset, options, dense if method == OURS else None)
+                    task = MethodRun(
+                        label, method, subset, options, dense if method == OURS else None
+                    )
                     key = _key(task)
                     known = self._known(item, label, key)
                     if known is not None:
@@ -243,7 +245,7 @@ class _SceneRuns:
             return None  # what failed may have lacked memory, and is tried again
         return record
 
-    def _record(self, item: EvaluationSet, key: str, task: Task, outcome: Outcome) -> Record:
+    def _record(self, item: EvaluationSet, key: str, task: MethodRun, outcome: Outcome) -> Record:
         return Record(
             self._scene.name,
             self._config_name,
@@ -273,7 +275,7 @@ def _label(method: str, prior: str) -> str:
     return f"{method}-{prior}" if method in USING_PRIORS else method
 
 
-def _key(task: Task) -> str:
+def _key(task: MethodRun) -> str:
     """Names all that the outcome of a task depends on."""
     parts: list[object] = [task.method, core_version(), pycolmap.__version__]
     if task.method == OURS:

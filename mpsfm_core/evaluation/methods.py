@@ -57,7 +57,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class MethodRun:
     """One run: ``method`` is :data:`OURS`, :data:`CHAIN` or the name of a peer. ``dense``: how the
     depth of ours is measured and compared, None where it is not. ``threads``: at most, one unless
     wall time with more is what is compared; results of a peer may depend on them."""
@@ -70,12 +70,12 @@ class Task:
     threads: int = 1
 
 
-def run_tasks(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, Outcome]]:
+def run_tasks(tasks: Sequence[MethodRun], workers: int) -> Iterator[tuple[MethodRun, Outcome]]:
     """Run tasks in ``workers`` processes; yields them as they are done."""
     lanes = _Lanes()
     pool = ThreadPoolExecutor(max(1, workers), thread_name_prefix="mpsfm-benchmark")
     try:
-        futures: dict[Future[Outcome], Task] = {pool.submit(lanes.run, t): t for t in tasks}
+        futures: dict[Future[Outcome], MethodRun] = {pool.submit(lanes.run, t): t for t in tasks}
         for future in as_completed(futures):
             yield futures[future], future.result()
     finally:
@@ -83,7 +83,7 @@ def run_tasks(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, Outco
         lanes.close()
 
 
-def run_method(task: Task) -> Outcome:
+def run_method(task: MethodRun) -> Outcome:
     """Run a task here and now; what it raises becomes the outcome's error."""
     started, cpu_started = time.perf_counter(), time.process_time()
     models: list[dict[str, Pose]] = []
@@ -118,7 +118,7 @@ class _Lanes:
         self._lock = threading.Lock()
         self._processes: list[ProcessPoolExecutor] = []
 
-    def run(self, task: Task) -> Outcome:
+    def run(self, task: MethodRun) -> Outcome:
         """Run a task in the process of the calling thread."""
         process = getattr(self._local, "process", None) or self._start()
         try:
@@ -148,4 +148,4 @@ def _prepare() -> None:
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     camera = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
     problem = mapping_problem(room_scene(), camera, arc_poses(3, 8.0))
-    run_method(Task(OURS, OURS, problem, MapperOptions()))
+    run_method(MethodRun(OURS, OURS, problem, MapperOptions()))

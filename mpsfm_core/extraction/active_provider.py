@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data.errors import ProviderRunError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.providers import API_VERSION, Capability, Kind, ProviderContext, ProviderSpec
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore, file_sha256, is_remote
@@ -43,7 +43,7 @@ class ActiveProvider:
     """
 
     def __init__(
-        self, kind: Kind, backend: Backend, registry: Registry, runtime: RuntimeOptions
+        self, kind: Kind, backend: ProviderConfig, registry: Registry, runtime: RuntimeOptions
     ) -> None:
         self.kind = kind
         self.backend = backend

@@ -12,7 +12,7 @@ import numpy as np
 from mpsfm_core.config import Config
 from mpsfm_core.data import Bool, UInt8, View
 from mpsfm_core.data.errors import MpsfmError, ProviderOutputError, ProviderRunError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.active_provider import ActiveProvider, worker_count
 from mpsfm_core.extraction.cache import Cache, content_key, digest
 from mpsfm_core.extraction.empty_results import NOTHING
@@ -31,7 +31,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class Workbench:
+class ExtractionContext:
     """Runs providers on views and keeps what they return.
 
     ``failures``: images that the run goes on without -> what a provider failed with.
@@ -54,7 +54,7 @@ class Workbench:
         self._mask_providers: list[ActiveProvider] = []
         self._masks: dict[int, tuple[UInt8, str]] = {}
 
-    def provider(self, kind: Kind, backend: Backend) -> ActiveProvider:
+    def provider(self, kind: Kind, backend: ProviderConfig) -> ActiveProvider:
         """Take a provider into use."""
         provider = ActiveProvider(kind, backend, self.registry, self.config.runtime)
         self.providers.append(provider)

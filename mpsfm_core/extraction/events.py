@@ -15,7 +15,7 @@ class ExtractionEvents(Protocol):
     def stage_finished(self, stage: str, seconds: float) -> None: ...
 
 
-class Silent:
+class NullExtractionEvents:
     """Nobody listens."""
 
     def stage_started(self, stage: str, total: int | None) -> None:

@@ -21,8 +21,8 @@ from mpsfm_core.config import Config
 from mpsfm_core.data.errors import ConfigError, InputError, did_you_mean
 from mpsfm_core.extraction.active_provider import thread_count
 from mpsfm_core.extraction.cache import content_key
-from mpsfm_core.extraction.context import RUNS, Workbench
-from mpsfm_core.extraction.events import Silent
+from mpsfm_core.extraction.context import RUNS, ExtractionContext
+from mpsfm_core.extraction.events import NullExtractionEvents
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.matching.matching import PairMatcher
 from mpsfm_core.extraction.pairs.selection import PairSelection
@@ -38,7 +38,7 @@ THREADS = "threads"
 
 
 @contextmanager
-def workers_elsewhere(bench: Workbench) -> Iterator[None]:
+def workers_elsewhere(bench: ExtractionContext) -> Iterator[None]:
     """While this lasts, the stages that the executor's workers can do are done there first.
 
     Raises :class:`ConfigError` when no plugin brings the executor, or its workers cannot be had.
@@ -54,7 +54,7 @@ def workers_elsewhere(bench: Workbench) -> Iterator[None]:
         executor.close()
 
 
-def _executor(bench: Workbench) -> Executor | None:
+def _executor(bench: ExtractionContext) -> Executor | None:
     runtime = bench.config.runtime
     name, options = runtime.executor, runtime.executor_options
     if name == THREADS:
@@ -72,7 +72,7 @@ def _executor(bench: Workbench) -> Executor | None:
 class _Elsewhere:
     """The stages of a run that its executor's workers do."""
 
-    def __init__(self, bench: Workbench, executor: Executor) -> None:
+    def __init__(self, bench: ExtractionContext, executor: Executor) -> None:
         runtime = bench.config.runtime.model_copy(update={"executor": THREADS})
         config = bench.config.model_copy(update={"runtime": runtime})
         self._step = Step(uuid.uuid4().hex, "", bench.images, config)
@@ -107,7 +107,7 @@ class _Station:
 
     def __init__(self, step: Step) -> None:
         config = step.config
-        bench = Workbench(step.images, config, Registry.discover(), Silent())
+        bench = ExtractionContext(step.images, config, Registry.discover(), NullExtractionEvents())
         bench.shared_run = step.run
         if bench.cache.load(RUNS, content_key(step.run), np.ndarray) is None:
             raise InputError(

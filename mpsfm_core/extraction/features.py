@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import Bool, Features
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.cache import digest
-from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.geometry import sample_nearest
-from mpsfm_core.inputs.image_cache import Recent
 from mpsfm_core.providers import validation
+from mpsfm_core.support.lru_cache import LruCache
 
 CACHED_BYTES = 512 << 20
 """Features that are kept while pairs are matched; 8192 SIFT features have 4 MB."""
@@ -21,10 +21,12 @@ CACHED_BYTES = 512 << 20
 class FeatureTable:
     """Features of each image without those in masked areas; loaded again when needed."""
 
-    def __init__(self, bench: Workbench, backend: Backend) -> None:
+    def __init__(self, bench: ExtractionContext, backend: ProviderConfig) -> None:
         self._bench = bench
         self._provider = bench.provider("features", backend)
-        self._recent: Recent[int, Features] = Recent(CACHED_BYTES, lambda f: f.descriptors.nbytes)
+        self._recent: LruCache[int, Features] = LruCache(
+            CACHED_BYTES, lambda f: f.descriptors.nbytes
+        )
 
     def extract(self) -> list[Features]:
         """Run the stage; returns features without descriptors, to keep memory small."""

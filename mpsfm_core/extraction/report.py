@@ -9,13 +9,13 @@ import numpy as np
 
 from mpsfm_core.data import DepthPrior, MappingImage, MappingProblem
 from mpsfm_core.extraction.active_provider import ActiveProvider
-from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.matching.matching import Candidates
 from mpsfm_core.extraction.matching.verification import TwoView
 
 
 def describe(
-    bench: Workbench,
+    bench: ExtractionContext,
     problem: MappingProblem,
     proposed: int,
     candidates: list[Candidates],

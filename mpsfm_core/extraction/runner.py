@@ -19,8 +19,8 @@ from mpsfm_core.config import Config
 from mpsfm_core.data import Features, MappingImage, MappingProblem, SparseMatches, VerifiedPair
 from mpsfm_core.data.options import FROM_MULTIVIEW
 from mpsfm_core.extraction.active_provider import thread_count
-from mpsfm_core.extraction.context import Workbench
-from mpsfm_core.extraction.events import ExtractionEvents, Silent
+from mpsfm_core.extraction.context import ExtractionContext
+from mpsfm_core.extraction.events import ExtractionEvents, NullExtractionEvents
 from mpsfm_core.extraction.execution import workers_elsewhere
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.matching.dense_matches import NO_POINTS
@@ -76,7 +76,7 @@ def extract(
         ConfigError: the executor cannot be had, or its workers do not share the cache.
         OutputError: the cache cannot be written.
     """
-    bench = Workbench(images, config, registry, events or Silent())
+    bench = ExtractionContext(images, config, registry, events or NullExtractionEvents())
     with (
         threadpool_limits(thread_count(config.runtime), user_api="blas"),
         workers_elsewhere(bench),
@@ -97,7 +97,7 @@ def extract_more(
 
     Depth and normals stay. Raises as :func:`extract`.
     """
-    bench = Workbench(images, config, registry, events or Silent())
+    bench = ExtractionContext(images, config, registry, events or NullExtractionEvents())
     with (
         threadpool_limits(thread_count(config.runtime), user_api="blas"),
         workers_elsewhere(bench),
@@ -116,12 +116,12 @@ def adjust(
 ) -> MappingProblem:
     """The problem of an extraction without adjustment, or a part of its pairs, with adjusted
     keypoints. Raises as :func:`extract`."""
-    bench = Workbench(images, config, registry, Silent())
+    bench = ExtractionContext(images, config, registry, NullExtractionEvents())
     with threadpool_limits(thread_count(config.runtime), user_api="blas"):
         return adjusted_problem(bench, problem)
 
 
-def _extract(bench: Workbench, imported: ImportedMatches | None) -> Extraction:
+def _extract(bench: ExtractionContext, imported: ImportedMatches | None) -> Extraction:
     check_depth_source(bench.config, bench.registry)
     bench.run_masks()
     found = _match(bench) if imported is None else _verify(bench, imported)
@@ -153,7 +153,7 @@ def _extract(bench: Workbench, imported: ImportedMatches | None) -> Extraction:
     return Extraction(problem, described)
 
 
-def _see_groups(bench: Workbench, pairs: tuple[VerifiedPair, ...]) -> GroupPriors | None:
+def _see_groups(bench: ExtractionContext, pairs: tuple[VerifiedPair, ...]) -> GroupPriors | None:
     """Show the multi-view network, where there is one, groups of photos that see the same."""
     if bench.config.multiview is None:
         return None
@@ -162,7 +162,7 @@ def _see_groups(bench: Workbench, pairs: tuple[VerifiedPair, ...]) -> GroupPrior
     return groups
 
 
-def _place(bench: Workbench, groups: GroupPriors | None, index: int) -> dict[str, Any]:
+def _place(bench: ExtractionContext, groups: GroupPriors | None, index: int) -> dict[str, Any]:
     """What the mapper is told of an image's group, if its depth is the group's."""
     if groups is None or bench.config.depth.use != FROM_MULTIVIEW:
         return {}
@@ -183,7 +183,7 @@ class _Found:
 
 
 def _match(
-    bench: Workbench,
+    bench: ExtractionContext,
     loose: Collection[int] | None = None,
     verified: Sequence[VerifiedPair] = (),
 ) -> _Found:
@@ -205,7 +205,7 @@ def _match(
     return _Found(located, selection.proposed, candidates, outcomes, matcher)
 
 
-def _verify(bench: Workbench, imported: ImportedMatches) -> _Found:
+def _verify(bench: ExtractionContext, imported: ImportedMatches) -> _Found:
     """As they come, without those in masked areas."""
     located, allowed = [], []
     for index, (xy, std_px) in enumerate(zip(imported.keypoints, imported.std_px, strict=True)):

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from mpsfm_core.data import SceneState
+from mpsfm_core.data.decisions import Reason
 
 
 class MappingEvents(Protocol):
@@ -13,18 +14,18 @@ class MappingEvents(Protocol):
 
     def image_registered(self, name: str, registered: int, total: int) -> None: ...
 
-    def image_rejected(self, name: str, reason: str) -> None: ...
+    def image_rejected(self, name: str, reason: Reason) -> None: ...
 
     def scene_changed(self, scene: Callable[[], SceneState]) -> None: ...
 
 
-class Silent:
+class NullMappingEvents:
     """Nobody listens."""
 
     def image_registered(self, name: str, registered: int, total: int) -> None:
         """Nothing."""
 
-    def image_rejected(self, name: str, reason: str) -> None:
+    def image_rejected(self, name: str, reason: Reason) -> None:
         """Nothing."""
 
     def scene_changed(self, scene: Callable[[], SceneState]) -> None:

@@ -9,10 +9,11 @@ from functools import partial
 import numpy as np
 
 from mpsfm_core.data import Bool, MappingProblem
+from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.checkpoints import Checkpoints, Keeper
 from mpsfm_core.mapping.component import Group, nothing
 from mpsfm_core.mapping.event_log import Journal
-from mpsfm_core.mapping.events import MappingEvents, Silent
+from mpsfm_core.mapping.events import MappingEvents, NullMappingEvents
 from mpsfm_core.mapping.initialization.initial_pair import Starts
 from mpsfm_core.mapping.model_selection import Run, best, explained_shares, settled, with_all_times
 from mpsfm_core.mapping.options import MapperOptions
@@ -39,7 +40,7 @@ def reconstruct(
     much. The result is the same bit for bit for the same problem, options and machine, also where a
     run that ended early goes on from one of its ``checkpoints``.
     """
-    options, events = options or MapperOptions(), events or Silent()
+    options, events = options or MapperOptions(), events or NullMappingEvents()
     problem = canonical(problem)
     keeper = Keeper(checkpoints, problem, events)
     runs, unfinished = keeper.load()
@@ -107,7 +108,7 @@ class Mapper:
             if not self.reconstruct_next(paused):
                 return self.models
             self._tried += 1
-        self._reject(self.left, f"not tried: there are {most} groups")
+        self._reject(self.left, ImageReason.COMPONENT_LIMIT.because(max_components=most))
         return self.models
 
     def reconstruct_next(self, paused: Callable[[], None] = nothing) -> bool:
@@ -131,7 +132,7 @@ class Mapper:
             self.group.finish()
         self._keep(in_users_world=known and self.options.known_poses != "guess")
         if fixed:
-            self._reject(self.left, "has no known pose, and known poses are fixed")
+            self._reject(self.left, ImageReason.NO_KNOWN_POSE.because())
         return not fixed
 
     def _new_group(self) -> Group:
@@ -193,9 +194,9 @@ class Mapper:
         if size >= least:
             self.models.append(finished(scene, keep_units=in_users_world))
         else:
-            reason = f"only {size} images are connected, {least} are wanted"
+            reason = ImageReason.COMPONENT_TOO_SMALL.because(num_images=size, min_images=least)
             self._reject(scene.registered, reason)
 
-    def _reject(self, images: Bool, reason: str) -> None:
+    def _reject(self, images: Bool, reason: Reason) -> None:
         for image in np.flatnonzero(images):
             self.journal.rejected(int(image), reason)

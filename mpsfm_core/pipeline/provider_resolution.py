@@ -15,7 +15,14 @@ from pathlib import Path
 
 from mpsfm_core.config import BLOCKS, Config, check_backend, combination_problems
 from mpsfm_core.data.errors import ConfigError, InputError
-from mpsfm_core.data.options import AS_DEPTH, Backend, Options, SettingPath, SettingsError, dotted
+from mpsfm_core.data.options import (
+    AS_DEPTH,
+    Options,
+    ProviderConfig,
+    SettingPath,
+    SettingsError,
+    dotted,
+)
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers import Kind, ProviderSpec, WeightsFile
 from mpsfm_core.providers.registry import Registry
@@ -57,7 +64,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Provision:
+class ProviderResolution:
     """A configuration that leaves no choice open, and how each of its providers was chosen."""
 
     config: Config
@@ -69,7 +76,7 @@ def provide(
     registry: Registry,
     stages: Stages | None = None,
     blocks: Collection[str] = BLOCKS,
-) -> Provision:
+) -> ProviderResolution:
     """Find or fetch everything that a run with this configuration needs.
 
     ``stages`` is told of every choice and of downloads. ``blocks``: those that are wanted; others
@@ -96,7 +103,9 @@ def provide(
     return provision
 
 
-def look_up(config: Config, registry: Registry, blocks: Collection[str] = BLOCKS) -> Provision:
+def look_up(
+    config: Config, registry: Registry, blocks: Collection[str] = BLOCKS
+) -> ProviderResolution:
     """What :func:`provide` would give if every download succeeded; downloads nothing.
 
     Raises as :func:`provide`.
@@ -136,7 +145,7 @@ class _Search:
         self._have = have
         self._absent = [] if absent is None else absent
 
-    def __call__(self, config: Config, blocks: Collection[str]) -> Provision:
+    def __call__(self, config: Config, blocks: Collection[str]) -> ProviderResolution:
         choices = []
         for path, kind, backend in list(config.backends()):
             if path[0] not in blocks:
@@ -144,11 +153,11 @@ class _Search:
             found, choice = self._choose(config, path, kind, backend)
             config = config.replaced(path, found)
             choices.append(choice)
-        return Provision(config, tuple(choices))
+        return ProviderResolution(config, tuple(choices))
 
     def _choose(
-        self, config: Config, path: SettingPath, kind: Kind, backend: Backend
-    ) -> tuple[Backend, Choice]:
+        self, config: Config, path: SettingPath, kind: Kind, backend: ProviderConfig
+    ) -> tuple[ProviderConfig, Choice]:
         names = (backend.use, *backend.otherwise)
         passed_over: dict[str, str] = {}
         for name in names:
@@ -171,8 +180,8 @@ class _Search:
         raise ConfigError(f"{dotted(path)}: no provider can be had: {reasons}")
 
     def _candidate(
-        self, config: Config, path: SettingPath, kind: Kind, backend: Backend, name: str
-    ) -> Backend:
+        self, config: Config, path: SettingPath, kind: Kind, backend: ProviderConfig, name: str
+    ) -> ProviderConfig:
         """The block with this provider alone, once all that it needs is here."""
         candidate = backend.model_copy(update={"use": name, "otherwise": ()})
         if name == AS_DEPTH:
@@ -185,7 +194,7 @@ class _Search:
             self._equip((*path, "wrap", index), "wrapper", wrapper)
         return candidate
 
-    def _as_depth(self, depth: Backend, backend: Backend) -> Backend:
+    def _as_depth(self, depth: ProviderConfig, backend: ProviderConfig) -> ProviderConfig:
         if "joint-normals" not in self._registry.spec("depth", depth.use).capabilities:
             raise ConfigError(f"the depth provider {depth.use!r} gives no normals")
         return backend.model_copy(update={"use": depth.use, "options": depth.options})
@@ -196,7 +205,7 @@ class _Search:
         if problems:
             raise SettingsError(tuple(problems))
 
-    def _equip(self, path: SettingPath, kind: Kind, backend: Backend) -> None:
+    def _equip(self, path: SettingPath, kind: Kind, backend: ProviderConfig) -> None:
         """See to the files that a provider reads and to its weights."""
         options = self._registry.validate_options(kind, backend.use, backend.options)
         for key, file in _paths(options):

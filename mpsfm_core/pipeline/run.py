@@ -18,11 +18,11 @@ from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import DepthPrior, Float64, MappingProblem, Pose, View
 from mpsfm_core.data.errors import ConfigError, InputError, ReconstructionError
 from mpsfm_core.data.options import FROM_MATCHER
+from mpsfm_core.dense.densify import DenseReport, densify
+from mpsfm_core.dense.depth_range import depth_of_points
 from mpsfm_core.dense.fusion import fuse_depth_maps
-from mpsfm_core.dense.mesh import Mesh, mesh_of_depth_maps
+from mpsfm_core.dense.mesh import TriangleMesh, mesh_of_depth_maps
 from mpsfm_core.dense.options import DenseOptions, MeshOptions
-from mpsfm_core.dense.sparse_depth import depth_of_points
-from mpsfm_core.dense.stage import DenseReport, densify
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.priors.focal_length import estimate_focals
 from mpsfm_core.extraction.runner import Extraction, extract, extract_more
@@ -41,7 +41,7 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
 from mpsfm_core.pipeline import precompile, resources
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, DiskCheckpoints
-from mpsfm_core.pipeline.provider_resolution import Provision, provide
+from mpsfm_core.pipeline.provider_resolution import ProviderResolution, provide
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry, core_version
 from mpsfm_core.providers.weights import WeightStore
@@ -173,7 +173,7 @@ class _Run:
         self._output = output
         self._fresh = fresh
         self._stages = Stages(registry)
-        self._provision = Provision(config, ())
+        self._provision = ProviderResolution(config, ())
         self._folder = Path()
         self._dense: list[dict[str, Any]] | None = None
         self._imported: ImportedMatches | None = None
@@ -624,7 +624,7 @@ def mesh_model(
     folder: PathLike,
     photos: PathLike | None = None,
     options: MeshOptions | None = None,
-) -> Mesh:
+) -> TriangleMesh:
     """Write ``mesh.ply`` and ``mesh.glb`` into a result folder that has depth maps.
 
     ``photos``: the folder of the photos, if they are not where the run found them. The PLY file has

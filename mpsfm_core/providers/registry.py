@@ -18,7 +18,7 @@ from typing import Any, Literal
 import pluggy
 
 from mpsfm_core.data.errors import InputError, MpsfmError, ProviderError, did_you_mean
-from mpsfm_core.data.options import Backend, Options, SettingPath, parse_settings
+from mpsfm_core.data.options import Options, ProviderConfig, SettingPath, parse_settings
 from mpsfm_core.providers import (
     CAPABILITY_METHODS,
     KINDS,
@@ -136,7 +136,7 @@ class Registry:
         """Add a plugin (a module or object with ``@hookimpl`` functions) of this process.
 
         Raises :class:`~mpsfm_core.data.errors.ProviderError` where discovery would list it as
-        broken. """
+        broken."""
         name = name or str(getattr(plugin, "__name__", type(plugin).__name__))
         try:
             loaded = inspect_plugin(plugin, name, distribution, version)
@@ -177,7 +177,7 @@ class Registry:
         """The specification of an available provider.
 
         Raises :class:`~mpsfm_core.data.errors.ProviderError` with the nearest name and what to
-        install when there is none, or with the reason when it is there and unavailable. """
+        install when there is none, or with the reason when it is there and unavailable."""
         return self._entry(kind, name).spec
 
     def version(self, kind: Kind, name: str) -> str:
@@ -195,7 +195,7 @@ class Registry:
         """The provider's options with defaults filled in, None when it has none.
 
         Raises :class:`~mpsfm_core.data.options.SettingsError` with the path (below ``path``) and
-        the nearest key for each wrong setting. """
+        the nearest key for each wrong setting."""
         model = self._options_model(kind, name)
         return parse_settings(model or _NoOptions, values or {}, path) if model or values else None
 
@@ -210,7 +210,7 @@ class Registry:
         """The weights files that a provider loads with these options.
 
         Raises :class:`~mpsfm_core.data.options.SettingsError` when the options are wrong or lack
-        one that the user has to give. """
+        one that the user has to give."""
         entry = self._entry(kind, name)
         files = entry.spec.weights
         if not callable(files):
@@ -224,7 +224,7 @@ class Registry:
             what = f"cannot say which weights it loads: {type(error).__name__}: {error}"
             raise ProviderError(_sentence(entry.label, what, "tell its author")) from error
 
-    def calibration(self, kind: Kind, backend: Backend) -> Calibration:
+    def calibration(self, kind: Kind, backend: ProviderConfig) -> Calibration:
         """The uncertainty model of a depth, multi-view or normals backend.
 
         What the configuration says (``backend.calibration``, values only: a file was read when the
@@ -235,7 +235,9 @@ class Registry:
         model: type[Calibration] = NormalCalibration if kind == "normals" else DepthCalibration
         if isinstance(backend.calibration, Mapping):
             return parse_settings(model, backend.calibration, ("calibration",))
-        wrappers: list[tuple[Kind, Backend]] = [("wrapper", w) for w in reversed(backend.wrap)]
+        wrappers: list[tuple[Kind, ProviderConfig]] = [
+            ("wrapper", w) for w in reversed(backend.wrap)
+        ]
         for chosen, block in (*wrappers, (kind, backend)):
             options = self.validate_options(chosen, block.use, block.options)
             answers = self.call_hook(
@@ -252,13 +254,13 @@ class Registry:
         name: str,
         options: Options | Mapping[str, Any] | None,
         context: ProviderContext,
-        wrap: Sequence[Backend] = (),
+        wrap: Sequence[ProviderConfig] = (),
     ) -> Any:
         """Import and construct a provider, inside of its wrappers (the innermost first).
 
         The result has the method of ``PROTOCOLS[kind]``. Raises
         :class:`~mpsfm_core.data.errors.ProviderError` naming provider, plugin and what to do when
-        it cannot be imported or constructed; errors that are already ours pass unchanged. """
+        it cannot be imported or constructed; errors that are already ours pass unchanged."""
         entry = self._entry(kind, name)
         provider = self._construct(entry, (), options, context)
         extra = [m for c, m in CAPABILITY_METHODS.items() if c in entry.spec.capabilities]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import DepthPrior, Features, GroupPrior, View
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.providers import Capability, Kind, ProviderContext, ProviderSpec, validation
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
@@ -142,7 +142,7 @@ class Case:
         registry = Registry()
         oracle = ORACLE_SPECS[self.kind]
         registry.add(self.spec, replace(oracle, factory=self._oracle.factory(self.kind)))
-        wrapper = Backend(use=self.spec.name, options=dict(self.setup.options))
+        wrapper = ProviderConfig(use=self.spec.name, options=dict(self.setup.options))
         return self._create(registry, self.kind, oracle.name, inner, (wrapper,))
 
     @property
@@ -227,12 +227,12 @@ class Case:
         options = dict(self.setup.options)
         if self._oracle is None:
             return self.registry.calibration(
-                self.kind, Backend(use=self.spec.name, options=options)
+                self.kind, ProviderConfig(use=self.spec.name, options=options)
             )
-        wrapper = Backend(use=self.spec.name, options=options)
+        wrapper = ProviderConfig(use=self.spec.name, options=options)
         registry = Registry()
         registry.add(self.spec, ORACLE_SPECS[self.kind])
-        inner = Backend(use=ORACLE_SPECS[self.kind].name, wrap=(wrapper,))
+        inner = ProviderConfig(use=ORACLE_SPECS[self.kind].name, wrap=(wrapper,))
         return registry.calibration(self.kind, inner)
 
     @property
@@ -273,7 +273,7 @@ class Case:
         kind: Kind,
         name: str,
         options: Mapping[str, Any],
-        wrap: tuple[Backend, ...] = (),
+        wrap: tuple[ProviderConfig, ...] = (),
     ) -> Any:
         context = ProviderContext(WeightStore().resolve, device=self._device)
         return registry.create(kind, name, options, context, wrap)

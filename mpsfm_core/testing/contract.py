@@ -71,7 +71,7 @@ class CheckResult:
 
 
 @dataclass(frozen=True)
-class Task:
+class CheckTask:
     """One check of one provider; ``around`` as in :class:`CheckResult`."""
 
     id: str
@@ -86,7 +86,7 @@ class Contract:
 
     ``setup``: how it is put under test, by default what its plugin says (``spec.contract``).
     ``folder``: for the files of stand-ins. Raises :class:`~mpsfm_core.data.errors.ProviderError`
-    when there is no such provider or it is unavailable. """
+    when there is no such provider or it is unavailable."""
 
     def __init__(
         self,
@@ -111,11 +111,11 @@ class Contract:
         """Kind and name."""
         return f"{self.spec.kind}/{self.spec.name}"
 
-    def tasks(self) -> list[Task]:
+    def tasks(self) -> list[CheckTask]:
         """The checks in the order to run them; knows them without making anything."""
         return tasks_of(self.spec)
 
-    def run(self, task: Task) -> CheckResult:
+    def run(self, task: CheckTask) -> CheckResult:
         """Run one check."""
         started = time.perf_counter()
         reason = ""
@@ -132,7 +132,7 @@ class Contract:
         seconds = time.perf_counter() - started
         return CheckResult(self.provider, task.around, task.id, status, message, seconds)
 
-    def _outcome(self, case: Case, task: Task) -> tuple[Status, str]:
+    def _outcome(self, case: Case, task: CheckTask) -> tuple[Status, str]:
         check = check_of(task.id)
         if check not in REQUIRED and check not in STANDALONE:
             fault = self._fault(case, task.around)
@@ -208,7 +208,7 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
 
     Raises :class:`~mpsfm_core.data.errors.InputError` when there is none, and
     :class:`~mpsfm_core.data.errors.ProviderError` with the reason if the plugin is there and has
-    none. """
+    none."""
     known = [line for line in registry.status() if line.kind != "plugin"]
     found = [
         (line.kind, line.name)
@@ -252,7 +252,7 @@ def setup_from(assignments: Sequence[str]) -> Setup | None:
     return Setup(options=options) if options else None
 
 
-def tasks_of(spec: ProviderSpec) -> list[Task]:
+def tasks_of(spec: ProviderSpec) -> list[CheckTask]:
     """The checks of a provider of this specification, in the order to run them."""
     wrapped = [kind for kind in ("depth", "normals") if f"wraps-{kind}" in spec.capabilities]
     tasks = []
@@ -260,7 +260,7 @@ def tasks_of(spec: ProviderSpec) -> list[Task]:
         special = [*CHECKS_BY_KIND[spec.kind]]
         special += next((checks for kind, checks in CHECKS_BY_KIND.items() if kind == around), ())
         checks = [*STANDALONE, check_output_rules, *special, *COMMON]
-        tasks += [Task(id_of(check), around) for check in checks]
+        tasks += [CheckTask(id_of(check), around) for check in checks]
     return tasks
 
 

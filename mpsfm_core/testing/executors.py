@@ -17,8 +17,8 @@ import cv2
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.errors import ConfigError, DataError, ProviderRunError
-from mpsfm_core.data.options import Backend
-from mpsfm_core.extraction.events import Silent
+from mpsfm_core.data.options import ProviderConfig
+from mpsfm_core.extraction.events import NullExtractionEvents
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.providers import Executor
@@ -199,7 +199,7 @@ def _installed(folder: Path) -> Iterator[None]:
             os.environ["PYTHONPATH"] = before
 
 
-class _Watch(Silent):
+class _Watch(NullExtractionEvents):
     def __init__(self) -> None:
         self.done: dict[str, int] = {}
 
@@ -218,7 +218,7 @@ def _hearing_ctrl_c() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-class _CtrlC(Silent):
+class _CtrlC(NullExtractionEvents):
     def stage_progress(self, stage: str, done: int, total: int) -> None:
         if stage == "matching":
             signal.raise_signal(signal.SIGINT)
@@ -234,13 +234,16 @@ def _make_photos(folder: Path) -> None:
 
 
 def _extract(
-    folder: Path, runtime: RuntimeOptions, events: Silent | None = None, depth: str = "flat"
+    folder: Path,
+    runtime: RuntimeOptions,
+    events: NullExtractionEvents | None = None,
+    depth: str = "flat",
 ) -> Extraction:
     config = Config(
-        features=Backend(use="sift"),
-        matcher=Backend(use="mutual-nearest"),
-        depth=Backend(use=depth),
-        normals=Backend(use="from-depth"),
+        features=ProviderConfig(use="sift"),
+        matcher=ProviderConfig(use="mutual-nearest"),
+        depth=ProviderConfig(use=depth),
+        normals=ProviderConfig(use="from-depth"),
         runtime=runtime,
     )
     images = load_images(folder / "photos", folder / "intrinsics.yaml", None, config.inputs)

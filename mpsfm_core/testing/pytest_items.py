@@ -12,7 +12,7 @@ import pytest
 
 from mpsfm_core.data.errors import MpsfmError
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing.contract import Contract, Task, find_providers, setup_from
+from mpsfm_core.testing.contract import CheckTask, Contract, find_providers, setup_from
 from mpsfm_core.testing.pytest_tests import report
 
 
@@ -62,7 +62,7 @@ class _Provider(pytest.Collector):
 class ContractItem(pytest.Item):
     """One check."""
 
-    def __init__(self, *, contract: Contract, task: Task, **rest: Any) -> None:
+    def __init__(self, *, contract: Contract, task: CheckTask, **rest: Any) -> None:
         super().__init__(**rest)
         self._contract = contract
         self._task = task

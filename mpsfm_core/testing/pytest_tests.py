@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from mpsfm_core.providers import Kind
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing.contract import CheckResult, Contract, SetupSource, Task, tasks_of
+from mpsfm_core.testing.contract import CheckResult, CheckTask, Contract, SetupSource, tasks_of
 
 
 def contract_tests(
@@ -25,7 +25,7 @@ def contract_tests(
     tasks = tasks_of(registry.spec(kind, name))
     contracts: list[Contract] = []
 
-    def test_contract(task: Task, tmp_path_factory: pytest.TempPathFactory) -> None:
+    def test_contract(task: CheckTask, tmp_path_factory: pytest.TempPathFactory) -> None:
         if not contracts:
             folder = tmp_path_factory.mktemp("contract")
             contracts.append(Contract(registry, kind, name, folder, setup))

@@ -14,7 +14,7 @@ from mpsfm_core.cli import build_app
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation import methods
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
-from mpsfm_core.evaluation.methods import Task, run_method, run_tasks
+from mpsfm_core.evaluation.methods import MethodRun, run_method, run_tasks
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.records import read_record, read_records
 from mpsfm_core.evaluation.report import CLOUD
@@ -197,9 +197,9 @@ def test_two_scenes_of_one_name_are_refused(scene_folder: Path, tmp_path: Path) 
         run_benchmark(Plan((scene_folder, scene_folder)), tmp_path)
 
 
-def small_task(method: str = "ours") -> Task:
+def small_task(method: str = "ours") -> MethodRun:
     problem = mapping_problem(room_scene(), CAMERA, arc_poses(3, 10.0))
-    return Task(method, method, problem, MapperOptions())
+    return MethodRun(method, method, problem, MapperOptions())
 
 
 def test_what_a_method_raises_is_its_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -213,7 +213,7 @@ def test_what_a_method_raises_is_its_outcome(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_method_that_kills_its_process_is_recorded_and_the_rest_goes_on() -> None:
-    dies = Task("dies", "ours", Deadly(), MapperOptions())  # type: ignore[arg-type]
+    dies = MethodRun("dies", "ours", Deadly(), MapperOptions())  # type: ignore[arg-type]
     outcomes = {task.label: outcome for task, outcome in run_tasks([dies, small_task("colmap")], 1)}
     assert outcomes["dies"].error == "its process died"
     assert len(outcomes["colmap"].models[0]) == 3

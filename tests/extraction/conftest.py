@@ -23,7 +23,7 @@ from mpsfm_core.data import (
     PinholeCamera,
     View,
 )
-from mpsfm_core.data.options import Backend, Options
+from mpsfm_core.data.options import Options, ProviderConfig
 from mpsfm_core.extraction.options import AdjustmentOptions
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
@@ -86,10 +86,10 @@ class World:
 
     def config(self, **changes: Any) -> Config:
         values: dict[str, Any] = {
-            "features": Backend(use="truth"),
-            "matcher": Backend(use="mutual-nearest"),
-            "depth": Backend(use="truth"),
-            "normals": Backend(use="truth"),
+            "features": ProviderConfig(use="truth"),
+            "matcher": ProviderConfig(use="mutual-nearest"),
+            "depth": ProviderConfig(use="truth"),
+            "normals": ProviderConfig(use="truth"),
             "adjustment": AdjustmentOptions(enabled=False),  # true keypoints are exact
             "runtime": RuntimeOptions(cache_dir=self.cache, workers=2),
             **changes,

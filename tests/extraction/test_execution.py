@@ -17,7 +17,7 @@ from mpsfm_core import hookimpl
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import DataError, PinholeCamera
 from mpsfm_core.data.errors import ConfigError, InputError, ProviderOutputError, ReconstructionError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.execution import Step
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
@@ -78,10 +78,10 @@ def run(tmp_path: Path, plugin: Plugin) -> Callable[..., Extraction]:
     def run(executor: str, **changes: Any) -> Extraction:
         runtime = RuntimeOptions(cache_dir=tmp_path / executor, workers=2, executor=executor)
         values: dict[str, Any] = {
-            "features": Backend(use="sift"),
-            "matcher": Backend(use="mutual-nearest"),
-            "depth": Backend(use="flat"),
-            "normals": Backend(use="from-depth"),
+            "features": ProviderConfig(use="sift"),
+            "matcher": ProviderConfig(use="mutual-nearest"),
+            "depth": ProviderConfig(use="flat"),
+            "normals": ProviderConfig(use="from-depth"),
             "runtime": runtime,
         }
         images = load_images(tmp_path / "photos")
@@ -101,8 +101,8 @@ def test_results_are_those_of_threads(run: Callable[..., Extraction], plugin: Pl
 
 def test_masks_and_retrieval(run: Callable[..., Extraction], plugin: Plugin) -> None:
     changes = {
-        "masks": (Backend(use="sky-simple"),),
-        "retrieval": Backend(use="appearance"),
+        "masks": (ProviderConfig(use="sky-simple"),),
+        "retrieval": ProviderConfig(use="appearance"),
         "pairs": {"mode": "retrieval", "top_k": 1},
     }
     here, there = run("threads", **changes), run("pickled", **changes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.priors.focal_length import estimate_focals
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.providers import ProviderSpec
@@ -31,7 +31,7 @@ def estimated(world):
 
     def run(provider="sees", intrinsics=None):
         images = load_images(world.root / "images", intrinsics)
-        config = world.config(depth=Backend(use=provider))
+        config = world.config(depth=ProviderConfig(use=provider))
         return estimate_focals(images, config, world.registry), asked
 
     return run

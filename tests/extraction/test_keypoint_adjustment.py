@@ -15,7 +15,7 @@ from mpsfm_core.data import (
     VerifiedPair,
     View,
 )
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.matching.keypoint_adjustment import (
     AlignedPair,
     Side,
@@ -190,7 +190,7 @@ def test_images_of_coarse_keypoints_are_made_smaller() -> None:
 
 
 OFF = AdjustmentOptions(enabled=False)
-ROUNDED = {"features": Backend(use="rounded"), "adjustment": AdjustmentOptions()}
+ROUNDED = {"features": ProviderConfig(use="rounded"), "adjustment": AdjustmentOptions()}
 
 
 class RoundedFeatures:

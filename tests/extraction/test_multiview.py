@@ -11,7 +11,7 @@ import pytest
 from mpsfm_core import DepthPrior, GroupPrior, View
 from mpsfm_core.data import DataError
 from mpsfm_core.data.errors import ConfigError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.cache import Cache, pack, unpack
 from mpsfm_core.extraction.priors.multiview import choose_groups, in_turn
 from mpsfm_core.geometry import compose, invert
@@ -88,7 +88,7 @@ def shown(world: World) -> list[list[str]]:
     return asked
 
 
-MULTIVIEW = {"multiview": Backend(use="truth"), "depth": Backend(use="multiview")}
+MULTIVIEW = {"multiview": ProviderConfig(use="truth"), "depth": ProviderConfig(use="multiview")}
 
 
 def test_the_mapper_gets_depth_groups_and_poses(world: World, shown: list[list[str]]) -> None:
@@ -119,14 +119,14 @@ def test_a_second_run_asks_nothing_and_the_report_names_the_groups(
 
 
 def test_other_depth_takes_no_scale_of_a_group(world: World, shown: list[list[str]]) -> None:
-    problem = world.extract(multiview=Backend(use="truth")).problem
+    problem = world.extract(multiview=ProviderConfig(use="truth")).problem
     assert shown
     assert {(image.depth_group, image.proposed_pose) for image in problem.images} == {(None, None)}
 
 
 def test_the_calibration_is_that_of_the_network(world: World, shown: list[list[str]]) -> None:
     wide = {"relative_std": 0.5, "std_scale": 1.0, "std_floor": 0.0}
-    blocks = {**MULTIVIEW, "multiview": Backend(use="truth", calibration=wide)}
+    blocks = {**MULTIVIEW, "multiview": ProviderConfig(use="truth", calibration=wide)}
     depth = world.extract(**blocks).problem.images[0].depth
     assert depth.variance is not None
     relative = np.sqrt(depth.variance[depth.valid]) / depth.depth[depth.valid]
@@ -144,7 +144,7 @@ def test_a_provider_that_fails_leaves_depth_unknown(
         return Failing()
 
     world.registry.add(ProviderSpec("multiview", "failing", fail))
-    blocks = {**MULTIVIEW, "multiview": Backend(use="failing")}
+    blocks = {**MULTIVIEW, "multiview": ProviderConfig(use="failing")}
     runtime = world.config().runtime.model_copy(update={"on_error": "skip"})
     problem = world.extract(**blocks, runtime=runtime).problem
     assert not any(image.depth.valid.any() for image in problem.images)

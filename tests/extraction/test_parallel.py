@@ -10,7 +10,7 @@ import pytest
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.extraction import active_provider as backends
 from mpsfm_core.extraction.active_provider import thread_count, worker_count
-from mpsfm_core.extraction.events import Silent
+from mpsfm_core.extraction.events import NullExtractionEvents
 from mpsfm_core.extraction.parallel import run_stage
 from mpsfm_core.providers import ProviderSpec
 
@@ -20,13 +20,15 @@ def test_order_is_that_of_the_items() -> None:
         time.sleep(0.02 * (3 - item % 4))
         return item * item
 
-    assert run_stage(Silent(), "stage", range(8), work, 4) == [i * i for i in range(8)]
-    assert run_stage(Silent(), "stage", [], work, 4) == []
+    assert run_stage(NullExtractionEvents(), "stage", range(8), work, 4) == [
+        i * i for i in range(8)
+    ]
+    assert run_stage(NullExtractionEvents(), "stage", [], work, 4) == []
 
 
 def test_items_run_at_the_same_time() -> None:
     meeting = threading.Barrier(3, timeout=10)
-    run_stage(Silent(), "stage", range(3), lambda _: meeting.wait(), 3)
+    run_stage(NullExtractionEvents(), "stage", range(3), lambda _: meeting.wait(), 3)
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
@@ -39,7 +41,7 @@ def test_an_error_drops_the_rest(error: type[BaseException]) -> None:
         done.append(item)
         time.sleep(0.01)
 
-    class Watch(Silent):
+    class Watch(NullExtractionEvents):
         finished = False
 
         def stage_finished(self, stage: str, seconds: float) -> None:
@@ -54,7 +56,7 @@ def test_an_error_drops_the_rest(error: type[BaseException]) -> None:
 def test_events_come_from_the_calling_thread() -> None:
     seen: set[int] = set()
 
-    class Watch(Silent):
+    class Watch(NullExtractionEvents):
         def stage_progress(self, stage: str, done: int, total: int) -> None:
             seen.add(threading.get_ident())
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpsfm_core.config import QuickMatching
+from mpsfm_core.config import FastPass
 from mpsfm_core.data import Float64
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.options import PairOptions
 from mpsfm_core.extraction.runner import Extraction, extract_more
 from mpsfm_core.geometry import transform
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.pipeline.run import reconstruct
 
-TRUTH = QuickMatching(features=Backend(use="truth"), matcher=Backend(use="mutual-nearest"))
-DENSE = {"features": None, "matcher": None, "dense_matcher": Backend(use="dense")}
+TRUTH = FastPass(features=ProviderConfig(use="truth"), matcher=ProviderConfig(use="mutual-nearest"))
+DENSE = {"features": None, "matcher": None, "dense_matcher": ProviderConfig(use="dense")}
 
 
 def distances_to_epipolar_lines(world, extraction: Extraction, pair) -> Float64:
@@ -60,7 +60,7 @@ def test_more_matches_of_one_photo(world) -> None:
 
 
 def test_a_pair_that_quick_matching_dropped(world) -> None:
-    first = world.extract(matcher=Backend(use="mutual-nearest", options={"ratio": 0.001}))
+    first = world.extract(matcher=ProviderConfig(use="mutual-nearest", options={"ratio": 0.001}))
     assert not first.problem.pairs
     images = load_images(world.root / "images", world.root / "intrinsics.yaml")
     both = extract_more(images, world.config(), world.registry, first, {0})
@@ -88,7 +88,7 @@ def test_photos_that_are_held_ask_for_no_partners(world) -> None:
 @pytest.mark.parametrize(("quick", "asked"), [(TRUTH, 0), ("weak", 6)])
 def test_photos_that_are_held_are_not_matched_again(world, quick, asked: int) -> None:
     if quick == "weak":
-        sift = Backend(use="sift", options={"max_keypoints": 5})
+        sift = ProviderConfig(use="sift", options={"max_keypoints": 5})
         quick = TRUTH.model_copy(update={"features": sift})
     config = world.config(**DENSE, quick=quick)
     result = reconstruct(

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core.config import RuntimeOptions
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.options import ExtractionOptions, VerificationOptions
 
 FULL = {"features": 4, "depth": 4, "normals": 4}
@@ -45,7 +45,7 @@ def test_nothing_changed(done) -> None:
     [
         {"extraction": ExtractionOptions(integration_size=80, edge_ratio=None)},
         {"verification": VerificationOptions(max_error_px=2.0)},
-        {"depth": Backend(use="truth", calibration={"relative_std": 0.1})},
+        {"depth": ProviderConfig(use="truth", calibration={"relative_std": 0.1})},
     ],
 )
 def test_what_comes_after_the_providers(done, changes) -> None:
@@ -58,19 +58,19 @@ def test_where_it_is_computed(done, runtime) -> None:
 
 
 def test_options_of_features(done) -> None:
-    changed = Backend(use="truth", options={"flavour": 1})
+    changed = ProviderConfig(use="truth", options={"flavour": 1})
     assert again(done, features=changed) == {"features": 4, "matcher": 6}
     assert not again(done, features=changed)
     assert not again(done)  # and the way back
 
 
 def test_options_of_the_matcher(done) -> None:
-    matcher = Backend(use="mutual-nearest", options={"ratio": 0.7})
+    matcher = ProviderConfig(use="mutual-nearest", options={"ratio": 0.7})
     assert again(done, matcher=matcher) == {"matcher": 6}
 
 
 def test_options_of_depth_reach_normals_that_need_it(world) -> None:
-    normals = Backend(use="from-depth")
+    normals = ProviderConfig(use="from-depth")
     first = world.extract(normals=normals)
     assert world.asked() == {"features": 4, "depth": 4}
 
@@ -79,24 +79,24 @@ def test_options_of_depth_reach_normals_that_need_it(world) -> None:
 
     assert normals_computed(first) == 4
     assert normals_computed(world.extract(normals=normals)) == 0
-    calibrated = Backend(use="truth", calibration={"relative_std": 0.1})
+    calibrated = ProviderConfig(use="truth", calibration={"relative_std": 0.1})
     assert normals_computed(world.extract(normals=normals, depth=calibrated)) == 4
     # Another provider that says the same: normals depend on what it says.
-    same = world.extract(normals=normals, depth=Backend(use="truth", options={"flavour": 1}))
+    same = world.extract(normals=normals, depth=ProviderConfig(use="truth", options={"flavour": 1}))
     assert world.asked()["depth"] == 4 and normals_computed(same) == 0
 
 
 def test_weights(world) -> None:
     weights = world.root / "network.bin"
     weights.write_bytes(b"first")
-    depth = Backend(use="truth", options={"weights": str(weights)})
+    depth = ProviderConfig(use="truth", options={"weights": str(weights)})
     world.extract(depth=depth)
     assert world.asked() == FULL
     assert not again(world, depth=depth)
     weights.write_bytes(b"second")
     assert again(world, depth=depth) == {"depth": 4}
     moved = weights.rename(world.root / "other.bin")
-    elsewhere = Backend(use="truth", options={"weights": str(moved)})
+    elsewhere = ProviderConfig(use="truth", options={"weights": str(moved)})
     assert again(world, depth=elsewhere) == {"depth": 4}
 
 
@@ -106,7 +106,7 @@ def test_pixels_of_one_image(done) -> None:
 
 
 def test_intrinsics_matter_to_those_who_use_them(done) -> None:
-    intrinsic = Backend(use="intrinsic")
+    intrinsic = ProviderConfig(use="intrinsic")
     again(done, depth=intrinsic)
     (done.root / "intrinsics.yaml").write_text("1: {params: [141, 140, 80, 60], images: all}")
     assert not again(done)
@@ -114,12 +114,12 @@ def test_intrinsics_matter_to_those_who_use_them(done) -> None:
 
 
 def test_masks_reach_everything(done) -> None:
-    masks = (Backend(use="left"),)
+    masks = (ProviderConfig(use="left"),)
     assert again(done, masks=masks) == {"mask": 4, **FULL, "matcher": 6}
     assert not again(done, masks=masks)
-    wider = (Backend(use="left", options={"flavour": 5}),)
+    wider = (ProviderConfig(use="left", options={"flavour": 5}),)
     assert again(done, masks=wider) == {"mask": 4, **FULL, "matcher": 6}
-    same = (Backend(use="left"), Backend(use="left", options={"flavour": 9}))
+    same = (ProviderConfig(use="left"), ProviderConfig(use="left", options={"flavour": 9}))
     # Two masks whose intersection is the old one: views are as before.
     assert again(done, masks=same) == {"mask": 4}
 
@@ -145,7 +145,7 @@ def test_files_are_read_again(world) -> None:
     folder.mkdir()
     for name in world.names:
         np.save(folder / f"{name}.npy", np.full((30, 40), 2.0))
-    depth = Backend(use="files", options={"directory": str(folder), "relative_std": 0.02})
+    depth = ProviderConfig(use="files", options={"directory": str(folder), "relative_std": 0.02})
     first = world.extract(depth=depth).problem.images[0].depth.depth
     np.save(folder / f"{world.names[0]}.npy", np.full((30, 40), 3.0))
     second = world.extract(depth=depth).problem.images[0].depth.depth
@@ -178,16 +178,16 @@ from pathlib import Path
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.extraction.runner import extract
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.options import Backend
+from mpsfm_core.options import ProviderConfig
 from mpsfm_core.registry import Registry
 
 root = Path(sys.argv[1])
 depth = {"directory": str(root / "depth"), "relative_std": 0.02}
 config = Config(
-    features=Backend(use="sift"),
-    matcher=Backend(use="mutual-nearest"),
-    depth=Backend(use="files", options=depth),
-    normals=Backend(use="from-depth"),
+    features=ProviderConfig(use="sift"),
+    matcher=ProviderConfig(use="mutual-nearest"),
+    depth=ProviderConfig(use="files", options=depth),
+    normals=ProviderConfig(use="from-depth"),
     runtime=RuntimeOptions(cache_dir=root / "cache", workers=2),
 )
 report = extract(

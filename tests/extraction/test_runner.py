@@ -11,7 +11,7 @@ import pytest
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import ConfigError, ProviderOutputError, ProviderRunError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.options import AdjustmentOptions, ExtractionOptions, PairOptions
 from mpsfm_core.extraction.pairs import candidates as pairs
@@ -99,14 +99,16 @@ def test_result_does_not_depend_on_the_number_of_workers(world) -> None:
 def test_joint_prediction_takes_one_pass(world) -> None:
     separate = world.extract().problem
     world.asked()
-    joint = world.extract(depth=Backend(use="joint"), normals=Backend(use="joint")).problem
+    joint = world.extract(
+        depth=ProviderConfig(use="joint"), normals=ProviderConfig(use="joint")
+    ).problem
     assert world.asked() == {"joint": 4, "depth": 4}  # the joint pass calls depth itself
     assert identical(separate, joint)
 
 
 def test_dense_matches_stand_behind_the_sparse_ones(world) -> None:
     sparse = world.extract().problem
-    both = world.extract(dense_matcher=Backend(use="dense")).problem
+    both = world.extract(dense_matcher=ProviderConfig(use="dense")).problem
     for before, after in zip(sparse.images, both.images, strict=True):
         count = len(before.keypoints)
         assert np.array_equal(after.keypoints[:count], before.keypoints)
@@ -125,7 +127,9 @@ def test_dense_matches_stand_behind_the_sparse_ones(world) -> None:
 
 
 def test_each_dense_match_has_keypoints_of_its_own(world) -> None:
-    problem = world.extract(features=None, matcher=None, dense_matcher=Backend(use="dense")).problem
+    problem = world.extract(
+        features=None, matcher=None, dense_matcher=ProviderConfig(use="dense")
+    ).problem
     assert pairs_of(problem) == ALL_PAIRS
     for index, image in enumerate(problem.images):
         columns = [p.matches[:, 0] for p in problem.pairs if p.image_a == index]
@@ -138,7 +142,7 @@ def test_each_dense_match_has_keypoints_of_its_own(world) -> None:
 def test_dense_matches_snap_to_features_without_a_sparse_matcher(world) -> None:
     options = ExtractionOptions(dense_snap_px=4.0)
     problem = world.extract(
-        matcher=None, dense_matcher=Backend(use="dense"), extraction=options
+        matcher=None, dense_matcher=ProviderConfig(use="dense"), extraction=options
     ).problem
     features = world.positions(world.names[0])[0]
     assert np.array_equal(problem.images[0].keypoints[: len(features)], features)
@@ -150,8 +154,8 @@ def test_depth_of_the_matcher(world) -> None:
     """The pair whose prediction is most certain gives an image's depth."""
     calibration = {"std_scale": 1.0, "relative_std": 0.0, "std_floor": 0.0}
     problem = world.extract(
-        dense_matcher=Backend(use="dense-depth"),
-        depth=Backend(use="matcher", calibration=calibration),
+        dense_matcher=ProviderConfig(use="dense-depth"),
+        depth=ProviderConfig(use="matcher", calibration=calibration),
     ).problem
     furthest = {0: 3, 1: 2, 2: 2, 3: 3}  # images apart
     for index, image in enumerate(problem.images):
@@ -161,13 +165,13 @@ def test_depth_of_the_matcher(world) -> None:
 
 def test_depth_of_a_matcher_without_depth(world) -> None:
     with pytest.raises(ConfigError, match="'mutual-nearest' predicts no depth"):
-        world.extract(depth=Backend(use="matcher"))
+        world.extract(depth=ProviderConfig(use="matcher"))
     assert not world.asked()
 
 
 def test_masks_of_providers(world) -> None:
     plain = world.extract().problem
-    problem = world.extract(masks=(Backend(use="left"),)).problem
+    problem = world.extract(masks=(ProviderConfig(use="left"),)).problem
     for image, full in zip(problem.images, plain.images, strict=True):
         assert 0 < len(image.keypoints) < len(full.keypoints)
         assert image.keypoints[:, 0].max() <= 80
@@ -183,7 +187,7 @@ def test_masks_of_providers_and_of_the_user_intersect(world) -> None:
         drawn[60:] = 255
         cv2.imwrite(str(world.root / "masks" / name), drawn)
     problem = world.extract(
-        inputs=InputOptions(masks=world.root / "masks"), masks=(Backend(use="left"),)
+        inputs=InputOptions(masks=world.root / "masks"), masks=(ProviderConfig(use="left"),)
     ).problem
     for image in problem.images:
         assert image.keypoints[:, 0].max() <= 80 and image.keypoints[:, 1].min() >= 60
@@ -194,8 +198,8 @@ def test_masked_dense_matches(world) -> None:
     problem = world.extract(
         features=None,
         matcher=None,
-        dense_matcher=Backend(use="dense"),
-        masks=(Backend(use="left"),),
+        dense_matcher=ProviderConfig(use="dense"),
+        masks=(ProviderConfig(use="left"),),
     ).problem
     assert problem.pairs
     assert max(image.keypoints[:, 0].max() for image in problem.images) <= 80
@@ -203,7 +207,7 @@ def test_masked_dense_matches(world) -> None:
 
 def test_retrieval(world) -> None:
     options = PairOptions(mode="retrieval", top_k=1)
-    extraction = world.extract(pairs=options, retrieval=Backend(use="truth"))
+    extraction = world.extract(pairs=options, retrieval=ProviderConfig(use="truth"))
     assert pairs_of(extraction.problem) == {(0, 1), (1, 2), (2, 3)}
     with pytest.raises(ConfigError, match=r"set retrieval\.use"):
         world.extract(pairs=options)
@@ -225,13 +229,13 @@ def test_auto_takes_a_first_look(world) -> None:
 
 def test_auto_by_retrieval(world) -> None:
     options = PairOptions(mode="auto", partners=1, overlap=1)
-    extraction = world.extract(pairs=options, retrieval=Backend(use="truth"))
+    extraction = world.extract(pairs=options, retrieval=ProviderConfig(use="truth"))
     assert pairs_of(extraction.problem) == {(0, 1), (1, 2), (2, 3)}
     assert world.asked()["retrieval"] == 4
 
 
 def test_auto_without_features_matches_all(world) -> None:
-    changes = {"features": None, "matcher": None, "dense_matcher": Backend(use="dense")}
+    changes = {"features": None, "matcher": None, "dense_matcher": ProviderConfig(use="dense")}
     extraction = world.extract(pairs=PairOptions(mode="auto", partners=1), **changes)
     assert extraction.report["pairs_matched"] == 6
 
@@ -274,7 +278,7 @@ def test_stages_in_order(world) -> None:
             self.events.append(("finished", stage))
 
     recorder = Recorder()
-    world.extract(recorder, masks=(Backend(use="left"),), adjustment=AdjustmentOptions())
+    world.extract(recorder, masks=(ProviderConfig(use="left"),), adjustment=AdjustmentOptions())
     started = [event[1:] for event in recorder.events if event[0] == "started"]
     assert started == [
         ("masks", 4),
@@ -291,7 +295,7 @@ def test_stages_in_order(world) -> None:
 
 
 def test_normals_from_depth_get_the_calibrated_depth(world) -> None:
-    problem = world.extract(normals=Backend(use="from-depth")).problem
+    problem = world.extract(normals=ProviderConfig(use="from-depth")).problem
     truth = world.scene.render(problem.images[0].camera, world.poses[world.names[0]])
     normals = problem.images[0].normals
     resized = cv2.resize(truth.normals, normals.shape[::-1], interpolation=cv2.INTER_LINEAR)
@@ -334,7 +338,7 @@ def test_the_seed_reaches_the_providers(world) -> None:
     world.registry.add(ProviderSpec(kind="retrieval", name="seeded", factory=factory))
     runtime = RuntimeOptions(cache_dir=world.cache, workers=1, threads=3, seed=7, device="cpu")
     world.extract(
-        runtime=runtime, pairs=PairOptions(mode="retrieval"), retrieval=Backend(use="seeded")
+        runtime=runtime, pairs=PairOptions(mode="retrieval"), retrieval=ProviderConfig(use="seeded")
     )
     assert seeds == [(7, 3, "cpu")]
 
@@ -411,7 +415,7 @@ def test_a_provider_cannot_change_its_inputs_unnoticed(world) -> None:
     factory = lambda options, context: Scribbles()  # noqa: E731
     world.registry.add(ProviderSpec(kind="retrieval", name="scribbles", factory=factory))
     options = PairOptions(mode="retrieval", top_k=1)
-    changes = {"pairs": options, "retrieval": Backend(use="scribbles")}
+    changes = {"pairs": options, "retrieval": ProviderConfig(use="scribbles")}
     with pytest.raises(
         ProviderRunError, match=r"'scribbles', image 'view2\.png': ValueError: .*read-only"
     ):

@@ -10,7 +10,7 @@ import pytest
 
 from mpsfm_core.data import DepthPrior, MappingProblem, PinholeCamera
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper, reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult
@@ -60,7 +60,7 @@ def content(result: MappingResult, problem: MappingProblem) -> Frozen:
 
 
 def thawed_poses(state: Frozen, problem: MappingProblem) -> Frozen:
-    _, mapper = thaw(state, (problem, Silent()))
+    _, mapper = thaw(state, (problem, NullMappingEvents()))
     return freeze(mapper.group.scene.snapshot())
 
 
@@ -86,7 +86,7 @@ def undisturbed(problem: MappingProblem) -> tuple[MappingResult, list[Frozen]]:
 
 def test_every_attribute_comes_back(problem: MappingProblem, undisturbed) -> None:
     _, states = undisturbed
-    shared = (problem, Silent())
+    shared = (problem, NullMappingEvents())
     for state in states:
         assert same(freeze(thaw(state, shared), shared), state)
 
@@ -131,7 +131,7 @@ def test_a_damaged_state_is_a_new_start(problem: MappingProblem, undisturbed) ->
     broken.append({**states[0], "tree": np.frombuffer(b'{"format":1,"state":1}', np.uint8)})
     for state in broken[:-1]:
         with pytest.raises(DataError, match="state: is damaged"):
-            thaw(state, (problem, Silent()))
+            thaw(state, (problem, NullMappingEvents()))
     memory = Memory([broken[-1]], 2)
     with pytest.raises(Killed):
         reconstruct(problem, OPTIONS, checkpoints=memory)
@@ -149,7 +149,7 @@ def test_no_other_classes_come_out_of_a_state(path: str) -> None:
 
 
 def test_what_cannot_be_kept_is_named_with_its_place(problem: MappingProblem) -> None:
-    mapper = Mapper(problem, OPTIONS, Silent())
+    mapper = Mapper(problem, OPTIONS, NullMappingEvents())
     mapper.journal._seconds["lock"] = threading.Lock()
     with pytest.raises(TypeError, match=r"state\.journal\._seconds\['lock'\]: a _thread\.lock"):
         freeze(mapper, (problem, mapper.journal._events))

@@ -10,7 +10,7 @@ import pytest
 
 from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
 from mpsfm_core.mapping.registration.correspondences import correspondences
@@ -55,7 +55,7 @@ def test_images_of_a_group_share_their_scale(all_at_once: bool) -> None:
     options = MapperOptions()
     initialization = options.initialization.model_copy(update={"all_at_once": all_at_once})
     options = options.model_copy(update={"initialization": initialization})
-    mapper = Mapper(in_units([0, 0, 1, 1]), options, Silent())
+    mapper = Mapper(in_units([0, 0, 1, 1]), options, NullMappingEvents())
     mapper.reconstruct_next()
     scene = mapper.group.scene
     assert scene.registered.all()
@@ -65,7 +65,7 @@ def test_images_of_a_group_share_their_scale(all_at_once: bool) -> None:
 
 
 def test_without_groups_each_image_has_its_own_scale() -> None:
-    mapper = Mapper(in_units([None] * 3), MapperOptions(), Silent())
+    mapper = Mapper(in_units([None] * 3), MapperOptions(), NullMappingEvents())
     mapper.reconstruct_next()
     assert len({depth_map.scale for depth_map in mapper.group.scene.maps}) == 3
 

@@ -18,7 +18,7 @@ from mpsfm_core.mapping.consistency.misregistration import (
     weak_holds,
     widest_ways,
 )
-from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.synthetic.problems import mapping_problem
@@ -107,7 +107,7 @@ def test_widest_ways_are_those_of_all_ways() -> None:
 def group() -> Group:
     """All of an exact scene is registered."""
     problem = mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0))
-    mapper = Mapper(problem, MapperOptions(), Silent())
+    mapper = Mapper(problem, MapperOptions(), NullMappingEvents())
     mapper.reconstruct_next()
     return mapper.group
 
@@ -155,7 +155,7 @@ def test_images_that_came_with_a_pose_stay_unless_it_is_a_guess(known: str, move
     problem = mapping_problem(room_scene(), CAMERA, poses)
     named = zip(problem.images, poses, strict=True)
     problem = problem.with_poses({i.name: (p[:, :3].copy(), p[:, 3].copy()) for i, p in named})
-    mapper = Mapper(problem, MapperOptions(known_poses=known), Silent())  # type: ignore[arg-type]
+    mapper = Mapper(problem, MapperOptions(known_poses=known), NullMappingEvents())  # type: ignore[arg-type]
     mapper.reconstruct_next()
     misplace(mapper.group, 4)
     wrong = mapper.group.scene.rotations[4].copy()

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from mpsfm_core.data import Bool, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.component import Group
-from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.maintenance import Upkeep
@@ -28,7 +28,9 @@ CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 def group() -> Group:
     """All of an exact scene is registered."""
     mapper = Mapper(
-        mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0)), MapperOptions(), Silent()
+        mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0)),
+        MapperOptions(),
+        NullMappingEvents(),
     )
     mapper.reconstruct_next()
     assert mapper.group.scene.registered.all()
@@ -161,7 +163,7 @@ def test_an_image_that_only_drift_contradicts_is_registered(
     problem = mapping_problem(
         room_scene(), CAMERA, arc_poses(5, 14.0), links=links, declared_depth_std=0.02
     )
-    mapper = Mapper(problem, MapperOptions(), Silent())
+    mapper = Mapper(problem, MapperOptions(), NullMappingEvents())
     mapper.reconstruct_next()
     group = mapper.group
     scene = group.scene
@@ -218,7 +220,7 @@ def test_the_group_that_ends_larger_gets_the_images(
 ) -> None:
     problem = mapping_problem(room_scene(), CAMERA, arc_poses(6, 14.0))
     options = MapperOptions.model_validate({"initialization": {"all_at_once": False}})
-    mapper = Mapper(problem, options, Silent())
+    mapper = Mapper(problem, options, NullMappingEvents())
     mapper.group_type = Limited
     monkeypatch.setattr(Critical, "kept", kept)
     monkeypatch.setattr(Few, "limit", 2)

@@ -9,7 +9,7 @@ import pytest
 
 from mpsfm_core.data import Float64, PinholeCamera
 from mpsfm_core.mapping.component import Group
-from mpsfm_core.mapping.events import Silent
+from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.depth_noise import DepthNoise
@@ -27,7 +27,7 @@ def mapped(declared_depth_std: float, *, nearer: float = 1.0) -> Group:
     last = problem.images[-1]
     depth = replace(last.depth, depth=last.depth.depth / np.float32(nearer))
     problem = replace(problem, images=(*problem.images[:-1], replace(last, depth=depth)))
-    mapper = Mapper(problem, MapperOptions(), Silent())
+    mapper = Mapper(problem, MapperOptions(), NullMappingEvents())
     mapper.reconstruct_next()
     group = mapper.group
     assert group.scene.registered.all()
@@ -93,7 +93,7 @@ def test_a_focal_length_that_runs_away_changes_nothing() -> None:
     guess = replace(CAMERA, fx=1.1 * CAMERA.fx, fy=1.1 * CAMERA.fy)
     images = tuple(replace(image, camera=guess, focal_known=False) for image in problem.images)
     keep = MapperOptions.model_validate({"refinement": {"refine_focal": False}})
-    mapper = Mapper(replace(problem, images=images), keep, Silent())
+    mapper = Mapper(replace(problem, images=images), keep, NullMappingEvents())
     mapper.reconstruct_next()
     group = mapper.group
     scene, refiner = group.scene, group.refiner

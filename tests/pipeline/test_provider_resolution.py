@@ -18,7 +18,7 @@ from mpsfm_core.cli import build_app
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera, View
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.pipeline.provider_resolution import Provision, look_up, provide
+from mpsfm_core.pipeline.provider_resolution import ProviderResolution, look_up, provide
 from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.providers import ProviderContext, file_named_by, weights
 from mpsfm_core.providers.builtin import plugin as builtin
@@ -121,7 +121,7 @@ def configured(tmp_path: Path) -> Configured:
     return load
 
 
-def names(provision: Provision) -> list[str]:
+def names(provision: ProviderResolution) -> list[str]:
     """Of the providers, without those of quick matching."""
     return [c.provider.name for c in provision.choices if not c.block.startswith("quick.")]
 

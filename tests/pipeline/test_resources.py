@@ -10,7 +10,7 @@ import pytest
 
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.pipeline import resources
 from mpsfm_core.pipeline import run as pipeline
@@ -23,10 +23,10 @@ SIZE = (640, 480)
 
 def config(**changes: object) -> Config:
     values = {
-        "features": Backend(use="sift", options={"max_keypoints": 1000}),
-        "matcher": Backend(use="mutual-nearest"),
-        "depth": Backend(use="flat"),
-        "normals": Backend(use="from-depth"),
+        "features": ProviderConfig(use="sift", options={"max_keypoints": 1000}),
+        "matcher": ProviderConfig(use="mutual-nearest"),
+        "depth": ProviderConfig(use="flat"),
+        "normals": ProviderConfig(use="from-depth"),
         "runtime": RuntimeOptions(workers=1),
     }
     return Config(**values | changes)

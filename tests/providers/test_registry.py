@@ -23,7 +23,7 @@ from mpsfm_core import (
     hookimpl,
 )
 from mpsfm_core.data.errors import InputError, ProviderError, WeightsError
-from mpsfm_core.data.options import Backend, SettingsError
+from mpsfm_core.data.options import ProviderConfig, SettingsError
 from mpsfm_core.providers.registry import CORE, ProviderStatus, Registry
 from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
 
@@ -355,7 +355,7 @@ class TestCreate:
         registry = Registry()
         adding = dataclasses.replace(DOUBLING, name="adding", factory=Adding)
         registry.add(FLAT, DOUBLING, adding)
-        wrap = [Backend(use="doubling"), Backend(use="adding")]
+        wrap = [ProviderConfig(use="doubling"), ProviderConfig(use="adding")]
         provider = registry.create("depth", "flat", {"depth": 5}, context, wrap)
         assert provider.predict(view).depth[0, 0] == 11
 
@@ -403,7 +403,7 @@ class TestCreate:
         wraps_normals = frozenset({"wraps-normals"})
         registry.add(FLAT, dataclasses.replace(DOUBLING, capabilities=wraps_normals))
         with pytest.raises(ProviderError, match="does not wrap depth"):
-            registry.create("depth", "flat", None, context, [Backend(use="doubling")])
+            registry.create("depth", "flat", None, context, [ProviderConfig(use="doubling")])
 
 
 class TestHooks:
@@ -450,17 +450,17 @@ class TestHooks:
         registry.register(Knows(), name="knows")
 
         def relative_std(**settings: Any) -> float:
-            calibration = registry.calibration("depth", Backend(use="flat", **settings))
+            calibration = registry.calibration("depth", ProviderConfig(use="flat", **settings))
             assert isinstance(calibration, DepthCalibration)
             return calibration.relative_std
 
         assert relative_std() == 0.1
-        assert relative_std(wrap=(Backend(use="doubling"),)) == 0.3
+        assert relative_std(wrap=(ProviderConfig(use="doubling"),)) == 0.3
         assert relative_std(options={"depth": 2}) == 0.2
-        assert relative_std(options={"depth": 2}, wrap=(Backend(use="doubling"),)) == 0.3
+        assert relative_std(options={"depth": 2}, wrap=(ProviderConfig(use="doubling"),)) == 0.3
         assert relative_std(options={"depth": 2}, calibration={"relative_std": 0.5}) == 0.5
 
     def test_calibration_of_normals_has_a_default(self) -> None:
         registry = Registry()
         registry.add(ProviderSpec("normals", "plain", Flat))
-        assert registry.calibration("normals", Backend(use="plain")) == NormalCalibration()
+        assert registry.calibration("normals", ProviderConfig(use="plain")) == NormalCalibration()

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_info
 from mpsfm_core import ProviderSpec
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import DepthPrior, PinholeCamera, View
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.providers import ProviderContext
 from mpsfm_core.providers.registry import Registry
@@ -95,10 +95,10 @@ def test_a_run_keeps_its_workers_busy_and_no_more(
     busy, watcher, registry = Busy(), Watcher(), Registry.discover()
     registry.add(ProviderSpec(kind="depth", name="watcher", factory=watcher))
     config = Config(
-        features=Backend(use="sift"),
-        matcher=Backend(use="mutual-nearest"),
-        depth=Backend(use="watcher"),
-        normals=Backend(use="from-depth"),
+        features=ProviderConfig(use="sift"),
+        matcher=ProviderConfig(use="mutual-nearest"),
+        depth=ProviderConfig(use="watcher"),
+        normals=ProviderConfig(use="from-depth"),
         runtime=RuntimeOptions(cache_dir=tmp_path, workers=workers),
     )
     with busy.watching():

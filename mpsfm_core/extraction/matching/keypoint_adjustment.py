@@ -19,11 +19,11 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8, VerifiedPair
-from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.options import AdjustmentOptions
 from mpsfm_core.geometry import rays
 from mpsfm_core.geometry.patch_alignment import align_patches
-from mpsfm_core.inputs.image_cache import Recent
+from mpsfm_core.support.lru_cache import LruCache
 
 CACHED_BYTES = 256 << 20
 """Of grey images that are kept."""
@@ -90,12 +90,12 @@ class KeypointAdjuster:
     """
 
     def __init__(
-        self, bench: Workbench, keypoints: Sequence[Float64], std_px: Sequence[float]
+        self, bench: ExtractionContext, keypoints: Sequence[Float64], std_px: Sequence[float]
     ) -> None:
         self._bench = bench
         self._keypoints = keypoints
         self._std_px = std_px
-        self._grey: Recent[int, Float32] = Recent(CACHED_BYTES, lambda image: image.nbytes)
+        self._grey: LruCache[int, Float32] = LruCache(CACHED_BYTES, lambda image: image.nbytes)
 
     def run(self, pairs: Sequence[VerifiedPair]) -> list[Adjusted]:
         """The stage."""

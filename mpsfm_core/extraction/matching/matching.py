@@ -21,7 +21,7 @@ from mpsfm_core.data import (
 )
 from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.cache import content_key, digest
-from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.empty_results import NOTHING
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.matching.dense_matches import NO_POINTS, PointMatches, sample, snap
@@ -53,7 +53,7 @@ class Candidates:
 class PairMatcher:
     """The chosen matchers on pairs of images."""
 
-    def __init__(self, bench: Workbench, table: FeatureTable | None) -> None:
+    def __init__(self, bench: ExtractionContext, table: FeatureTable | None) -> None:
         self._bench = bench
         self._table = table
         config = bench.config
@@ -129,7 +129,7 @@ class PairMatcher:
 class PairVerifier:
     """Two-view geometry of candidate matches."""
 
-    def __init__(self, bench: Workbench, located: list[Features]) -> None:
+    def __init__(self, bench: ExtractionContext, located: list[Features]) -> None:
         self._bench = bench
         self._located = located
 
@@ -216,7 +216,7 @@ def assemble(
     )
 
 
-def adjusted(bench: Workbench, assembled: Assembled) -> Assembled:
+def adjusted(bench: ExtractionContext, assembled: Assembled) -> Assembled:
     """With keypoints moved to where the patches of their matches are alike."""
     options = bench.config.adjustment
     if not (options.enabled and assembled.pairs):
@@ -230,7 +230,7 @@ def adjusted(bench: Workbench, assembled: Assembled) -> Assembled:
     )
 
 
-def adjusted_problem(bench: Workbench, problem: MappingProblem) -> MappingProblem:
+def adjusted_problem(bench: ExtractionContext, problem: MappingProblem) -> MappingProblem:
     """A problem that was assembled without adjustment, with keypoints that are adjusted."""
     images = problem.images
     found = adjusted(

@@ -14,7 +14,7 @@ from mpsfm_core.data import Float64
 from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.cache import content_key
-from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.pairs import candidates as pairs
 from mpsfm_core.extraction.pairs import similarity as first_look
@@ -30,7 +30,7 @@ class PairSelection:
 
     def __init__(
         self,
-        bench: Workbench,
+        bench: ExtractionContext,
         table: FeatureTable | None,
         loose: Collection[int] | None = None,
     ) -> None:

@@ -12,8 +12,8 @@ from threadpoolctl import threadpool_limits
 from mpsfm_core.config import Config
 from mpsfm_core.data import Float64
 from mpsfm_core.extraction.active_provider import thread_count
-from mpsfm_core.extraction.context import Workbench
-from mpsfm_core.extraction.events import ExtractionEvents, Silent
+from mpsfm_core.extraction.context import ExtractionContext
+from mpsfm_core.extraction.events import ExtractionEvents, NullExtractionEvents
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.providers import validation
 from mpsfm_core.providers.registry import Registry
@@ -37,7 +37,7 @@ def estimate_focals(
     guessed = [index for index, image in enumerate(images) if image.focal_source == "default"]
     if not guessed:
         return images
-    bench = Workbench(images, config, registry, events or Silent())
+    bench = ExtractionContext(images, config, registry, events or NullExtractionEvents())
     provider = bench.provider("depth", config.depth.model_copy(update={"wrap": ()}))
     if not provider.can("estimates-focal"):
         return images

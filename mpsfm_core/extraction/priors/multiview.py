@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, Float64, GroupPrior, Int64, Pose
-from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.empty_results import NOTHING
 from mpsfm_core.extraction.pairs.candidates import Pair
 from mpsfm_core.providers import validation
@@ -54,7 +54,7 @@ def _grown(group: list[int], shared: Int64, allowed: Any, size: int) -> list[int
 class GroupPriors:
     """Runs the multi-view provider of a configuration on groups of images; cached."""
 
-    def __init__(self, bench: Workbench) -> None:
+    def __init__(self, bench: ExtractionContext) -> None:
         assert bench.config.multiview is not None
         self.provider = bench.provider("multiview", bench.config.multiview)
         self.groups: list[tuple[Group, int]] = []

@@ -8,7 +8,7 @@ from mpsfm_core.config import Config
 from mpsfm_core.data import DepthPrior, NormalPrior
 from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.data.options import FROM_MATCHER, FROM_MULTIVIEW
-from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.matching.matching import Candidates, PairMatcher
 from mpsfm_core.extraction.priors import prior_maps as priors
 from mpsfm_core.extraction.priors.multiview import GroupPriors
@@ -26,7 +26,7 @@ class Predictions:
 
     def __init__(
         self,
-        bench: Workbench,
+        bench: ExtractionContext,
         matcher: PairMatcher | None,
         candidates: list[Candidates],
         groups: GroupPriors | None = None,

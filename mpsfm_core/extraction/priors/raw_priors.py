@@ -7,7 +7,7 @@ from typing import Any
 from mpsfm_core.data import DepthPrior, NormalPrior
 from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.cache import digest
-from mpsfm_core.extraction.context import Workbench
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.empty_results import JointPrior
 from mpsfm_core.providers import validation
 
@@ -19,7 +19,7 @@ class RawPriors:
     provider gives both.
     """
 
-    def __init__(self, bench: Workbench) -> None:
+    def __init__(self, bench: ExtractionContext) -> None:
         self._bench = bench
         self.depth = bench.provider("depth", bench.config.depth)
         joint = _is_joint(bench, self.depth)
@@ -57,7 +57,7 @@ class RawPriors:
         return bench.result(provider, NormalPrior, inputs, compute, [index])
 
 
-def _is_joint(bench: Workbench, depth: ActiveProvider) -> bool:
+def _is_joint(bench: ExtractionContext, depth: ActiveProvider) -> bool:
     """Whether one pass of the depth provider gives the normals too."""
     wanted, normals = bench.config.depth, bench.config.normals
     same = (wanted.use, wanted.options) == (normals.use, normals.options)

@@ -1,6 +1,6 @@
 """The other side of :mod:`mpsfm_core.providers.environments`: serves the providers of this
 environment to a main process, one question after the other. ``python -m
-mpsfm_core.providers.environments.worker FOLDER``. """
+mpsfm_core.providers.environments.worker FOLDER``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.providers import API_VERSION, ProviderContext
 from mpsfm_core.providers.environments.channel import Channel, Closed
 from mpsfm_core.providers.environments.process import PROTOCOL, described, error_of
@@ -81,7 +81,7 @@ class Service:
         if what == "weights":
             return registry.weights(kind, name, values)
         if what == "calibration":
-            return registry.calibration(kind, Backend(use=name, options=values))
+            return registry.calibration(kind, ProviderConfig(use=name, options=values))
         raise ProviderError(f"nobody here can {what!r}")
 
     def _limit_threads(self) -> None:

@@ -10,7 +10,7 @@ from mpsfm_flip_consistency.wrapper import FlipConsistency
 
 from mpsfm_core import DepthPrior, NormalPrior, PinholeCamera, View
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.geometry import pixel_centers, rays
 from mpsfm_core.providers.registry import Registry
 
@@ -180,7 +180,7 @@ def test_grids_of_different_sizes_are_told():
 
 def test_registry_wraps_both_kinds(context):
     registry = Registry.discover()
-    wrap = (Backend(use="flip-consistency"),)
+    wrap = (ProviderConfig(use="flip-consistency"),)
     normals = registry.create("normals", "from-depth", None, context, wrap)
     depth = Plane().predict(VIEW)
     calibrated = DepthPrior.from_arrays(depth.depth, (0.01 * depth.depth) ** 2)

@@ -10,7 +10,7 @@ from mpsfm_mast3r.options import DenseOptions, SparseOptions
 
 from mpsfm_core import Features, PinholeCamera, View
 from mpsfm_core.data.errors import ConfigError, ProviderError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.model import DepthCalibration
 
@@ -185,5 +185,5 @@ def test_another_model_is_told(write_onnx, context):
 
 
 def test_calibration_of_its_depth_is_the_references():
-    calibration = Registry.discover().calibration("depth", Backend(use="matcher"))
+    calibration = Registry.discover().calibration("depth", ProviderConfig(use="matcher"))
     assert calibration == DepthCalibration(std_scale=0.862, relative_std=0, std_floor=0.02)

@@ -10,7 +10,7 @@ from mpsfm_onnx.decode import expected_angle
 
 from mpsfm_core import PinholeCamera, View
 from mpsfm_core.data.errors import ConfigError, WeightsError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 
 # Depth is the red channel as it is fed, confidence a 200th of the blue one.
@@ -120,9 +120,9 @@ def test_default_weights_are_asked_for_with_their_companions(size, context):
 def test_calibration_of_the_reference_with_confidence(name, std_scale, relative_std):
     registry = Registry.discover()
     provider = f"metric3d-v2-{name}"
-    alone = registry.calibration("depth", Backend(use=provider))
+    alone = registry.calibration("depth", ProviderConfig(use=provider))
     assert (alone.std_scale, alone.relative_std, alone.std_floor) == (std_scale, 0.08, 0.02)
-    backend = Backend(use=provider, options={"confidence": True})
+    backend = ProviderConfig(use=provider, options={"confidence": True})
     full = registry.calibration("depth", backend)
     assert (full.std_scale, full.relative_std) == (std_scale, relative_std)
-    assert registry.calibration("normals", Backend(use=provider)).std_scale == 1.0
+    assert registry.calibration("normals", ProviderConfig(use=provider)).std_scale == 1.0

@@ -14,7 +14,7 @@ from mpsfm_onnx.options import OnnxOptions
 from mpsfm_onnx.providers import OnnxDepth, OnnxJoint, OnnxNormals
 
 from mpsfm_core.data.errors import ConfigError, WeightsError
-from mpsfm_core.data.options import Backend
+from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.geometry import pixel_centers, rays, resize_map, unproject
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.model import DepthCalibration
@@ -300,9 +300,9 @@ def test_all_shipped_descriptions_load_and_are_pinned():
 
 def test_registry_takes_the_calibration_of_the_description():
     registry = Registry.discover()
-    backend = Backend(use="onnx", options={"model": "x.onnx"})
+    backend = ProviderConfig(use="onnx", options={"model": "x.onnx"})
     assert registry.calibration("depth", backend).relative_std == 0.25
-    backend = Backend(use="onnx", options={"description": "depth-pro"})
+    backend = ProviderConfig(use="onnx", options={"description": "depth-pro"})
     assert registry.calibration("depth", backend) == DepthCalibration(
         std_scale=1.0, relative_std=0.0875
     )

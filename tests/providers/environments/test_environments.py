@@ -10,7 +10,7 @@ import pytest
 
 from mpsfm_core.config import load_config
 from mpsfm_core.data.errors import InputError, ProviderError, ProviderRunError, WeightsError
-from mpsfm_core.data.options import Backend, SettingsError
+from mpsfm_core.data.options import ProviderConfig, SettingsError
 from mpsfm_core.providers.environments import process, remote, store
 from mpsfm_core.providers.validation import run_depth
 from mpsfm_core.testing.contract import run_checks
@@ -65,9 +65,9 @@ def test_in_a_configuration(registry):
 
 
 def test_a_place_is_said_once():
-    assert Backend.model_validate({"use": "a", "environment": "b"}).use == "a@b"
+    assert ProviderConfig.model_validate({"use": "a", "environment": "b"}).use == "a@b"
     with pytest.raises(ValueError, match="says where it is"):
-        Backend.model_validate({"use": "a@c", "environment": "b"})
+        ProviderConfig.model_validate({"use": "a@c", "environment": "b"})
 
 
 def test_options_are_checked_there_and_survive_pickling(registry):
