@@ -6,14 +6,13 @@ The reference is the same re-weighted least squares in scipy with a Jacobi-CG so
 each re-weighting, as published (`tests/optimize/integration_reference.py`); it runs until its
 energy is within 1e-4 of ours or below. Runs are interleaved and ratios are of medians; wall clock,
 and CPU time where said. Real data ($MPSFM_SHARED or ../shared) are used when they are there.
-Sections, all by default: analytic, hololens_room, variance, scaling, torch, and the race at 387x258
+Sections, all by default: analytic, hololens_room, variance, scaling, and the race at 387x258
 and 768x512. The last line of ``--json`` is one JSON object.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import os
 import statistics
@@ -227,28 +226,6 @@ def bench_warm(problem: Problem, repeats: int) -> float:
     return median_time(partial(integrator.refine, moved, start=before), repeats)
 
 
-def bench_torch(size: tuple[int, int]) -> dict[str, Any] | None:
-    """How far the torch version ends from the kernels; None without torch."""
-    if importlib.util.find_spec("torch") is None:
-        return None
-    import torch
-
-    torch.set_num_threads(1)  # the operations are too small for more
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    problem = analytic_problem(size, seed=0)
-    tensors = DepthIntegrator(problem.depth, problem.normals, problem.camera, torch_device=device)
-    ours = problem.integrator().refine(problem.anchors)
-    seconds, theirs = timed(partial(tensors.refine, problem.anchors))
-    difference = theirs.log_depth - ours.log_depth
-    return {
-        "device": device,
-        "first_call_ms": 1e3 * seconds,
-        "relative_energy": abs(theirs.energy / ours.energy - 1),
-        "rms_log_depth": float(np.sqrt(np.mean(difference**2))),
-        "reweightings": [ours.iterations, theirs.iterations],
-    }
-
-
 def bench_scaling(repeats: int) -> dict[str, Any]:
     """Exponent of the growth of time with the number of pixels; CPU time of one thread.
 
@@ -381,7 +358,6 @@ def main() -> None:
         "hololens_room": lambda: bench_accuracy(real(), DEFAULT_OPTIONS),
         "variance": lambda: bench_variance(arguments.repeats),
         "scaling": lambda: bench_scaling(arguments.repeats),
-        "torch": lambda: {f"{size[0]}x{size[1]}": bench_torch(size) for size in SIZES},
         **{
             f"{size[0]}x{size[1]}": lambda size=size: bench_speed(size, arguments.repeats)
             for size in SIZES

@@ -8,7 +8,7 @@ Large maps are refined on every second pixel first.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -143,14 +143,9 @@ class RefinedDepth:
         return np.exp(self.log_depth).astype(np.float32)
 
 
-class _Solver(Protocol):
+class _Solver:
     """Majorises the energy of one image, and steps towards the minimum of a majoriser."""
 
-    def majorise(self, z: Float64) -> Any: ...
-    def step(self, here: Any, iterations: int) -> Solution: ...
-
-
-class _KernelSolver:
     def __init__(self, terms: EnergyTerms) -> None:
         self._terms = terms
         self._multigrid = Multigrid(*terms.prior.log_depth.shape)
@@ -177,20 +172,13 @@ class DepthIntegrator:
         normals: NormalPrior,
         camera: PinholeCamera,
         options: IntegrationOptions = DEFAULT_OPTIONS,
-        *,
-        torch_device: str | None = None,
     ) -> None:
-        """Raises DataError when grids differ or a variance is missing.
-
-        With a `torch_device` such as "cuda" refinement runs there and needs torch; by default it
-        runs in compiled kernels on one CPU core.
-        """
+        """Raises DataError when grids differ or a variance is missing."""
         if depth.variance is None or normals.variance is None:
             raise DataError("variance", "depth integration needs one for depth and for normals")
         if not depth.shape == normals.shape == (camera.height, camera.width):
             raise DataError("camera", "depth, normals and camera must have one grid")
         self.options = options
-        self._torch_device = torch_device
         self._normals = normals
         self.camera = camera
         self._active = _reachable(depth.valid, normals.valid)
@@ -208,7 +196,7 @@ class DepthIntegrator:
         self._coarse: DepthIntegrator | None = None
         if camera.width >= 2 * _COARSE_COLUMNS:
             parts = thinned_prior(depth, 2), thinned_prior(normals, 2), thinned_camera(camera, 2)
-            self._coarse = DepthIntegrator(*parts, options, torch_device=torch_device)
+            self._coarse = DepthIntegrator(*parts, options)
 
     def refine(
         self,
@@ -223,7 +211,7 @@ class DepthIntegrator:
         rescaled when the scale has changed), which is returned as it is when little is new.
         """
         if start is None:
-            solver = self._solver(self._terms(anchors, scale))
+            solver = _Solver(self._terms(anchors, scale))
             z = self._log_depth + np.log(scale)
             return self._descend_from_prior(z, solver.majorise(z), solver, anchors, scale)
         z = start.log_depth + np.log(scale / start.scale)
@@ -231,7 +219,7 @@ class DepthIntegrator:
         energy = mean_point_energy(z, points, self.options.point_scale)
         if energy <= self.options.max_point_growth * start.point_energy:
             return replace(start, log_depth=z, scale=scale, skipped=True)
-        solver = self._solver(self._terms(anchors, scale))
+        solver = _Solver(self._terms(anchors, scale))
         return self._descend(z, solver.majorise(z), solver, scale)
 
     def variance(self, refined: RefinedDepth, anchors: Anchors = NO_ANCHORS) -> Float32:
@@ -244,15 +232,8 @@ class DepthIntegrator:
         here = majorise(refined.log_depth, terms)
         return inverse_diagonal(here.east, here.south, here.mass).astype(np.float32)
 
-    def _solver(self, terms: EnergyTerms) -> _Solver:
-        if self._torch_device is None:
-            return _KernelSolver(terms)
-        from mpsfm_core.optimize.depth_integration_torch import TorchSolver
-
-        return TorchSolver(terms, self._torch_device)
-
     def _descend_from_prior(
-        self, prior: Float64, here: Any, solver: _Solver, anchors: Anchors, scale: float
+        self, prior: Float64, here: Majoriser, solver: _Solver, anchors: Anchors, scale: float
     ) -> RefinedDepth:
         """Descend from the scaled prior, or from what every second pixel makes of it."""
         if self._coarse is None:
@@ -272,7 +253,7 @@ class DepthIntegrator:
     def _descend(
         self,
         z: Float64,
-        here: Any,
+        here: Majoriser,
         solver: _Solver,
         scale: float,
         max_iterations: int | None = None,
@@ -347,7 +328,7 @@ class DepthIntegrator:
             self._point_terms(NO_ANCHORS, self._log_depth),
             blunt,
         )
-        solver = _KernelSolver(terms)
+        solver = _Solver(terms)
         step = solver.step(solver.majorise(self._log_depth), iterations=50, tolerance=1e-3)
         low, high = self._log_depth[known].min(), self._log_depth[known].max()
         margin = np.log(_MAX_CONTINUATION)
