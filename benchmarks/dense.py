@@ -33,8 +33,8 @@ from benchmarks.accuracy import FASTDEPTH, PRIORS
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, MappingProblem, Pose
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.sparse_depth import depth_of_points
-from mpsfm_core.dense.stage import densify
+from mpsfm_core.dense.depth_range import depth_prior_from_points
+from mpsfm_core.dense.densify import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.benchmark import PairsOfSets, PreparedSets, problem_of_sets
 from mpsfm_core.evaluation.dense_geometry import dense_accuracy
@@ -162,11 +162,11 @@ def measured(
     scene: SceneFolder,
     mapped: Sequence[Reconstruction],
     problem: MappingProblem | None,
-    posed_by_depth: bool = True,
+    poses_use_depth: bool = True,
 ) -> list[dict[str, Any]]:
     """Means over the sets of a case, a row for each way to make the maps.
 
-    ``posed_by_depth``: the mapper found the poses.
+    ``poses_use_depth``: the mapper found the poses.
     """
     photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
     rows = []
@@ -183,7 +183,7 @@ def measured(
                     view_of(photos),
                     DenseOptions(),
                     workers=1,
-                    posed_by_depth=posed_by_depth and way != "without prior",
+                    poses_use_depth=poses_use_depth and way != "without prior",
                 )
                 seen = report.measured
                 seconds = (time.process_time() - started) / len(model.images)
@@ -200,7 +200,7 @@ def without_prior(model: Reconstruction) -> Reconstruction:
     images = []
     for image in model.images:
         points = model.points[image.point_ids[image.point_ids >= 0]]
-        depth = depth_of_points(transform(image.rotation, image.translation, points)[:, 2])
+        depth = depth_prior_from_points(transform(image.rotation, image.translation, points)[:, 2])
         if depth is not None:
             images.append(replace(image, depth=depth))
     return replace(model, images=tuple(images))

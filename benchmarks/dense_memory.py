@@ -24,7 +24,7 @@ from benchmarks._scenes import shared_folder
 from benchmarks.dense import view_of
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.stage import densify
+from mpsfm_core.dense.densify import densify
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.scene_folder import read_scene
 from mpsfm_core.evaluation.true_surface import depth_file
@@ -96,7 +96,7 @@ def measured(count: int) -> dict[str, float | None]:
             model,
             lambda name: photo_of(original[name]),
             DenseOptions(),
-            keep=DiskArrays(Path(folder)).keep,
+            store_array=DiskArrays(Path(folder)).store,
         )
     return {
         "before_mb": before,

@@ -30,7 +30,7 @@ from benchmarks.dense import CASES, TOLERANCES, mapped_sets, table, view_of, wit
 from mpsfm_core.data import Bool, DepthPrior, Float64, View
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.stage import densify
+from mpsfm_core.dense.densify import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.dense_geometry import dense_accuracy
 from mpsfm_core.evaluation.depth_accuracy import depth_beside_truth
@@ -135,8 +135,8 @@ def ours(
 ) -> tuple[Maps, Float64, dict[str, Bool]]:
     """Our maps, our cloud, and what was measured."""
     model = model if prior else without_prior(model)
-    posed_by_depth = prior and not true_poses
-    model, report = densify(model, view, DenseOptions(), posed_by_depth=posed_by_depth)
+    poses_use_depth = prior and not true_poses
+    model, report = densify(model, view, DenseOptions(), poses_use_depth=poses_use_depth)
     cloud = fuse_depth_maps(model, view, ResultOptions()).points
     return {image.name: image.depth for image in model.images}, cloud, dict(report.measured)
 

@@ -23,7 +23,7 @@ _FARTHEST = 1.0
 on rendered_kitchen)."""
 
 
-class Blocks(NamedTuple):
+class MeasuredCorrection(NamedTuple):
     """What was measured, on a coarse grid (h, w).
 
     ``change``: of log depth, from what was known. ``precision``: 1 / variance, 0 where nothing was
@@ -34,7 +34,7 @@ class Blocks(NamedTuple):
     precision: Float32
 
 
-class Flatness(NamedTuple):
+class PlanarityPrior(NamedTuple):
     """What is known of second differences of inverse depth, relative to it.
 
     ``bends`` (m, n): of a grid of n pixels, applied to its ratios of known to true depth.
@@ -45,7 +45,9 @@ class Flatness(NamedTuple):
     weight: Float64
 
 
-def flatness(log_depth: Float32, hole: Bool, found: Blocks, least: float) -> Flatness:
+def estimate_planarity(
+    log_depth: Float32, hole: Bool, found: MeasuredCorrection, least: float
+) -> PlanarityPrior:
     """How flat the surfaces of a photo are.
 
     ``log_depth``: (h, w), what was known; in each ``hole`` it is what was known around. ``found``:
@@ -61,16 +63,18 @@ def flatness(log_depth: Float32, hole: Bool, found: Blocks, least: float) -> Fla
     bends = csr_array(diags_array(relative) @ second @ diags_array(inverse))
     inside = size @ (found.precision.ravel() == 0).astype(np.float64) == 0
     if not inside.any():
-        return Flatness(bends, np.zeros(len(relative)))
+        return PlanarityPrior(bends, np.zeros(len(relative)))
     measured = (bends @ np.exp(-found.change.astype(np.float64)).ravel())[inside]
     std = max(float(np.quantile(np.abs(measured), ONE_SIGMA)), least)
     known = bends @ np.ones(len(inverse))
     holes = size @ hole.ravel().astype(np.float64)
     alike = (holes == 0) | (holes == size.sum(axis=1))
-    return Flatness(bends, alike / (std**2 + known**2))
+    return PlanarityPrior(bends, alike / (std**2 + known**2))
 
 
-def continued(field: tuple[Float32, Float32, Float32], flat: Flatness, found: Blocks) -> Float32:
+def solve_depth_correction(
+    field: tuple[Float32, Float32, Float32], flat: PlanarityPrior, found: MeasuredCorrection
+) -> Float32:
     """By how much known log depth is moved, (h, w).
 
     ``field``: the ratio as a Markov random field, couplings (east, south) of a pixel with its

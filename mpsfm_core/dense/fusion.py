@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
-from mpsfm_core.dense.source_views import choose_sources
+from mpsfm_core.dense.view_selection import select_source_views
 from mpsfm_core.geometry import camera_center, pixel_centers, resize_map, unproject
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.results.options import ResultOptions
@@ -32,7 +32,7 @@ _MUCH_SURER = 0.5
 any distance (ours)."""
 
 
-class _Verdict(NamedTuple):
+class _ConsistencyVotes(NamedTuple):
     """Of points (n,): which stay, which of them an image shows that is more certain, and how many
     images agree on each, its own counted."""
 
@@ -41,7 +41,7 @@ class _Verdict(NamedTuple):
     views: UInt8
 
 
-class Cloud(NamedTuple):
+class FusedPointCloud(NamedTuple):
     """Points of a surface, (n, ...).
 
     ``points``: (n, 3) float64, world. ``colors``: (n, 3) uint8, RGB. ``normals``: (n, 3) float32,
@@ -62,7 +62,7 @@ def fuse_depth_maps(
     view_of: Callable[[str], View],
     options: ResultOptions,
     seed: int = 0,
-) -> Cloud:
+) -> FusedPointCloud:
     """Where images agree on a surface it is taken from the one that is most certain.
 
     Left out are uncertain pixels, those that more images see through than confirm, and images
@@ -71,7 +71,7 @@ def fuse_depth_maps(
     """
     images = reconstruction.confirmed_images
 
-    def kept(_: int, pixels: Int64, verdict: _Verdict) -> tuple[Int64, UInt8]:
+    def kept(_: int, pixels: Int64, verdict: _ConsistencyVotes) -> tuple[Int64, UInt8]:
         ours = verdict.stays & ~verdict.better_elsewhere
         return pixels[ours], verdict.views[ours]
 
@@ -83,21 +83,21 @@ def fuse_depth_maps(
         chosen = np.sort(rng.choice(len(pixels), int(share * len(pixels)), replace=False))
         found[row] = pixels[chosen], views[chosen]
 
-    def part(row: int) -> Cloud:
+    def part(row: int) -> FusedPointCloud:
         image, (pixels, views) = images[row], found[row]
         points, variance = _lift(image, pixels)
         colors = _colors(view_of(image.name), image, pixels)
         normals = _normals(image).reshape(-1, 3)[pixels]
-        return Cloud(points, colors, normals, np.sqrt(variance).astype(np.float32), views)
+        return FusedPointCloud(points, colors, normals, np.sqrt(variance).astype(np.float32), views)
 
     parts = [_EMPTY, *each(part, range(len(images)))]
-    return Cloud(*map(np.concatenate, zip(*parts, strict=True)))
+    return FusedPointCloud(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def consistent_pixels(images: Sequence[RegisteredImage], options: ResultOptions) -> list[Bool]:
     """For each image (h, w): certain pixels that not more images see through than confirm."""
 
-    def mask(row: int, pixels: Int64, verdict: _Verdict) -> Bool:
+    def mask(row: int, pixels: Int64, verdict: _ConsistencyVotes) -> Bool:
         which = np.zeros(images[row].depth.shape, np.bool_)
         which.ravel()[pixels[verdict.stays]] = True
         return which
@@ -108,13 +108,13 @@ def consistent_pixels(images: Sequence[RegisteredImage], options: ResultOptions)
 def _judged(
     images: Sequence[RegisteredImage],
     options: ResultOptions,
-    take: Callable[[int, Int64, _Verdict], _T],
+    take: Callable[[int, Int64, _ConsistencyVotes], _T],
 ) -> list[_T]:
     """What is taken of each image: of its row, its certain pixels, flat, and what the others say
     of them."""
     limit = max(options.dense_max_relative_std, _std_of_surest(images))
     usable = [_certain(image, limit) for image in images]
-    near = choose_sources(images, _NEIGHBORS)
+    near = select_source_views(images, _NEIGHBORS)
 
     def judged(row: int) -> _T:
         pixels = np.flatnonzero(usable[row])
@@ -126,7 +126,7 @@ def _judged(
     return each(judged, range(len(images)))
 
 
-_EMPTY = Cloud(
+_EMPTY = FusedPointCloud(
     np.zeros((0, 3)),
     np.zeros((0, 3), np.uint8),
     np.zeros((0, 3), np.float32),
@@ -170,7 +170,7 @@ def _votes(
     variance: Float64,
     others: Sequence[tuple[RegisteredImage, Bool, bool]],
     sigmas: float,
-) -> _Verdict:
+) -> _ConsistencyVotes:
     """What other images say of points.
 
     ``others``: images, which of their pixels may become points, and whether they come first among
@@ -185,7 +185,7 @@ def _votes(
         turned, shift = camera.matrix @ other.rotation, camera.matrix @ other.translation
         map_ = (other.depth.depth, other.depth.valid, _variance(other), usable)
         _vote(points, variance, turned, shift, *map_, first, sigmas, votes, views, theirs)
-    return _Verdict(votes >= 0, theirs, views)
+    return _ConsistencyVotes(votes >= 0, theirs, views)
 
 
 @kernel()

@@ -45,7 +45,7 @@ _SAME_VERTEX = 1e-3
 _CORNERS = np.array(list(product((0.0, 1.0), repeat=3)))
 
 
-class Mesh(NamedTuple):
+class TriangleMesh(NamedTuple):
     """``vertices``: (n, 3) float64, world. ``triangles``: (m, 3) int64, rows of the vertices,
     anticlockwise as the cameras saw them. ``colors``: (n, 3) uint8, RGB."""
 
@@ -101,9 +101,9 @@ class _Map(NamedTuple):
         return bool((xy.max(axis=0) > 0).all() and (xy.min(axis=0) < (width, height)).all())
 
 
-def mesh_of_depth_maps(
+def mesh_depth_maps(
     reconstruction: Reconstruction, view_of: Callable[[str], View], options: MeshOptions
-) -> Mesh:
+) -> TriangleMesh:
     """The surface that the maps agree on, open where no image looks.
 
     ``view_of``: undistorted view by name, for the colours. Uncertain pixels and those that other
@@ -142,7 +142,7 @@ def mesh_of_depth_maps(
             target_count=options.max_triangles,
         )
         vertices, triangles = points.astype(np.float64), faces.astype(np.int64)
-    return Mesh(vertices, triangles, _colors(vertices, maps, view_of, voxel))
+    return TriangleMesh(vertices, triangles, _colors(vertices, maps, view_of, voxel))
 
 
 def _libraries() -> tuple[Any, Any]:

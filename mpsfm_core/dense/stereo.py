@@ -16,15 +16,15 @@ import cv2
 import numpy as np
 
 from mpsfm_core.data import Float32, Float64
-from mpsfm_core.dense.matching_kernels import (
-    aggregated_costs,
-    best_labels,
-    correlation_costs,
-    joined_costs,
-)
+from mpsfm_core.dense.dense_view import DenseView
+from mpsfm_core.dense.depth_posterior import UNKNOWN_LOG_STD
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.posterior import UNKNOWN_LOG_STD
-from mpsfm_core.dense.view import DenseView
+from mpsfm_core.dense.stereo_kernels import (
+    aggregate_costs,
+    compute_ncc_costs,
+    merge_view_costs,
+    select_labels,
+)
 from mpsfm_core.geometry import resize_map
 
 _LEVELS = (2, 1)
@@ -57,7 +57,7 @@ class StereoDepth:
     parallax: Float32
 
 
-def match_depth(
+def match_stereo_depth(
     view: DenseView, sources: Sequence[DenseView], options: DenseOptions
 ) -> StereoDepth:
     """Search the depth of ``view`` in one or more source views."""
@@ -92,18 +92,18 @@ def _search(
     for source, plane in zip(sources, costs, strict=True):
         turned, shift = source.pixels_from(view)
         own, their = (view.grey, base, offsets), (source.grey, turned, shift)
-        correlation_costs(*own, *their, options.window_radius, noise, plane)
+        compute_ncc_costs(*own, *their, options.window_radius, noise, plane)
     joined = np.empty((*base.shape, len(offsets)), np.float32)
-    joined_costs(costs, options.view_share, _UNSEEN_COST, joined)
+    merge_view_costs(costs, options.view_share, _UNSEEN_COST, joined)
     change = (surface - view.log_depth)[..., None] + offsets.astype(np.float32)
     deviation = change / view.log_std[..., None]
     weighed = joined + np.float32(options.prior_weight) * np.minimum(deviation**2, _MAX_PRIOR)
     weighed[np.abs(change) > _reach(view, options)[..., None] + (offsets[1] - offsets[0])] = _BEYOND
     total = np.zeros_like(joined)
     steps = options.small_step, options.large_step
-    aggregated_costs(weighed.astype(np.float32), view.grey, *steps, _EDGE, total)
+    aggregate_costs(weighed.astype(np.float32), view.grey, *steps, _EDGE, total)
     offset, cost = np.empty_like(base), np.empty_like(base)
-    best_labels(total, joined, offsets, offset, cost)
+    select_labels(total, joined, offsets, offset, cost)
     return surface + offset, cost
 
 

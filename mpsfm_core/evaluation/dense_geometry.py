@@ -9,7 +9,7 @@ from typing import Any
 from mpsfm_core.data import Float64, MappingProblem, PinholeCamera
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.stage import densify
+from mpsfm_core.dense.densify import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy
 from mpsfm_core.evaluation.depth_accuracy import depth_accuracy, mean_accuracy
@@ -19,7 +19,7 @@ from mpsfm_core.evaluation.true_surface import depth_file, surface_of_depth
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.results.options import ResultOptions
-from mpsfm_core.results.photos import Photos
+from mpsfm_core.results.original_images import OriginalImages
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class DenseTask:
 
     def measure(self, model: Reconstruction, problem: MappingProblem) -> dict[str, Any] | None:
         """Run the dense stage on a model of the problem; what :func:`dense_accuracy` says of it."""
-        photos = Photos(self.images, problem)
+        photos = OriginalImages(self.images, problem)
         dense, _ = densify(model, photos.view, self.dense)
         cloud = fuse_depth_maps(dense, photos.view, self.results).points
         cameras = {image.name: image.pinhole for image in self.images}

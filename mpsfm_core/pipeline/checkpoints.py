@@ -168,11 +168,11 @@ class DenseCheckpoints:
         self._failed, self._telling = False, Lock()
 
     def load(self, name: str) -> StereoDepth | None:
-        """As :class:`mpsfm_core.dense.stage.FoundBefore`."""
+        """As :class:`mpsfm_core.dense.densify.StereoCheckpoints`."""
         return self._cache.load("dense", self._key(name), StereoDepth)
 
     def save(self, name: str, depth: StereoDepth) -> None:
-        """As :class:`mpsfm_core.dense.stage.FoundBefore`; a full disk as with the mapper."""
+        """As :class:`mpsfm_core.dense.densify.StereoCheckpoints`; a full disk as with the mapper."""
         if self._failed:
             return
         try:

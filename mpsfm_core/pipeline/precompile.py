@@ -18,7 +18,7 @@ import numpy as np
 from mpsfm_core.data import PinholeCamera, View
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.stage import densify
+from mpsfm_core.dense.densify import densify
 from mpsfm_core.geometry.patch_alignment import align_patches
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import InitializationOptions, MapperOptions
@@ -26,7 +26,7 @@ from mpsfm_core.optimize.bundle_kernels import step_points
 from mpsfm_core.optimize.depth_integration import DepthIntegrator
 from mpsfm_core.providers.builtin.mutual_nearest import mutual_nearest
 from mpsfm_core.results.options import ResultOptions
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 _ENDS = ("bundles", "depth")
@@ -63,13 +63,13 @@ def begin() -> Compilation | None:
 def compile_kernels(end: str) -> None:
     """Compile all kernels, beginning with those of ``bundles`` or of ``depth``."""
     scene, poses = room_scene(), arc_poses(3, 10.0)
-    problem = mapping_problem(scene, _CAMERA, poses, points_per_view=60, map_width=64)
+    problem = make_mapping_problem(scene, _CAMERA, poses, points_per_view=60, map_width=64)
     if end == "depth":
         depth, normals = problem.images[0].depth, problem.images[0].normals
         height, width = depth.shape
         DepthIntegrator(depth, normals, _CAMERA.resized(width, height)).refine()
     for at_once in (True, False):
-        start = InitializationOptions(all_at_once=at_once)
+        start = InitializationOptions(global_initialization=at_once)
         mapping = mapper.reconstruct(problem, MapperOptions(initialization=start))
     views = {
         image.name: View(image.name, scene.render(_CAMERA, pose).rgb, _CAMERA)

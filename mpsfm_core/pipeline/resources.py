@@ -21,7 +21,7 @@ import psutil
 
 from mpsfm_core.config import Config
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.dense.view import dense_size
+from mpsfm_core.dense.dense_view import dense_grid_size
 from mpsfm_core.extraction.active_provider import worker_count
 from mpsfm_core.extraction.features import CACHED_BYTES as CACHED_FEATURES
 from mpsfm_core.extraction.matching.keypoint_adjustment import CACHED_BYTES as CACHED_GREY
@@ -135,7 +135,7 @@ def predict(
         memory += workers * (_WEIGHTS * size + min(_WORKING * size, _MOST_WORKING_MB * _MB))
     cache = features + _CACHE_MAP_MB * _MB * count + _CACHE_PAIR_BYTES * _pairs(count, config)
     if config.dense.enabled:
-        dense = [math.prod(dense_size(size, config.dense.max_size)) for size in sizes]
+        dense = [math.prod(dense_grid_size(size, config.dense.max_size)) for size in sizes]
         final = sum(dense)
         memory += min(_DENSE_BYTES * final, IN_MEMORY)
         memory += workers * _DENSE_WORKER_BYTES * max(dense)

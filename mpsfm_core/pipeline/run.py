@@ -19,15 +19,15 @@ from mpsfm_core.data import DepthPrior, Float64, MappingProblem, Pose, View
 from mpsfm_core.data.errors import ConfigError, InputError, ReconstructionError
 from mpsfm_core.data.options import FROM_MATCHER
 from mpsfm_core.dense.densify import DenseReport, densify
-from mpsfm_core.dense.depth_range import depth_of_points
+from mpsfm_core.dense.depth_range import depth_prior_from_points
 from mpsfm_core.dense.fusion import fuse_depth_maps
-from mpsfm_core.dense.mesh import TriangleMesh, mesh_of_depth_maps
+from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
 from mpsfm_core.dense.options import DenseOptions, MeshOptions
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.priors.focal_length import estimate_focals
 from mpsfm_core.extraction.runner import Extraction, extract, extract_more
 from mpsfm_core.geometry import transform
-from mpsfm_core.inputs.images import SUMMARY, ImageSet, check_apart, find_images, load_images
+from mpsfm_core.inputs.images import SUMMARY, ImageSet, check_output_folder, find_images, load_images
 from mpsfm_core.inputs.matches import (
     ImportedMatches,
     matches_from_database,
@@ -36,7 +36,7 @@ from mpsfm_core.inputs.matches import (
 from mpsfm_core.inputs.models import match_names, read_model, read_poses, reconstruction_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
-from mpsfm_core.mapping.initialization.seed_poses import held_images, starting_from
+from mpsfm_core.mapping.initialization.seed_poses import select_seed_images, with_seed_poses
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
 from mpsfm_core.pipeline import precompile, resources
@@ -48,11 +48,11 @@ from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.report.page import write_report
 from mpsfm_core.results.colmap_model import write_model
 from mpsfm_core.results.depth_maps import read_depth_map, write_depth_maps
-from mpsfm_core.results.exports.source import Source
+from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.results.georeference import georeference
 from mpsfm_core.results.mesh import write_mesh
 from mpsfm_core.results.options import ResultOptions
-from mpsfm_core.results.photos import Photos
+from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.ply import write_cloud
 from mpsfm_core.results.summary import FORMAT as SUMMARY_FORMAT
 from mpsfm_core.results.summary import describe_images, describe_pairs, describe_reconstructions
@@ -61,7 +61,7 @@ from mpsfm_core.results.writer import (
     DEPTH,
     MESH,
     SPARSE,
-    Component,
+    ComponentResult,
     update_summary,
     write_failure,
     write_results,
@@ -147,7 +147,7 @@ def reconstruct(
     with ExitStack() as stack:
         stack.enter_context(limited(config.runtime.workers))
         if target is not None:
-            check_apart(target, folder)
+            check_output_folder(target, folder)
             stack.enter_context(claimed(target))
         elif is_video(folder):
             raise InputError(f"{folder}: a video needs an output folder, for its frames")
@@ -219,21 +219,21 @@ class _Run:
             self._imported = _import_matches(matches, images)
         with stage("extraction"):
             images = estimate_focals(images, config, self._registry, self._stages)
-            first = config.quick_pass() or config
+            first = config.fast_pass_config() or config
             extraction = extract(images, first, self._registry, self._stages, self._imported)
         if compilation is not None:
             with stage("compilation"):
                 compilation.wait()
         problem = extraction.problem.with_poses(known)
         mapping = self._map(problem, config.mapper_options())
-        if config.tries_again and (held := self._held(mapping, images)) is not None:
+        if config.has_second_pass and (held := self._held(mapping, images)) is not None:
             with stage("extraction"):
                 loose = frozenset(range(len(images))) - {image.index for image in held}
                 extraction = extract_more(
                     images, config, self._registry, extraction, loose, self._stages
                 )
             mapping = self._map_again(extraction, known, held)
-        photos = Photos(images, extraction.problem)
+        photos = OriginalImages(images, extraction.problem)
         if not mapping.reconstructions:
             self._forget_checkpoints()
             self._give_up(images, extraction, mapping, photos)
@@ -242,7 +242,7 @@ class _Run:
         mapping, self._dense = self._densified(mapping, photos, known)
         summary: dict[str, Any] = {}
         with stage("results"):
-            components = [Component.of(part, photos) for part in mapping.reconstructions]
+            components = [ComponentResult.of(part, photos) for part in mapping.reconstructions]
             models = tuple(component.model for component in components)
 
             def summarize() -> dict[str, Any]:
@@ -277,14 +277,14 @@ class _Run:
         if not known:
             options = options.model_copy(update={"known_poses": "guess"})
         if options.known_poses != "fixed":
-            problem = starting_from(problem, held)
+            problem = with_seed_poses(problem, held)
         return self._map(problem, options)
 
     def _held(self, mapping: MappingResult, images: ImageSet) -> list[RegisteredImage] | None:
         """The images that quick matching holds in place, None if that is all."""
         config = self._provision.config
-        assert config.quick is not None
-        held = held_images(mapping, config.quick.min_points)
+        assert config.fast_pass is not None
+        held = select_seed_images(mapping, config.fast_pass.min_points)
         if len(held) == len(images):
             return None
         matchers = (config.matcher, config.dense_matcher)
@@ -299,7 +299,7 @@ class _Run:
         store = WeightStore(config.runtime.cache_dir, offline=True)
         networks = {  # one that gives two things at once is there once
             (backend.use, file.uri): resources.network_bytes(file, store)
-            for _, kind, backend in config.backends()
+            for _, kind, backend in config.provider_configs()
             for file in registry.weights(kind, backend.use, backend.options)
         }
         self._needs = resources.predict(
@@ -341,7 +341,7 @@ class _Run:
         self._checkpoints.append(checkpoints)
         return checkpoints
 
-    def _dense_checkpoints(self, part: Reconstruction, photos: Photos) -> DenseCheckpoints | None:
+    def _dense_checkpoints(self, part: Reconstruction, photos: OriginalImages) -> DenseCheckpoints | None:
         config = self._provision.config
         if config.runtime.checkpoint_s is None:
             return None
@@ -358,7 +358,7 @@ class _Run:
             checkpoints.forget()
 
     def _densified(
-        self, mapping: MappingResult, photos: Photos, known: Mapping[str, Pose]
+        self, mapping: MappingResult, photos: OriginalImages, known: Mapping[str, Pose]
     ) -> tuple[MappingResult, list[dict[str, Any]] | None]:
         """The groups with depth measured in the photos, and what to say of each.
 
@@ -378,8 +378,8 @@ class _Run:
                     None,
                     partial(self._stages.stage_progress, "dense"),
                     self._dense_checkpoints(part, photos),
-                    disk.keep,
-                    posed_by_depth=not _poses_are(part, known),
+                    disk.store,
+                    poses_use_depth=not _poses_are(part, known),
                 )
                 parts.append(dense)
                 reports.append(report.describe())
@@ -413,7 +413,7 @@ class _Run:
         return extract_frames(video, self._output, self._provision.config.inputs.video, progress)
 
     def _give_up(
-        self, images: ImageSet, extraction: Extraction, mapping: MappingResult, photos: Photos
+        self, images: ImageSet, extraction: Extraction, mapping: MappingResult, photos: OriginalImages
     ) -> None:
         """Leave the reasons in the summary and raise."""
         summary = self._summary("failed", images, extraction, mapping, ())
@@ -479,7 +479,7 @@ class _Run:
         used = {(line["kind"], line["name"]): line for line in usage}
         described = []
         unused = {"computed": 0, "from_cache": 0, "seconds": 0.0}
-        blocks = zip(self._provision.choices, self._provision.config.backends(), strict=True)
+        blocks = zip(self._provision.choices, self._provision.config.provider_configs(), strict=True)
         for choice, (_, kind, backend) in blocks:
             spec = choice.provider
             described.append(
@@ -502,7 +502,7 @@ def _without_matching(config: Config) -> Config:
     """No providers for what is brought."""
     if config.depth.use == FROM_MATCHER:
         raise ConfigError("depth: the matcher gives it, which does not run for matches of others")
-    nothing = dict.fromkeys(("quick", "features", "matcher", "dense_matcher", "retrieval"))
+    nothing = dict.fromkeys(("fast_pass", "features", "matcher", "dense_matcher", "retrieval"))
     return config.model_copy(update=nothing)
 
 
@@ -570,19 +570,19 @@ def _densify_model(
         raise InputError(f"{images}: has {len(matched)} of the photos of {model}, two are needed")
     photos = load_images(images, model=model, names=list(matched))
     points = {str(image.name): _depths_of_points(colmap, image) for image in colmap.images.values()}
-    depths, posed_by_depth = [], True
+    depths, poses_use_depth = [], True
     for photo in photos:
         found = matched[photo.name]
         file = model / DEPTH / f"{found}.npz"
-        posed_by_depth &= file.is_file()
-        depths.append(read_depth_map(file)[1] if file.is_file() else depth_of_points(points[found]))
+        poses_use_depth &= file.is_file()
+        depths.append(read_depth_map(file)[1] if file.is_file() else depth_prior_from_points(points[found]))
     known = _maps_alone(photos, [poses[matched[photo.name]] for photo in photos], depths)
     if not known.images:
         raise InputError(f"{model}: has no points, so nothing says how far the surfaces are")
     view_of = _view_of(photos)
     disk = DiskArrays(cache_folder())
     dense, report = densify(
-        known, view_of, options or DenseOptions(), keep=disk.keep, posed_by_depth=posed_by_depth
+        known, view_of, options or DenseOptions(), store_array=disk.store, poses_use_depth=poses_use_depth
     )
     with replacing(output, (SPARSE, DENSE, DEPTH)) as folder:
         write_model(folder / SPARSE, colmap)
@@ -635,14 +635,14 @@ def mesh_model(
             or the libraries for meshes are not installed.
     """
     with claimed(Path(folder)):
-        source = Source.read(Path(folder), _path(photos))
+        source = ExportSource.read(Path(folder), _path(photos))
         poses = reconstruction_poses(source.model)
         files = [source.folder / DEPTH / f"{name}.npz" for name in source.names]
         depths = [read_depth_map(file)[1] if file.is_file() else None for file in files]
         known = _maps_alone(source.images, [poses[name] for name in source.names], depths)
         if not known.images:
             raise InputError(f"{folder}: has no depth maps; mpsfm dense makes them")
-        mesh = mesh_of_depth_maps(known, _view_of(source.images), options or MeshOptions())
+        mesh = mesh_depth_maps(known, _view_of(source.images), options or MeshOptions())
         with replacing(source.folder, MESH) as written:
             write_mesh(written, mesh, source)
     return mesh

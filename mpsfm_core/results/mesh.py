@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mpsfm_core.dense.mesh import Mesh
-from mpsfm_core.results.exports.source import Source
+from mpsfm_core.dense.mesh import TriangleMesh
+from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.results.gltf import FLIP, TRIANGLES, Y_UP_FROM_Z, GltfScene
 from mpsfm_core.results.ply import write_ply
 from mpsfm_core.results.writer import MESH
 
 
-def write_mesh(folder: Path, mesh: Mesh, source: Source) -> None:
+def write_mesh(folder: Path, mesh: TriangleMesh, source: ExportSource) -> None:
     """Write ``mesh.ply`` with the axes of the model, and ``mesh.glb`` with gravity down."""
     ply, glb = MESH
     write_ply(folder / ply, mesh.vertices, mesh.colors, triangles=mesh.triangles)

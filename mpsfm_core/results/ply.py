@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import Float32, Float64, Int64, UInt8
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.dense.fusion import Cloud
+from mpsfm_core.dense.fusion import FusedPointCloud
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -61,7 +61,7 @@ def write_ply(
     path.write_bytes(text + vertices.tobytes() + faces.tobytes())
 
 
-def write_cloud(path: Path, cloud: Cloud) -> None:
+def write_cloud(path: Path, cloud: FusedPointCloud) -> None:
     """Write a fused cloud, with ``std`` and ``views`` as properties of that name."""
     further: dict[str, NDArray[Any]] = {"std": cloud.std, "views": cloud.views}
     write_ply(path, cloud.points, cloud.colors, cloud.normals, further)

@@ -33,10 +33,10 @@ from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.inputs.images import SUMMARY
 from mpsfm_core.inputs.nerfstudio import can_hold, write_transforms
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
-from mpsfm_core.results.colmap_model import build_model, pinhole, point_colors, write_model
+from mpsfm_core.results.colmap_model import build_model, pinhole, average_point_colors, write_model
 from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.options import ResultOptions
-from mpsfm_core.results.photos import Photos, portable_name
+from mpsfm_core.results.original_images import OriginalImages, exported_image_name
 from mpsfm_core.results.ply import write_cloud, write_ply
 from mpsfm_core.results.views import write_views
 from mpsfm_core.support.files import replacing, write_file
@@ -65,7 +65,7 @@ ENTRIES = (
 
 
 @dataclass(frozen=True, eq=False)
-class Component:
+class ComponentResult:
     """A reconstruction ready to be written.
 
     ``colors``: (p, 3) uint8, RGB of each point. ``model``: COLMAP model of the original photos.
@@ -76,27 +76,27 @@ class Component:
     model: pycolmap.Reconstruction
 
     @classmethod
-    def of(cls, reconstruction: Reconstruction, photos: Photos) -> Component:
+    def of(cls, reconstruction: Reconstruction, photos: OriginalImages) -> ComponentResult:
         """Colour the points and build the model."""
-        colors = point_colors(reconstruction, photos.keypoints(reconstruction), photos.view)
+        colors = average_point_colors(reconstruction, photos.keypoints(reconstruction), photos.view)
         cameras = [photos.original_camera(image) for image in reconstruction.images]
         keypoints = photos.original_keypoints(reconstruction)
         model = build_model(reconstruction, cameras, keypoints, colors)
         return cls(reconstruction, colors, model)
 
-    def undistorted(self, photos: Photos) -> pycolmap.Reconstruction:
+    def undistorted(self, photos: OriginalImages) -> pycolmap.Reconstruction:
         """The model of the undistorted views."""
         cameras = [pinhole(image.camera) for image in self.reconstruction.images]
         keypoints = photos.keypoints(self.reconstruction)
-        images = (replace(i, name=portable_name(i.name)) for i in self.reconstruction.images)
+        images = (replace(i, name=exported_image_name(i.name)) for i in self.reconstruction.images)
         renamed = replace(self.reconstruction, images=tuple(images))
         return build_model(renamed, cameras, keypoints, self.colors)
 
 
 def write_results(
     output: Path,
-    components: Sequence[Component],
-    photos: Photos,
+    components: Sequence[ComponentResult],
+    photos: OriginalImages,
     options: ResultOptions,
     summarize: Callable[[], Mapping[str, Any]],
     seed: int = 0,
@@ -128,7 +128,7 @@ def write_results(
 
 
 def _write_dense(
-    folder: Path, component: Component, photos: Photos, options: ResultOptions, seed: int
+    folder: Path, component: ComponentResult, photos: OriginalImages, options: ResultOptions, seed: int
 ) -> None:
     """The depth maps and their cloud, as far as they are asked for."""
     if options.dense_cloud:
@@ -144,7 +144,7 @@ def update_summary(output: Path, summary: Mapping[str, Any]) -> None:
 
 
 def write_failure(
-    output: Path, photos: Photos, options: ResultOptions, summary: Mapping[str, Any]
+    output: Path, photos: OriginalImages, options: ResultOptions, summary: Mapping[str, Any]
 ) -> None:
     """Write summary and views of a run without reconstruction; earlier results stay."""
     with replacing(output, (VIEWS, REPORT, SUMMARY)) as folder:
@@ -153,13 +153,13 @@ def write_failure(
         _write_json(folder / SUMMARY, summary)
 
 
-def _write_undistorted(folder: Path, component: Component, photos: Photos) -> None:
+def _write_undistorted(folder: Path, component: ComponentResult, photos: OriginalImages) -> None:
     write_model(folder / "sparse", component.undistorted(photos))
     for image in component.reconstruction.images:
-        photos.write_view(image, folder / "images" / portable_name(image.name))
+        photos.write_view(image, folder / "images" / exported_image_name(image.name))
 
 
-def _write_nerfstudio(path: Path, output: Path, component: Component, photos: Photos) -> None:
+def _write_nerfstudio(path: Path, output: Path, component: ComponentResult, photos: OriginalImages) -> None:
     """The photos themselves where the format has their cameras, else the undistorted views."""
     images = component.reconstruction.images
     if all(can_hold(camera) for camera in component.model.cameras.values()):
@@ -167,7 +167,7 @@ def _write_nerfstudio(path: Path, output: Path, component: Component, photos: Ph
         files = {image.name: os.path.relpath(photos.source(image).path, output) for image in images}
     else:
         model = component.undistorted(photos)
-        names = [portable_name(image.name) for image in images]
+        names = [exported_image_name(image.name) for image in images]
         files = {name: f"undistorted/images/{name}" for name in names}
     write_transforms(path, model, files)
 

@@ -43,7 +43,7 @@ class DiskArrays:
         self._used = 0
         self._usable = True
 
-    def keep(self, array: NDArray[_T]) -> NDArray[_T]:
+    def store(self, array: NDArray[_T]) -> NDArray[_T]:
         """The same values, to be held instead of ``array``."""
         with self._lock:
             if array.nbytes <= self._left:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpsfm_core.dense.posterior import Observed, posterior
+from mpsfm_core.dense.depth_posterior import LogDepthMap, compute_depth_posterior
 
 SHAPE = (120, 160)
 Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float32)
@@ -20,8 +20,10 @@ def moved(known: np.ndarray, truth: np.ndarray, where: np.ndarray) -> np.ndarray
     noise = np.random.default_rng(0).normal(0, 0.003, SHAPE)
     measured = np.where(where, 0.003, np.inf).astype(np.float32)
     std = np.full(SHAPE, 0.25, np.float32)
-    found = Observed((truth + noise).astype(np.float32), measured)
-    return posterior(Observed(known.astype(np.float32), std), found, correlation_px=40).log_depth
+    found = LogDepthMap((truth + noise).astype(np.float32), measured)
+    return compute_depth_posterior(
+        LogDepthMap(known.astype(np.float32), std), found, correlation_px=40
+    ).log_depth
 
 
 def test_a_wall_goes_on_where_known_depth_is_poor() -> None:

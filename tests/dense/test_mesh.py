@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from mpsfm_core.cli import build_app
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.dense.mesh import Mesh, mesh_of_depth_maps
+from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
 from mpsfm_core.dense.options import MeshOptions
 from mpsfm_core.geometry import pixel_centers, unproject
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
@@ -52,11 +52,11 @@ def surface(room: Room) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def mesh(room: Room) -> Mesh:
-    return mesh_of_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
+def mesh(room: Room) -> TriangleMesh:
+    return mesh_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
 
 
-def test_the_mesh_lies_on_the_surfaces_and_covers_them(room: Room, mesh: Mesh) -> None:
+def test_the_mesh_lies_on_the_surfaces_and_covers_them(room: Room, mesh: TriangleMesh) -> None:
     truth = surface(room)
     depth = float(np.median(np.concatenate([t.ravel() for t in room.truth.values()])))
     pixel = depth / CAMERA.fx
@@ -66,7 +66,7 @@ def test_the_mesh_lies_on_the_surfaces_and_covers_them(room: Room, mesh: Mesh) -
     assert (to_mesh < 4 * pixel).mean() > 0.95
 
 
-def test_averaging_makes_it_smoother_than_the_maps(room: Room, mesh: Mesh) -> None:
+def test_averaging_makes_it_smoother_than_the_maps(room: Room, mesh: TriangleMesh) -> None:
     image = room.reconstruction.images[0]
     local = mesh.vertices @ image.rotation.T + image.translation
     xy = CAMERA.fx * local[:, :2] / local[:, 2:] + (CAMERA.cx, CAMERA.cy)
@@ -77,7 +77,7 @@ def test_averaging_makes_it_smoother_than_the_maps(room: Room, mesh: Mesh) -> No
 
 
 def test_triangles_face_the_cameras_and_have_the_photos_colours(room: Room) -> None:
-    mesh = mesh_of_depth_maps(measured(room, std=0.0), room.views.__getitem__, MeshOptions())
+    mesh = mesh_depth_maps(measured(room, std=0.0), room.views.__getitem__, MeshOptions())
     corners = mesh.vertices[mesh.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     centers = [-(i.rotation.T @ i.translation) for i in room.reconstruction.images]
@@ -92,10 +92,10 @@ def test_triangles_face_the_cameras_and_have_the_photos_colours(room: Room) -> N
     assert np.median(np.abs(mesh.colors[nearest] - seen)) < 20
 
 
-def test_the_number_of_triangles_has_a_limit(room: Room, mesh: Mesh) -> None:
+def test_the_number_of_triangles_has_a_limit(room: Room, mesh: TriangleMesh) -> None:
     limit = len(mesh.triangles) // 4
     options = MeshOptions(max_triangles=limit)
-    small = mesh_of_depth_maps(measured(room), room.views.__getitem__, options)
+    small = mesh_depth_maps(measured(room), room.views.__getitem__, options)
     assert 0.8 * limit < len(small.triangles) <= limit + 2
     assert np.median(cKDTree(surface(room)).query(small.vertices)[0]) < 0.05
 
@@ -107,7 +107,7 @@ def test_a_wrong_uncertain_map_does_not_bend_what_others_know(room: Room) -> Non
     images = list(exact.images)
     images[1] = replace(images[1], depth=vague)
     bent = replace(exact, images=tuple(images))
-    mesh = mesh_of_depth_maps(bent, room.views.__getitem__, MeshOptions())
+    mesh = mesh_depth_maps(bent, room.views.__getitem__, MeshOptions())
     to_truth = cKDTree(surface(room)).query(mesh.vertices)[0]
     assert np.median(to_truth) < 0.25 * 0.04 * np.median(wrong.depth)
 
@@ -118,7 +118,7 @@ def test_maps_without_a_certain_pixel_are_told(room: Room) -> None:
         for i in room.reconstruction.images
     ]
     with pytest.raises(InputError, match="no pixel"):
-        mesh_of_depth_maps(
+        mesh_depth_maps(
             replace(room.reconstruction, images=tuple(none)),
             room.views.__getitem__,
             MeshOptions(),
@@ -128,7 +128,7 @@ def test_maps_without_a_certain_pixel_are_told(room: Room) -> None:
 def test_missing_libraries_are_told(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
     with pytest.raises(InputError, match=r"mpsfm-core\[mesh\]"):
-        mesh_of_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
+        mesh_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
 
 
 @pytest.fixture

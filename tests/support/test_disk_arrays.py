@@ -21,7 +21,7 @@ def array(seed: int) -> np.ndarray:
 def test_the_first_stay_in_memory_and_the_rest_is_on_disk(tmp_path: Path) -> None:
     disk = DiskArrays(tmp_path / "made", in_memory=2 * SIZE)
     arrays = [array(seed) for seed in range(4)]
-    kept = [disk.keep(each) for each in arrays]
+    kept = [disk.store(each) for each in arrays]
     assert [a is b for a, b in zip(arrays, kept, strict=True)] == [True, True, False, False]
     assert not list((tmp_path / "made").iterdir())  # their file has no name
     for seed, each in enumerate(kept):
@@ -34,7 +34,7 @@ def test_values_outlive_the_memory_that_they_were_in(
     """Each array fills a file, and a new file takes back the memory of those before."""
     monkeypatch.setattr(mpsfm_core.support.disk_arrays, "_CHUNK", SIZE)
     with ThreadPoolExecutor(4) as pool:
-        kept = list(pool.map(DiskArrays(tmp_path, in_memory=0).keep, map(array, range(12))))
+        kept = list(pool.map(DiskArrays(tmp_path, in_memory=0).store, map(array, range(12))))
     for seed, each in enumerate(kept):
         np.testing.assert_array_equal(each, array(seed))
 
@@ -44,7 +44,7 @@ def test_any_type_and_no_values(tmp_path: Path, dtype: type) -> None:
     disk = DiskArrays(tmp_path, in_memory=0)
     for shape in ((3, 5), (0, 4), (7,)):
         values = np.ones(shape, dtype)
-        found = disk.keep(values)
+        found = disk.store(values)
         assert found.dtype == dtype and found.shape == shape
         np.testing.assert_array_equal(found, values)
 
@@ -55,5 +55,5 @@ def test_without_a_disk_all_stay_in_memory(
     (tmp_path / "file").touch()
     disk = DiskArrays(tmp_path / "file", in_memory=0)
     first, second = array(0), array(1)
-    assert disk.keep(first) is first and disk.keep(second) is second
+    assert disk.store(first) is first and disk.store(second) is second
     assert caplog.text.count("depth maps stay in memory") == 1

@@ -13,7 +13,7 @@ import pytest
 import mpsfm_core
 from mpsfm_core.cli.reconstruct import _refined_focal_lengths
 from mpsfm_core.data.errors import ReconstructionError
-from mpsfm_core.dense.stage import densify
+from mpsfm_core.dense.densify import densify
 from mpsfm_core.evaluation import evaluate, read_poses, reconstruction_poses
 from mpsfm_core.inputs.nerfstudio import write_transforms
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, MappingResult

@@ -4,7 +4,7 @@ Known depth is moved everywhere as :mod:`mpsfm_core.dense.depth_completion` says
 a smooth random field, the error of known log depth, which hangs together over some distance: the
 declared one where nothing was measured near, and less where measured depth observes it. The field
 is a Gaussian Markov random field (Lindgren et al., 2011): one sparse system on the pixels. That
-surfaces are flat lowers no std: what was not measured often lies behind an edge. """
+surfaces are flat lowers no std: what was not measured often lies behind an edge."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, Float32
-from mpsfm_core.dense.depth_completion import Blocks, continued, flatness
+from mpsfm_core.dense.depth_completion import (
+    MeasuredCorrection,
+    estimate_planarity,
+    solve_depth_correction,
+)
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.geometry.statistics import ONE_SIGMA
 from mpsfm_core.optimize.depth_variance import inverse_diagonal
@@ -35,7 +39,7 @@ UNKNOWN_LOG_STD = 1.0
 """Of depth that nothing is known of but what is around."""
 
 
-class Observed(NamedTuple):
+class LogDepthMap(NamedTuple):
     """Measured log depth and its std, (h, w) float32; not measured where the std is infinite."""
 
     log_depth: Float32
@@ -47,7 +51,7 @@ class Observed(NamedTuple):
         return np.isfinite(self.log_std)
 
 
-def with_known(measured: Observed, known: Observed) -> Observed:
+def fuse_known_depth(measured: LogDepthMap, known: LogDepthMap) -> LogDepthMap:
     """What was measured, joined with what was known at the same pixels.
 
     The std of the known depth is taken as its distance to the measured one says, less the noise of
@@ -64,13 +68,15 @@ def with_known(measured: Observed, known: Observed) -> Observed:
     ours, theirs = measured.log_std**-2.0, std**-2.0
     total = ours + theirs
     mean = (ours * measured.log_depth + theirs * known.log_depth) / total
-    return Observed(
+    return LogDepthMap(
         np.where(compared, mean, measured.log_depth).astype(np.float32),
         np.where(compared, total**-0.5, measured.log_std).astype(np.float32),
     )
 
 
-def posterior(known: Observed, measured: Observed, correlation_px: float) -> Observed:
+def compute_depth_posterior(
+    known: LogDepthMap, measured: LogDepthMap, correlation_px: float
+) -> LogDepthMap:
     """Log depth everywhere: ``known`` before, moved by what was ``measured``.
 
     ``correlation_px``: distance over which errors of the known depth hang together.
@@ -86,23 +92,25 @@ def posterior(known: Observed, measured: Observed, correlation_px: float) -> Obs
     precision = np.where(enough, resize_map(weight, *small), np.float32(0))
     error = np.where(which, measured.log_depth - known.log_depth, 0) * weight
     mean = resize_map(error, *small) / np.where(enough, precision, np.float32(1))
-    found = Blocks(np.where(enough, mean, np.float32(0)), precision)
+    found = MeasuredCorrection(np.where(enough, mean, np.float32(0)), precision)
     hole = std >= UNKNOWN_LOG_STD
-    flat = flatness(resize_map(known.log_depth, *small), hole, found, MIN_STD)
-    correction = continued(_field(_found_std(known, measured, std), length), flat, found)
+    flat = estimate_planarity(resize_map(known.log_depth, *small), hole, found, MIN_STD)
+    correction = solve_depth_correction(
+        _field(_found_std(known, measured, std), length), flat, found
+    )
     east, south, mass = _field(std, length)
     variance = inverse_diagonal(east, south, mass + precision)
     alike = _alike(known.log_std, resize_map(std, width, height))
     here = resize_map(variance, width, height)
     spread = np.sqrt(alike * here + (1 - alike) * known.log_std**2)
     moved = known.log_depth + alike * resize_map(correction, width, height)
-    return Observed(
+    return LogDepthMap(
         np.where(which, measured.log_depth, moved),
         np.where(which, measured.log_std, spread),
     )
 
 
-def _found_std(known: Observed, measured: Observed, std: Float32) -> Float32:
+def _found_std(known: LogDepthMap, measured: LogDepthMap, std: Float32) -> Float32:
     """The declared ``std`` of known depth on any grid, as large as its distances to measured depth
     say it is; holes stay unknown."""
     compared = measured.known & (known.log_std < UNKNOWN_LOG_STD)

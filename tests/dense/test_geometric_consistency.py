@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import Float32, PinholeCamera
-from mpsfm_core.dense.consistency import Differences, PosedDepth, agreement_of, depth_differences
-from mpsfm_core.dense.view import PosedGrid
+from mpsfm_core.dense.dense_view import PosedGrid
+from mpsfm_core.dense.geometric_consistency import (
+    DepthDifferences,
+    PosedDepth,
+    compare_depths,
+    evaluate_consistency,
+)
 
 SHAPE = 200, 300
 
@@ -29,7 +34,7 @@ def test_differences_say_how_exact_matches_are(std_px: float) -> None:
     rows = np.linspace(50, 400, SHAPE[0], dtype=np.float32)
     parallax = np.repeat(rows[:, None], SHAPE[1], axis=1)
     found = [differences(std_px, parallax, seed, wrong=0.4) for seed in range(3)]
-    agreement = agreement_of(parallax, found)
+    agreement = evaluate_consistency(parallax, found)
     assert agreement.match_std_px == pytest.approx(std_px, rel=0.03)
     assert agreement.confirmed.mean() == pytest.approx(1 - 0.4**3, abs=0.01)
 
@@ -37,12 +42,12 @@ def test_differences_say_how_exact_matches_are(std_px: float) -> None:
 def test_the_mean_is_that_of_ours_and_those_that_agree() -> None:
     parallax = np.ones(SHAPE, np.float32)
     one, other = np.full(SHAPE, 0.3, np.float32), np.full(SHAPE, np.nan, np.float32)
-    np.testing.assert_allclose(agreement_of(parallax, [one, other]).mean_change, 0.15)
-    np.testing.assert_allclose(agreement_of(parallax, [one, one]).mean_change, 0.2)
+    np.testing.assert_allclose(evaluate_consistency(parallax, [one, other]).mean_change, 0.15)
+    np.testing.assert_allclose(evaluate_consistency(parallax, [one, one]).mean_change, 0.2)
 
 
 def test_nobody_says_nothing() -> None:
-    agreement = agreement_of(np.ones(SHAPE, np.float32), [])
+    agreement = evaluate_consistency(np.ones(SHAPE, np.float32), [])
     assert not agreement.confirmed.any()
     assert np.isnan(agreement.match_std_px)
 
@@ -54,7 +59,7 @@ def test_errors_of_maps_hang_together(views: int) -> None:
     common = 0.3**0.5 * rng.normal(size=SHAPE)
     errors = std_px * (common + 0.7**0.5 * rng.normal(size=(1 + max(views, 1), *SHAPE)))
     found = [((each - errors[0]) / 50).astype(np.float32) for each in errors[1:]]
-    agreement = agreement_of(parallax, found)
+    agreement = evaluate_consistency(parallax, found)
     if not views:  # where nobody agrees our own error is left
         agreement = replace(agreement, views=np.zeros(SHAPE, np.uint16))
     mean = errors[: 1 + views].mean(axis=0)
@@ -63,7 +68,7 @@ def test_errors_of_maps_hang_together(views: int) -> None:
 
 def test_errors_of_poses_are_in_every_map() -> None:
     parallax, found = np.ones(SHAPE, np.float32), [np.zeros(SHAPE, np.float32)] * 4
-    np.testing.assert_allclose(agreement_of(parallax, found, pose_std_px=0.7).std_px, 0.7)
+    np.testing.assert_allclose(evaluate_consistency(parallax, found, pose_std_px=0.7).std_px, 0.7)
 
 
 def test_what_differs_by_more_than_agrees_is_beyond() -> None:
@@ -72,7 +77,7 @@ def test_what_differs_by_more_than_agrees_is_beyond() -> None:
     own = PosedDepth(grid, np.zeros((1, 4), np.float32), std)
     # three times the std of two maps, 0.042, agree
     other = own._replace(log_depth=np.array([[0.0, 0.04, -0.08, 0.09]], np.float32))
-    found = depth_differences(own, other)
+    found = compare_depths(own, other)
     assert found.agree.tolist() == [[True, True, False, False]]
     assert found.beyond.tolist() == [[False, False, True, False]]
     usable = found.where(np.array([[False, True, False, True]]))
@@ -88,4 +93,4 @@ def test_what_agrees_by_chance_agrees_no_oftener_than_not(
     rng = np.random.default_rng(0)
     agree = np.where(rng.random(SHAPE) < 0.2, 0, np.nan).astype(np.float32)
     off = ~np.isfinite(agree) & (rng.random(SHAPE) < 0.25 * beyond)
-    assert Differences(agree, off).by_chance(found) == chance
+    assert DepthDifferences(agree, off).by_chance(found) == chance

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from mpsfm_core.cli import build_app
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.dense.sparse_depth import depth_of_points
+from mpsfm_core.dense.depth_range import depth_prior_from_points
 from mpsfm_core.geometry import project, transform
 from mpsfm_core.pipeline.run import densify_model
 from mpsfm_core.results.colmap_model import build_model, pinhole, write_model
@@ -80,7 +80,7 @@ def test_other_photos_are_told(model: Path, tmp_path: Path) -> None:
 
 
 def test_the_range_of_points_behind_the_camera_does_not_count() -> None:
-    found = depth_of_points(np.array([-3.0, 1.0, 2.0, 4.0]))
+    found = depth_prior_from_points(np.array([-3.0, 1.0, 2.0, 4.0]))
     assert isinstance(found, DepthPrior)
     assert found.depth == pytest.approx(2.0, rel=0.1)
-    assert depth_of_points(np.array([-1.0])) is None
+    assert depth_prior_from_points(np.array([-1.0])) is None

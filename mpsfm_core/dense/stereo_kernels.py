@@ -23,7 +23,7 @@ WORST = 250
 
 
 @kernel(fastmath=_FASTMATH)
-def correlation_costs(
+def compute_ncc_costs(
     reference: Float32,
     base: Float32,
     offsets: Float64,
@@ -111,7 +111,7 @@ def correlation_costs(
 
 
 @kernel(fastmath=_FASTMATH)
-def joined_costs(costs: UInt8, share: float, unseen: float, joined: Float32) -> None:
+def merge_view_costs(costs: UInt8, share: float, unseen: float, joined: Float32) -> None:
     """Mean cost over the better views of each pixel and label.
 
     ``costs``: (v, k, h, w). ``share``: of the views that see a pixel, which count (rounded up).
@@ -194,7 +194,7 @@ def _aggregate_path(
             lowest_before, lowest_here = lowest_here, lowest_before
 
 
-def aggregated_costs(
+def aggregate_costs(
     costs: Float32, guide: Float32, small: float, large: float, edge: float, total: Float32
 ) -> None:
     """Semi-global matching along eight directions.
@@ -210,7 +210,7 @@ def aggregated_costs(
 
 
 @kernel(fastmath=_FASTMATH)
-def best_labels(
+def select_labels(
     total: Float32, costs: Float32, offsets: Float64, offset: Float32, cost: Float32
 ) -> None:
     """Offset of log depth of the best label, between labels by a parabola, and its own cost.

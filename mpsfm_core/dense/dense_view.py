@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, PinholeCamera, View
-from mpsfm_core.dense.posterior import UNKNOWN_LOG_STD
+from mpsfm_core.dense.depth_posterior import UNKNOWN_LOG_STD
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 
 
-def dense_size(size: tuple[int, int], longer_side: int) -> tuple[int, int]:
+def dense_grid_size(size: tuple[int, int], longer_side: int) -> tuple[int, int]:
     """(width, height) of the grid for a photo of this size."""
     factor = min(1.0, longer_side / max(size))
     return max(2, round(size[0] * factor)), max(2, round(size[1] * factor))
@@ -60,12 +60,12 @@ class DenseView(PosedGrid):
     def of(cls, image: RegisteredImage, view: View, max_size: int) -> DenseView:
         """A registered image with its photo, the longer side ``max_size`` at most."""
         rows, columns = view.image.shape[:2]
-        width, height = dense_size((columns, rows), max_size)
+        width, height = dense_grid_size((columns, rows), max_size)
         grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
         usable = np.ones((height, width), np.bool_)
         if view.mask is not None:
             usable = resize_map(view.mask, width, height, linear=False) > 0
-        log_depth, log_std = known_depth(image.depth, width, height)
+        log_depth, log_std = resample_known_depth(image.depth, width, height)
         return cls(
             image.camera.resized(width, height),
             image.rotation,
@@ -97,7 +97,7 @@ class DenseView(PosedGrid):
         return PosedGrid(self.camera, self.rotation, self.translation)
 
 
-def known_depth(depth: DepthPrior, width: int, height: int) -> tuple[Float32, Float32]:
+def resample_known_depth(depth: DepthPrior, width: int, height: int) -> tuple[Float32, Float32]:
     """:attr:`DenseView.log_depth` and its std of a refined map, on a grid of this size.
 
     What lies between two samples of different surfaces is on neither: where the mean is further

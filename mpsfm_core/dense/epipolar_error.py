@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, Float32, Float64
-from mpsfm_core.dense.view import DenseView
+from mpsfm_core.dense.dense_view import DenseView
 from mpsfm_core.geometry.patch_alignment import align_patches
 from mpsfm_core.geometry.statistics import ONE_SIGMA
 
@@ -41,13 +41,13 @@ class PatchOffsets(NamedTuple):
     found: float
 
 
-def pose_error_px(pairs: Iterable[PatchOffsets]) -> float:
+def estimate_pose_error_px(pairs: Iterable[PatchOffsets]) -> float:
     """Std of the offsets beside the lines of a photo's pairs; 0 where no patch tells."""
     offsets = np.abs(np.concatenate([np.zeros(0), *(pair.beside_lines for pair in pairs)]))
     return float(np.quantile(offsets, ONE_SIGMA)) if len(offsets) else 0.0
 
 
-def patch_offsets(
+def measure_patch_offsets(
     view: DenseView, log_depth: Float32, other: DenseView, which: Bool
 ) -> PatchOffsets:
     """Look for patches of the ``view``, evenly spread over ``which`` (h, w), where their

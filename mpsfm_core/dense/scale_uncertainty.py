@@ -32,7 +32,7 @@ _COLUMNS = 256
 """Of an inverse that are held at once."""
 
 
-class Ties(NamedTuple):
+class ScaleConstraints(NamedTuple):
     """What one photo says of the pairs that it makes with others.
 
     ``others`` (k,): those views. ``pixels`` (k,): how many of its pixels each confirms.
@@ -48,16 +48,16 @@ class Ties(NamedTuple):
     known_std: float
 
 
-def ties_of_photo(
+def measure_scale_constraints(
     differences: Mapping[int, Float32],
     change: Float32,
     known_std: float,
     correlation_px: float,
-) -> Ties:
+) -> ScaleConstraints:
     """Compare what the pairs of a photo say of it, all (h, w) of its map.
 
     Args:
-        differences: other view -> what :func:`~mpsfm_core.dense.consistency.depth_differences`
+        differences: other view -> what :func:`~mpsfm_core.dense.geometric_consistency.compare_depths`
             says of it.
         change: from the log depth that was known before to the measured one.
         known_std: declared, of that depth.
@@ -84,14 +84,14 @@ def ties_of_photo(
             share = float(np.mean(2 / views[both]))
             shared[a, b] = shared[b, a] = share / max(variance, _LEAST_STD**2)
     pixels = np.array([np.count_nonzero(confirmed[each]) for each in others], np.int64)
-    return Ties(others, pixels, shared, known, known_std)
+    return ScaleConstraints(others, pixels, shared, known, known_std)
 
 
-def scale_stds(photos: Mapping[int, Ties]) -> dict[int, float]:
+def estimate_scale_stds(photos: Mapping[int, ScaleConstraints]) -> dict[int, float]:
     """Of each photo the std of the log scale of what was measured of it: that of its pairs, each as
     far as it confirms pixels; that of its known depth where none does. 0 if there is no pair.
 
-    ``photos``: by view, whose numbers are those of :attr:`Ties.others`.
+    ``photos``: by view, whose numbers are those of :attr:`ScaleConstraints.others`.
     """
     numbers: dict[tuple[int, int], int] = {}
     pairs = {

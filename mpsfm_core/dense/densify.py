@@ -12,27 +12,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, View
-from mpsfm_core.dense.consistency import (
-    Agreement,
-    Differences,
+from mpsfm_core.dense.dense_view import DenseView, PosedGrid
+from mpsfm_core.dense.depth_posterior import (
+    MIN_STD,
+    UNKNOWN_LOG_STD,
+    LogDepthMap,
+    compute_depth_posterior,
+    fuse_known_depth,
+)
+from mpsfm_core.dense.epipolar_error import estimate_pose_error_px, measure_patch_offsets
+from mpsfm_core.dense.geometric_consistency import (
+    DepthDifferences,
+    GeometricConsistency,
     PosedDepth,
-    agreement_of,
-    depth_differences,
+    compare_depths,
+    evaluate_consistency,
     splat_depth,
 )
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.pose_errors import patch_offsets, pose_error_px
-from mpsfm_core.dense.posterior import (
-    MIN_STD,
-    UNKNOWN_LOG_STD,
-    Observed,
-    posterior,
-    with_known,
+from mpsfm_core.dense.scale_uncertainty import (
+    ScaleConstraints,
+    estimate_scale_stds,
+    measure_scale_constraints,
 )
-from mpsfm_core.dense.scale_errors import Ties, scale_stds, ties_of_photo
-from mpsfm_core.dense.source_views import choose_sources
-from mpsfm_core.dense.stereo import StereoDepth, match_depth
-from mpsfm_core.dense.view import DenseView, PosedGrid
+from mpsfm_core.dense.stereo import StereoDepth, match_stereo_depth
+from mpsfm_core.dense.view_selection import select_source_views
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.support.threads import allowed
@@ -66,7 +70,7 @@ class DenseReport:
         return {"sources": self.sources, "confirmed": self.confirmed}
 
 
-class Keep(Protocol):
+class ArrayStore(Protocol):
     """Gives an array of the same values that is held instead, in memory or elsewhere."""
 
     def __call__(self, array: NDArray[_T]) -> NDArray[_T]: ...
@@ -77,14 +81,14 @@ def in_memory(array: NDArray[_T]) -> NDArray[_T]:
     return array
 
 
-class FoundBefore(Protocol):
+class StereoCheckpoints(Protocol):
     """Keeps what was found in the photos, for a run that goes on after it was killed."""
 
     def load(self, name: str) -> StereoDepth | None:
         """Of an image with the same reconstruction, photos and options; None if there is none."""
 
     def save(self, name: str, depth: StereoDepth) -> None:
-        """Keep that of an image; called from several threads."""
+        """ArrayStore that of an image; called from several threads."""
 
 
 def densify(
@@ -93,42 +97,42 @@ def densify(
     options: DenseOptions,
     workers: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-    found_before: FoundBefore | None = None,
-    keep: Keep = in_memory,
-    posed_by_depth: bool = True,
+    checkpoints: StereoCheckpoints | None = None,
+    store_array: ArrayStore = in_memory,
+    poses_use_depth: bool = True,
 ) -> tuple[Reconstruction, DenseReport]:
     """The reconstruction with depth that was measured in the photos where that is possible.
 
     ``view_of``: undistorted view by name. ``workers``: images at once, None for as many as the run
     may use; what comes out does not depend on it. ``progress``: is told how many images of how many
-    are matched. ``found_before``: has what a run that was killed found, and keeps what this finds.
-    ``keep``: holds maps, those of the result too; called from several threads. ``posed_by_depth``:
+    are matched. ``checkpoints``: has what a run that was killed found, and keeps what this finds.
+    ``store_array``: holds maps, those of the result too; called from several threads. ``poses_use_depth``:
     the mapper found the poses with the depth of these images, so that scales of pairs may hang
     together by it alone; else poses are taken to be right.
-    Images that no other one overlaps keep their maps, and so do those without confirmed pose.
+    Images that no other one overlaps store_array their maps, and so do those without confirmed pose.
     """
     posed = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
     images = [reconstruction.images[row] for row in posed]
-    near = choose_sources(images, max(options.num_sources, _SEEN_FROM))
+    near = select_source_views(images, max(options.num_sources, _SEEN_FROM))
     sources = [others[: options.num_sources] for others in near]
     compared_with = _compared_with(sources)
-    views = _Views(images, view_of, options)
+    views = _ViewCache(images, view_of, options)
 
-    def matched(row: int) -> _Found:
+    def matched(row: int) -> _MatchedImage:
         view, name = views[row], images[row].name
-        stereo = found_before.load(name) if found_before else None
+        stereo = checkpoints.load(name) if checkpoints else None
         if stereo is None:
-            stereo = match_depth(view, [views[other] for other in sources[row]], options)
-            if found_before:
-                found_before.save(name, stereo)
+            stereo = match_stereo_depth(view, [views[other] for other in sources[row]], options)
+            if checkpoints:
+                checkpoints.save(name, stereo)
         # where the photo may be used and says anything
         supported = view.usable & (stereo.cost < _MAX_COST)
-        return _Found(view.grid, keep(stereo.log_depth), stereo.parallax, keep(supported))
+        return _MatchedImage(view.grid, store_array(stereo.log_depth), stereo.parallax, store_array(supported))
 
-    def compared(row: int) -> tuple[Agreement, Ties | None]:
+    def compared(row: int) -> tuple[GeometricConsistency, ScaleConstraints | None]:
         own, differences = found[row], _differences(row, found, compared_with[row], options)
         patches = {
-            j: patch_offsets(views[row], own.log_depth, views[j], each.agree)
+            j: measure_patch_offsets(views[row], own.log_depth, views[j], each.agree)
             for j, each in differences.items()
         }
         agreeing = {
@@ -136,28 +140,28 @@ def densify(
             for j, each in differences.items()
             if not each.by_chance(patches[j].found)
         }
-        of_poses = pose_error_px(patches[j] for j in agreeing)
-        agreement = agreement_of(own.parallax_px, agreeing.values(), of_poses)
-        ties = _ties(own, agreeing, views[row], options) if posed_by_depth else None
-        return _kept(agreement, keep), ties
+        of_poses = estimate_pose_error_px(patches[j] for j in agreeing)
+        agreement = evaluate_consistency(own.parallax_px, agreeing.values(), of_poses)
+        ties = _ties(own, agreeing, views[row], options) if poses_use_depth else None
+        return _kept(agreement, store_array), ties
 
     def finished(row: int) -> tuple[RegisteredImage, Bool]:
         view = views[row]
-        known = Observed(view.log_depth, view.log_std)
-        measured = with_known(_measured(row, view, found, agreed, near[row], options), known)
-        joined = posterior(known, measured, options.correlation_px)
-        image = _with_depth(images[row], view, joined, scale_std.get(row, 0.0), keep)
-        return image, keep(measured.known)
+        known = LogDepthMap(view.log_depth, view.log_std)
+        measured = fuse_known_depth(_measured(row, view, found, agreed, near[row], options), known)
+        joined = compute_depth_posterior(known, measured, options.correlation_px)
+        image = _with_depth(images[row], view, joined, scale_std.get(row, 0.0), store_array)
+        return image, store_array(measured.known)
 
     rows = [row for row, others in enumerate(sources) if others]
-    found: dict[int, _Found] = {}
+    found: dict[int, _MatchedImage] = {}
     with ThreadPoolExecutor(workers or allowed()) as pool:
         for row, own in zip(rows, pool.map(matched, rows), strict=True):
             found[row] = own
             progress(len(found), len(rows))
         judged = dict(zip(rows, pool.map(compared, rows), strict=True))
         agreed = {row: agreement for row, (agreement, _) in judged.items()}
-        scale_std = scale_stds({row: ties for row, (_, ties) in judged.items() if ties})
+        scale_std = estimate_scale_stds({row: ties for row, (_, ties) in judged.items() if ties})
         maps, which = list(reconstruction.images), {}
         for row, (image, measured) in zip(rows, pool.map(finished, rows), strict=True):
             maps[posed[row]], which[image.name] = image, measured
@@ -170,11 +174,11 @@ def densify(
     return replace(reconstruction, images=tuple(maps)), report
 
 
-def _share(agreement: Agreement | None) -> float:
+def _share(agreement: GeometricConsistency | None) -> float:
     return 0.0 if agreement is None else float(agreement.confirmed.mean())
 
 
-class _Views:
+class _ViewCache:
     """Photos on the grid of the stage, made when they are needed; the last ones are kept."""
 
     def __init__(
@@ -194,7 +198,7 @@ class _Views:
         return DenseView.of(image, self._view_of(image.name), self._options.max_size)
 
 
-class _Found(NamedTuple):
+class _MatchedImage(NamedTuple):
     """What is kept of a matched photo: ``supported`` (h, w) says where it says anything."""
 
     grid: PosedGrid
@@ -227,39 +231,39 @@ def _compared_with(sources: Sequence[Sequence[int]]) -> list[list[int]]:
 
 
 def _differences(
-    row: int, found: Mapping[int, _Found], others: Sequence[int], options: DenseOptions
-) -> dict[int, Differences]:
+    row: int, found: Mapping[int, _MatchedImage], others: Sequence[int], options: DenseOptions
+) -> dict[int, DepthDifferences]:
     """From a map to those of other views, where it is supported."""
     own = found[row].posed_depth(options)
     return {
-        other: depth_differences(own, found[other].posed_depth(options)).where(found[row].supported)
+        other: compare_depths(own, found[other].posed_depth(options)).where(found[row].supported)
         for other in others
         if other in found
     }
 
 
-def _kept(agreement: Agreement, keep: Keep) -> Agreement:
-    return replace(agreement, views=keep(agreement.views), mean_change=keep(agreement.mean_change))
+def _kept(agreement: GeometricConsistency, store_array: ArrayStore) -> GeometricConsistency:
+    return replace(agreement, views=store_array(agreement.views), mean_change=store_array(agreement.mean_change))
 
 
 def _ties(
-    own: _Found, differences: Mapping[int, Float32], view: DenseView, options: DenseOptions
-) -> Ties:
+    own: _MatchedImage, differences: Mapping[int, Float32], view: DenseView, options: DenseOptions
+) -> ScaleConstraints:
     """A map beside those of others and the depth that was known of the ``view``."""
     known = view.log_std < UNKNOWN_LOG_STD
     std = float(np.median(view.log_std[known])) if known.any() else UNKNOWN_LOG_STD
     change = own.log_depth - view.log_depth
-    return ties_of_photo(differences, change, std, options.correlation_px)
+    return measure_scale_constraints(differences, change, std, options.correlation_px)
 
 
 def _measured(
     row: int,
     view: DenseView,
-    found: Mapping[int, _Found],
-    agreed: Mapping[int, Agreement],
+    found: Mapping[int, _MatchedImage],
+    agreed: Mapping[int, GeometricConsistency],
     near: Sequence[int],
     options: DenseOptions,
-) -> Observed:
+) -> LogDepthMap:
     """What the photos say of a view: its own depth where others agree, and where they do not the
     depth of others' confirmed pixels, if that is about what was known."""
     own, agreement = found[row], agreed[row]
@@ -272,18 +276,18 @@ def _measured(
     )
     seen = splat_depth(own.grid, others)
     usable = ~confirmed & (np.abs(seen - view.log_depth) < _SEEN_STDS * view.log_std)
-    return Observed(
+    return LogDepthMap(
         np.where(usable, seen, log_depth).astype(np.float32),
         np.where(usable, _SEEN_FACTOR * std, np.where(confirmed, std, np.inf)).astype(np.float32),
     )
 
 
 def _with_depth(
-    image: RegisteredImage, view: DenseView, joined: Observed, scale_std: float, keep: Keep
+    image: RegisteredImage, view: DenseView, joined: LogDepthMap, scale_std: float, store_array: ArrayStore
 ) -> RegisteredImage:
     depth = np.exp(joined.log_depth)
     variance = (joined.log_std**2 + np.float32(scale_std**2)) * depth**2
     prior = DepthPrior.from_arrays(depth, variance, view.usable, metric=image.depth.metric)
     assert prior.variance is not None
-    maps = keep(prior.depth), keep(prior.variance), keep(prior.valid)
+    maps = store_array(prior.depth), store_array(prior.variance), store_array(prior.valid)
     return replace(image, depth=DepthPrior(*maps, metric=prior.metric))

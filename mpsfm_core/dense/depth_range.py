@@ -15,7 +15,7 @@ _RANGE_STDS = 1.5
 _MIN_LOG_STD = 0.1
 
 
-def depth_of_points(depths: Float64) -> DepthPrior | None:
+def depth_prior_from_points(depths: Float64) -> DepthPrior | None:
     """One depth for the whole image, with a std that covers the points' (n,) depths.
 
     None without points in front of the camera.

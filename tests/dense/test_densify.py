@@ -12,10 +12,10 @@ import pytest
 
 from mpsfm_core.data import DepthPrior, View
 from mpsfm_core.data.errors import OutputError
+from mpsfm_core.dense.dense_view import DenseView
+from mpsfm_core.dense.densify import densify
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.stage import densify
 from mpsfm_core.dense.stereo import StereoDepth
-from mpsfm_core.dense.view import DenseView
 from mpsfm_core.extraction.cache import Cache
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints
 from mpsfm_core.support.disk_arrays import DiskArrays
@@ -75,7 +75,7 @@ def test_scales_that_hang_on_known_depth_are_less_sure(room) -> None:
     # without shared pixels (a correlation as long as the map) only known depth ties the pairs
     loose = OPTIONS.model_copy(update={"correlation_px": 1000.0})
     tied, _ = densify(room.reconstruction, room.views.__getitem__, loose)
-    fixed, _ = densify(room.reconstruction, room.views.__getitem__, loose, posed_by_depth=False)
+    fixed, _ = densify(room.reconstruction, room.views.__getitem__, loose, poses_use_depth=False)
     for a, b in zip(tied.images, fixed.images, strict=True):
         np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
         added = (a.depth.variance - b.depth.variance) / a.depth.depth**2
@@ -92,8 +92,8 @@ def test_threads_do_not_change_the_result(room) -> None:
 
 def test_maps_may_lie_on_disk(room, tmp_path: Path) -> None:
     there, report = densify(room.reconstruction, room.views.__getitem__, OPTIONS)
-    keep = DiskArrays(tmp_path, in_memory=0).keep
-    here, same = densify(room.reconstruction, room.views.__getitem__, OPTIONS, keep=keep)
+    store = DiskArrays(tmp_path, in_memory=0).store
+    here, same = densify(room.reconstruction, room.views.__getitem__, OPTIONS, store_array=store)
     for a, b in zip(there.images, here.images, strict=True):
         np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
         np.testing.assert_array_equal(a.depth.variance, b.depth.variance)
@@ -178,11 +178,11 @@ def test_a_run_goes_on_with_what_a_killed_one_found(room, tmp_path: Path) -> Non
             room.views.__getitem__,
             OPTIONS,
             workers=1,
-            found_before=Dies(checkpoints(keys)),
+            checkpoints=Dies(checkpoints(keys)),
         )
     second = Dies(checkpoints(keys))
     again, _ = densify(
-        room.reconstruction, room.views.__getitem__, OPTIONS, workers=1, found_before=second
+        room.reconstruction, room.views.__getitem__, OPTIONS, workers=1, checkpoints=second
     )
     assert second.loaded == 2
     for a, b in zip(whole.images, again.images, strict=True):
@@ -202,7 +202,7 @@ def test_a_full_disk_ends_no_run(
 
     kept = DenseCheckpoints(tmp_path, room.reconstruction, list(room.views), OPTIONS)
     monkeypatch.setattr(Cache, "store", full)
-    dense, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS, found_before=kept)
+    dense, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS, checkpoints=kept)
     assert all(image.depth is not None for image in dense.images)
     assert caplog.text.count("no checkpoints from now on") == 1
     assert "the disk is full" in caplog.text

@@ -9,10 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import View
+from mpsfm_core.dense.dense_view import DenseView
+from mpsfm_core.dense.densify import densify
+from mpsfm_core.dense.epipolar_error import (
+    PatchOffsets,
+    estimate_pose_error_px,
+    measure_patch_offsets,
+)
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.pose_errors import PatchOffsets, patch_offsets, pose_error_px
-from mpsfm_core.dense.stage import densify
-from mpsfm_core.dense.view import DenseView
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 
 ACROSS, ALONG = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
@@ -33,7 +37,7 @@ def looked_for(room, axis: list[float], pixels: float) -> PatchOffsets:
         for image in (first, turned(second, axis, pixels))
     )
     depth = np.log(room.truth[first.name])
-    return patch_offsets(one, depth, other, np.ones(depth.shape, np.bool_))
+    return measure_patch_offsets(one, depth, other, np.ones(depth.shape, np.bool_))
 
 
 @pytest.mark.parametrize(("axis", "pixels"), [(ACROSS, 0.0), (ALONG, 2.0)])
@@ -41,12 +45,14 @@ def test_right_poses_and_what_depth_may_explain_leave_nothing(
     room, axis: list[float], pixels: float
 ) -> None:
     seen = looked_for(room, axis, pixels)
-    assert pose_error_px([seen]) < 0.25 and seen.found > 0.5
+    assert estimate_pose_error_px([seen]) < 0.25 and seen.found > 0.5
 
 
 @pytest.mark.parametrize("pixels", [1.0, 3.0])
 def test_errors_across_the_lines_are_measured(room, pixels: float) -> None:
-    assert pose_error_px([looked_for(room, ACROSS, pixels)]) == pytest.approx(pixels, rel=0.15)
+    assert estimate_pose_error_px([looked_for(room, ACROSS, pixels)]) == pytest.approx(
+        pixels, rel=0.15
+    )
 
 
 def test_depth_is_less_sure_where_poses_are_wrong(room) -> None:
@@ -71,9 +77,9 @@ def test_without_pixels_nothing_is_said(room) -> None:
     image = room.reconstruction.images[0]
     view = DenseView.of(image, room.views[image.name], max(image.camera.size))
     depth = np.log(room.truth[image.name])
-    nothing = patch_offsets(view, depth, view, np.zeros(depth.shape, np.bool_))
+    nothing = measure_patch_offsets(view, depth, view, np.zeros(depth.shape, np.bool_))
     assert nothing.found == 0.0
-    assert pose_error_px([nothing]) == pose_error_px([]) == 0.0
+    assert estimate_pose_error_px([nothing]) == estimate_pose_error_px([]) == 0.0
 
 
 def test_patches_are_not_found_in_photos_of_something_else(room) -> None:

@@ -26,7 +26,7 @@ _HIDDEN_STDS = 1.5
 """A point so far behind what a view sees is hidden there, in std of depth (ours)."""
 
 
-class _Sampled(NamedTuple):
+class _SampledViews(NamedTuple):
     """What is looked at of m views: a grid of pixels of each, of ``columns`` (m,) columns.
 
     ``params`` (m, 4): fx, fy, cx, cy of the grids. ``log_depth`` (m, rows, most columns),
@@ -43,7 +43,7 @@ class _Sampled(NamedTuple):
     points: list[Float64]
 
 
-def choose_sources(images: Sequence[RegisteredImage], limit: int) -> list[list[int]]:
+def select_source_views(images: Sequence[RegisteredImage], limit: int) -> list[list[int]]:
     """For each image the positions of at most ``limit`` others, the most useful first.
 
     Taken one after the other: each by what it adds where others see little.
@@ -54,7 +54,7 @@ def choose_sources(images: Sequence[RegisteredImage], limit: int) -> list[list[i
     return [_sources(views, row, limit) for row in range(len(images))]
 
 
-def _sample(images: Sequence[RegisteredImage]) -> _Sampled:
+def _sample(images: Sequence[RegisteredImage]) -> _SampledViews:
     ratios = [image.camera.width / image.camera.height for image in images]
     columns = np.array([max(2, round(_ROWS * ratio)) for ratio in ratios])
     cameras = [
@@ -81,10 +81,12 @@ def _sample(images: Sequence[RegisteredImage]) -> _Sampled:
         log_depth[row, :, : camera.width] = np.log(depth).reshape(_ROWS, -1)
         points.append(unproject(camera, xy, depth) @ image.rotation + centers[row])
     params = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras])
-    return _Sampled(params, columns, rotations, translations, centers, log_depth, log_std, points)
+    return _SampledViews(
+        params, columns, rotations, translations, centers, log_depth, log_std, points
+    )
 
 
-def _sources(views: _Sampled, row: int, limit: int) -> list[int]:
+def _sources(views: _SampledViews, row: int, limit: int) -> list[int]:
     gains = np.zeros((len(views.points), len(views.points[row])))
     _gains(row, views.points[row], *views[:-1], gains)
     chosen: list[int] = []

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, Float32, Float64
-from mpsfm_core.dense.view import PosedGrid
+from mpsfm_core.dense.dense_view import PosedGrid
 from mpsfm_core.geometry.statistics import ONE_SIGMA
 from mpsfm_core.support.jit import kernel
 
@@ -33,7 +33,7 @@ wrong by more than 30 (ours)."""
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
+class GeometricConsistency:
     """What other views say of a map, (h, w).
 
     ``views``: uint16, how many agree; one is enough, as two wrong depths rarely do (of those that
@@ -71,7 +71,7 @@ class PosedDepth(NamedTuple):
     log_std: Float32
 
 
-class Differences(NamedTuple):
+class DepthDifferences(NamedTuple):
     """From a map to that of another view, (h, w).
 
     ``log_depth``: float32, at the same points, NaN where they do not agree or the other does not
@@ -86,9 +86,9 @@ class Differences(NamedTuple):
         """(h, w)."""
         return np.isfinite(self.log_depth)
 
-    def where(self, usable: Bool) -> Differences:
+    def where(self, usable: Bool) -> DepthDifferences:
         """Of usable pixels (h, w) alone."""
-        return Differences(
+        return DepthDifferences(
             np.where(usable, self.log_depth, np.float32(np.nan)), self.beyond & usable
         )
 
@@ -101,22 +101,22 @@ class Differences(NamedTuple):
         return beyond > _CHANCE * agree and patches_found < _MIN_FOUND
 
 
-def depth_differences(own: PosedDepth, other: PosedDepth) -> Differences:
+def compare_depths(own: PosedDepth, other: PosedDepth) -> DepthDifferences:
     """From our log depth to that of another view."""
     differences = np.full(own.log_depth.shape, np.nan, np.float32)
     beyond = np.zeros(differences.shape, np.bool_)
     turned, shift = other.grid.pixels_from(own.grid)
     _compare(*own[1:], turned, shift, *other[1:], differences, beyond)
-    return Differences(differences, beyond)
+    return DepthDifferences(differences, beyond)
 
 
-def agreement_of(
+def evaluate_consistency(
     parallax: Float32, differences: Iterable[Float32], pose_std_px: float = 0.0
-) -> Agreement:
-    """What :attr:`Differences.log_depth` of other views say together of a map (h, w).
+) -> GeometricConsistency:
+    """What :attr:`DepthDifferences.log_depth` of other views say together of a map (h, w).
 
     ``parallax``: (h, w), pixels that a point moves when its log depth changes by one. A difference
-    has the errors of two matches. ``pose_std_px``: see :class:`Agreement`.
+    has the errors of two matches. ``pose_std_px``: see :class:`GeometricConsistency`.
     """
     views, change, moved = np.zeros(parallax.shape, np.uint16), np.zeros_like(parallax), []
     for each in differences:
@@ -126,7 +126,7 @@ def agreement_of(
         moved.append(np.abs(each[agree]) * parallax[agree])
     all_moved = np.concatenate([np.zeros(0, np.float32), *moved])
     std = float(np.quantile(all_moved, ONE_SIGMA)) / math.sqrt(2) if len(all_moved) else math.nan
-    return Agreement(views, change / (1 + views.astype(np.float32)), std, pose_std_px)
+    return GeometricConsistency(views, change / (1 + views.astype(np.float32)), std, pose_std_px)
 
 
 def splat_depth(grid: PosedGrid, others: Iterable[tuple[PosedGrid, Float32, Bool]]) -> Float32:
