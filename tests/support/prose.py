@@ -11,7 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 _BREAK = re.compile(r"(?<=[.!?:;])\s+(?=[A-Z`\"(])")
-_MARKDOWN_NOISE = re.compile(r"```.*?```|^\|.*$|^#.*$|^\s*[-*] *$|<[^>]+>|^ {4,}.*$", re.S | re.M)
+_MARKDOWN_NOISE = re.compile(
+    r"^```(?s:.*?)^```|^\|.*$|^#.*$|^\s*[-*] *$|^\[[^]]+\]: .*$|<[^>\n]+>|^ {4,}.*$", re.M
+)
+_PARAGRAPH = re.compile(r"(?s:.+?)(?=\n\s*\n|\n\s*[-*] |\n\d+\. |\Z)")
 
 
 class Sentence(NamedTuple):
@@ -90,8 +93,12 @@ def sentences_of(path: Path, root: Path) -> Iterator[Sentence]:
         texts += [("message", line, text) for line, text in messages(tree)]
         texts += [("comment", line, text) for line, text in comments(source)]
     else:
-        prose = _MARKDOWN_NOISE.sub("\n", source)
-        texts += [("markdown", 1, part) for part in re.split(r"\n\s*\n|\n\s*[-*] |\n\d+\. ", prose)]
+        # Noise is replaced by as many line breaks, so that line numbers stay those of the file.
+        prose = _MARKDOWN_NOISE.sub(lambda noise: "\n" * noise[0].count("\n"), source)
+        for part in _PARAGRAPH.finditer(prose):
+            indent = len(part[0]) - len(part[0].lstrip())
+            line = prose.count("\n", 0, part.start() + indent) + 1
+            texts.append(("markdown", line, re.sub(r"^\s*(?:[-*]|\d+\.) ", "", part[0])))
     for kind, line, text in texts:
         for sentence in split_sentences(text):
             yield Sentence(name, line, kind, sentence)
