@@ -28,9 +28,9 @@ import pycolmap
 from benchmarks._scenes import shared_folder
 from benchmarks.dense import CASES, TOLERANCES, mapped_sets, table, view_of, without_prior
 from mpsfm_core.data import Bool, DepthPrior, Float64, View
+from mpsfm_core.dense.densify import densify
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.densify import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.dense_geometry import dense_accuracy
 from mpsfm_core.evaluation.depth_accuracy import depth_beside_truth
@@ -39,10 +39,11 @@ from mpsfm_core.evaluation.report import CLOUD
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
 from mpsfm_core.evaluation.true_surface import depth_file
 from mpsfm_core.geometry import sample_nearest
+from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
-from mpsfm_core.results.colmap_model import build_model, pinhole
+from mpsfm_core.results.colmap_model import build_model
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.ply import read_ply
 
@@ -67,7 +68,7 @@ def peer_result(
         picture = np.round(view(image.name).image).astype(np.uint8)[..., ::-1]
         cv2.imwrite(str(folder / "images" / image.name), picture)
         grey[image.index + 1] = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-    cameras = [pinhole(image.camera) for image in model.images]
+    cameras = [colmap_from_pinhole(image.camera) for image in model.images]
     nowhere = [np.zeros((len(image.point_ids), 2)) for image in model.images]
     colmap = build_model(model, cameras, nowhere, np.zeros((len(model.points), 3), np.uint8))
     colmap.write_binary(str(folder / "sparse"))

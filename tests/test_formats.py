@@ -30,14 +30,14 @@ from mpsfm_core.extraction.matching.verification import TwoView
 from mpsfm_core.inputs import video
 from mpsfm_core.mapping.state import thaw
 from mpsfm_core.pipeline.checkpoints import read_checkpoint
-from mpsfm_core.providers.environments.store import Environment
+from mpsfm_core.providers.environments.environment import Environment
 from mpsfm_core.providers.registry import core_version
-from mpsfm_core.providers.uncertainty.file import load_calibration
+from mpsfm_core.providers.uncertainty.calibration_file import load_calibration
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.report.page import render
 from mpsfm_core.report.result_folder import ResultFolder
 from mpsfm_core.results.depth_maps import read_depth_map
-from mpsfm_core.results.exports.source import Source
+from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.support.files import claimed
 from mpsfm_core.support.format_versions import VERSION, check_version
 
@@ -50,7 +50,7 @@ KEY = "0" * 64
 def results(folder: Path) -> Any:
     """All that is read of a result folder."""
     found = ResultFolder.open(folder / "out")
-    assert found.names == ["0.png", "1.png", "2.png"] == Source.read(folder / "out").names
+    assert found.names == ["0.png", "1.png", "2.png"] == ExportSource.read(folder / "out").names
     assert found.model.num_reg_images() == 3 and len(found.dense_cloud()[0]) > 100
     maps = [(found.refined(n), found.prior(n), found.picture(n)) for n in found.names]
     assert all(part is not None for parts in maps for part in parts)

@@ -12,7 +12,7 @@ from mpsfm_core.cli.arguments import Quiet
 if TYPE_CHECKING:
     from mpsfm_core.calibration.calibrate import Calibrated
     from mpsfm_core.calibration.fitting import Alignment
-    from mpsfm_core.providers.uncertainty.file import CalibratedKind
+    from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 
 _OWN = ("options.", "wrap.", "calibration")
 _TRUTH = "ground_truth."
@@ -70,7 +70,7 @@ def calibrate(
     from mpsfm_core.cli.progress import showing_progress
     from mpsfm_core.config import load_config
     from mpsfm_core.data.errors import InputError
-    from mpsfm_core.inputs.models import model_folder
+    from mpsfm_core.inputs.models import find_model_folder
     from mpsfm_core.providers.registry import Registry
 
     calibrated_kind, alignments = _checked(kind, alignment or [])
@@ -87,7 +87,7 @@ def calibrate(
     )
     output.parent.mkdir(parents=True, exist_ok=True)
     if intrinsics is None and model is not None:
-        intrinsics = model_folder(model)
+        intrinsics = find_model_folder(model)
     with showing_progress(registry, quiet):
         result = calibrate(
             Photos(images, intrinsics, image_list),
@@ -112,7 +112,7 @@ def _checked(
     """The kind and the alignments if there are such."""
     from mpsfm_core.calibration.fitting import Alignment
     from mpsfm_core.data.errors import InputError, did_you_mean
-    from mpsfm_core.providers.uncertainty.file import CalibratedKind
+    from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 
     kinds: dict[str, CalibratedKind] = {name: name for name in get_args(CalibratedKind)}
     known: dict[str, Alignment] = {name: name for name in get_args(Alignment)}

@@ -1,4 +1,9 @@
-"""The dense stage: from a finished reconstruction to one with measured depth."""
+"""Densification: replace refined depth maps by multi-view stereo depth where images overlap.
+
+The stages follow the order of the data: select source views, match each view by plane-sweep stereo,
+compare the depth maps of neighboring views, estimate the scale uncertainty, and fuse stereo depth
+with the known depth.
+"""
 
 from __future__ import annotations
 
@@ -43,52 +48,57 @@ from mpsfm_core.support.threads import allowed
 
 _T = TypeVar("_T", bound=np.generic)
 _MAX_COST = 0.9
-"""Of depth that counts as measured: black photos agree on everything (ours)."""
-_SEEN_STDS = 1.5
-"""Depth seen from elsewhere counts up to so many std of the known depth from it: what is further
-may be seen past an edge (ours)."""
-_SEEN_FROM = 16
-"""Views whose depth is seen in a view, at most, so that time grows with the number of photos."""
-_KEPT_ROUNDS = 4
-"""Photos that are kept, in those that are matched with one: neighbours share them."""
-_SEEN_FACTOR = 3.0
-"""Its std in that of the view's own matches (ours)."""
+"""Matching cost from which a pixel counts as not measured; textureless images match anything [ours]."""
+_MAX_SPLAT_STDS = 1.5
+"""Largest deviation of splatted depth from the known depth, in stds of the latter.
+
+Splatted depth beyond may belong to a surface past an edge [ours]."""
+_MAX_SPLAT_VIEWS = 16
+"""Maximum number of views whose depth is splatted into a view; bounds the run time."""
+_NUM_CACHED_NEIGHBORHOODS = 4
+"""Neighborhoods (a view and its sources) in the view cache; neighboring views share sources."""
+_SPLAT_STD_FACTOR = 3.0
+"""Std of splatted depth relative to the std of matched depth [ours]."""
 
 
 @dataclass(frozen=True)
 class DenseReport:
-    """``sources``: image name -> the views it was matched with; ``confirmed``: image name -> share
-    of its pixels whose depth other views confirm; ``measured``: image name -> (h, w) bool, where
-    the photos say something about depth, and not the map before alone."""
+    """Result of densification per image."""
 
     sources: dict[str, list[str]]
+    """Image name -> names of its source images."""
     confirmed: dict[str, float]
+    """Image name -> ratio of pixels whose depth another view confirms, in [0, 1]."""
     measured: dict[str, Bool]
+    """Image name -> (h, w) mask of pixels whose depth comes from stereo."""
 
     def describe(self) -> dict[str, Any]:
-        """For the summary."""
+        """Return the entries of `summary.json`."""
         return {"sources": self.sources, "confirmed": self.confirmed}
 
 
 class ArrayStore(Protocol):
-    """Gives an array of the same values that is held instead, in memory or elsewhere."""
+    """Stores an array in memory or on disk and returns an array of equal values."""
 
     def __call__(self, array: NDArray[_T]) -> NDArray[_T]: ...
 
 
-def in_memory(array: NDArray[_T]) -> NDArray[_T]:
-    """The array itself."""
+def store_in_memory(array: NDArray[_T]) -> NDArray[_T]:
+    """Return the array itself."""
     return array
 
 
 class StereoCheckpoints(Protocol):
-    """Keeps what was found in the photos, for a run that goes on after it was killed."""
+    """Stores stereo depth per image, so that an interrupted run can resume."""
 
     def load(self, name: str) -> StereoDepth | None:
-        """Of an image with the same reconstruction, photos and options; None if there is none."""
+        """Return the stereo depth of an image, or None.
+
+        The stored depth must come from the same reconstruction, images and options.
+        """
 
     def save(self, name: str, depth: StereoDepth) -> None:
-        """ArrayStore that of an image; called from several threads."""
+        """Store the stereo depth of an image; several threads may call this method."""
 
 
 def densify(
@@ -98,88 +108,109 @@ def densify(
     workers: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     checkpoints: StereoCheckpoints | None = None,
-    store_array: ArrayStore = in_memory,
+    store_array: ArrayStore = store_in_memory,
     poses_use_depth: bool = True,
 ) -> tuple[Reconstruction, DenseReport]:
-    """The reconstruction with depth that was measured in the photos where that is possible.
+    """Refine the depth maps of a reconstruction by multi-view stereo.
 
-    ``view_of``: undistorted view by name. ``workers``: images at once, None for as many as the run
-    may use; what comes out does not depend on it. ``progress``: is told how many images of how many
-    are matched. ``checkpoints``: has what a run that was killed found, and keeps what this finds.
-    ``store_array``: holds maps, those of the result too; called from several threads. ``poses_use_depth``:
-    the mapper found the poses with the depth of these images, so that scales of pairs may hang
-    together by it alone; else poses are taken to be right.
-    Images that no other one overlaps store_array their maps, and so do those without confirmed pose.
+    Images without confirmed pose and images without overlap keep their depth maps. The result does
+    not depend on the number of threads.
+
+    Args:
+        reconstruction: Posed images with refined depth maps.
+        view_of: Returns the undistorted view of an image name.
+        options: Options of stereo and fusion.
+        workers: Number of threads; None uses the limit of the run.
+        progress: Called with the number of matched images and the total.
+        checkpoints: Stores stereo depth for an interrupted run.
+        store_array: Stores large maps, including those of the result. Several threads call it.
+        poses_use_depth: True if depth priors of these images constrained the poses. The scales of
+            image pairs may then depend on the priors alone, which adds a scale variance.
+
+    Returns:
+        The reconstruction with new depth maps, and the report.
     """
-    posed = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
-    images = [reconstruction.images[row] for row in posed]
-    near = select_source_views(images, max(options.num_sources, _SEEN_FROM))
-    sources = [others[: options.num_sources] for others in near]
-    compared_with = _compared_with(sources)
+    image_rows = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
+    images = [reconstruction.images[row] for row in image_rows]
+    neighbors = select_source_views(images, max(options.num_sources, _MAX_SPLAT_VIEWS))
+    sources = [views[: options.num_sources] for views in neighbors]
+    compared_views = _symmetric_neighbors(sources)
     views = _ViewCache(images, view_of, options)
 
-    def matched(row: int) -> _MatchedImage:
+    def match_image(row: int) -> _MatchedImage:
         view, name = views[row], images[row].name
         stereo = checkpoints.load(name) if checkpoints else None
         if stereo is None:
-            stereo = match_stereo_depth(view, [views[other] for other in sources[row]], options)
+            stereo = match_stereo_depth(view, [views[source] for source in sources[row]], options)
             if checkpoints:
                 checkpoints.save(name, stereo)
-        # where the photo may be used and says anything
         supported = view.usable & (stereo.cost < _MAX_COST)
-        return _MatchedImage(view.grid, store_array(stereo.log_depth), stereo.parallax, store_array(supported))
+        return _MatchedImage(
+            view.grid, store_array(stereo.log_depth), stereo.parallax, store_array(supported)
+        )
 
-    def compared(row: int) -> tuple[GeometricConsistency, ScaleConstraints | None]:
-        own, differences = found[row], _differences(row, found, compared_with[row], options)
+    def check_image(row: int) -> tuple[GeometricConsistency, ScaleConstraints | None]:
+        image = matched[row]
+        differences = _compare_with_views(row, matched, compared_views[row], options)
         patches = {
-            j: measure_patch_offsets(views[row], own.log_depth, views[j], each.agree)
-            for j, each in differences.items()
+            source: measure_patch_offsets(
+                views[row], image.log_depth, views[source], difference.agree
+            )
+            for source, difference in differences.items()
         }
-        agreeing = {
-            j: each.log_depth
-            for j, each in differences.items()
-            if not each.by_chance(patches[j].found)
+        consistent = {
+            source: difference.log_depth
+            for source, difference in differences.items()
+            if not difference.is_coincidental(patches[source].matched_ratio)
         }
-        of_poses = estimate_pose_error_px(patches[j] for j in agreeing)
-        agreement = evaluate_consistency(own.parallax_px, agreeing.values(), of_poses)
-        ties = _ties(own, agreeing, views[row], options) if poses_use_depth else None
-        return _kept(agreement, store_array), ties
+        pose_std_px = estimate_pose_error_px(patches[source] for source in consistent)
+        consistency = evaluate_consistency(image.parallax_px, consistent.values(), pose_std_px)
+        constraints = (
+            _measure_constraints(image, consistent, views[row], options)
+            if poses_use_depth
+            else None
+        )
+        return _store_consistency(consistency, store_array), constraints
 
-    def finished(row: int) -> tuple[RegisteredImage, Bool]:
+    def fuse_image(row: int) -> tuple[RegisteredImage, Bool]:
         view = views[row]
         known = LogDepthMap(view.log_depth, view.log_std)
-        measured = fuse_known_depth(_measured(row, view, found, agreed, near[row], options), known)
-        joined = compute_depth_posterior(known, measured, options.correlation_px)
-        image = _with_depth(images[row], view, joined, scale_std.get(row, 0.0), store_array)
+        stereo = _merge_stereo_depth(row, view, matched, consistency, neighbors[row], options)
+        measured = fuse_known_depth(stereo, known)
+        posterior = compute_depth_posterior(known, measured, options.correlation_px)
+        scale_std = scale_stds.get(row, 0.0)
+        image = _replace_depth(images[row], view, posterior, scale_std, store_array)
         return image, store_array(measured.known)
 
-    rows = [row for row, others in enumerate(sources) if others]
-    found: dict[int, _MatchedImage] = {}
+    rows = [row for row, views_ in enumerate(sources) if views_]
+    matched: dict[int, _MatchedImage] = {}
     with ThreadPoolExecutor(workers or allowed()) as pool:
-        for row, own in zip(rows, pool.map(matched, rows), strict=True):
-            found[row] = own
-            progress(len(found), len(rows))
-        judged = dict(zip(rows, pool.map(compared, rows), strict=True))
-        agreed = {row: agreement for row, (agreement, _) in judged.items()}
-        scale_std = estimate_scale_stds({row: ties for row, (_, ties) in judged.items() if ties})
-        maps, which = list(reconstruction.images), {}
-        for row, (image, measured) in zip(rows, pool.map(finished, rows), strict=True):
-            maps[posed[row]], which[image.name] = image, measured
+        for row, image in zip(rows, pool.map(match_image, rows), strict=True):
+            matched[row] = image
+            progress(len(matched), len(rows))
+        checks = dict(zip(rows, pool.map(check_image, rows), strict=True))
+        consistency = {row: result for row, (result, _) in checks.items()}
+        scale_stds = estimate_scale_stds(
+            {row: constraints for row, (_, constraints) in checks.items() if constraints}
+        )
+        dense_images, measured_masks = list(reconstruction.images), {}
+        for row, (dense_image, mask) in zip(rows, pool.map(fuse_image, rows), strict=True):
+            dense_images[image_rows[row]], measured_masks[dense_image.name] = dense_image, mask
     names = [image.name for image in images]
     report = DenseReport(
-        {names[row]: [names[other] for other in others] for row, others in enumerate(sources)},
-        {name: _share(agreed.get(row)) for row, name in enumerate(names)},
-        which,
+        {names[row]: [names[view] for view in views_] for row, views_ in enumerate(sources)},
+        {name: _confirmed_ratio(consistency.get(row)) for row, name in enumerate(names)},
+        measured_masks,
     )
-    return replace(reconstruction, images=tuple(maps)), report
+    return replace(reconstruction, images=tuple(dense_images)), report
 
 
-def _share(agreement: GeometricConsistency | None) -> float:
-    return 0.0 if agreement is None else float(agreement.confirmed.mean())
+def _confirmed_ratio(consistency: GeometricConsistency | None) -> float:
+    return 0.0 if consistency is None else float(consistency.confirmed.mean())
 
 
 class _ViewCache:
-    """Photos on the grid of the stage, made when they are needed; the last ones are kept."""
+    """Loads views on the grid of densification on demand and caches the latest."""
 
     def __init__(
         self,
@@ -188,105 +219,129 @@ class _ViewCache:
         options: DenseOptions,
     ) -> None:
         self._images, self._view_of, self._options = images, view_of, options
-        self._made = lru_cache(_KEPT_ROUNDS * (1 + options.num_sources))(self._make)
+        self._cached_load = lru_cache(_NUM_CACHED_NEIGHBORHOODS * (1 + options.num_sources))(
+            self._load
+        )
 
     def __getitem__(self, row: int) -> DenseView:
-        return self._made(row)
+        return self._cached_load(row)
 
-    def _make(self, row: int) -> DenseView:
+    def _load(self, row: int) -> DenseView:
         image = self._images[row]
-        return DenseView.of(image, self._view_of(image.name), self._options.max_size)
+        return DenseView.from_view(image, self._view_of(image.name), self._options.max_size)
 
 
 class _MatchedImage(NamedTuple):
-    """What is kept of a matched photo: ``supported`` (h, w) says where it says anything."""
+    """Stereo depth of an image as the later stages need it."""
 
     grid: PosedGrid
     log_depth: Float32
+    """(h, w) log depth."""
     parallax: Float32
+    """:attr:`StereoDepth.parallax`."""
     supported: Bool
+    """(h, w) mask of unmasked pixels with a low matching cost."""
 
     def log_std(self, std_px: float | Float32) -> Float32:
-        """Of a match that is as sure, (h, w)."""
+        """Convert the std of a match in pixels to the std of log depth, (h, w)."""
         std: Float32 = np.float32(std_px) / self.parallax_px
         return std
 
     @property
     def parallax_px(self) -> Float32:
-        """Of each pixel, (h, w)."""
+        """(h, w) pixels that a point moves per unit of log depth."""
         return resize_map(self.parallax, *self.grid.camera.size)
 
     def posed_depth(self, options: DenseOptions) -> PosedDepth:
-        """What was found."""
+        """Return the depth map with its pose and nominal std."""
         return PosedDepth(self.grid, self.log_depth, self.log_std(options.match_std_px))
 
 
-def _compared_with(sources: Sequence[Sequence[int]]) -> list[list[int]]:
-    """Of each view its sources, and those whose source it is, in order."""
-    beside = [set(others) for others in sources]
-    for row, others in enumerate(sources):
-        for other in others:
-            beside[other].add(row)
-    return [sorted(others) for others in beside]
+def _symmetric_neighbors(sources: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Return for each view its sources and the views that have it as a source, sorted."""
+    neighbors = [set(views) for views in sources]
+    for row, views in enumerate(sources):
+        for view in views:
+            neighbors[view].add(row)
+    return [sorted(views) for views in neighbors]
 
 
-def _differences(
-    row: int, found: Mapping[int, _MatchedImage], others: Sequence[int], options: DenseOptions
+def _compare_with_views(
+    row: int, matched: Mapping[int, _MatchedImage], views: Sequence[int], options: DenseOptions
 ) -> dict[int, DepthDifferences]:
-    """From a map to those of other views, where it is supported."""
-    own = found[row].posed_depth(options)
+    """Compare the supported depth of an image with the depth maps of other views."""
+    depth = matched[row].posed_depth(options)
     return {
-        other: compare_depths(own, found[other].posed_depth(options)).where(found[row].supported)
-        for other in others
-        if other in found
+        view: compare_depths(depth, matched[view].posed_depth(options)).where(
+            matched[row].supported
+        )
+        for view in views
+        if view in matched
     }
 
 
-def _kept(agreement: GeometricConsistency, store_array: ArrayStore) -> GeometricConsistency:
-    return replace(agreement, views=store_array(agreement.views), mean_change=store_array(agreement.mean_change))
+def _store_consistency(
+    consistency: GeometricConsistency, store_array: ArrayStore
+) -> GeometricConsistency:
+    return replace(
+        consistency,
+        views=store_array(consistency.views),
+        mean_change=store_array(consistency.mean_change),
+    )
 
 
-def _ties(
-    own: _MatchedImage, differences: Mapping[int, Float32], view: DenseView, options: DenseOptions
+def _measure_constraints(
+    image: _MatchedImage, differences: Mapping[int, Float32], view: DenseView, options: DenseOptions
 ) -> ScaleConstraints:
-    """A map beside those of others and the depth that was known of the ``view``."""
+    """Measure the scale constraints between an image's pairs and the known depth of its view."""
     known = view.log_std < UNKNOWN_LOG_STD
     std = float(np.median(view.log_std[known])) if known.any() else UNKNOWN_LOG_STD
-    change = own.log_depth - view.log_depth
+    change = image.log_depth - view.log_depth
     return measure_scale_constraints(differences, change, std, options.correlation_px)
 
 
-def _measured(
+def _merge_stereo_depth(
     row: int,
     view: DenseView,
-    found: Mapping[int, _MatchedImage],
-    agreed: Mapping[int, GeometricConsistency],
-    near: Sequence[int],
+    matched: Mapping[int, _MatchedImage],
+    consistency: Mapping[int, GeometricConsistency],
+    neighbors: Sequence[int],
     options: DenseOptions,
 ) -> LogDepthMap:
-    """What the photos say of a view: its own depth where others agree, and where they do not the
-    depth of others' confirmed pixels, if that is about what was known."""
-    own, agreement = found[row], agreed[row]
-    confirmed = agreement.confirmed
-    log_depth = own.log_depth + agreement.mean_change
-    std = own.log_std(agreement.std_px if confirmed.any() else options.match_std_px)
+    """Merge the consistent depth of an image with depth splatted from its neighbors.
+
+    Pixels that other views confirm use their own depth. Elsewhere the confirmed pixels of neighbors
+    fill in if they are close to the known depth.
+    """
+    image, confirmed = matched[row], consistency[row].confirmed
+    log_depth = image.log_depth + consistency[row].mean_change
+    std = image.log_std(consistency[row].std_px if confirmed.any() else options.match_std_px)
     std = np.maximum(std, np.float32(MIN_STD))
-    others = (
-        (found[j].grid, found[j].log_depth, agreed[j].confirmed) for j in sorted(near) if j in found
+    neighbor_depths = (
+        (matched[j].grid, matched[j].log_depth, consistency[j].confirmed)
+        for j in sorted(neighbors)
+        if j in matched
     )
-    seen = splat_depth(own.grid, others)
-    usable = ~confirmed & (np.abs(seen - view.log_depth) < _SEEN_STDS * view.log_std)
+    splatted = splat_depth(image.grid, neighbor_depths)
+    deviation = np.abs(splatted - view.log_depth)
+    use_splatted = ~confirmed & (deviation < _MAX_SPLAT_STDS * view.log_std)
+    stereo_std = np.where(confirmed, std, np.inf)
     return LogDepthMap(
-        np.where(usable, seen, log_depth).astype(np.float32),
-        np.where(usable, _SEEN_FACTOR * std, np.where(confirmed, std, np.inf)).astype(np.float32),
+        np.where(use_splatted, splatted, log_depth).astype(np.float32),
+        np.where(use_splatted, _SPLAT_STD_FACTOR * std, stereo_std).astype(np.float32),
     )
 
 
-def _with_depth(
-    image: RegisteredImage, view: DenseView, joined: LogDepthMap, scale_std: float, store_array: ArrayStore
+def _replace_depth(
+    image: RegisteredImage,
+    view: DenseView,
+    posterior: LogDepthMap,
+    scale_std: float,
+    store_array: ArrayStore,
 ) -> RegisteredImage:
-    depth = np.exp(joined.log_depth)
-    variance = (joined.log_std**2 + np.float32(scale_std**2)) * depth**2
+    """Return the image with a new depth map; `scale_std` is the std of its log scale."""
+    depth = np.exp(posterior.log_depth)
+    variance = (posterior.log_std**2 + np.float32(scale_std**2)) * depth**2
     prior = DepthPrior.from_arrays(depth, variance, view.usable, metric=image.depth.metric)
     assert prior.variance is not None
     maps = store_array(prior.depth), store_array(prior.variance), store_array(prior.valid)

@@ -14,7 +14,7 @@ from mpsfm_core.evaluation.depth_accuracy import DepthAccuracy, depth_accuracy, 
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.true_surface import depth_file, surface_of_depth
 from mpsfm_core.inputs.models import read_model, reconstruction_poses
-from mpsfm_core.inputs.undistortion import pinhole_camera
+from mpsfm_core.inputs.undistortion import undistort_camera
 from mpsfm_core.results.depth_maps import load_depth_map
 from mpsfm_core.results.ply import read_ply
 
@@ -78,7 +78,7 @@ def true_surface(
     """What :func:`surface_of_depth` says with the cameras and poses of a true model."""
     true = read_model(model)
     cameras = {
-        str(image.name): pinhole_camera(true.cameras[image.camera_id], 0.0)
+        str(image.name): undistort_camera(true.cameras[image.camera_id], 0.0)
         for image in true.images.values()
     }
     return surface_of_depth(depth, images, cameras, reconstruction_poses(true), min(tolerances) / 2)

@@ -17,8 +17,8 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Float64, MappingProblem, Pose, VerifiedPair
+from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.inputs.models import reconstruction_poses
-from mpsfm_core.results.colmap_model import pinhole
 from mpsfm_core.support.threads import allowed
 
 Models = Mapping[int, pycolmap.Reconstruction]
@@ -94,7 +94,7 @@ def write_database(problem: MappingProblem, path: Path) -> None:
     """
     with pycolmap.Database.open(path) as database:
         for number, image in enumerate(problem.images, start=1):
-            camera = pinhole(image.camera)
+            camera = colmap_from_pinhole(image.camera)
             camera.camera_id = number
             camera.has_prior_focal_length = True
             database.write_camera(camera, use_camera_id=True)

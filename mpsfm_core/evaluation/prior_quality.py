@@ -20,7 +20,7 @@ from mpsfm_core.data import Float32
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.scene_folder import SceneFolder
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.inputs.pixels import check_size, read_bytes
+from mpsfm_core.inputs.image_decoding import check_size, read_bytes
 from mpsfm_core.support.files import write_file
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors, degrade_depth
 

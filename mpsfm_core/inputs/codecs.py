@@ -18,7 +18,7 @@ RAW = frozenset((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2",
 """File names; a raw file's content tells no more than its name, most are TIFF files too."""
 
 
-def decoder_of(data: bytes, path: Path) -> Callable[[bytes, Path], UInt8] | None:
+def find_decoder(data: bytes, path: Path) -> Callable[[bytes, Path], UInt8] | None:
     """What decodes this content of a file called so, None if OpenCV does.
 
     It gives (H, W, 3) uint8 RGB, upright, and raises :class:`InputError` when the file is damaged

@@ -11,12 +11,12 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Float64
-from mpsfm_core.inputs.header import exif_block, tiff_entries
+from mpsfm_core.inputs.image_header import exif_block, tiff_entries
 
 _GPS_IFD = 0x8825
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE = 1, 2, 3, 4
 _ALTITUDE_REF, _ALTITUDE, _ERROR_M = 5, 6, 31
-USUAL_STD_M = 5.0
+DEFAULT_STD_M = 5.0
 """Horizontal noise of a phone under the open sky (GPS.gov: 4.9 m), where the photo says none."""
 
 
@@ -28,7 +28,7 @@ class GpsPosition:
     latitude: float
     longitude: float
     altitude: float | None = None
-    std_m: float = USUAL_STD_M
+    std_m: float = DEFAULT_STD_M
 
 
 def read_gps(data: bytes) -> GpsPosition | None:
@@ -47,7 +47,7 @@ def read_gps(data: bytes) -> GpsPosition | None:
         altitude = _number(values, _ALTITUDE)
         if altitude is not None and values.get(_ALTITUDE_REF) in (b"\x01", [1]):
             altitude = -altitude
-        std_m = _number(values, _ERROR_M) or USUAL_STD_M
+        std_m = _number(values, _ERROR_M) or DEFAULT_STD_M
     except (struct.error, ValueError, TypeError, ZeroDivisionError):
         return None
     plausible = abs(latitude) <= 90 and abs(longitude) <= 180 and 0 < std_m < math.inf
@@ -58,7 +58,7 @@ def read_gps(data: bytes) -> GpsPosition | None:
     return GpsPosition(latitude, longitude, altitude, std_m)
 
 
-def to_enu(positions: Sequence[GpsPosition], origin: GpsPosition) -> Float64:
+def convert_to_enu(positions: Sequence[GpsPosition], origin: GpsPosition) -> Float64:
     """Metres east, north and up (n, 3) of the origin; up is NaN without an altitude."""
     reference = origin.altitude or 0.0
     geographic = [

@@ -17,29 +17,30 @@ import pycolmap
 
 from mpsfm_core.data import Bool, Float64, PinholeCamera, UInt8, View
 from mpsfm_core.data.errors import InputError, did_you_mean
+from mpsfm_core.data.result_layout import SUMMARY
+from mpsfm_core.geometry.pycolmap_conversion import camera_key
 from mpsfm_core.inputs.gps import GpsPosition, read_gps
-from mpsfm_core.inputs.header import Header, read_header
-from mpsfm_core.inputs.image_cache import Recent
-from mpsfm_core.inputs.intrinsics import Intrinsics, read_intrinsics
-from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.inputs.pixels import (
+from mpsfm_core.inputs.image_decoding import (
     EXTENSIONS,
+    check_decodable,
     check_size,
-    check_whole,
     decode_rgb,
     read_bytes,
     read_mask,
     upright_size,
 )
+from mpsfm_core.inputs.image_header import ImageHeader, read_header
+from mpsfm_core.inputs.intrinsics import Intrinsics, read_intrinsics
+from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.undistortion import (
-    Warp,
-    camera_key,
+    UndistortionMap,
+    distort_pixels,
     is_pinhole,
-    pinhole_camera,
-    resized_camera,
-    to_original,
-    to_view,
+    resize_camera,
+    undistort_camera,
+    undistort_pixels,
 )
+from mpsfm_core.support.lru_cache import LruCache
 from mpsfm_core.support.threads import allowed
 
 _log = logging.getLogger(__name__)
@@ -53,8 +54,6 @@ _CACHED_WARPS = 2
 _READERS = 4
 """Threads that read and hash files, at most."""
 _MENTIONED = 5
-SUMMARY = "summary.json"
-"""The file that tells a folder of results from one of photos."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +79,11 @@ class SourceImage:
 
     def original_pixels(self, xy: Float64) -> Float64:
         """Pixels (n, 2) of the undistorted view as pixels of the upright original image."""
-        return to_original(self.pinhole, self.camera, xy)
+        return distort_pixels(self.pinhole, self.camera, xy)
 
     def view_pixels(self, xy: Float64) -> Float64:
         """Pixels (n, 2) of the upright original image as pixels of the undistorted view."""
-        return to_view(self.pinhole, self.camera, xy)
+        return undistort_pixels(self.pinhole, self.camera, xy)
 
     def refined_camera(self, pinhole: PinholeCamera) -> pycolmap.Camera:
         """The original camera, with the focal length that a refined camera of the view has.
@@ -125,8 +124,8 @@ class ImageSet:
         self.images = tuple(images)
         self.left_out = dict(left_out or {})
         self._options = options
-        self._views: Recent[int, View] = Recent(CACHED_BYTES, _bytes)
-        self._warps: Recent[str, Warp] = Recent(_CACHED_WARPS, lambda _: 1)
+        self._views: LruCache[int, View] = LruCache(CACHED_BYTES, _bytes)
+        self._warps: LruCache[str, UndistortionMap] = LruCache(_CACHED_WARPS, lambda _: 1)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.images, self._options)  # decoded views stay where they are
@@ -202,8 +201,8 @@ class ImageSet:
             mask = None if mask is None else _resize_mask(mask, image.pinhole.size)
             return View(image.name, pixels, image.pinhole, mask)
         size = _reduced_size(image.original_size, self._options.max_image_size)
-        camera = resized_camera(image.camera, size)
-        warp = self._warps.get(camera_key(camera), lambda: Warp(camera, image.pinhole))
+        camera = resize_camera(image.camera, size)
+        warp = self._warps.get(camera_key(camera), lambda: UndistortionMap(camera, image.pinhole))
         pixels = warp.image(_resize(pixels, size))
         if mask is not None:
             mask = warp.mask(_resize_mask(mask, size))
@@ -245,7 +244,7 @@ def load_images(
     """Find the images of a folder (and its subfolders), check them, and find their cameras.
 
     Args:
-        folder: images, in any of the formats of :data:`mpsfm_core.inputs.pixels.EXTENSIONS`.
+        folder: images, in the formats of :data:`mpsfm_core.inputs.image_decoding.EXTENSIONS`.
         intrinsics: ``intrinsics.yaml``, a COLMAP model (folder or ``cameras.txt``) or
             ``transforms.json``, for the images upright (after EXIF rotation). Without it focal
             lengths come from EXIF, else from ``options.default_focal_ratio`` with a warning.
@@ -298,11 +297,11 @@ def _read_cameras(path: Path | None, names: Sequence[str]) -> Intrinsics | None:
 
 
 @dataclass(frozen=True)
-class _File:
+class _ProbedImage:
     """A probed image file: upright size, header and hash; or why it is unreadable."""
 
     size: tuple[int, int]
-    header: Header
+    header: ImageHeader
     digest: str
     fault: str = ""
     gps: GpsPosition | None = None
@@ -316,7 +315,7 @@ class _CameraGuesses:
         self._max_id = max_id
         self._ids: dict[tuple[tuple[int, int], float], int] = {}
 
-    def camera(self, file: _File) -> tuple[pycolmap.Camera, FocalSource]:
+    def camera(self, file: _ProbedImage) -> tuple[pycolmap.Camera, FocalSource]:
         """A SIMPLE_PINHOLE camera with the principal point in the centre."""
         source: FocalSource = "exif"
         focal = file.header.focal_px(*file.size)
@@ -329,7 +328,7 @@ class _CameraGuesses:
 def _source_image(
     name: str,
     path: Path,
-    file: _File,
+    file: _ProbedImage,
     camera: pycolmap.Camera,
     focal: FocalSource,
     options: InputOptions,
@@ -352,8 +351,8 @@ def _view_camera(camera: pycolmap.Camera, options: InputOptions) -> PinholeCamer
     """The camera of the view that is made of an image."""
     original = camera.width, camera.height
     size = _reduced_size(original, options.max_image_size)
-    reduced = camera if size == original else resized_camera(camera, size)
-    return pinhole_camera(reduced, options.blank_pixels)
+    reduced = camera if size == original else resize_camera(camera, size)
+    return undistort_camera(reduced, options.blank_pixels)
 
 
 def find_images(folder: Path, without: Path | None = None) -> list[str]:
@@ -379,7 +378,7 @@ def find_images(folder: Path, without: Path | None = None) -> list[str]:
     return sorted(found, key=_natural)
 
 
-def check_apart(output: Path, folder: Path) -> None:
+def check_output_folder(output: Path, folder: Path) -> None:
     """Raise :class:`InputError` if results in ``output`` would lie among photos."""
     if output.resolve() == folder.resolve():
         raise InputError(
@@ -434,14 +433,14 @@ def _listed(image_list: Path, names: list[str], folder: Path) -> list[str]:
     return listed
 
 
-def _probe(path: Path, options: InputOptions) -> _File:
+def _probe(path: Path, options: InputOptions) -> _ProbedImage:
     try:
         data = read_bytes(path)
     except InputError as error:
-        return _File((0, 0), Header(None, 1, {}), "", str(error))
+        return _ProbedImage((0, 0), ImageHeader(None, 1, {}), "", str(error))
     check_size(data, path, options.max_pixels)
     try:
-        check_whole(data, path)
+        check_decodable(data, path)
         header = read_header(data)
         if header.projection is not None:
             raise InputError(
@@ -450,8 +449,8 @@ def _probe(path: Path, options: InputOptions) -> _File:
             )
         size = upright_size(data, header, path)
     except InputError as error:
-        return _File((0, 0), Header(None, 1, {}), "", str(error))
-    return _File(size, header, hashlib.sha256(data).hexdigest(), gps=read_gps(data))
+        return _ProbedImage((0, 0), ImageHeader(None, 1, {}), "", str(error))
+    return _ProbedImage(size, header, hashlib.sha256(data).hexdigest(), gps=read_gps(data))
 
 
 def _judge(left_out: Mapping[str, str], total: int, options: InputOptions) -> None:

@@ -13,9 +13,9 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.geometry import inside
 from mpsfm_core.inputs.colmap_database import read_database
 from mpsfm_core.inputs.hloc import HlocFiles
+from mpsfm_core.inputs.image_decoding import apply_orientation_to_pixels
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.inputs.models import match_names
-from mpsfm_core.inputs.pixels import orient_pixels
 
 Pair = tuple[int, int]
 
@@ -130,7 +130,7 @@ def _upright(
     width, height = image.original_size
     stored = (height, width) if image.orientation >= 5 else (width, height)
     if size is None or size == stored:
-        return orient_pixels(keypoints, stored, image.orientation)
+        return apply_orientation_to_pixels(keypoints, stored, image.orientation)
     if size == (width, height):
         return keypoints
     raise InputError(

@@ -23,13 +23,13 @@ def read_poses(path: Path) -> dict[str, Pose]:
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
-    """The COLMAP model of a folder (see :func:`model_folder`), or a ``transforms.json``.
+    """The COLMAP model of a folder (see :func:`find_model_folder`), or a ``transforms.json``.
 
     Raises :class:`~mpsfm_core.data.errors.InputError` when it is not there or cannot be read.
     """
     if path.suffix == ".json":
         return read_transforms(path)
-    folder = model_folder(path)
+    folder = find_model_folder(path)
     try:
         check_binary_model(folder)
         model = pycolmap.Reconstruction(str(folder))
@@ -40,7 +40,7 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     return model
 
 
-def model_folder(folder: Path) -> Path:
+def find_model_folder(folder: Path) -> Path:
     """Where a COLMAP model (binary or text) lies: here, in ``sparse`` or in ``sparse/0``.
 
     Raises :class:`~mpsfm_core.data.errors.InputError` when there is none.

@@ -19,12 +19,12 @@ import pycolmap
 
 from mpsfm_core.data import Float64
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.header import read_header
+from mpsfm_core.geometry.pycolmap_conversion import camera_key
+from mpsfm_core.inputs.image_decoding import EXTENSIONS, check_size, read_bytes, upright_size
+from mpsfm_core.inputs.image_header import read_header
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.inputs.pixels import EXTENSIONS, check_size, read_bytes, upright_size
-from mpsfm_core.inputs.undistortion import camera_key
 
-_COEFFICIENTS: Mapping[str, tuple[str, ...]] = {
+DISTORTION_KEYS: Mapping[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
     "SIMPLE_RADIAL": ("k1",),
@@ -37,52 +37,12 @@ _CAMERA_KEYS = (
     *("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x"),
     *("k1", "k2", "k3", "k4", "p1", "p2"),
 )
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Between the axes of OpenGL's cameras and ours."""
 _LARGEST = 1 << 20
 """Pixels of a side, and more than any photo has."""
 _ROTATION_TOLERANCE = 1e-3
 """Of an entry of R^T R: files are written with few digits."""
-
-
-def can_hold(camera: pycolmap.Camera) -> bool:
-    """Whether the format has this camera model; others have to be undistorted first."""
-    return camera.model_name in _COEFFICIENTS
-
-
-def write_transforms(path: Path, model: pycolmap.Reconstruction, files: Mapping[str, str]) -> None:
-    """Write poses and cameras of a model.
-
-    ``files``: image name -> path of its picture, relative to the folder of ``path``.
-    """
-    frames = []
-    for image in sorted(model.images.values(), key=lambda image: str(image.name)):
-        pose = np.eye(4)
-        pose[:3] = image.cam_from_world().inverse().matrix()
-        frames.append(
-            {
-                "file_path": files[image.name],
-                "transform_matrix": (pose @ _FLIP).tolist(),
-                **_intrinsics(model.cameras[image.camera_id]),
-            }
-        )
-    path.write_text(json.dumps({"frames": frames}, indent=2), encoding="utf-8")
-
-
-def _intrinsics(camera: pycolmap.Camera) -> dict[str, Any]:
-    names = _COEFFICIENTS[camera.model_name]
-    matrix = camera.calibration_matrix()
-    fisheye = camera.model_name == "OPENCV_FISHEYE"
-    return {
-        "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": matrix[0, 0],
-        "fl_y": matrix[1, 1],
-        "cx": matrix[0, 2],
-        "cy": matrix[1, 2],
-        **dict(zip(names, camera.params[len(camera.params) - len(names) :].tolist(), strict=True)),
-    }
 
 
 def read_transforms(path: Path) -> pycolmap.Reconstruction:
@@ -139,7 +99,7 @@ def _world_from_camera(where: str, value: object) -> Float64:
         raise InputError(f"{where}: the left 3x3 block of 'transform_matrix' is no rotation")
     left, _, right = np.linalg.svd(rotation)
     pose[:3, :3] = left @ right
-    return pose @ _FLIP
+    return pose @ OPENGL_FROM_OPENCV
 
 
 def _camera(where: str, values: Mapping[str, Any], picture: Path) -> pycolmap.Camera:
@@ -160,8 +120,10 @@ def _camera(where: str, values: Mapping[str, Any], picture: Path) -> pycolmap.Ca
     model = values.get("camera_model", "OPENCV")
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye"):
         model, params = "OPENCV_FISHEYE", [*params, k1, k2, k3, k4]
-    elif model not in _COEFFICIENTS or k4:
-        what = f"camera model {model}" if model not in _COEFFICIENTS else "a fourth coefficient k4"
+    elif model not in DISTORTION_KEYS or k4:
+        what = (
+            f"camera model {model}" if model not in DISTORTION_KEYS else "a fourth coefficient k4"
+        )
         raise InputError(f"{where}: {what} is not supported; undistort the photos first")
     elif k3:
         model, params = "FULL_OPENCV", [*params, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]

@@ -8,14 +8,10 @@ import pycolmap
 
 from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera, UInt8
 from mpsfm_core.geometry import inside, pixel_centers, project, rays, scale_pixels
+from mpsfm_core.geometry.pycolmap_conversion import pinhole_from_colmap
 
 _ROWS = 256
 """Rows of a warp that are computed at once: bounds the memory for large images."""
-
-
-def camera_key(camera: pycolmap.Camera) -> str:
-    """The same text for cameras that are the same but for their number."""
-    return f"{camera.model_name} {camera.width} {camera.height} {camera.params.tolist()}"
 
 
 def is_pinhole(camera: pycolmap.Camera) -> bool:
@@ -23,30 +19,23 @@ def is_pinhole(camera: pycolmap.Camera) -> bool:
     return bool(camera.is_perspective_pinhole() and camera.is_undistorted())
 
 
-def resized_camera(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:
+def resize_camera(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:
     """The same camera for an image resized to (width, height)."""
     resized = pycolmap.Camera(camera.todict())
     resized.rescale(*size)
     return resized
 
 
-def pinhole_camera(camera: pycolmap.Camera, blank_pixels: float) -> PinholeCamera:
+def undistort_camera(camera: pycolmap.Camera, blank_pixels: float) -> PinholeCamera:
     """The undistorted camera: COLMAP's choice of field of view, or the camera itself."""
     if not is_pinhole(camera):
         options = pycolmap.UndistortCameraOptions()
         options.blank_pixels = blank_pixels
         camera = pycolmap.undistort_camera(options, camera)
-    return PinholeCamera(
-        camera.width,
-        camera.height,
-        float(camera.focal_length_x if _has_two_focals(camera) else camera.focal_length),
-        float(camera.focal_length_y if _has_two_focals(camera) else camera.focal_length),
-        float(camera.principal_point_x),
-        float(camera.principal_point_y),
-    )
+    return pinhole_from_colmap(camera)
 
 
-def to_original(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64) -> Float64:
+def distort_pixels(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64) -> Float64:
     """Pixels (n, 2) of the undistorted view as pixels of the original camera."""
     if is_pinhole(camera):
         return scale_pixels(xy, pinhole.size, (camera.width, camera.height))
@@ -54,7 +43,7 @@ def to_original(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64) ->
     return original
 
 
-def to_view(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64) -> Float64:
+def undistort_pixels(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64) -> Float64:
     """Pixels (n, 2) of the original camera as pixels of the undistorted view; NaN where a
     distortion has no inverse."""
     if is_pinhole(camera):
@@ -63,7 +52,7 @@ def to_view(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64) -> Flo
     return project(pinhole, np.concatenate([direction, np.ones((len(xy), 1))], axis=1))
 
 
-class Warp:
+class UndistortionMap:
     """Resampling from a distorted image to its pinhole view; made once for each camera.
 
     ``valid``: (h, w) bool, False where the view looks past the border of the original image.
@@ -74,7 +63,7 @@ class Warp:
         source = np.empty((*centers.shape[:2], 2), dtype=np.float32)
         for start in range(0, pinhole.height, _ROWS):
             block = centers[start : start + _ROWS]
-            xy = to_original(pinhole, camera, block.reshape(-1, 2))
+            xy = distort_pixels(pinhole, camera, block.reshape(-1, 2))
             source[start : start + _ROWS] = xy.reshape(block.shape)
         self.valid: Bool = inside(source.astype(np.float64), (camera.width, camera.height))
         self._source: Float32 = source - np.float32(0.5)
@@ -95,7 +84,3 @@ class Warp:
         )
         result: Bool = (warped > 0) & self.valid
         return result
-
-
-def _has_two_focals(camera: pycolmap.Camera) -> bool:
-    return len(camera.focal_length_idxs()) == 2

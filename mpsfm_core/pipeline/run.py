@@ -18,6 +18,7 @@ from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import DepthPrior, Float64, MappingProblem, Pose, View
 from mpsfm_core.data.errors import ConfigError, InputError, ReconstructionError
 from mpsfm_core.data.options import FROM_MATCHER
+from mpsfm_core.data.result_layout import DENSE, DEPTH, MESH, SPARSE, SUMMARY
 from mpsfm_core.dense.densify import DenseReport, densify
 from mpsfm_core.dense.depth_range import depth_prior_from_points
 from mpsfm_core.dense.fusion import fuse_depth_maps
@@ -27,7 +28,7 @@ from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.priors.focal_length import estimate_focals
 from mpsfm_core.extraction.runner import Extraction, extract, extract_more
 from mpsfm_core.geometry import transform
-from mpsfm_core.inputs.images import SUMMARY, ImageSet, check_output_folder, find_images, load_images
+from mpsfm_core.inputs.images import ImageSet, check_output_folder, find_images, load_images
 from mpsfm_core.inputs.matches import (
     ImportedMatches,
     matches_from_database,
@@ -56,16 +57,7 @@ from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.ply import write_cloud
 from mpsfm_core.results.summary import FORMAT as SUMMARY_FORMAT
 from mpsfm_core.results.summary import describe_images, describe_pairs, describe_reconstructions
-from mpsfm_core.results.writer import (
-    DENSE,
-    DEPTH,
-    MESH,
-    SPARSE,
-    ComponentResult,
-    update_summary,
-    write_failure,
-    write_results,
-)
+from mpsfm_core.results.writer import ComponentResult, update_summary, write_failure, write_results
 from mpsfm_core.support.disk_arrays import DiskArrays
 from mpsfm_core.support.files import claimed, replacing
 from mpsfm_core.support.format_versions import VERSION
@@ -341,7 +333,9 @@ class _Run:
         self._checkpoints.append(checkpoints)
         return checkpoints
 
-    def _dense_checkpoints(self, part: Reconstruction, photos: OriginalImages) -> DenseCheckpoints | None:
+    def _dense_checkpoints(
+        self, part: Reconstruction, photos: OriginalImages
+    ) -> DenseCheckpoints | None:
         config = self._provision.config
         if config.runtime.checkpoint_s is None:
             return None
@@ -413,7 +407,11 @@ class _Run:
         return extract_frames(video, self._output, self._provision.config.inputs.video, progress)
 
     def _give_up(
-        self, images: ImageSet, extraction: Extraction, mapping: MappingResult, photos: OriginalImages
+        self,
+        images: ImageSet,
+        extraction: Extraction,
+        mapping: MappingResult,
+        photos: OriginalImages,
     ) -> None:
         """Leave the reasons in the summary and raise."""
         summary = self._summary("failed", images, extraction, mapping, ())
@@ -479,7 +477,9 @@ class _Run:
         used = {(line["kind"], line["name"]): line for line in usage}
         described = []
         unused = {"computed": 0, "from_cache": 0, "seconds": 0.0}
-        blocks = zip(self._provision.choices, self._provision.config.provider_configs(), strict=True)
+        blocks = zip(
+            self._provision.choices, self._provision.config.provider_configs(), strict=True
+        )
         for choice, (_, kind, backend) in blocks:
             spec = choice.provider
             described.append(
@@ -487,8 +487,8 @@ class _Run:
                     "block": choice.block,
                     **used.get((kind, spec.name), {"kind": kind, "name": spec.name, **unused}),
                     "from": choice.origin,
-                    "chosen": choice.reason,
-                    "passed_over": dict(choice.passed_over),
+                    "chosen": choice.reason.value,
+                    "passed_over": {name: why.to_json() for name, why in choice.passed_over.items()},
                     "code_license": spec.code_license,
                     "weights_license": spec.weights_license,
                     "accuracy": spec.accuracy,
@@ -575,14 +575,20 @@ def _densify_model(
         found = matched[photo.name]
         file = model / DEPTH / f"{found}.npz"
         poses_use_depth &= file.is_file()
-        depths.append(read_depth_map(file)[1] if file.is_file() else depth_prior_from_points(points[found]))
+        depths.append(
+            read_depth_map(file)[1] if file.is_file() else depth_prior_from_points(points[found])
+        )
     known = _maps_alone(photos, [poses[matched[photo.name]] for photo in photos], depths)
     if not known.images:
         raise InputError(f"{model}: has no points, so nothing says how far the surfaces are")
     view_of = _view_of(photos)
     disk = DiskArrays(cache_folder())
     dense, report = densify(
-        known, view_of, options or DenseOptions(), store_array=disk.store, poses_use_depth=poses_use_depth
+        known,
+        view_of,
+        options or DenseOptions(),
+        store_array=disk.store,
+        poses_use_depth=poses_use_depth,
     )
     with replacing(output, (SPARSE, DENSE, DEPTH)) as folder:
         write_model(folder / SPARSE, colmap)

@@ -36,9 +36,10 @@ from mpsfm_core.data import (
     SceneState,
     View,
 )
+from mpsfm_core.data.decisions import Reason
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.data.options import Options
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 API_VERSION = 1
 """Version of this contract. A plugin that names a newer one is listed as unavailable."""
@@ -145,7 +146,7 @@ class Matcher(Protocol):
     ) -> PairMatches: ...
 
 
-def required_features(
+def require_features(
     purpose: str, features_a: Features | None, features_b: Features | None
 ) -> tuple[Features, Features]:
     """The features of both views, for a matcher that cannot do without.
@@ -222,7 +223,7 @@ class WeightsFile:
     size: int | None = None
 
 
-def file_named_by(
+def weights_from_option(
     option: str, *known: WeightsFile, sha256: str = "sha256"
 ) -> Callable[[Any], tuple[WeightsFile, ...]]:
     """For :attr:`ProviderSpec.weights`: the file that an option of the provider names.
@@ -274,7 +275,7 @@ class ProviderSpec:
     before it looks at the first photo. ``accuracy``: what to expect, with its source, in a line.
     ``calibration``: declared uncertainty of a depth, multi-view or normals provider. ``contract``:
     how the contract kit tests it without weights, a function (see
-    :class:`mpsfm_core.testing.Setup`) by reference like ``factory``.
+    :class:`mpsfm_core.testing.ContractSetup`) by reference like ``factory``.
 
     An option of type :class:`~pathlib.Path` names a file or folder that the provider reads: a run
     ends at once where it does not exist.
@@ -305,7 +306,7 @@ class ExportFormat:
     """A format of another program that ``mpsfm export`` writes.
 
     ``description``: one line for people. ``entries``: what it writes into its folder. ``write``:
-    called with a :class:`~mpsfm_core.results.exports.source.Source` and an empty folder; a plugin
+    called with a :class:`~mpsfm_core.results.exports.source.ExportSource` and an empty folder; a plugin
     gives ``"package.module:function"``, imported when the format is wanted. It raises
     :class:`~mpsfm_core.data.errors.InputError` when the input lacks what the format needs.
     ``turned``: gravity is -z unless the user wants otherwise, for programs that show or render the
@@ -390,5 +391,5 @@ class Hooks:
         """The formats that this plugin writes for ``mpsfm export``."""
 
     @hookspec
-    def mpsfm_image_rejected(self, name: str, reason: str) -> None:
+    def mpsfm_image_rejected(self, name: str, reason: Reason, text: str) -> None:
         """The mapper tried an image and rejected it."""

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import Float64
 from mpsfm_core.data.errors import InputError, MpsfmError
+from mpsfm_core.data.result_layout import REPORT
 from mpsfm_core.report import pictures
 from mpsfm_core.report.findings import findings, partner_counts, verdict
 from mpsfm_core.report.points import PointSet, dense_points, sparse_points
-from mpsfm_core.report.reasons import explain
-from mpsfm_core.report.result_folder import PairLines, PriorMaps, RefinedMap, ResultFolder
-from mpsfm_core.results.writer import REPORT
+from mpsfm_core.report.reasons import explain_image, explain_pair
+from mpsfm_core.report.result_folder import PairMatches, PriorMaps, RefinedMap, ResultFolder
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.threads import each
 from mpsfm_core.support.yaml_text import write_yaml
@@ -144,7 +144,7 @@ class _Photos:
     def describe(self, name: str) -> dict[str, Any]:
         images = self._result.summary["images"]
         reason = {**images["unregistered"], **images["unconfirmed"]}.get(name)
-        explained = None if reason is None else explain(reason)
+        explained = None if reason is None else explain_image(reason)
         status = "registered"
         if name in images["unconfirmed"]:
             status = "unconfirmed"
@@ -157,8 +157,7 @@ class _Photos:
         return {
             "name": name,
             "status": status,
-            "reason": reason,
-            "plain": explained and explained.plain,
+            "explanation": explained and explained.text,
             "remedy": explained and explained.remedy,
             "keypoints": details["keypoints"],
             "partners": self._partners[name] if explained is None else self._matched[name],
@@ -172,7 +171,7 @@ class _Photos:
             "pictures": self._pictures(name, prior, refined),
         }
 
-    def lines(self, pair: PairLines) -> str:
+    def lines(self, pair: PairMatches) -> str:
         """Matches in shares of the widths and heights of both views: ax, ay, bx, by, uint16."""
         sides = []
         for name, points in ((pair.image_a, pair.points_a), (pair.image_b, pair.points_b)):
@@ -281,10 +280,17 @@ def _pairs(summary: Mapping[str, Any], ids: Mapping[str, int]) -> list[list[Any]
             *(ids[name] for name in pair["images"]),
             pair["matches"],
             pair.get("inliers", 0),
-            pair.get("dropped") or pair.get("cannot_start") or "",
+            _why_unused(pair),
         ]
         for pair in summary["pairs"]["all"]
     ]
+
+
+def _why_unused(pair: Mapping[str, Any]) -> str:
+    """Return why a pair was dropped or cannot initialize a component; empty if neither."""
+    if "dropped" in pair:
+        return explain_pair(pair["dropped"]).text
+    return explain_image(pair["cannot_start"]).text if "cannot_start" in pair else ""
 
 
 def _points(points: PointSet) -> dict[str, Any]:

@@ -14,13 +14,12 @@ import pycolmap
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.images import SUMMARY
+from mpsfm_core.data.result_layout import DENSE, DEPTH, SUMMARY, VIEWS
 from mpsfm_core.inputs.models import read_model
 from mpsfm_core.results.depth_maps import load_depth_map
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.summary import read_summary
 from mpsfm_core.results.views import MATCHES
-from mpsfm_core.results.writer import DENSE, DEPTH, VIEWS
 from mpsfm_core.support.npz import read_npz
 
 _UNREADABLE = (ValueError, KeyError, TypeError, IndexError)
@@ -58,7 +57,7 @@ class PriorMaps:
 
 
 @dataclass(frozen=True, eq=False)
-class PairLines:
+class PairMatches:
     """Some of the verified matches of two images: (m, 2) float32 each, pixels of the views."""
 
     image_a: str
@@ -154,7 +153,7 @@ class ResultFolder:
             raise InputError(f"{file}: is damaged")
         return np.asarray(picture, np.uint8)
 
-    def lines(self) -> list[PairLines]:
+    def lines(self) -> list[PairMatches]:
         """Verified matches, none if they were not written."""
         file = self.path / VIEWS / MATCHES
         if not file.is_file():
@@ -163,7 +162,7 @@ class ResultFolder:
         try:
             starts: Int64 = data["starts"]
             return [
-                PairLines(
+                PairMatches(
                     str(data["names"][a]),
                     str(data["names"][b]),
                     data["points_a"][starts[row] : starts[row + 1]],

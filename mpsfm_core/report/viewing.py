@@ -20,18 +20,17 @@ from mpsfm_core.data import (
     Bool,
     DepthPrior,
     Float64,
-    PinholeCamera,
     PosedImage,
     SceneState,
     UInt8,
 )
 from mpsfm_core.data.errors import InputError
+from mpsfm_core.data.result_layout import DENSE, SUMMARY, VIEWS
 from mpsfm_core.geometry import camera_center, pixel_centers, resize_map, unproject
-from mpsfm_core.inputs.images import SUMMARY
+from mpsfm_core.geometry.pycolmap_conversion import pinhole_from_colmap
 from mpsfm_core.inputs.models import read_model
 from mpsfm_core.report.result_folder import ResultFolder
 from mpsfm_core.results.ply import read_ply
-from mpsfm_core.results.writer import DENSE, VIEWS
 
 PICTURE_SIDE = 320
 """Longer side of pictures in viewers, in pixels."""
@@ -44,7 +43,7 @@ _SHOWN_PIXELS = 8000
 class Viewer(Protocol):
     """Shows scenes."""
 
-    def show(self, scene: SceneState, cloud: Cloud | None = None) -> None:
+    def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
         """Show a scene in the place of what was shown before."""
         ...
 
@@ -58,7 +57,7 @@ class Viewer(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class ColoredPoints:
     """``xyz``: (n, 3) float64, world units. ``rgb``: (n, 3) uint8."""
 
     xyz: Float64
@@ -69,21 +68,21 @@ Pictures = Callable[[str], UInt8 | None]
 """Small RGB picture (h, w, 3) uint8 of an image by its name, None where there is none."""
 
 
-def photos_in(folder: Path) -> Pictures:
+def pictures_from_photos(folder: Path) -> Pictures:
     """Pictures from a folder of photos; a photo that cannot be read has none."""
     return lambda name: _decoded(folder / name)
 
 
-def views_in(folder: Path) -> Pictures:
+def pictures_from_results(folder: Path) -> Pictures:
     """Pictures from a result folder."""
     return lambda name: _decoded(folder / VIEWS / f"{name}.webp")
 
 
-def lifted(image: PosedImage, picture: UInt8 | None) -> Cloud:
+def lifted(image: PosedImage, picture: UInt8 | None) -> ColoredPoints:
     """The depth map of an image as thinned points, grey without a picture, none without depth."""
     depth = image.depth
     if depth is None:
-        return Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        return ColoredPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     height, width = depth.shape
     pixels = np.flatnonzero(certain(depth))
     pixels = pixels[:: max(1, -(-len(pixels) // _SHOWN_PIXELS))]
@@ -93,7 +92,7 @@ def lifted(image: PosedImage, picture: UInt8 | None) -> Cloud:
     rgb = np.full((len(pixels), 3), 128, np.uint8)
     if picture is not None:
         rgb = np.asarray(resize_map(picture, width, height).reshape(-1, 3)[pixels], np.uint8)
-    return Cloud(world, rgb)
+    return ColoredPoints(world, rgb)
 
 
 def certain(depth: DepthPrior) -> Bool:
@@ -105,7 +104,7 @@ def certain(depth: DepthPrior) -> Bool:
     return shown
 
 
-def read_scene(folder: Path) -> tuple[SceneState, Cloud, Pictures]:
+def read_scene(folder: Path) -> tuple[SceneState, ColoredPoints, Pictures]:
     """A result folder, any COLMAP model, or a ``transforms.json``; its photos lie in ``images/``.
 
     Raises :class:`InputError` when the folder is none of them.
@@ -114,36 +113,25 @@ def read_scene(folder: Path) -> tuple[SceneState, Cloud, Pictures]:
         result = ResultFolder.open(folder)
         if result.failed:
             raise InputError(f"{folder}: the run failed, open {folder}/report.html instead")
-        scene, cloud = scene_of(result.model)
+        scene, cloud = scene_from_model(result.model)
         if (folder / DENSE).is_file():
-            cloud = Cloud(*read_ply(folder / DENSE))
-        return scene, cloud, views_in(folder)
-    return *scene_of(read_model(folder)), photos_in(folder / "images")
+            cloud = ColoredPoints(*read_ply(folder / DENSE))
+        return scene, cloud, pictures_from_results(folder)
+    return *scene_from_model(read_model(folder)), pictures_from_photos(folder / "images")
 
 
-def scene_of(model: pycolmap.Reconstruction) -> tuple[SceneState, Cloud]:
+def scene_from_model(model: pycolmap.Reconstruction) -> tuple[SceneState, ColoredPoints]:
     """The images of a COLMAP model that have a pose, sorted by name, and its points."""
     images = []
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.has_pose:
             pose = image.cam_from_world().matrix()
-            camera = _pinhole(model.cameras[image.camera_id])
+            camera = pinhole_from_colmap(model.cameras[image.camera_id])
             images.append(PosedImage(image.name, camera, pose[:, :3], pose[:, 3], None))
     points = [model.points3D[key] for key in sorted(model.points3D)]
     xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     rgb = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
-    return SceneState(tuple(images), xyz), Cloud(xyz, rgb)
-
-
-def _pinhole(camera: pycolmap.Camera) -> PinholeCamera:
-    return PinholeCamera(
-        camera.width,
-        camera.height,
-        camera.focal_length_x,
-        camera.focal_length_y,
-        camera.principal_point_x,
-        camera.principal_point_y,
-    )
+    return SceneState(tuple(images), xyz), ColoredPoints(xyz, rgb)
 
 
 def _decoded(file: Path) -> UInt8 | None:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Float64, PinholeCamera, UInt8, View
+from mpsfm_core.data import Float64, UInt8, View
 from mpsfm_core.geometry import sample_nearest
+from mpsfm_core.geometry.pycolmap_conversion import camera_key
 from mpsfm_core.inputs.colmap_files import check_binary_model
-from mpsfm_core.inputs.undistortion import camera_key
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 
 MIN_TRACK_LENGTH = 2
@@ -79,7 +79,7 @@ def write_model(folder: Path, model: pycolmap.Reconstruction, *, text: bool = Fa
         raise OSError(errno.EIO, f"the disk did not take all of {folder.name}/")
 
 
-def point_colors(
+def average_point_colors(
     reconstruction: Reconstruction, keypoints: Keypoints, view_of: Callable[[str], View]
 ) -> UInt8:
     """Mean RGB colour (p, 3) of each point over its observations, black without any.
@@ -94,13 +94,6 @@ def point_colors(
         np.add.at(total, rows, sample_nearest(view_of(image.name).image, xy[seen]))
         np.add.at(count, rows, 1)
     return np.round(total / np.maximum(count, 1)[:, None]).astype(np.uint8)
-
-
-def pinhole(camera: PinholeCamera) -> pycolmap.Camera:
-    """The COLMAP camera of an undistorted view."""
-    return pycolmap.Camera(
-        model="PINHOLE", width=camera.width, height=camera.height, params=camera.params
-    )
 
 
 def _whole_binary(folder: Path, model: pycolmap.Reconstruction) -> bool:

@@ -11,9 +11,9 @@ import pycolmap
 
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.geometry import camera_center
-from mpsfm_core.inputs.gps import GpsPosition, to_enu
+from mpsfm_core.inputs.gps import GpsPosition, convert_to_enu
 from mpsfm_core.mapping.scene.reconstruction import MetricScale, Reconstruction, transformed
-from mpsfm_core.results.orientation import estimate_gravity, rotation_to_z
+from mpsfm_core.results.gravity import estimate_gravity, rotation_to_z
 
 _FEWEST = 4
 """Positions: three fix a similarity, one more can deny it."""
@@ -61,7 +61,7 @@ def georeference(
     if len(known) < _FEWEST:
         return f"{len(known)} registered photos have a GPS position, {_FEWEST} are needed"
     origin = _middle([positions[name] for name in known])
-    enu = to_enu([positions[name] for name in known], origin)
+    enu = convert_to_enu([positions[name] for name in known], origin)
     std_m = float(np.median([positions[name].std_m for name in known]))
     deviations = enu[:, :2] - np.median(enu[:, :2], axis=0)
     spread = float(np.sqrt((deviations**2).sum(axis=1).mean()))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mpsfm_core.data.result_layout import MESH
 from mpsfm_core.dense.mesh import TriangleMesh
 from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.results.gltf import FLIP, TRIANGLES, Y_UP_FROM_Z, GltfScene
 from mpsfm_core.results.ply import write_ply
-from mpsfm_core.results.writer import MESH
 
 
 def write_mesh(folder: Path, mesh: TriangleMesh, source: ExportSource) -> None:

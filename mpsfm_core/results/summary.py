@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import PinholeCamera
+from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, MetricScale, Reconstruction
@@ -59,9 +60,11 @@ def describe_images(
     reasons = {}
     for name in images.names:
         if name not in component:
-            reasons[name] = mapping.report.image_reasons.get(name, "no reason recorded")
+            reasons[name] = mapping.report.image_reasons.get(
+                name, ImageReason.NOT_RECORDED.because()
+            ).to_json()
         elif component[name] > 0:
-            reasons[name] = f"not connected to the others; in components/{component[name]}"
+            reasons[name] = ImageReason.OTHER_COMPONENT.because(component=component[name]).to_json()
     return {
         "total": len(images),
         "registered": [name for name in images.names if name not in reasons],
@@ -96,7 +99,7 @@ def describe_pairs(extraction: Mapping[str, Any], mapping: MappingResult) -> dic
     described = []
     for pair in extraction["pairs"]:
         reason = mapping.report.pair_reasons.get(" ".join(pair["images"]))
-        described.append(pair if reason is None else {**pair, "cannot_start": reason})
+        described.append(pair if reason is None else {**pair, "cannot_start": reason.to_json()})
     return {
         "proposed": extraction["pairs_proposed"],
         "matched": extraction["pairs_matched"],

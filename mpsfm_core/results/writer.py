@@ -29,39 +29,31 @@ from typing import Any
 import pycolmap
 
 from mpsfm_core.data import UInt8
+from mpsfm_core.data.result_layout import (
+    COMPONENTS,
+    DENSE,
+    DEPTH,
+    ENTRIES,
+    POINTS,
+    REPORT,
+    SPARSE,
+    SPARSE_TEXT,
+    SUMMARY,
+    TRANSFORMS,
+    UNDISTORTED,
+    VIEWS,
+)
 from mpsfm_core.dense.fusion import fuse_depth_maps
-from mpsfm_core.inputs.images import SUMMARY
-from mpsfm_core.inputs.nerfstudio import can_hold, write_transforms
+from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
-from mpsfm_core.results.colmap_model import build_model, pinhole, average_point_colors, write_model
+from mpsfm_core.results.colmap_model import average_point_colors, build_model, write_model
 from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.original_images import OriginalImages, exported_image_name
 from mpsfm_core.results.ply import write_cloud, write_ply
+from mpsfm_core.results.transforms_json import supports_camera, write_transforms
 from mpsfm_core.results.views import write_views
 from mpsfm_core.support.files import replacing, write_file
-
-SPARSE = "sparse"
-DENSE = "dense.ply"
-DEPTH = "depth"
-MESH = ("mesh.ply", "mesh.glb")
-VIEWS = "views"
-REPORT = "report.html"
-ENTRIES = (
-    SPARSE,
-    "sparse_text",
-    "components",
-    "undistorted",
-    "points.ply",
-    DENSE,
-    *MESH,
-    DEPTH,
-    "transforms.json",
-    VIEWS,
-    REPORT,
-    SUMMARY,
-)
-"""What belongs to us in an output folder. Report and mesh are made from the rest of it, later."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +78,7 @@ class ComponentResult:
 
     def undistorted(self, photos: OriginalImages) -> pycolmap.Reconstruction:
         """The model of the undistorted views."""
-        cameras = [pinhole(image.camera) for image in self.reconstruction.images]
+        cameras = [colmap_from_pinhole(image.camera) for image in self.reconstruction.images]
         keypoints = photos.keypoints(self.reconstruction)
         images = (replace(i, name=exported_image_name(i.name)) for i in self.reconstruction.images)
         renamed = replace(self.reconstruction, images=tuple(images))
@@ -111,24 +103,28 @@ def write_results(
     with replacing(output, ENTRIES) as folder:
         write_model(folder / SPARSE, best.model)
         if options.text_model:
-            write_model(folder / "sparse_text", best.model, text=True)
+            write_model(folder / SPARSE_TEXT, best.model, text=True)
         for number, component in enumerate(rest, start=1):
-            own = folder / "components" / str(number)
+            own = folder / COMPONENTS / str(number)
             write_model(own, component.model)
             _write_dense(own, component, photos, options, seed)
-        write_ply(folder / "points.ply", best.reconstruction.points, best.colors)
+        write_ply(folder / POINTS, best.reconstruction.points, best.colors)
         _write_dense(folder, best, photos, options, seed)
         if photos.any_distorted(best.reconstruction):
-            _write_undistorted(folder / "undistorted", best, photos)
+            _write_undistorted(folder / UNDISTORTED, best, photos)
         if options.nerfstudio:
-            _write_nerfstudio(folder / "transforms.json", output, best, photos)
+            _write_nerfstudio(folder / TRANSFORMS, output, best, photos)
         if options.report:
             write_views(folder / VIEWS, photos.problem, photos.view)
         _write_json(folder / SUMMARY, summarize())
 
 
 def _write_dense(
-    folder: Path, component: ComponentResult, photos: OriginalImages, options: ResultOptions, seed: int
+    folder: Path,
+    component: ComponentResult,
+    photos: OriginalImages,
+    options: ResultOptions,
+    seed: int,
 ) -> None:
     """The depth maps and their cloud, as far as they are asked for."""
     if options.dense_cloud:
@@ -159,16 +155,18 @@ def _write_undistorted(folder: Path, component: ComponentResult, photos: Origina
         photos.write_view(image, folder / "images" / exported_image_name(image.name))
 
 
-def _write_nerfstudio(path: Path, output: Path, component: ComponentResult, photos: OriginalImages) -> None:
+def _write_nerfstudio(
+    path: Path, output: Path, component: ComponentResult, photos: OriginalImages
+) -> None:
     """The photos themselves where the format has their cameras, else the undistorted views."""
     images = component.reconstruction.images
-    if all(can_hold(camera) for camera in component.model.cameras.values()):
+    if all(supports_camera(camera) for camera in component.model.cameras.values()):
         model = component.model
         files = {image.name: os.path.relpath(photos.source(image).path, output) for image in images}
     else:
         model = component.undistorted(photos)
         names = [exported_image_name(image.name) for image in images]
-        files = {name: f"undistorted/images/{name}" for name in names}
+        files = {name: f"{UNDISTORTED}/images/{name}" for name in names}
     write_transforms(path, model, files)
 
 

@@ -15,8 +15,9 @@ from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.depth_range import depth_prior_from_points
 from mpsfm_core.geometry import project, transform
+from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.pipeline.run import densify_model
-from mpsfm_core.results.colmap_model import build_model, pinhole, write_model
+from mpsfm_core.results.colmap_model import build_model, write_model
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.testing.synthetic.scenes import room_scene
 
@@ -37,7 +38,7 @@ def model(room, tmp_path: Path) -> Path:
         room.reconstruction, images=registered, points=points, errors_px=np.zeros(len(points))
     )
     colors = np.zeros((len(points), 3), np.uint8)
-    built = build_model(sparse, [pinhole(camera)] * len(images), seen, colors)
+    built = build_model(sparse, [colmap_from_pinhole(camera)] * len(images), seen, colors)
     write_model(tmp_path / "sparse", built)
     (tmp_path / "photos").mkdir()
     for name, view in room.views.items():

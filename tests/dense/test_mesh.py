@@ -21,8 +21,9 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
 from mpsfm_core.dense.options import MeshOptions
 from mpsfm_core.geometry import pixel_centers, unproject
+from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
-from mpsfm_core.results.colmap_model import build_model, pinhole, write_model
+from mpsfm_core.results.colmap_model import build_model, write_model
 from mpsfm_core.results.depth_maps import write_depth_maps
 
 from .conftest import CAMERA, Room
@@ -136,7 +137,7 @@ def result(room: Room, tmp_path: Path) -> Path:
     """A folder with a model, depth maps and photos."""
     exact = measured(room)
     nothing = np.zeros((0, 2))
-    cameras, colors = [pinhole(CAMERA)] * len(exact.images), np.zeros((0, 3), np.uint8)
+    cameras, colors = [colmap_from_pinhole(CAMERA)] * len(exact.images), np.zeros((0, 3), np.uint8)
     built = build_model(exact, cameras, [nothing] * len(exact.images), colors)
     write_model(tmp_path / "sparse", built)
     write_depth_maps(tmp_path / "depth", exact)

@@ -16,7 +16,7 @@ from mpsfm_core.evaluation.pose_auc import CONVENTIONS
 from mpsfm_core.evaluation.records import read_record, write_record
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder
 from mpsfm_core.inputs.models import reconstruction_poses
-from mpsfm_core.inputs.nerfstudio import write_transforms
+from mpsfm_core.results.transforms_json import write_transforms
 
 
 def scene_of(model: pycolmap.Reconstruction, path: Path) -> SceneFolder:

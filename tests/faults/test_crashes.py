@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mpsfm_core.results.writer import REPORT
+from mpsfm_core.data.result_layout import REPORT
 
 from .conftest import Scene, content
 

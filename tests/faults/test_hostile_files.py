@@ -27,15 +27,15 @@ from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.records import read_record
 from mpsfm_core.evaluation.scene_folder import _read_sets
 from mpsfm_core.extraction.cache import Cache, content_key
-from mpsfm_core.inputs.header import declared_pixels, is_cut_jpeg, read_header
+from mpsfm_core.inputs.image_header import read_declared_num_pixels, is_cut_jpeg, read_header
 from mpsfm_core.inputs.images import load_images, read_image_list
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.models import read_model, read_poses
 from mpsfm_core.mapping.state import freeze, thaw
 from mpsfm_core.pipeline import checkpoints
-from mpsfm_core.providers.builtin.arrays import read_arrays
+from mpsfm_core.providers.builtin.map_files import read_arrays
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.providers.uncertainty.file import read_values
+from mpsfm_core.providers.uncertainty.calibration_file import read_values
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.report.page import write_report
 from mpsfm_core.results.depth_maps import read_depth_map
@@ -337,7 +337,7 @@ def test_any_bytes_have_a_header(data: bytes) -> None:
     header = read_header(data)
     assert 1 <= header.orientation <= 8
     header.focal_px(32, 24)
-    declared_pixels(data)
+    read_declared_num_pixels(data)
     is_cut_jpeg(data)
 
 

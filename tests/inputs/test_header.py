@@ -6,14 +6,14 @@ import math
 
 import pytest
 
-from mpsfm_core.inputs.header import Header, read_header
+from mpsfm_core.inputs.image_header import ImageHeader, read_header
 
 FOCAL_35MM, FOCAL_MM = 0xA405, 0x920A
 PIXELS_X, PIXELS_Y = 0xA002, 0xA003
 PLANE_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
 
 
-def header(**tags: float) -> Header:
+def header(**tags: float) -> ImageHeader:
     numbers = {
         "f35": FOCAL_35MM,
         "mm": FOCAL_MM,
@@ -22,7 +22,7 @@ def header(**tags: float) -> Header:
         "resolution": PLANE_RESOLUTION,
         "unit": PLANE_UNIT,
     }
-    return Header(None, 1, {numbers[name]: value for name, value in tags.items()})
+    return ImageHeader(None, 1, {numbers[name]: value for name, value in tags.items()})
 
 
 def test_equivalent_of_full_frame_sensor() -> None:

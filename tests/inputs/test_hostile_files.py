@@ -27,7 +27,7 @@ from mpsfm_core.inputs.nerfstudio import read_transforms
 from mpsfm_core.inputs.options import InputOptions, VideoOptions
 from mpsfm_core.inputs.video import choose_frames
 from mpsfm_core.report.viewing import read_scene
-from mpsfm_core.results.exports.source import Source
+from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.results.ply import read_ply
 
 NAMES = ("0.png", "1.png")
@@ -291,15 +291,15 @@ def negative(path: Path) -> None:
 def test_depth_maps_of_results(result: Path, damage: Damage) -> None:
     (path,) = (result / "depth").rglob("*.npz")
     name = path.relative_to(result / "depth").as_posix().removesuffix(".npz")
-    assert Source.read(result).maps(name) is not None
+    assert ExportSource.read(result).maps(name) is not None
     damage(path)
-    refused(lambda: Source.read(result).maps(name), path)
+    refused(lambda: ExportSource.read(result).maps(name), path)
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"status": "failed"}', "[" * 100_000])
 def test_summaries_of_results(result: Path, content: str) -> None:
     (result / "summary.json").write_text(content)
-    refused(lambda: Source.read(result), result / "summary.json")
+    refused(lambda: ExportSource.read(result), result / "summary.json")
 
 
 @pytest.mark.parametrize(
@@ -327,7 +327,7 @@ def test_clouds(tmp_path: Path, content: bytes) -> None:
 GLB_READERS: dict[str, Callable[[Path], object]] = {
     "photos.glb": load_images,
     "model.glb": read_model,
-    "result.glb": Source.read,
+    "result.glb": ExportSource.read,
     "scene.glb": read_scene,
     "intrinsics.glb": read_intrinsics,
     "intrinsics.db": read_intrinsics,

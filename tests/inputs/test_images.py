@@ -13,7 +13,7 @@ import pytest
 
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs import images as module
-from mpsfm_core.inputs.images import ImageSet, check_apart, find_images, load_images
+from mpsfm_core.inputs.images import ImageSet, check_output_folder, find_images, load_images
 from mpsfm_core.inputs.options import InputOptions
 
 INTRINSICS = "1: {params: [70, 70, 40, 30], images: all}"
@@ -137,14 +137,14 @@ def test_results_below_the_photos_are_no_input(folder: Path) -> None:
     assert len(find_images(folder)) == len(names) + 1
     assert find_images(folder, folder / "out") == names
     with pytest.raises(InputError, match="holds 1 of them"):
-        check_apart(folder / "out", folder)
+        check_output_folder(folder / "out", folder)
     (folder / "out" / "summary.json").write_text("{}")
     assert find_images(folder) == names
-    check_apart(folder / "out", folder)
-    check_apart(folder / "new", folder)
-    check_apart(folder.parent / "elsewhere", folder)
+    check_output_folder(folder / "out", folder)
+    check_output_folder(folder / "new", folder)
+    check_output_folder(folder.parent / "elsewhere", folder)
     with pytest.raises(InputError, match="the folder of the photos"):
-        check_apart(folder / ".", folder)
+        check_output_folder(folder / ".", folder)
 
 
 def test_focal_length_from_exif(tmp_path: Path, write_image) -> None:

@@ -16,7 +16,7 @@ from mpsfm_core.inputs.colmap_database import read_database
 from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.matches import matches_from_database, matches_from_hloc
-from mpsfm_core.inputs.pixels import orient, orient_pixels
+from mpsfm_core.inputs.image_decoding import orient, apply_orientation_to_pixels
 from mpsfm_core.testing.synthetic.scenes import arc_poses, project, room_scene
 
 SIZE = (160, 120)
@@ -156,7 +156,7 @@ def test_pixels_turn_with_their_photo(orientation: int) -> None:
     stored = np.zeros((4, 6, 3), np.uint8)
     stored[1, 4] = 255
     upright = orient(stored, orientation)
-    (x, y) = orient_pixels(np.array([[4.5, 1.5]]), (6, 4), orientation)[0]
+    (x, y) = apply_orientation_to_pixels(np.array([[4.5, 1.5]]), (6, 4), orientation)[0]
     assert upright[int(y), int(x)].tolist() == [255] * 3
 
 

@@ -14,7 +14,8 @@ import pytest
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.models import read_poses
-from mpsfm_core.inputs.nerfstudio import read_transforms, write_transforms
+from mpsfm_core.inputs.nerfstudio import read_transforms
+from mpsfm_core.results.transforms_json import write_transforms
 
 FRAME: dict[str, Any] = {
     "file_path": "images/a.png",

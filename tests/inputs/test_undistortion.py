@@ -8,11 +8,11 @@ import pytest
 
 from mpsfm_core.geometry import pixel_centers, project
 from mpsfm_core.inputs.undistortion import (
-    Warp,
+    UndistortionMap,
     is_pinhole,
-    pinhole_camera,
-    resized_camera,
-    to_original,
+    undistort_camera,
+    resize_camera,
+    distort_pixels,
 )
 
 WIDTH, HEIGHT = 160, 120
@@ -42,13 +42,13 @@ def image() -> np.ndarray:
 @pytest.mark.parametrize("model", MODELS)
 def test_same_as_colmap(model: str, image: np.ndarray) -> None:
     original = camera(model)
-    pinhole = pinhole_camera(original, 0.0)
+    pinhole = undistort_camera(original, 0.0)
     options = pycolmap.UndistortCameraOptions()
     bitmap, colmap = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(image), original)
     assert pinhole.size == (colmap.width, colmap.height)
     assert np.allclose(pinhole.params, colmap.params)
     inner = np.s_[2:-2, 2:-2]  # COLMAP leaves a black rim of half a pixel
-    warped = Warp(original, pinhole).image(image)
+    warped = UndistortionMap(original, pinhole).image(image)
     difference = np.abs(warped.astype(int) - bitmap.to_array())[inner]
     assert difference.max() <= 1
 
@@ -56,58 +56,58 @@ def test_same_as_colmap(model: str, image: np.ndarray) -> None:
 @pytest.mark.parametrize("model", MODELS)
 def test_to_original_follows_the_camera_model(model: str) -> None:
     original = camera(model)
-    pinhole = pinhole_camera(original, 0.0)
+    pinhole = undistort_camera(original, 0.0)
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-0.3, 0.3, (50, 2)), np.ones(50)])
-    seen = to_original(pinhole, original, project(pinhole, points))
+    seen = distort_pixels(pinhole, original, project(pinhole, points))
     assert np.allclose(seen, original.img_from_cam(points), atol=1e-9)
 
 
 def test_pinhole_needs_no_warp() -> None:
     plain = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 505, 310, 245])
     assert is_pinhole(plain)
-    assert pinhole_camera(plain, 0.0).params.tolist() == [500, 505, 310, 245]
+    assert undistort_camera(plain, 0.0).params.tolist() == [500, 505, 310, 245]
     straight = pycolmap.Camera(
         model="SIMPLE_RADIAL", width=640, height=480, params=[500, 320, 240, 0.0]
     )
-    assert is_pinhole(straight) and pinhole_camera(straight, 0.0).size == (640, 480)
+    assert is_pinhole(straight) and undistort_camera(straight, 0.0).size == (640, 480)
     # Without distortion a fisheye is still no pinhole camera.
     assert not is_pinhole(camera("SIMPLE_FISHEYE"))
 
 
 def test_reduced_pinhole_maps_back() -> None:
     plain = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 505, 310, 245])
-    reduced = pinhole_camera(resized_camera(plain, (320, 240)), 0.0)
+    reduced = undistort_camera(resize_camera(plain, (320, 240)), 0.0)
     assert reduced.params.tolist() == [250, 252.5, 155, 122.5]
     xy = np.array([[0.5, 0.5], [320.0, 240.0]])
-    assert to_original(reduced, plain, xy).tolist() == [[1.0, 1.0], [640.0, 480.0]]
+    assert distort_pixels(reduced, plain, xy).tolist() == [[1.0, 1.0], [640.0, 480.0]]
     assert (plain.width, plain.height) == (640, 480)
 
 
 def test_reduced_distorted_maps_back() -> None:
     original = camera("OPENCV")
-    reduced = resized_camera(original, (80, 60))
-    pinhole = pinhole_camera(reduced, 0.0)
+    reduced = resize_camera(original, (80, 60))
+    pinhole = undistort_camera(reduced, 0.0)
     xy = pixel_centers(*pinhole.size).reshape(-1, 2)
-    scaled = to_original(pinhole, reduced, xy) * 2
-    assert np.allclose(to_original(pinhole, original, xy), scaled, atol=1e-9)
+    scaled = distort_pixels(pinhole, reduced, xy) * 2
+    assert np.allclose(distort_pixels(pinhole, original, xy), scaled, atol=1e-9)
 
 
 def test_blank_pixels_are_masked(image: np.ndarray) -> None:
     original = camera("OPENCV")
     original.params = [130, 132, 79, 61, 0.25, 0.05, 0.0, 0.0]
-    full = Warp(original, pinhole_camera(original, 1.0))
+    full = UndistortionMap(original, undistort_camera(original, 1.0))
     assert 0.005 < 1 - full.valid.mean() < 0.5
     bright = np.full_like(image, 200)
     warped = full.image(bright)
     assert (warped[full.valid] == 200).all() and (warped[~full.valid] == 0).all()
-    cropped = Warp(original, pinhole_camera(original, 0.0))
+    cropped = UndistortionMap(original, undistort_camera(original, 0.0))
     assert cropped.valid.all()
 
 
 def test_mask_is_warped_with_the_image(image: np.ndarray) -> None:
     original = camera("OPENCV")
-    warp = Warp(original, pinhole_camera(original, 0.0))
+    warp = UndistortionMap(original, undistort_camera(original, 0.0))
     mask = np.zeros((HEIGHT, WIDTH), dtype=np.bool_)
     mask[:, WIDTH // 2 :] = True
     painted = np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) * 255

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from mpsfm_core.results.writer import REPORT
+from mpsfm_core.data.result_layout import REPORT
 
 Open = Callable[[Path], Any]
 

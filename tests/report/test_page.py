@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data.errors import InputError
+from mpsfm_core.data.result_layout import REPORT
 from mpsfm_core.report.page import render, write_report
 from mpsfm_core.report.result_folder import ResultFolder
-from mpsfm_core.results.writer import REPORT
 
 
 def data_of(page: str) -> dict[str, Any]:

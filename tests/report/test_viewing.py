@@ -19,8 +19,8 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers import hookimpl
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.report.viewing import lifted, photos_in, read_scene
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.report.viewing import lifted, pictures_from_photos, read_scene
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 
@@ -35,8 +35,8 @@ def test_a_run_shows_how_it_grows() -> None:
     registry = Registry()
     registry.register(Watcher())
     camera = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
-    problem = mapping_problem(room_scene(), camera, arc_poses(4, 12.0), map_width=80)
-    one_by_one = MapperOptions.model_validate({"initialization": {"all_at_once": False}})
+    problem = make_mapping_problem(room_scene(), camera, arc_poses(4, 12.0), map_width=80)
+    one_by_one = MapperOptions.model_validate({"initialization": {"global_initialization": False}})
     result = mapper.reconstruct(problem, one_by_one, Stages(registry))
     sizes = [len(scene.images) for scene in seen]
     assert sizes[0] < sizes[-1] == len(result.reconstructions[0].images)
@@ -85,12 +85,12 @@ def test_photos_are_reduced_and_may_be_damaged(tmp_path: Path) -> None:
     picture[..., 2] = 200  # red, as OpenCV orders it
     cv2.imwrite(str(tmp_path / "a.png"), picture)
     (tmp_path / "b.png").write_bytes(b"nothing")
-    small = photos_in(tmp_path)("a.png")
+    small = pictures_from_photos(tmp_path)("a.png")
     assert small is not None
     assert small.shape == (240, 320, 3)
     assert small[0, 0].tolist() == [200, 0, 0]
-    assert photos_in(tmp_path)("b.png") is None
-    assert photos_in(tmp_path)("c.png") is None
+    assert pictures_from_photos(tmp_path)("b.png") is None
+    assert pictures_from_photos(tmp_path)("c.png") is None
 
 
 def test_viewers_come_from_plugins(tmp_path: Path, install_plugin) -> None:
@@ -109,12 +109,12 @@ def test_viewers_come_from_plugins(tmp_path: Path, install_plugin) -> None:
         """,
     )
     registry = Registry.discover()
-    watch = open_viewer(registry, "watch", tmp_path, photos_in(tmp_path))
+    watch = open_viewer(registry, "watch", tmp_path, pictures_from_photos(tmp_path))
     assert watch.output == tmp_path
     with pytest.raises(InputError, match="did you mean 'watch'"):
-        open_viewer(registry, "wach", tmp_path, photos_in(tmp_path))
+        open_viewer(registry, "wach", tmp_path, pictures_from_photos(tmp_path))
     with pytest.raises(InputError, match=f"'broken' cannot be opened.*{module}"):
-        open_viewer(registry, "broken", tmp_path, photos_in(tmp_path))
+        open_viewer(registry, "broken", tmp_path, pictures_from_photos(tmp_path))
 
 
 def test_a_model_is_shown_by_the_command(

@@ -9,8 +9,9 @@ import numpy as np
 import pycolmap
 import pytest
 
+from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.results import colmap_model
-from mpsfm_core.results.colmap_model import build_model, pinhole, point_colors, write_model
+from mpsfm_core.results.colmap_model import average_point_colors, build_model, write_model
 
 DISTORTED = pycolmap.Camera(
     model="OPENCV", width=200, height=150, params=[150, 151, 100, 75, 0.1, -0.05, 0.001, -0.002]
@@ -23,8 +24,8 @@ def keypoints_of(solved):
 
 @pytest.fixture
 def model(solved) -> pycolmap.Reconstruction:
-    cameras = [pinhole(image.camera) for image in solved.best.images]
-    colors = point_colors(solved.best, keypoints_of(solved), solved.views.__getitem__)
+    cameras = [colmap_from_pinhole(image.camera) for image in solved.best.images]
+    colors = average_point_colors(solved.best, keypoints_of(solved), solved.views.__getitem__)
     return build_model(solved.best, cameras, keypoints_of(solved), colors)
 
 
@@ -68,7 +69,7 @@ def test_reprojection_errors_are_those_of_the_models_own_camera(solved) -> None:
 
 
 def test_different_cameras_stay_apart(solved) -> None:
-    cameras = [pinhole(image.camera) for image in solved.best.images]
+    cameras = [colmap_from_pinhole(image.camera) for image in solved.best.images]
     cameras[1] = DISTORTED
     colors = np.zeros((len(solved.best.points), 3), np.uint8)
     model = build_model(solved.best, cameras, keypoints_of(solved), colors)
@@ -77,7 +78,7 @@ def test_different_cameras_stay_apart(solved) -> None:
 
 
 def test_points_have_the_colour_of_the_photos(solved, model) -> None:
-    expected = point_colors(solved.best, keypoints_of(solved), solved.views.__getitem__)
+    expected = average_point_colors(solved.best, keypoints_of(solved), solved.views.__getitem__)
     stored = {tuple(point.xyz): point.color for point in model.points3D.values()}
     for xyz, color in zip(solved.best.points[:40], expected[:40], strict=True):
         np.testing.assert_array_equal(stored[tuple(xyz)], color)

@@ -10,7 +10,7 @@ import pytest
 
 from mpsfm_core.data import DepthPrior, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, camera_center
-from mpsfm_core.inputs.gps import GpsPosition, to_enu
+from mpsfm_core.inputs.gps import GpsPosition, convert_to_enu
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage, transformed
 from mpsfm_core.results.georeference import georeference
 
@@ -124,7 +124,7 @@ def test_positions_that_do_not_suffice_change_nothing(centers, noise_m, why: str
 def test_enu_is_metres_and_unknown_altitudes_stay_unknown() -> None:
     east = GpsPosition(ORIGIN.latitude, ORIGIN.longitude + 0.001, None)
     north = GpsPosition(ORIGIN.latitude + 0.001, ORIGIN.longitude, 420.0)
-    enu = to_enu([east, north], ORIGIN)
+    enu = convert_to_enu([east, north], ORIGIN)
     assert enu[0, 0] == pytest.approx(111_320 * np.cos(np.radians(47.3764)) * 0.001, rel=0.01)
     assert np.isnan(enu[0, 2])
     assert enu[1, 1:] == pytest.approx([111.2, 10], rel=0.01)

@@ -15,16 +15,16 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.geometry import project, transform
 from mpsfm_core.inputs.images import FocalSource, ImageSet, SourceImage
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.inputs.undistortion import pinhole_camera
+from mpsfm_core.inputs.undistortion import undistort_camera
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, MappingResult, Reconstruction
 from mpsfm_core.results.options import ResultOptions
-from mpsfm_core.results.photos import Photos
+from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.summary import (
     describe_images,
     describe_pairs,
     describe_reconstructions,
 )
-from mpsfm_core.results.writer import Component, write_failure, write_results
+from mpsfm_core.results.writer import ComponentResult, write_failure, write_results
 
 PINHOLE = pycolmap.Camera(
     model="PINHOLE", width=160, height=120, params=[140, 141, 80.5, 59], camera_id=1
@@ -45,7 +45,7 @@ def photos_of(solved, folder: Path, camera: pycolmap.Camera, known: bool = True)
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), cv2.cvtColor(view.image, cv2.COLOR_RGB2BGR))
-        pinhole = pinhole_camera(camera, 0.0)
+        pinhole = undistort_camera(camera, 0.0)
         sources.append(SourceImage(name, path, camera, pinhole, source, "0"))
     return ImageSet(sources, InputOptions())
 
@@ -70,8 +70,8 @@ def seen_through(solved, images: ImageSet) -> tuple[MappingProblem, Reconstructi
 def write(solved, tmp_path: Path, camera: pycolmap.Camera, options: ResultOptions) -> Path:
     images = photos_of(solved, tmp_path / "photos", camera)
     problem, reconstruction = seen_through(solved, images)
-    photos = Photos(images, problem)
-    component = Component.of(reconstruction, photos)
+    photos = OriginalImages(images, problem)
+    component = ComponentResult.of(reconstruction, photos)
     write_results(tmp_path / "out", [component], photos, options, lambda: {"status": "success"})
     return tmp_path / "out"
 
@@ -156,7 +156,7 @@ def test_a_refined_focal_length_reaches_the_photos_camera(solved, tmp_path: Path
         reconstruction,
         images=tuple(replace(image, camera=refined) for image in reconstruction.images),
     )
-    model = Component.of(reconstruction, Photos(images, problem)).model
+    model = ComponentResult.of(reconstruction, OriginalImages(images, problem)).model
     (camera,) = model.cameras.values()
     np.testing.assert_allclose(camera.params, [154, 155.1, 80.5, 59])
     mapping = MappingResult((reconstruction,), solved.result.report)
@@ -175,7 +175,7 @@ def test_views_show_what_the_mapper_was_given(solved, tmp_path: Path) -> None:
     given = solved.problem.images[3]  # not registered
     size = given.camera.size
     picture = cv2.imread(str(output / "views" / f"{given.name}.webp"))
-    assert picture.shape == (*pinhole_camera(DISTORTED, 0.0).size[::-1], 3)
+    assert picture.shape == (*undistort_camera(DISTORTED, 0.0).size[::-1], 3)
     with np.load(output / "views" / f"{given.name}.npz") as maps:
         assert maps["camera"].tolist() == [*size, *given.camera.params]
         np.testing.assert_array_equal(maps["depth"], given.depth.depth)
@@ -195,10 +195,10 @@ def test_everything_that_can_be_left_out_is(solved, tmp_path: Path) -> None:
 def test_further_components_are_models_of_their_own(solved, tmp_path: Path) -> None:
     images = photos_of(solved, tmp_path / "photos", PINHOLE)
     problem, reconstruction = seen_through(solved, images)
-    photos = Photos(images, problem)
+    photos = OriginalImages(images, problem)
     first = replace(reconstruction, images=reconstruction.images[:2])
     second = replace(reconstruction, images=reconstruction.images[1:])
-    components = [Component.of(part, photos) for part in (first, second)]
+    components = [ComponentResult.of(part, photos) for part in (first, second)]
     write_results(tmp_path / "out", components, photos, ResultOptions(), dict)
     main = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse"))
     other = pycolmap.Reconstruction(str(tmp_path / "out" / "components" / "1"))
@@ -217,9 +217,9 @@ def test_images_that_nothing_confirms_are_in_the_model_without_points(
     *others, last = reconstruction.images
     guessed = replace(last, confirmed=False, point_ids=np.full_like(last.point_ids, -1))
     complete = replace(reconstruction, images=(*others, guessed))
-    component = Component.of(complete, Photos(images, problem))
+    component = ComponentResult.of(complete, OriginalImages(images, problem))
     options = ResultOptions(nerfstudio=True)
-    write_results(tmp_path / "out", [component], Photos(images, problem), options, dict)
+    write_results(tmp_path / "out", [component], OriginalImages(images, problem), options, dict)
     model = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse"))
     points = {image.name: image.num_points3D for image in model.images.values()}
     assert points == {"images/0.png": 40, "images/1.png": 40, "images/2.png": 0}
@@ -249,7 +249,7 @@ def test_a_failed_run_leaves_its_summary_and_the_earlier_model(solved, tmp_path:
     output = write(solved, tmp_path, PINHOLE, ResultOptions())
     before = (output / "sparse" / "points3D.bin").read_bytes()
     (output / "report.html").write_text("of the run before")
-    photos = Photos(photos_of(solved, tmp_path / "photos", PINHOLE), solved.problem)
+    photos = OriginalImages(photos_of(solved, tmp_path / "photos", PINHOLE), solved.problem)
     write_failure(output, photos, ResultOptions(), {"status": "failed"})
     assert not (output / "report.html").exists()
     assert (output / "views" / "images" / "3.png.npz").exists()
@@ -260,7 +260,7 @@ def test_a_failed_run_leaves_its_summary_and_the_earlier_model(solved, tmp_path:
 def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path) -> None:
     images = photos_of(solved, tmp_path, PINHOLE)
     problem, reconstruction = seen_through(solved, images)
-    model = Component.of(reconstruction, Photos(images, problem)).model
+    model = ComponentResult.of(reconstruction, OriginalImages(images, problem)).model
     mapping = MappingResult((reconstruction,), solved.result.report)
     extraction = {
         "images": {name: {"keypoints": 46} for name in images.names},

@@ -15,8 +15,8 @@ from mpsfm_core.cli.reconstruct import _refined_focal_lengths
 from mpsfm_core.data.errors import ReconstructionError
 from mpsfm_core.dense.densify import densify
 from mpsfm_core.evaluation import evaluate, read_poses, reconstruction_poses
-from mpsfm_core.inputs.nerfstudio import write_transforms
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, MappingResult
+from mpsfm_core.results.transforms_json import write_transforms
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from mpsfm_core.data import Float32, Float64, Int64
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.prior_quality import write_depth
 from mpsfm_core.geometry import inside, pixel_centers, sample_nearest
-from mpsfm_core.inputs.header import read_header
-from mpsfm_core.inputs.undistortion import camera_key
+from mpsfm_core.geometry.pycolmap_conversion import camera_key
+from mpsfm_core.inputs.image_header import read_header
 
 PHOTOS = (".jpg", ".jpeg", ".png")
 _DEPTH_COLUMNS = 1024

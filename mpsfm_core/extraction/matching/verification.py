@@ -10,7 +10,9 @@ import pycolmap
 from scipy.special import bdtrc
 
 from mpsfm_core.data import Float64, Int64, PinholeCamera
+from mpsfm_core.data.decisions import PairReason, Reason
 from mpsfm_core.extraction.options import VerificationOptions
+from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 
 _Configuration = pycolmap.TwoViewGeometryConfiguration
 CALIBRATED = "calibrated"
@@ -25,18 +27,31 @@ _USABLE = {
 
 @dataclass(frozen=True, eq=False)
 class TwoView:
-    """Outcome of verification.
+    """Two-view geometry of an image pair, or the code of the reason why the pair is dropped."""
 
-    ``reason``: why the pair is dropped, empty if it is kept. ``configuration``: COLMAP's, in
-    words. ``inliers``: (k,) int64, rows of the matches. ``rotation`` (3, 3), ``translation`` (3,)
-    float64: ``cam_b_from_cam_a``, a unit or zero translation.
-    """
-
-    reason: str
+    dropped: str
+    """Value of a :class:`~mpsfm_core.data.decisions.PairReason`; empty for a verified pair."""
     configuration: str
+    """COLMAP's configuration of the two-view geometry, in words."""
+    num_inliers: int
+    """Inliers of the estimated geometry, also of a dropped pair."""
     inliers: Int64
+    """(k,) rows of the inlier matches; none of a dropped pair."""
     rotation: Float64
+    """(3, 3) rotation of ``cam_b_from_cam_a``."""
     translation: Float64
+    """(3,) translation of ``cam_b_from_cam_a``, of unit or zero length."""
+
+    def drop_reason(self, num_matches: int, min_matches: int) -> Reason:
+        """Return the reason why the pair is dropped, with its numbers."""
+        code = PairReason(self.dropped)
+        values = {
+            "num_matches": num_matches,
+            "min_matches": min_matches,
+            "num_inliers": self.num_inliers,
+            "geometry": self.configuration,
+        }
+        return code.because(**{name: values[name] for name in code.fields})
 
 
 def verify(
@@ -54,12 +69,12 @@ def verify(
     The same input and seed give the same outcome. ``std_px``: localisation noise of the matches.
     """
     if len(xy_a) < options.min_inliers:
-        return _dropped(f"{len(xy_a)} matches, at least {options.min_inliers} are needed")
+        return _dropped(PairReason.TOO_FEW_MATCHES)
     matches = np.repeat(np.arange(len(xy_a), dtype=np.uint32)[:, None], 2, axis=1)
     geometry = pycolmap.estimate_calibrated_two_view_geometry(
-        _colmap_camera(camera_a),
+        colmap_from_pinhole(camera_a),
         xy_a,
-        _colmap_camera(camera_b),
+        colmap_from_pinhole(camera_b),
         xy_b,
         matches,
         _colmap_options(options, std_px, seed),
@@ -67,21 +82,19 @@ def verify(
     inliers = np.asarray(geometry.inlier_matches)[:, 0].astype(np.int64)
     if geometry.config not in _USABLE:
         name = _Configuration(geometry.config).name.lower()
-        return _dropped(f"{len(inliers)} inliers of {len(xy_a)} matches ({name})", name)
+        return _dropped(PairReason.DEGENERATE, name, len(inliers))
     configuration = _USABLE[geometry.config]
     if len(inliers) < options.min_inliers:
-        return _dropped(f"{len(inliers)} inliers of {len(xy_a)} matches", configuration)
+        return _dropped(PairReason.TOO_FEW_INLIERS, configuration, len(inliers))
     chance = _chance(len(inliers), len(xy_a), camera_b, options.max_error_px * max(1.0, std_px))
     if chance > options.max_chance:
-        return _dropped(
-            f"{len(inliers)} inliers of {len(xy_a)} matches fit by chance", configuration
-        )
+        return _dropped(PairReason.EXPLAINED_BY_CHANCE, configuration, len(inliers))
     pose = geometry.cam2_from_cam1
     if pose is None:
-        return _dropped("no relative pose", configuration)
+        return _dropped(PairReason.NO_RELATIVE_POSE, configuration, len(inliers))
     rotation = np.asarray(pose.rotation.matrix(), dtype=np.float64)
     translation = np.asarray(pose.translation, dtype=np.float64)
-    return TwoView("", configuration, inliers, rotation, translation)
+    return TwoView("", configuration, len(inliers), inliers, rotation, translation)
 
 
 def _chance(inliers: int, matches: int, camera: PinholeCamera, error_px: float) -> float:
@@ -97,14 +110,10 @@ def _chance(inliers: int, matches: int, camera: PinholeCamera, error_px: float) 
     return float(bdtrc(inliers - sample - 1, matches - sample, min(band, 1.0)))
 
 
-def _dropped(reason: str, configuration: str = "") -> TwoView:
-    return TwoView(reason, configuration, np.empty(0, np.int64), np.eye(3), np.zeros(3))
-
-
-def _colmap_camera(camera: PinholeCamera) -> pycolmap.Camera:
-    return pycolmap.Camera(
-        model="PINHOLE", width=camera.width, height=camera.height, params=camera.params
-    )
+def _dropped(reason: PairReason, configuration: str = "", num_inliers: int = 0) -> TwoView:
+    """Return the result for a dropped pair."""
+    none = np.empty(0, np.int64)
+    return TwoView(reason.value, configuration, num_inliers, none, np.eye(3), np.zeros(3))
 
 
 def _colmap_options(

@@ -1,7 +1,7 @@
 """Possible poses of a new image: hypotheses, each to be judged by all matches.
 
 Lifted points of an uncertain depth miss by many pixels over a wide baseline, so one PnP is not
-enough. Hypotheses come from PnP on the points of the scene, from PnP the other way round (the new
+enough. PoseHypothesisGenerator come from PnP on the points of the scene, from PnP the other way round (the new
 image's own lifts seen in a registered image), and from the essential matrices of verified pairs
 with the length that depth gives them, and from what a network that saw several photos at once
 proposes.
@@ -19,16 +19,17 @@ import pycolmap
 
 from mpsfm_core.data import Bool, Float64, PinholeCamera, Pose
 from mpsfm_core.geometry import compose, invert
+from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.registration.correspondences import Correspondences
+from mpsfm_core.mapping.registration.correspondences import PoseCorrespondences
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.mapping.triangulation import midpoints
+from mpsfm_core.mapping.triangulation import triangulate_midpoints
 
 MIN_CORRESPONDENCES = 4
 """PnP needs three; the fourth chooses among the solutions."""
 
 
-class Hypothesis(NamedTuple):
+class PoseHypothesis(NamedTuple):
     """``cam_from_world`` of an image, and where it comes from."""
 
     rotation: Float64
@@ -36,15 +37,8 @@ class Hypothesis(NamedTuple):
     source: str
 
 
-Estimate = Callable[[], Hypothesis | None]
+HypothesisEstimator = Callable[[], PoseHypothesis | None]
 """Makes a hypothesis; COLMAP's estimators let other threads work meanwhile."""
-
-
-def colmap_camera(camera: PinholeCamera) -> pycolmap.Camera:
-    """The camera as COLMAP's estimators want it."""
-    return pycolmap.Camera(
-        model="PINHOLE", width=camera.width, height=camera.height, params=camera.params
-    )
 
 
 def estimate_absolute_pose(
@@ -77,7 +71,7 @@ def estimate_absolute_pose(
     result = estimate(
         xy,
         points,
-        colmap_camera(camera),
+        colmap_from_pinhole(camera),
         pycolmap.AbsolutePoseEstimationOptions(ransac=ransac),
     )
     if result is None:
@@ -91,16 +85,16 @@ def estimate_absolute_pose(
 
 
 @dataclass(frozen=True, eq=False)
-class Hypotheses:
+class PoseHypothesisGenerator:
     """The estimators of an image's pose on some correspondences."""
 
     scene: Scene
     image: int
-    found: Correspondences
+    found: PoseCorrespondences
     options: RegistrationOptions
     seed: int
 
-    def of_all(self) -> Iterator[Estimate]:
+    def generate_from_all(self) -> Iterator[HypothesisEstimator]:
         """From all correspondences, and from each reference image alone."""
         yield self._forward
         if not self.options.lifting:
@@ -118,7 +112,7 @@ class Hypotheses:
                 yield partial(self._scaled, self.found, reference, relative)
             yield partial(self._proposed, reference)
 
-    def of_halves(self) -> Iterator[Estimate]:
+    def generate_from_halves(self) -> Iterator[HypothesisEstimator]:
         """From random halves of the matches to the image that has most of them.
 
         A match is drawn in proportion to its weight.
@@ -138,13 +132,13 @@ class Hypotheses:
             yield partial(half._reverse, reference)
             yield partial(half._essential, found, reference)
 
-    def _forward(self) -> Hypothesis | None:
+    def _forward(self) -> PoseHypothesis | None:
         """PnP on the points of the scene."""
         found = self.found.select(self.found.known)
         pose = self._pnp(self.image, self.scene.keypoints[found.keypoints], found.points)
-        return Hypothesis(*pose, "PnP") if pose else None
+        return PoseHypothesis(*pose, "PnP") if pose else None
 
-    def _reverse(self, reference: int) -> Hypothesis | None:
+    def _reverse(self, reference: int) -> PoseHypothesis | None:
         """PnP of the reference on the image's own lifts, at the reference's scale."""
         scene, found = self.scene, self.found
         depth_map = scene.maps[self.image]
@@ -158,14 +152,14 @@ class Hypotheses:
         pose = self._pnp(reference, xy, points)
         return self._placed(reference, invert(*pose), "reverse PnP") if pose else None
 
-    def _essential(self, judges: Correspondences, reference: int) -> Hypothesis | None:
+    def _essential(self, judges: PoseCorrespondences, reference: int) -> PoseHypothesis | None:
         """The essential matrix of the matches, its length by the depth of the ``judges``."""
         scene, found = self.scene, self.found
         result = pycolmap.estimate_essential_matrix(
             scene.keypoints[found.matched],
             scene.keypoints[found.keypoints],
-            colmap_camera(scene.camera(reference)),
-            colmap_camera(scene.camera(self.image)),
+            colmap_from_pinhole(scene.camera(reference)),
+            colmap_from_pinhole(scene.camera(self.image)),
             pycolmap.RANSACOptions(
                 max_error=0.5 * self.options.max_support_error_px,
                 min_inlier_ratio=self.options.min_inlier_ratio,
@@ -180,14 +174,16 @@ class Hypotheses:
         relative = np.array(pose.rotation.matrix()), np.array(pose.translation)
         return self._scaled(judges, reference, relative)
 
-    def _scaled(self, judges: Correspondences, reference: int, relative: Pose) -> Hypothesis | None:
+    def _scaled(
+        self, judges: PoseCorrespondences, reference: int, relative: Pose
+    ) -> PoseHypothesis | None:
         """A pose relative to a reference, known up to its length."""
         length = _baseline(self.scene, judges, reference, relative)
         if not length:
             return None
         return self._placed(reference, (relative[0], relative[1] * length), "essential matrix")
 
-    def _proposed(self, reference: int) -> Hypothesis | None:
+    def _proposed(self, reference: int) -> PoseHypothesis | None:
         """As the image lies to the reference in the frame of the group that both are of."""
         scene = self.scene
         images, depth_map = scene.problem.images, scene.maps[reference]
@@ -199,10 +195,10 @@ class Hypotheses:
         relative = rotation, depth_map.scale * translation
         return self._placed(reference, relative, "multi-view network")
 
-    def _placed(self, reference: int, relative: Pose, source: str) -> Hypothesis:
+    def _placed(self, reference: int, relative: Pose, source: str) -> PoseHypothesis:
         """A pose relative to a reference as one in the world."""
         world = self.scene.rotations[reference], self.scene.translations[reference]
-        return Hypothesis(*compose(relative, world), source)
+        return PoseHypothesis(*compose(relative, world), source)
 
     def _pnp(self, image: int, xy: Float64, points: Float64) -> Pose | None:
         camera, options = self.scene.camera(image), self.options
@@ -210,7 +206,9 @@ class Hypotheses:
         return (pose[0], pose[1]) if pose else None
 
 
-def _baseline(scene: Scene, found: Correspondences, reference: int, relative: Pose) -> float | None:
+def _baseline(
+    scene: Scene, found: PoseCorrespondences, reference: int, relative: Pose
+) -> float | None:
     """Factor of a relative translation that brings triangulated points to the known depth."""
     mine = (found.references == reference) & found.known
     rotation, translation = relative
@@ -218,7 +216,7 @@ def _baseline(scene: Scene, found: Correspondences, reference: int, relative: Po
     rays_a = known / known[:, 2:]
     rays_b = scene.rays(found.keypoints[mine]) @ rotation
     center_b = -rotation.T @ translation
-    z = midpoints(np.zeros(3), rays_a, center_b, rays_b)[:, 2]
+    z = triangulate_midpoints(np.zeros(3), rays_a, center_b, rays_b)[:, 2]
     with np.errstate(invalid="ignore"):
         good = (z > 0) & (known[:, 2] > 0)
     return float(np.median(known[good, 2] / z[good])) if good.any() else None

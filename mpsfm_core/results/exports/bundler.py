@@ -9,21 +9,21 @@ from pathlib import Path
 
 import numpy as np
 
-from mpsfm_core.results.exports.source import Source
-from mpsfm_core.results.exports.tracks import describe_points, numbers, rows_of_images
+from mpsfm_core.results.exports.source import ExportSource
+from mpsfm_core.results.exports.tracks import describe_points, numbers, sort_images_by_name
 
 ENTRIES = ("bundle.out", "list.txt", "images")
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
-def write(source: Source, folder: Path) -> None:
+def write(source: ExportSource, folder: Path) -> None:
     """Write the folder. Raises :class:`~mpsfm_core.data.errors.InputError` without the photos.
 
     The format has one focal length a camera: the mean of both, which differ by little.
     """
     model = source.undistorted()
     source.write_photos(folder / "images")
-    images = rows_of_images(model)
+    images = sort_images_by_name(model)
     lines = ["# Bundle file v0.3", f"{len(images)} {model.num_points3D()}"]
     for image in images:
         pose = image.cam_from_world()

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mpsfm_core.results.exports.source import Source
+from mpsfm_core.results.exports.source import ExportSource
 
 ENTRIES = ("database.db",)
 
 
-def write(source: Source, folder: Path) -> None:
+def write(source: ExportSource, folder: Path) -> None:
     """Write the database of the registered images.
 
     The matches are those that the tracks of the points imply; they count as verified.

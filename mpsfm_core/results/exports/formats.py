@@ -21,7 +21,7 @@ from mpsfm_core.results.exports import (
     nerfstudio,
     nvm,
 )
-from mpsfm_core.results.exports.source import Source
+from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.support.files import replacing
 from mpsfm_core.support.format_versions import VERSION
 
@@ -104,7 +104,7 @@ def export(
         hint = install_hint(EXPORTS, format_name) or did_you_mean(format_name, known)
         raise InputError(f"no format {format_name!r}{hint}")
     chosen = known[format_name]
-    source = Source.read(folder, photos)
+    source = ExportSource.read(folder, photos)
     if turn is None:
         turn = chosen.turned and not source.is_georeferenced
     if turn:
@@ -118,18 +118,18 @@ def export(
     return {**described, "output": str(output)}
 
 
-def _writer_of(chosen: ExportFormat) -> Callable[[Source, Path], None]:
+def _writer_of(chosen: ExportFormat) -> Callable[[ExportSource, Path], None]:
     if callable(chosen.write):
         return chosen.write
     try:
-        writer: Callable[[Source, Path], None] = resolve_name(chosen.write)
+        writer: Callable[[ExportSource, Path], None] = resolve_name(chosen.write)
     except Exception as error:  # a plugin's
         text = f"format {chosen.name!r} cannot be written: {type(error).__name__}: {error}"
         raise InputError(text) from error
     return writer
 
 
-def _describe(source: Source, format_name: str) -> dict[str, Any]:
+def _describe(source: ExportSource, format_name: str) -> dict[str, Any]:
     orientation = "east, north, up" if source.is_georeferenced else "as in the model"
     if source.gravity is not None:
         orientation = f"z is up: {source.gravity}"

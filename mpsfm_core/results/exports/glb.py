@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mpsfm_core.data import Float64
-from mpsfm_core.results.exports.source import Source
+from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.results.gltf import FLIP, LINES, POINTS, Y_UP_FROM_Z, GltfScene
 
 ENTRIES = ("scene.glb",)
@@ -19,7 +19,7 @@ _OUTLINE = 0.05
 _EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 
 
-def write(source: Source, folder: Path) -> None:
+def write(source: ExportSource, folder: Path) -> None:
     """Write ``scene.glb``."""
     scene, y_up = GltfScene(), Y_UP_FROM_Z if source.z_is_up else FLIP
     points, colors = source.dense_points()

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Float64, UInt8
 from mpsfm_core.results.colmap_model import write_model
-from mpsfm_core.results.exports.source import Source
+from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.support.npz import write_npz
 
 ENTRIES = ("images", "sparse", "gaussians.ply", "maps")
@@ -30,7 +30,7 @@ _SH_0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 
 
-def write(source: Source, folder: Path) -> None:
+def write(source: ExportSource, folder: Path) -> None:
     """Write the folder. Raises :class:`~mpsfm_core.data.errors.InputError` without the photos."""
     source.write_photos(folder / "images")
     write_model(folder / "sparse" / "0", source.undistorted())
@@ -43,7 +43,7 @@ def write(source: Source, folder: Path) -> None:
         write_gaussians(folder / "gaussians.ply", points, colors)
 
 
-def write_maps(source: Source, folder: Path) -> None:
+def write_maps(source: ExportSource, folder: Path) -> None:
     """Write ``folder/NAME.npz`` for each image that has refined depth.
 
     Arrays: ``depth`` and ``depth_std`` (h, w) float32, z in units of the world; ``normals``

@@ -17,24 +17,24 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.inputs.nerfstudio import write_transforms
 from mpsfm_core.results.exports.gsplat import write_maps
-from mpsfm_core.results.exports.source import Source
-from mpsfm_core.results.photos import portable_name
+from mpsfm_core.results.exports.source import ExportSource
+from mpsfm_core.results.original_images import exported_image_name
 from mpsfm_core.results.ply import write_ply
+from mpsfm_core.results.transforms_json import write_transforms
 
 ENTRIES = ("transforms.json", "images", "depths", "maps", "sparse_pc.ply")
 _STORED_UNITS = 1000
 """nerfstudio multiplies depth by its depth_unit_scale_factor, 0.001 by default."""
 
 
-def write(source: Source, folder: Path) -> None:
+def write(source: ExportSource, folder: Path) -> None:
     """Write the folder. Raises :class:`~mpsfm_core.data.errors.InputError` without the photos."""
     source.write_photos(folder / "images")
     write_maps(source, folder / "maps")
     write_ply(folder / "sparse_pc.ply", *source.points())
     depths = _write_depths(source, folder)
-    names = [portable_name(name) for name in source.names]
+    names = [exported_image_name(name) for name in source.names]
     path = folder / "transforms.json"
     write_transforms(path, source.undistorted(), {name: f"images/{name}" for name in names})
     transforms: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -47,7 +47,7 @@ def write(source: Source, folder: Path) -> None:
     path.write_text(json.dumps(transforms, indent=2), encoding="utf-8")
 
 
-def _write_depths(source: Source, folder: Path) -> dict[str, str]:
+def _write_depths(source: ExportSource, folder: Path) -> dict[str, str]:
     """File of the photo -> file of its depth; empty unless all photos have depth."""
     found = {name: source.maps(name) for name in source.names}
     written = {}
@@ -58,5 +58,5 @@ def _write_depths(source: Source, folder: Path) -> dict[str, str]:
         path = folder / "depths" / f"{name}.npy"
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, depth.astype(np.float32))
-        written[f"images/{portable_name(name)}"] = f"depths/{name}.npy"
+        written[f"images/{exported_image_name(name)}"] = f"depths/{name}.npy"
     return written

@@ -8,20 +8,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.results.exports.source import Source
-from mpsfm_core.results.exports.tracks import describe_points, numbers, rows_of_images
+from mpsfm_core.results.exports.source import ExportSource
+from mpsfm_core.results.exports.tracks import describe_points, numbers, sort_images_by_name
 
 ENTRIES = ("reconstruction.nvm", "images")
 
 
-def write(source: Source, folder: Path) -> None:
+def write(source: ExportSource, folder: Path) -> None:
     """Write the folder. Raises :class:`InputError` without the photos, or when the name of one has
     a space, which the format cannot hold.
 
     The format has one focal length a camera: the mean of both, which differ by little.
     """
     model = source.undistorted()
-    images = rows_of_images(model)
+    images = sort_images_by_name(model)
     for image in images:
         if len(str(image.name).split()) != 1:
             raise InputError(f"NVM files cannot name {image.name!r}: a name must have no space")

@@ -13,25 +13,25 @@ import pycolmap
 
 from mpsfm_core.data import DepthPrior, Float64, NormalPrior, PinholeCamera, UInt8
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.images import SUMMARY, ImageSet, find_images, load_images
-from mpsfm_core.inputs.models import match_names, model_folder, read_model
+from mpsfm_core.data.result_layout import DENSE, DEPTH, SUMMARY
+from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
+from mpsfm_core.inputs.images import ImageSet, find_images, load_images
+from mpsfm_core.inputs.models import find_model_folder, match_names, read_model
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.providers.builtin.from_depth import fit_normals
-from mpsfm_core.providers.builtin.options import FromDepthOptions
-from mpsfm_core.results.colmap_model import pinhole
+from mpsfm_core.providers.builtin.normals_from_depth import fit_normals
+from mpsfm_core.providers.builtin.options import NormalsFromDepthOptions
 from mpsfm_core.results.depth_maps import read_depth_map
-from mpsfm_core.results.orientation import Gravity, estimate_gravity, rotation_to_z
-from mpsfm_core.results.photos import copy_view, portable_name
+from mpsfm_core.results.gravity import Gravity, estimate_gravity, rotation_to_z
+from mpsfm_core.results.original_images import export_view, exported_image_name
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.summary import read_summary
-from mpsfm_core.results.writer import DENSE, DEPTH
 
 _NORMALS_AN_IMAGE = 2000
 """Normals of an image that are asked for the direction of gravity."""
 
 
 @dataclass(frozen=True, eq=False)
-class Maps:
+class ExportMaps:
     """Refined depth of an image and the normals of its surfaces, on one grid.
 
     ``camera``: of that grid. Depth is in the units of the exported world.
@@ -43,7 +43,7 @@ class Maps:
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class ExportSource:
     """A reconstruction to be exported, and what lies beside it.
 
     ``model``: of the original photos; images whose pose is only a guess are left out.
@@ -61,7 +61,7 @@ class Source:
     gravity: Gravity | None = None
 
     @classmethod
-    def read(cls, folder: Path, photos: Path | None = None) -> Source:
+    def read(cls, folder: Path, photos: Path | None = None) -> ExportSource:
         """Read a folder; ``photos`` if they are not where the run found them.
 
         Raises :class:`InputError` when there is no model, or what is there is damaged.
@@ -80,7 +80,7 @@ class Source:
             raise InputError(f"{folder}: the model has no image with a pose")
         if photos is None:
             known = summary.get("photos")
-            beside = model_folder(folder).parent / "images"
+            beside = find_model_folder(folder).parent / "images"
             candidates = [Path(known)] if known else [folder / "images", beside]
             photos = next((path for path in candidates if path.is_dir()), None)
         return cls(folder, model, photos, summary, guesses)
@@ -135,7 +135,9 @@ class Source:
             strict=True,
         )
         names = [found[name] for name in self.names]
-        return load_images(self.photos, model_folder(self.folder), options=options, names=names)
+        return load_images(
+            self.photos, find_model_folder(self.folder), options=options, names=names
+        )
 
     @property
     def is_georeferenced(self) -> bool:
@@ -147,7 +149,7 @@ class Source:
         """Whether gravity is along -z in the exported world."""
         return self.gravity is not None or self.is_georeferenced
 
-    def turned(self) -> Source:
+    def turned(self) -> ExportSource:
         """In metres where these are known, with gravity along -z; the origin is the middle of the
         points, else of the cameras."""
         gravity = estimate_gravity(self._rotations(), self._world_normals())
@@ -182,7 +184,7 @@ class Source:
         moved: Float64 = self.world_from_model * points
         return moved, colors
 
-    def maps(self, name: str) -> Maps | None:
+    def maps(self, name: str) -> ExportMaps | None:
         """Depth and normals of an image, None if the folder has none.
 
         Raises :class:`InputError` when the file is damaged.
@@ -191,7 +193,7 @@ class Source:
         if not path.is_file():
             return None
         camera, depth = read_depth_map(path, float(self.world_from_model.scale))
-        return Maps(camera, depth, fit_normals(camera, depth, FromDepthOptions()))
+        return ExportMaps(camera, depth, fit_normals(camera, depth, NormalsFromDepthOptions()))
 
     def undistorted(self) -> pycolmap.Reconstruction:
         """A model of pinhole cameras for what :meth:`write_photos` writes.
@@ -202,7 +204,7 @@ class Source:
         cameras: dict[str, int] = {}
         rows: dict[int, dict[int, int]] = {}
         for image, photo in zip(self.registered(), self.images, strict=True):
-            camera = pinhole(photo.pinhole)
+            camera = colmap_from_pinhole(photo.pinhole)
             key = str(camera.todict())
             if key not in cameras:
                 cameras[key] = camera.camera_id = len(cameras) + 1
@@ -213,7 +215,7 @@ class Source:
             kept = np.flatnonzero(np.isfinite(xy).all(axis=1))
             rows[image.image_id] = {seen[k]: row for row, k in enumerate(kept)}
             new = pycolmap.Image(
-                name=portable_name(str(image.name)),
+                name=exported_image_name(str(image.name)),
                 keypoints=xy[kept],
                 camera_id=cameras[key],
                 image_id=image.image_id,
@@ -236,9 +238,9 @@ class Source:
     def write_photos(self, folder: Path) -> None:
         """The photos upright, undistorted, and in a format that everybody reads."""
         for index, name in enumerate(self.names):
-            copy_view(self.images, index, folder / portable_name(name))
+            export_view(self.images, index, folder / exported_image_name(name))
 
-    def _transformed(self, similarity: pycolmap.Sim3d) -> Source:
+    def _transformed(self, similarity: pycolmap.Sim3d) -> ExportSource:
         model = pycolmap.Reconstruction(self.model)
         model.transform(similarity)
         return replace(self, model=model, world_from_model=similarity * self.world_from_model)

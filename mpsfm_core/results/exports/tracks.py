@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 
 
-def rows_of_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+def sort_images_by_name(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     """The images by name: their places are what the formats number them by."""
     return sorted(model.images.values(), key=lambda image: str(image.name))
 
@@ -19,7 +19,7 @@ def describe_points(model: pycolmap.Reconstruction, y_sign: int) -> list[tuple[s
     Views: their number, then for each the image's row, the keypoint's row and its x and y in
     pixels relative to the principal point. ``y_sign``: 1 for y down, -1 for y up.
     """
-    rows = {image.image_id: row for row, image in enumerate(rows_of_images(model))}
+    rows = {image.image_id: row for row, image in enumerate(sort_images_by_name(model))}
     described = []
     for _, point in sorted(model.points3D.items()):
         views = []

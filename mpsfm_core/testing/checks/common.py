@@ -1,6 +1,6 @@
 """Checks of every provider, whatever its kind.
 
-A check is a function of a :class:`~mpsfm_core.testing.case.Case`. It returns nothing or a remark,
+A check is a function of a :class:`~mpsfm_core.testing.contract_case.ContractCase`. It returns nothing or a remark,
 and raises ``CheckFailed`` or ``CheckSkipped`` with the reason. Its id is its name without
 ``check_``, with dashes.
 """
@@ -26,9 +26,9 @@ import numpy as np
 
 from mpsfm_core.data import NormalPrior, UInt8, View
 from mpsfm_core.providers import ENTRY_POINT_GROUP
-from mpsfm_core.providers.discovery import spec_fault
-from mpsfm_core.testing.accuracy import judge
-from mpsfm_core.testing.case import Case, difference
+from mpsfm_core.providers.discovery import find_spec_fault
+from mpsfm_core.testing.accuracy import compare_with_truth
+from mpsfm_core.testing.contract_case import ContractCase, describe_difference
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
@@ -41,9 +41,9 @@ _KEPT_BYTES = 20_000
 caches of the interpreter grow by less than 4 kB."""
 
 
-def check_specification(case: Case) -> str:
+def check_specification(case: ContractCase) -> str:
     """The registry accepts the specification, and the options of the setup are valid."""
-    fault, hint = spec_fault(case.spec)
+    fault, hint = find_spec_fault(case.spec)
     if fault:
         raise CheckFailed(f"the specification {fault}; {hint}")
     if (
@@ -57,12 +57,12 @@ def check_specification(case: Case) -> str:
     return ""
 
 
-def check_construction(case: Case) -> None:
+def check_construction(case: ContractCase) -> None:
     """The provider can be constructed with the options of its setup."""
     assert case.provider is not None
 
 
-def check_light_import(case: Case) -> None:
+def check_light_import(case: ContractCase) -> None:
     """Importing the plugin's module, as every listing does, imports no heavy library."""
     modules = _plugin_modules(case)
     if not modules:
@@ -81,13 +81,13 @@ def check_light_import(case: Case) -> None:
         raise CheckFailed(f"importing {modules[0]!r} imports {run.stdout.strip()}")
 
 
-def check_output_rules(case: Case) -> None:
+def check_output_rules(case: ContractCase) -> None:
     """The answer passes the validator: type, dtype, shape, finite, positive, unit, inside of the
     view, and all that the capabilities promise. Without this no other check asks anything."""
     case.ask(case.main)
 
 
-def check_deterministic(case: Case) -> None:
+def check_deterministic(case: ContractCase) -> None:
     """The same view gives the same answer, bit by bit, from one instance and from another: results
     are cached, and a run with a seed can be repeated."""
     first = case.ask(case.main)
@@ -95,7 +95,7 @@ def check_deterministic(case: Case) -> None:
     _same(first, case.ask(case.main, case.make()), "asked a second instance")
 
 
-def check_no_state(case: Case) -> None:
+def check_no_state(case: ContractCase) -> None:
     """An answer does not depend on the views seen before: a batch, in any order, gives what single
     views give (the interface has no batches; this is what they would have to obey)."""
     others = [case.main.sized(104, 120), case.main.partner]
@@ -105,7 +105,7 @@ def check_no_state(case: Case) -> None:
     _same(alone, case.ask(case.main), "asked after other views")
 
 
-def check_inputs_unchanged(case: Case) -> None:
+def check_inputs_unchanged(case: ContractCase) -> None:
     """The view, and depth or features that come with it, are the same afterwards: other providers
     see them too."""
     example = case.main.sized(*case.main.camera.size)
@@ -118,12 +118,12 @@ def check_inputs_unchanged(case: Case) -> None:
     for what, old, new in zip(
         ("image", "mask", "depth or features"), before, (image, view.mask, extra), strict=True
     ):
-        changed = difference(old, new)
+        changed = describe_difference(old, new)
         if changed:
             raise CheckFailed(f"changes the {what} it is given: {changed}")
 
 
-def check_name_does_not_matter(case: Case) -> None:
+def check_name_does_not_matter(case: ContractCase) -> None:
     """The answer does not depend on the view's name, as the cache goes by pixels; providers that
     read files declare the capability ``uncached``."""
     if case.can("uncached"):
@@ -135,7 +135,7 @@ def check_name_does_not_matter(case: Case) -> None:
     _same(expected, case.ask_about(renamed, case.main), "asked about a renamed view")
 
 
-def check_intrinsics_declared(case: Case) -> None:
+def check_intrinsics_declared(case: ContractCase) -> None:
     """The answer changes with the focal length only if the provider declares
     ``intrinsics-aware``: otherwise the cache would return what was made for another camera."""
     if case.can("intrinsics-aware"):
@@ -147,12 +147,12 @@ def check_intrinsics_declared(case: Case) -> None:
     found = case.ask_about(replace(case.main.view, camera=camera), case.main)
     if isinstance(expected, NormalPrior):  # which normals face the camera depends on it, no more
         expected, found = _valid_in_both(expected, found)
-    changed = difference(expected, found)
+    changed = describe_difference(expected, found)
     if changed:
         raise CheckFailed(f"depends on the focal length and does not declare it: {changed}")
 
 
-def check_threads(case: Case) -> None:
+def check_threads(case: ContractCase) -> None:
     """Two instances in two threads at once answer as they do alone: a run has one in each."""
     examples = [case.main, case.main.sized(*case.main.camera.size).partner]
     alone = [case.ask(example) for example in examples]
@@ -167,7 +167,7 @@ def check_threads(case: Case) -> None:
                 together[index] = case.ask(examples[index], instances[index])
             except Exception as error:
                 together[index] = error
-            if isinstance(together[index], Exception) or difference(alone[index], together[index]):
+            if isinstance(together[index], Exception) or describe_difference(alone[index], together[index]):
                 return
 
     threads = [threading.Thread(target=work, args=(index,)) for index in range(len(examples))]
@@ -181,7 +181,7 @@ def check_threads(case: Case) -> None:
         _same(expected, found, "asked in two threads at once")
 
 
-def check_pickles(case: Case) -> None:
+def check_pickles(case: ContractCase) -> None:
     """Factory, options and answers survive pickling, so that process pools can work with them."""
     options = case.registry.validate_options(case.spec.kind, case.spec.name, case.setup.options)
     answer = case.ask(case.main)
@@ -194,7 +194,7 @@ def check_pickles(case: Case) -> None:
     _same(answer, copy, "pickled")
 
 
-def check_offline(case: Case) -> None:
+def check_offline(case: ContractCase) -> None:
     """Constructing the provider and asking it opens no socket once its weights are here. Sees what
     goes through Python's sockets; a library that makes its own is not seen."""
     case.provider  # noqa: B018 - fetches the weights, where they are not here yet
@@ -209,7 +209,7 @@ def check_offline(case: Case) -> None:
         raise CheckFailed(f"goes to the network: {attempts[0]}")
 
 
-def check_memory_released(case: Case) -> str:
+def check_memory_released(case: ContractCase) -> str:
     """Views and answers are not kept: what Python and numpy allocate does not grow with the number
     of views (the memory of native libraries is not seen)."""
     examples = [_renamed(case.main, f"memory/{number}.png") for number in range(_CALLS + 2)]
@@ -234,7 +234,7 @@ def check_memory_released(case: Case) -> str:
     return f"keeps {max(kept, 0) / 1000:.1f} kB a view"
 
 
-def check_speed(case: Case) -> str:
+def check_speed(case: ContractCase) -> str:
     """How long it takes; never fails."""
     started = time.perf_counter()
     provider = case.make()
@@ -250,52 +250,52 @@ def check_speed(case: Case) -> str:
     )
 
 
-def check_odd_size(case: Case) -> str:
+def check_odd_size(case: ContractCase) -> str:
     """A view whose sides no network likes, 149 x 107, is answered, and as well as any other."""
     return _judged(case, case.main.sized(149, 107))
 
 
-def check_portrait(case: Case) -> str:
+def check_portrait(case: ContractCase) -> str:
     """A view that is higher than wide is answered, and as well as any other."""
     width, height = case.main.camera.size
     return _judged(case, case.main.sized(height, width))
 
 
-def check_one_pixel(case: Case) -> None:
+def check_one_pixel(case: ContractCase) -> None:
     """A view of one pixel gives an answer, not a crash."""
     case.ask(case.main.sized(1, 1))
 
 
-def check_thin_view(case: Case) -> None:
+def check_thin_view(case: ContractCase) -> None:
     """A view of 5 x 120 pixels gives an answer, not a crash."""
     case.ask(case.main.sized(5, 120))
 
 
-def check_grayscale(case: Case) -> None:
+def check_grayscale(case: ContractCase) -> None:
     """A gray photo gives an answer; it comes as three equal channels."""
     gray = np.asarray(case.main.view.image).mean(axis=-1, keepdims=True)
     _ask_about_image(case, np.broadcast_to(gray.astype(np.uint8), case.main.view.image.shape))
 
 
-def check_sixteen_bit(case: Case) -> None:
+def check_sixteen_bit(case: ContractCase) -> None:
     """A gray photo of 16 bit gives an answer; the core makes 8 bit and three channels of it."""
     import cv2  # not at the top: pytest loads this module when it collects
 
-    from mpsfm_core.inputs.header import Header
-    from mpsfm_core.inputs.pixels import decode_rgb
+    from mpsfm_core.inputs.image_header import ImageHeader
+    from mpsfm_core.inputs.image_decoding import decode_rgb
 
     wide = case.main.view.image[..., 0].astype(np.uint16) * 257
     data = cv2.imencode(".png", wide)[1].tobytes()
-    _ask_about_image(case, decode_rgb(data, Header(None, 1, {}), Path("gray16.png")))
+    _ask_about_image(case, decode_rgb(data, ImageHeader(None, 1, {}), Path("gray16.png")))
 
 
-def check_flat(case: Case) -> None:
+def check_flat(case: ContractCase) -> None:
     """Black, white and gray views without any content give an answer."""
     for value in (0, 128, 255):
         _ask_about_image(case, np.full(case.main.view.image.shape, value, np.uint8))
 
 
-def check_masked(case: Case) -> None:
+def check_masked(case: ContractCase) -> None:
     """A view with a mask, partly or wholly False, gives an answer."""
     for visible in (case.main.camera.width // 2, 0):
         mask = np.zeros(case.main.view.image.shape[:2], np.bool_)
@@ -330,7 +330,7 @@ COMMON = (
 
 
 def _same(expected: object, found: object, when: str) -> None:
-    changed = difference(expected, found)
+    changed = describe_difference(expected, found)
     if changed:
         raise CheckFailed(f"{when}, the answer is another: {changed}")
 
@@ -345,11 +345,11 @@ def _valid_in_both(first: NormalPrior, second: NormalPrior) -> tuple[object, obj
     return a, b
 
 
-def _judged(case: Case, example: Example) -> str:
-    return judge(case, example, case.ask(example))
+def _judged(case: ContractCase, example: Example) -> str:
+    return compare_with_truth(case, example, case.ask(example))
 
 
-def _ask_about_image(case: Case, image: UInt8) -> None:
+def _ask_about_image(case: ContractCase, image: UInt8) -> None:
     case.tell(case.main)
     case.ask_about(replace(case.main.view, image=np.ascontiguousarray(image)), case.main)
 
@@ -361,7 +361,7 @@ def _renamed(example: Example, name: str) -> Example:
     return renamed
 
 
-def _plugin_modules(case: Case) -> list[str]:
+def _plugin_modules(case: ContractCase) -> list[str]:
     """The modules of the entry points of the provider's distribution."""
     distribution = case.registry.version(case.spec.kind, case.spec.name).partition(" ")[0]
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)

@@ -6,28 +6,28 @@ from dataclasses import replace
 from pathlib import Path
 
 from mpsfm_core.data import PosedImage, SceneState
-from mpsfm_core.report.viewing import Cloud, photos_in, scene_of, views_in
-from mpsfm_core.results.exports.source import Source
+from mpsfm_core.report.viewing import ColoredPoints, pictures_from_photos, scene_from_model, pictures_from_results
+from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_rerun.viewer import RerunViewer
 
 
-def write(source: Source, folder: Path) -> None:
+def write(source: ExportSource, folder: Path) -> None:
     """Write ``scene.rrd``.
 
     Photos and depth maps are in it as far as they are to be had: a COLMAP model alone has none.
     """
-    scene, _ = scene_of(source.model)
+    scene, _ = scene_from_model(source.model)
     images = tuple(_with_depth(source, image) for image in scene.images)
     if source.summary or source.photos is None:
-        pictures = views_in(source.folder)
+        pictures = pictures_from_results(source.folder)
     else:
-        pictures = photos_in(source.photos)
+        pictures = pictures_from_photos(source.photos)
     viewer = RerunViewer(folder, pictures, z_is_up=source.z_is_up)
-    viewer.show(SceneState(images, scene.points), Cloud(*source.dense_points()))
+    viewer.show(SceneState(images, scene.points), ColoredPoints(*source.dense_points()))
     viewer.finish()
 
 
-def _with_depth(source: Source, image: PosedImage) -> PosedImage:
+def _with_depth(source: ExportSource, image: PosedImage) -> PosedImage:
     """With its refined depth, and the camera of that."""
     maps = source.maps(image.name)
     return image if maps is None else replace(image, camera=maps.camera, depth=maps.depth)

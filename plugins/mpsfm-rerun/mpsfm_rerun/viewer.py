@@ -10,7 +10,7 @@ import rerun
 
 from mpsfm_core import hookimpl
 from mpsfm_core.data import DepthPrior, PosedImage, SceneState
-from mpsfm_core.report.viewing import Cloud, Pictures, certain, lifted
+from mpsfm_core.report.viewing import ColoredPoints, Pictures, certain, lifted
 
 RECORDING = "scene.rrd"
 TIMELINE = "step"
@@ -50,7 +50,7 @@ class RerunViewer:
         text = f"{name}: {reason}"
         self._recording.log("log", rerun.TextLog(text, level=rerun.TextLogLevel.WARN))
 
-    def show(self, scene: SceneState, cloud: Cloud | None = None) -> None:
+    def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
         """The next step. Depth is shown as points of the world, or beside ``cloud`` as maps."""
         self._step += 1
         self._recording.set_time(TIMELINE, sequence=self._step)

@@ -17,7 +17,7 @@ from rerun.chunk import RrdReader
 
 from mpsfm_core.data import DepthPrior, PinholeCamera, PosedImage, SceneState
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.report.viewing import Cloud
+from mpsfm_core.report.viewing import ColoredPoints
 from mpsfm_core.results.exports.formats import export
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 32.0, 24.0)
@@ -58,7 +58,7 @@ def test_a_run_is_recorded_step_by_step(tmp_path: Path) -> None:
 
 def test_a_finished_scene_is_recorded_with_its_cloud(tmp_path: Path) -> None:
     viewer = RerunViewer(tmp_path, lambda name: None)
-    viewer.show(scene(2), Cloud(np.zeros((4, 3)), np.zeros((4, 3), np.uint8)))
+    viewer.show(scene(2), ColoredPoints(np.zeros((4, 3)), np.zeros((4, 3), np.uint8)))
     viewer.finish()
     rows = recorded(tmp_path / RECORDING)
     assert rows["/world/dense"] == 1

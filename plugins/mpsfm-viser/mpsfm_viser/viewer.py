@@ -16,7 +16,7 @@ import viser.transforms
 from mpsfm_core import hookimpl
 from mpsfm_core.data import PosedImage, SceneState
 from mpsfm_core.geometry import camera_center
-from mpsfm_core.report.viewing import Cloud, Pictures, lifted
+from mpsfm_core.report.viewing import ColoredPoints, Pictures, lifted
 
 PORT_VARIABLE = "MPSFM_VIEWER_PORT"
 """Environment variable: where the page is served; if it is taken, the next free one."""
@@ -79,7 +79,7 @@ class ViserViewer:
         if not self._shown:
             self._state.content = f"{stage}: {done} of {total}"
 
-    def show(self, scene: SceneState, cloud: Cloud | None = None) -> None:
+    def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
         """Replace what is shown; ``cloud`` is shown instead of the depth maps."""
         with self._lock, self.server.atomic():
             self._unit = _unit(scene)
@@ -93,7 +93,7 @@ class ViserViewer:
                     self._cloud(f"/depth/{_key(image.name)}", lifted(image, self._picture(image)))
             if cloud is None:
                 grey = np.full(scene.points.shape, 200, np.uint8)
-                self._cloud("/sparse", Cloud(scene.points, grey))
+                self._cloud("/sparse", ColoredPoints(scene.points, grey))
             else:
                 self._cloud("/dense", cloud)
             self._shown = set(self.frustums)
@@ -134,7 +134,7 @@ class ViserViewer:
 
         return handle
 
-    def _cloud(self, name: str, cloud: Cloud) -> None:
+    def _cloud(self, name: str, cloud: ColoredPoints) -> None:
         handle = self.server.scene.add_point_cloud(
             name,
             cloud.xyz.astype(np.float32),

@@ -15,7 +15,7 @@ from mpsfm_viser.viewer import ViserViewer
 
 from mpsfm_core.data import DepthPrior, PinholeCamera, PosedImage, SceneState
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.report.viewing import Cloud
+from mpsfm_core.report.viewing import ColoredPoints
 
 CAMERA = PinholeCamera(64, 48, 60.0, 60.0, 32.0, 24.0)
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -66,7 +66,7 @@ def test_an_image_that_is_taken_out_goes(viewer: ViserViewer) -> None:
 def test_the_final_cloud_takes_the_place_of_the_depth_maps(viewer: ViserViewer) -> None:
     viewer.show(scene(2))
     before = list(viewer.clouds)
-    viewer.show(scene(2), Cloud(np.zeros((4, 3)), np.zeros((4, 3), np.uint8)))
+    viewer.show(scene(2), ColoredPoints(np.zeros((4, 3)), np.zeros((4, 3), np.uint8)))
     assert [cloud.name for cloud in viewer.clouds] == ["/dense"]
     for cloud in before:
         with pytest.warns(UserWarning, match="removed"):

@@ -14,11 +14,11 @@ import pytest
 from mpsfm_core.data import DepthPrior, MappingImage, MappingProblem, NormalPrior
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.inputs.undistortion import pinhole_camera
+from mpsfm_core.inputs.undistortion import undistort_camera
 from mpsfm_core.mapping.scene.reconstruction import MetricScale, Reconstruction, RegisteredImage
 from mpsfm_core.results.options import ResultOptions
-from mpsfm_core.results.photos import Photos
-from mpsfm_core.results.writer import Component, write_results
+from mpsfm_core.results.original_images import OriginalImages
+from mpsfm_core.results.writer import ComponentResult, write_results
 from mpsfm_core.testing.synthetic.scenes import arc_poses, project, room_scene
 
 CAMERA = pycolmap.Camera(
@@ -36,7 +36,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``out`` with ``photos`` beside it; the last image is not confirmed. World as the room's."""
     folder = tmp_path_factory.mktemp("result")
     scene, poses = room_scene(), arc_poses(4, 12.0)
-    pinhole = pinhole_camera(CAMERA, 0.0)
+    pinhole = undistort_camera(CAMERA, 0.0)
     points = scene.sample(
         pinhole, poses[0], np.random.default_rng(0).uniform([50, 35], [110, 85], (60, 2))
     ).points
@@ -61,8 +61,8 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     registered[-1] = replace(registered[-1], confirmed=False)
     metric = MetricScale(1.0, 0.01, 4, True)
     best = Reconstruction(tuple(registered), points, np.zeros(len(points)), metric)
-    photos = Photos(ImageSet(sources, InputOptions()), MappingProblem(tuple(problem)))
-    component = Component.of(best, photos)
+    photos = OriginalImages(ImageSet(sources, InputOptions()), MappingProblem(tuple(problem)))
+    component = ComponentResult.of(best, photos)
     summary = {
         "status": "success",
         "photos": str(folder / "photos"),

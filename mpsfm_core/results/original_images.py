@@ -8,16 +8,16 @@ import cv2
 import pycolmap
 
 from mpsfm_core.data import Float64, MappingProblem, View
-from mpsfm_core.inputs.header import read_header
+from mpsfm_core.inputs.image_decoding import read_bytes
+from mpsfm_core.inputs.image_header import read_header
 from mpsfm_core.inputs.images import ImageSet, SourceImage
-from mpsfm_core.inputs.pixels import read_bytes
 from mpsfm_core.inputs.undistortion import is_pinhole
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 _PORTABLE = frozenset((".jpg", ".jpeg", ".png"))
 
 
-class Photos:
+class OriginalImages:
     """The photos of the images of a problem, found by name."""
 
     def __init__(self, images: ImageSet, problem: MappingProblem) -> None:
@@ -57,17 +57,17 @@ class Photos:
         return any(not is_pinhole(self.source(image).camera) for image in reconstruction.images)
 
     def write_view(self, image: RegisteredImage, path: Path) -> None:
-        """Write the undistorted view as :func:`copy_view` does."""
-        copy_view(self._images, self._rows[image.name], path)
+        """Write the undistorted view as :func:`export_view` does."""
+        export_view(self._images, self._rows[image.name], path)
 
 
-def portable_name(name: str) -> str:
+def exported_image_name(name: str) -> str:
     """What an undistorted view is called: as its photo, with ``.jpg`` behind what not every
     program reads."""
     return name if PurePosixPath(name).suffix.lower() in _PORTABLE else f"{name}.jpg"
 
 
-def copy_view(images: ImageSet, index: int, path: Path) -> None:
+def export_view(images: ImageSet, index: int, path: Path) -> None:
     """Write the undistorted view of a photo, upright, in the format that ``path`` ends in.
 
     A photo that is already so is copied as it is.

@@ -11,7 +11,7 @@ Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
 
 
-class Recent(Generic[Key, Value]):
+class LruCache(Generic[Key, Value]):
     """Keeps values up to a total size, and forgets the ones that were not asked for longest.
 
     Threads may share it. Two that ask for the same missing value at once may both compute it.

@@ -30,7 +30,7 @@ _PLANE_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
 
 
 @dataclass(frozen=True)
-class Header:
+class ImageHeader:
     """What a file says of its image.
 
     ``size``: stored (width, height) before rotation, None where only decoding tells.
@@ -66,7 +66,7 @@ class Header:
         return focal_mm * resolution / unit_mm * reduction
 
 
-def declared_pixels(data: bytes) -> int | None:
+def read_declared_num_pixels(data: bytes) -> int | None:
     """Number of pixels that an encoded image says it has, None where it does not say so plainly."""
     if data[:4] in (b"II*\x00", b"MM\x00*"):
         tags = _read_tags(data)
@@ -126,8 +126,8 @@ def _jp2_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-def read_header(data: bytes) -> Header:
-    """Header of an encoded image; what is damaged or unknown is left out."""
+def read_header(data: bytes) -> ImageHeader:
+    """ImageHeader of an encoded image; what is damaged or unknown is left out."""
     size: tuple[int, int] | None = None
     if data[:2] == b"\xff\xd8":
         for marker, payload in _jpeg_segments(data):
@@ -142,7 +142,7 @@ def read_header(data: bytes) -> Header:
     if block is data or is_heif(data) or not 1 <= orientation <= 8:
         # Decoders turn TIFF and HEIF upright themselves; a TIFF's stored size then says nothing.
         orientation = 1
-    return Header(size, orientation, tags, _projection(data))
+    return ImageHeader(size, orientation, tags, _projection(data))
 
 
 def exif_block(data: bytes) -> bytes | None:

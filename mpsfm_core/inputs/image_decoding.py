@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, Float64, UInt8
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.codecs import HEIF, RAW, decoder_of
-from mpsfm_core.inputs.header import Header, declared_pixels, is_cut_jpeg, read_header
+from mpsfm_core.inputs.codecs import HEIF, RAW, find_decoder
+from mpsfm_core.inputs.image_header import (
+    ImageHeader,
+    is_cut_jpeg,
+    read_declared_num_pixels,
+    read_header,
+)
 
 EXTENSIONS = (
     HEIF
@@ -32,17 +37,17 @@ def read_bytes(path: Path) -> bytes:
         raise InputError(f"image {path} cannot be read: {error.strerror or error}") from error
 
 
-def check_whole(data: bytes, path: Path) -> None:
+def check_decodable(data: bytes, path: Path) -> None:
     """Decode an image once, coarsely; raises :class:`InputError` when it is damaged or none."""
     if is_cut_jpeg(data):
         raise InputError(f"image {path} is cut off: its end is missing; copy it again")
-    if decoder_of(data, path) is None:  # others are decoded whole, for their size
+    if find_decoder(data, path) is None:  # others are decoded whole, for their size
         _decode(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
 
 def check_size(data: bytes, path: Path, max_pixels: int) -> None:
     """Raise :class:`InputError` for an image that would take too much memory to decode."""
-    pixels = declared_pixels(data)
+    pixels = read_declared_num_pixels(data)
     if pixels is not None and pixels > max_pixels:
         raise InputError(
             f"image {path} has {pixels / 1e6:.0f} million pixels, more than inputs.max_pixels="
@@ -50,7 +55,7 @@ def check_size(data: bytes, path: Path, max_pixels: int) -> None:
         )
 
 
-def upright_size(data: bytes, header: Header, path: Path) -> tuple[int, int]:
+def upright_size(data: bytes, header: ImageHeader, path: Path) -> tuple[int, int]:
     """(width, height) with the EXIF orientation applied; decodes only where the header lacks it.
 
     Raises :class:`InputError` when the file is no image or damaged.
@@ -62,13 +67,13 @@ def upright_size(data: bytes, header: Header, path: Path) -> tuple[int, int]:
     return (size[1], size[0]) if header.orientation >= 5 else size
 
 
-def decode_rgb(data: bytes, header: Header, path: Path) -> UInt8:
+def decode_rgb(data: bytes, header: ImageHeader, path: Path) -> UInt8:
     """(H, W, 3) uint8 RGB with the EXIF orientation applied.
 
     16-bit values are scaled by 1/257, floats in [0, 1] by 255; grayscale is repeated, alpha
     dropped. Raises :class:`InputError` when the file is no image or damaged.
     """
-    decode = decoder_of(data, path)
+    decode = find_decoder(data, path)
     if decode is not None:
         return decode(data, path)
     pixels = _decode(data, path)
@@ -104,7 +109,7 @@ def orient(image: UInt8, orientation: int) -> UInt8:
     return np.ascontiguousarray(image)
 
 
-def orient_pixels(xy: Float64, size: tuple[int, int], orientation: int) -> Float64:
+def apply_orientation_to_pixels(xy: Float64, size: tuple[int, int], orientation: int) -> Float64:
     """Pixels (n, 2) of a stored image of (width, height) as those of :func:`orient`'s."""
     x, y = xy[:, 0], xy[:, 1]
     width, height = size
