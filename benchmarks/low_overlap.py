@@ -2,7 +2,7 @@
 
     python -m benchmarks.low_overlap [--scenes rendered_kitchen ...] [--buckets minimal ...]
 
-`fast-cpu` as it is, without its quick matching (``quick: null``), and `sift`, on the sets of each
+`fast-cpu` as it is, without its quick matching (``fast_pass: null``), and `sift`, on the sets of each
 bucket; the mean of the sets' pose AUC in percent, convention `paper`. A set without a
 reconstruction counts as none registered. Seconds are of whole runs, features and depth from the
 cache where an earlier run made them.
@@ -30,7 +30,7 @@ from mpsfm_core.pipeline.run import reconstruct
 SCENES = ("rendered_kitchen", "hololens_room")
 METHODS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "`fast-cpu`": ("fast-cpu", ()),
-    "without quick": ("fast-cpu", ("quick=null",)),
+    "without fast pass": ("fast-cpu", ("fast_pass=null",)),
     "`sift`": ("sift", ()),
 }
 """Label -> configuration and what is set in it."""

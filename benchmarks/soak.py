@@ -38,7 +38,7 @@ CONFIG = """
 features: {{use: sift, options: {{max_keypoints: 2048}}}}
 matcher: {{use: mutual-nearest}}
 depth: {{use: compact}}
-normals: {{use: as-depth}}
+normals: {{use: same-network}}
 pairs: {{mode: sequential, overlap: 4, quadratic: true}}
 extraction: {{integration_size: 160}}
 runtime: {{workers: {workers}, cache_dir: {cache}}}

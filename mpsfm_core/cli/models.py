@@ -135,8 +135,8 @@ def export(
     and its provider takes it by name from then on.
     """
     from mpsfm_core.data.errors import InputError, did_you_mean
-    from mpsfm_core.providers.environments.store import find_environment
-    from mpsfm_core.providers.model_export.run import export_model
+    from mpsfm_core.providers.environments.environment import find_environment
+    from mpsfm_core.providers.model_export.export import export_model
     from mpsfm_core.providers.registry import Registry
     from mpsfm_core.providers.weights import WeightStore
 
@@ -243,7 +243,7 @@ def _wanted(targets: list[str], overrides: list[str]) -> list[tuple[str, Weights
             provision = look_up(load_config(target, overrides, registry), registry)
             found = [
                 (spec.name, file)
-                for path, kind, backend in provision.config.backends()
+                for path, kind, backend in provision.config.provider_configs()
                 for spec in [registry.spec(kind, backend.use)]
                 for file in registry.weights(kind, backend.use, backend.options)
             ]

@@ -1,7 +1,7 @@
 """The configuration of a run: typed options, read from YAML files and ``--set`` overrides."""
 
 from mpsfm_core.config.loading import (
-    check_backend,
+    check_provider_config,
     combination_problems,
     describe_shipped,
     load_config,
@@ -15,7 +15,7 @@ __all__ = [
     "Config",
     "FastPass",
     "RuntimeOptions",
-    "check_backend",
+    "check_provider_config",
     "combination_problems",
     "describe_shipped",
     "load_config",

@@ -3,10 +3,10 @@
 A file may say ``extends:`` with the name of a shipped configuration or a path relative to itself.
 Mappings are merged key by key, everything else is replaced; a block whose ``use:`` changes loses
 the rest that its parent said of it, as another provider has other options, and a block that says
-``use:`` loses its parent's ``otherwise:``. Where features, a
+``use:`` loses its parent's ``fallback:``. Where features, a
 matcher or a multi-view network are named, the parent's quick matching is lost.
 
-A block may name providers to take ``otherwise``. Which of them it will be is not the
+A block may name providers to take ``fallback``. Which of them it will be is not the
 configuration's to say: it depends on the machine, and
 :mod:`mpsfm_core.pipeline.provider_resolution` finds it out when a run starts."""
 
@@ -20,7 +20,7 @@ from typing import Any
 from mpsfm_core.config.model import FORMAT, Config
 from mpsfm_core.data.errors import ConfigError, ProviderError, did_you_mean
 from mpsfm_core.data.options import (
-    AS_DEPTH,
+    SAME_NETWORK,
     FROM_MATCHER,
     FROM_MULTIVIEW,
     ProviderConfig,
@@ -31,7 +31,7 @@ from mpsfm_core.data.options import (
 )
 from mpsfm_core.providers import Kind
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.providers.uncertainty.file import CALIBRATIONS, read_values
+from mpsfm_core.providers.uncertainty.calibration_file import CALIBRATIONS, read_values
 from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.yaml_text import line_of, parse_assignment, parse_yaml
 
@@ -75,7 +75,7 @@ def load_config(
     layers = _read_chain(_find(str(name_or_path), Path()))
     # A change of provider drops the options of its block, one of the matcher quick matching: it
     # goes before the overrides that set them.
-    last = sorted(overrides, key=lambda text: (text.startswith("quick"), ".use=" not in text))
+    last = sorted(overrides, key=lambda text: (text.startswith("fast_pass"), ".use=" not in text))
     layers += [_Layer(f"--set {text}", parse_assignment(text)) for text in last]
     try:
         config = parse_settings(Config, _merge_all(layers))
@@ -160,7 +160,7 @@ def _merge_all(layers: Sequence[_Layer]) -> dict[str, Any]:
     for layer in layers:
         try:
             if any(layer.says((block, "use")) for block in _CAREFUL):
-                merged.pop("quick", None)
+                merged.pop("fast_pass", None)
             merged = _merge(merged, layer.data)
         except IndexError as error:
             raise ConfigError(f"{layer.source}: {error}") from error
@@ -176,7 +176,7 @@ def _merge(base: Any, change: Any) -> Any:
     if not isinstance(base, Mapping) or change.get("use", base.get("use")) != base.get("use"):
         base = {}
     elif "use" in change:  # who names a provider wants this one
-        base = {key: value for key, value in base.items() if key != "otherwise"}
+        base = {key: value for key, value in base.items() if key != "fallback"}
     return {**base, **{key: _merge(base.get(key), value) for key, value in change.items()}}
 
 
@@ -198,7 +198,7 @@ def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complet
     """
     problems: list[SettingProblem] = []
     checked = config
-    for path, kind, backend in config.backends():
+    for path, kind, backend in config.provider_configs():
         try:
             known = backend.model_copy(
                 update={"calibration": _calibration(path, kind, backend, layers)}
@@ -206,7 +206,7 @@ def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complet
             if known.is_open:
                 _check_open(path, kind, known, registry, complete)
             else:
-                known = check_backend(path, kind, known, registry, complete)
+                known = check_provider_config(path, kind, known, registry, complete)
             checked = checked.replaced(path, known)
         except SettingsError as error:
             problems += error.problems
@@ -223,21 +223,21 @@ def _check_open(
     path: SettingPath, kind: Kind, backend: ProviderConfig, registry: Registry, complete: bool
 ) -> None:
     """Raise if none of the candidates could be taken, whatever is on this machine later."""
-    names = (backend.use, *backend.otherwise)
+    names = (backend.use, *backend.fallback)
     here = [name for name in names if name in registry.names(kind)]
     known = {key for name in here for key in registry.default_options(kind, name)}
     unknown = [key for key in backend.options if key not in known]
-    if here and unknown and AS_DEPTH not in names:
+    if here and unknown and SAME_NETWORK not in names:
         places = [(*path, "options", key) for key in unknown]
         texts = [f"unknown key{did_you_mean(key, known)}" for key in unknown]
         raise SettingsError(tuple(map(SettingProblem, places, texts)))
     errors = []
     for name in here or names:
-        if name == AS_DEPTH:
+        if name == SAME_NETWORK:
             return
-        candidate = backend.model_copy(update={"use": name, "otherwise": ()})
+        candidate = backend.model_copy(update={"use": name, "fallback": ()})
         try:
-            check_backend(path, kind, candidate, registry, complete)
+            check_provider_config(path, kind, candidate, registry, complete)
             return
         except SettingsError as error:
             errors.append(error)
@@ -246,7 +246,7 @@ def _check_open(
     raise SettingsError(tuple(problem for error in errors for problem in error.problems))
 
 
-def check_backend(
+def check_provider_config(
     path: SettingPath,
     kind: Kind,
     backend: ProviderConfig,
@@ -269,7 +269,7 @@ def check_backend(
             raise
         filled = registry.default_options(kind, backend.use) | backend.options
     wrap = tuple(
-        check_backend((*path, "wrap", index), "wrapper", wrapper, registry, complete)
+        check_provider_config((*path, "wrap", index), "wrapper", wrapper, registry, complete)
         for index, wrapper in enumerate(backend.wrap)
     )
     for index, wrapper in enumerate(wrap):
@@ -304,8 +304,8 @@ def _missing_blocks(config: Config) -> list[SettingProblem]:
     if config.matcher is None and config.dense_matcher is None:
         return [SettingProblem(("matcher",), "a matcher or a dense_matcher is needed")]
     problems = []
-    if config.quick is not None and config.depth.use == FROM_MATCHER:
-        problems.append(SettingProblem(("quick",), "gives no depth, as depth.use: matcher needs"))
+    if config.fast_pass is not None and config.depth.use == FROM_MATCHER:
+        problems.append(SettingProblem(("fast_pass",), "gives no depth, as depth.use: matcher needs"))
     if config.depth.use == FROM_MULTIVIEW and config.multiview is None:
         problems.append(SettingProblem(("multiview",), "is needed by depth.use: multiview"))
     if config.matcher is not None and config.features is None:
@@ -322,12 +322,12 @@ def combination_problems(config: Config, registry: Registry) -> list[SettingProb
     Open blocks fit for the present. The path of a problem begins with the block that should change.
     """
     problems = []
-    if (alone := config.quick_pass()) is not None:
+    if (alone := config.fast_pass_config()) is not None:
         for problem in combination_problems(alone, registry):
-            problems.append(SettingProblem(("quick", *problem.path), problem.text))
+            problems.append(SettingProblem(("fast_pass", *problem.path), problem.text))
     settled = {
         path[0]: registry.spec(kind, backend.use)
-        for path, kind, backend in config.backends()
+        for path, kind, backend in config.provider_configs()
         if not backend.is_open
     }
     for name, capability in (("matcher", "sparse"), ("dense_matcher", "dense")):

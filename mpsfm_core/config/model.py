@@ -92,7 +92,7 @@ class Config(Options):
     """One line for ``mpsfm config list``; not inherited."""
     inputs: InputOptions = Field(default_factory=InputOptions)
     pairs: PairOptions = Field(default_factory=PairOptions)
-    quick: FastPass | None = None
+    fast_pass: FastPass | None = None
     """Matching that is tried first: photos that it holds in place are not given to ``features`` and
     ``matcher`` again, pairs with others are (:mod:`mpsfm_core.pipeline.run`)."""
     features: ProviderConfig | None = None
@@ -105,7 +105,7 @@ class Config(Options):
     """Network that sees several photos at once, needed by ``depth: {use: multiview}``."""
     depth: ProviderConfig
     normals: ProviderConfig
-    """Of the depth network's own pass with ``use: as-depth``, if that gives normals."""
+    """Of the depth network's own pass with ``use: same-network``, if that gives normals."""
     masks: tuple[ProviderConfig, ...] = ()
     """A pixel is used when all masks allow it."""
     verification: VerificationOptions = Field(default_factory=VerificationOptions)
@@ -116,11 +116,11 @@ class Config(Options):
     results: ResultOptions = Field(default_factory=ResultOptions)
     runtime: RuntimeOptions = Field(default_factory=RuntimeOptions)
 
-    def backends(self) -> Iterator[tuple[SettingPath, Kind, ProviderConfig]]:
+    def provider_configs(self) -> Iterator[tuple[SettingPath, Kind, ProviderConfig]]:
         """Every chosen provider: its path in the configuration, kind and block."""
-        if self.quick is not None:
-            yield ("quick", "features"), "features", self.quick.features
-            yield ("quick", "matcher"), "matcher", self.quick.matcher
+        if self.fast_pass is not None:
+            yield ("fast_pass", "features"), "features", self.fast_pass.features
+            yield ("fast_pass", "matcher"), "matcher", self.fast_pass.matcher
         for name, kind in PROVIDER_BLOCKS.items():
             backend = getattr(self, name)
             if backend is not None:
@@ -129,29 +129,29 @@ class Config(Options):
             yield ("masks", index), "mask", backend
 
     def replaced(self, path: SettingPath, backend: ProviderConfig) -> Config:
-        """The configuration with another backend at a path of :meth:`backends`."""
+        """The configuration with another backend at a path of :meth:`provider_configs`."""
         block, *index = path
         value: Any = backend
-        if block == "quick" and self.quick is not None:
-            value = self.quick.model_copy(update={str(index[0]): backend})
+        if block == "fast_pass" and self.fast_pass is not None:
+            value = self.fast_pass.model_copy(update={str(index[0]): backend})
         elif index:
             value = tuple(backend if i == index[0] else b for i, b in enumerate(self.masks))
         return self.model_copy(update={str(block): value})
 
-    def quick_pass(self) -> Config | None:
+    def fast_pass_config(self) -> Config | None:
         """The configuration with its quick matching alone, None where it has none."""
-        if self.quick is None:
+        if self.fast_pass is None:
             return None
-        alone = {"quick": None, "dense_matcher": None, **dict(self.quick)}
+        alone = {"fast_pass": None, "dense_matcher": None, **dict(self.fast_pass)}
         return self.model_copy(update=alone)
 
     @property
-    def tries_again(self) -> bool:
+    def has_second_pass(self) -> bool:
         """Whether quick matching is followed by another one where it does not suffice; not where
         the other's first choice cannot be had and the same features would be found again."""
-        if self.quick is None:
+        if self.fast_pass is None:
             return False
-        again = self.features is not None and self.features.use == self.quick.features.use
+        again = self.features is not None and self.features.use == self.fast_pass.features.use
         return self.dense_matcher is not None or not again
 
     def mapper_options(self) -> MapperOptions:
@@ -173,5 +173,5 @@ PROVIDER_BLOCKS: dict[str, Kind] = {
     "normals": "normals",
 }
 
-BLOCKS = ("quick", *PROVIDER_BLOCKS, "masks")
+BLOCKS = ("fast_pass", *PROVIDER_BLOCKS, "masks")
 """The blocks that name providers, each after those that its choice depends on."""

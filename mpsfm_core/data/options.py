@@ -24,7 +24,17 @@ class Options(BaseModel):
     )
 
 
-AS_DEPTH = "as-depth"
+def expert(default: Any, **constraints: Any) -> Any:
+    """Declare an option that users are not expected to set; help and templates may hide it.
+
+    Args:
+        default: Value of the option if nothing sets it.
+        constraints: Keyword arguments of :func:`pydantic.Field`, such as ``ge`` and ``gt``.
+    """
+    return Field(default, json_schema_extra={"expert": True}, **constraints)
+
+
+SAME_NETWORK = "same-network"
 """As the normals provider: the depth network's own normals, of the same pass."""
 
 
@@ -40,7 +50,7 @@ class ProviderConfig(Options):
 
     use: str
     """Name of the provider (see ``mpsfm plugins list``)."""
-    otherwise: tuple[str, ...] = ()
+    fallback: tuple[str, ...] = ()
     """Providers to take instead, in this order, where ``use`` cannot be had: its plugin or weights
     are missing, or it does not know the given options."""
     environment: str | None = None
@@ -58,7 +68,7 @@ class ProviderConfig(Options):
     @classmethod
     def _with_environment(cls, values: Any) -> Any:
         if isinstance(values, Mapping) and values.get("environment") and "use" in values:
-            if values["use"] == AS_DEPTH or "@" in str(values["use"]):
+            if values["use"] == SAME_NETWORK or "@" in str(values["use"]):
                 raise ValueError(f"environment: {values['use']!r} says where it is")
             values = {**values, "use": f"{values['use']}@{values['environment']}"}
             del values["environment"]
@@ -68,7 +78,7 @@ class ProviderConfig(Options):
     def is_open(self) -> bool:
         """Whether it is yet to be found out which provider it is
         (:mod:`mpsfm_core.pipeline.provider_resolution`)."""
-        return bool(self.otherwise) or self.use == AS_DEPTH
+        return bool(self.fallback) or self.use == SAME_NETWORK
 
 
 SettingPath = tuple[str | int, ...]

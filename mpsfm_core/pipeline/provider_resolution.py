@@ -1,7 +1,7 @@
 """What a run needs, found or fetched before it looks at the first photo.
 
 Providers, the packages below them, their weights, and the files and folders that their options
-name. Where a block of the configuration leaves a choice (``otherwise``, ``as-depth``), the first
+name. Where a block of the configuration leaves a choice (``fallback``, ``same-network``), the first
 provider is taken that can be had here and now; weights that can be fetched count, until fetching
 them fails.
 """
@@ -13,10 +13,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mpsfm_core.config import BLOCKS, Config, check_backend, combination_problems
-from mpsfm_core.data.errors import ConfigError, InputError
+from mpsfm_core.config import BLOCKS, Config, check_provider_config, combination_problems
+from mpsfm_core.data.decisions import ChoiceReason, ProviderReason, Reason
+from mpsfm_core.data.errors import ConfigError, InputError, WeightsError
 from mpsfm_core.data.options import (
-    AS_DEPTH,
+    SAME_NETWORK,
     Options,
     ProviderConfig,
     SettingPath,
@@ -27,6 +28,7 @@ from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers import Kind, ProviderSpec, WeightsFile
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore, is_remote
+from mpsfm_core.report.reasons import explain
 
 _MEGABYTE = 1_000_000
 
@@ -43,8 +45,8 @@ class Choice:
     block: str
     provider: ProviderSpec
     origin: str
-    reason: str
-    passed_over: Mapping[str, str] = field(default_factory=dict)
+    reason: ChoiceReason
+    passed_over: Mapping[str, Reason] = field(default_factory=dict)
     to_fetch: tuple[WeightsFile, ...] = ()
 
     def __str__(self) -> str:
@@ -53,13 +55,14 @@ class Choice:
         licenses = [spec.code_license]
         if spec.weights_license != "none":
             licenses.append(f"weights {spec.weights_license}")
-        text = f"{self.block}: {spec.name} ({self.origin}; {', '.join(licenses)}), {self.reason}"
+        text = f"{self.block}: {spec.name} ({self.origin}; {', '.join(licenses)}), "
+        text += explain(self.reason.because()).text
         if self.to_fetch:
             text += f"; to be fetched: {', '.join(map(describe_file, self.to_fetch))}"
         if spec.accuracy:
             text += f"; to expect: {spec.accuracy}"
         for name, why in self.passed_over.items():
-            text += f"; not {name}: {why}"
+            text += f"; not {name}: {explain(why).text}"
         return text
 
 
@@ -147,7 +150,7 @@ class _Search:
 
     def __call__(self, config: Config, blocks: Collection[str]) -> ProviderResolution:
         choices = []
-        for path, kind, backend in list(config.backends()):
+        for path, kind, backend in list(config.provider_configs()):
             if path[0] not in blocks:
                 continue
             found, choice = self._choose(config, path, kind, backend)
@@ -158,8 +161,8 @@ class _Search:
     def _choose(
         self, config: Config, path: SettingPath, kind: Kind, backend: ProviderConfig
     ) -> tuple[ProviderConfig, Choice]:
-        names = (backend.use, *backend.otherwise)
-        passed_over: dict[str, str] = {}
+        names = (backend.use, *backend.fallback)
+        passed_over: dict[str, Reason] = {}
         for name in names:
             self._absent.clear()
             try:
@@ -167,26 +170,26 @@ class _Search:
             except InputError as error:
                 if len(names) == 1:
                     raise
-                passed_over[name] = str(error)
+                passed_over[name] = _reason_of(error)
                 continue
-            reason = "the first choice" if backend.is_open else "as configured"
+            reason = ChoiceReason.FIRST_CHOICE if backend.is_open else ChoiceReason.CONFIGURED
             if passed_over:
-                reason = f"as {', '.join(passed_over)} cannot be had"
+                reason = ChoiceReason.FALLBACK
             spec = self._registry.spec(kind, found.use)
             origin = self._registry.version(kind, found.use)
             absent = tuple(self._absent)
             return found, Choice(dotted(path), spec, origin, reason, passed_over, absent)
-        reasons = "; ".join(f"{name}: {why}" for name, why in passed_over.items())
+        reasons = "; ".join(f"{name}: {explain(why).text}" for name, why in passed_over.items())
         raise ConfigError(f"{dotted(path)}: no provider can be had: {reasons}")
 
     def _candidate(
         self, config: Config, path: SettingPath, kind: Kind, backend: ProviderConfig, name: str
     ) -> ProviderConfig:
         """The block with this provider alone, once all that it needs is here."""
-        candidate = backend.model_copy(update={"use": name, "otherwise": ()})
-        if name == AS_DEPTH:
-            candidate = self._as_depth(config.depth, candidate)
-        candidate = check_backend(path, kind, candidate, self._registry)
+        candidate = backend.model_copy(update={"use": name, "fallback": ()})
+        if name == SAME_NETWORK:
+            candidate = self._same_network(config.depth, candidate)
+        candidate = check_provider_config(path, kind, candidate, self._registry)
         if path[-1] in ("matcher", "dense_matcher"):
             self._check_fit(config.replaced(path, candidate), path)
         self._equip(path, kind, candidate)
@@ -194,7 +197,7 @@ class _Search:
             self._equip((*path, "wrap", index), "wrapper", wrapper)
         return candidate
 
-    def _as_depth(self, depth: ProviderConfig, backend: ProviderConfig) -> ProviderConfig:
+    def _same_network(self, depth: ProviderConfig, backend: ProviderConfig) -> ProviderConfig:
         if "joint-normals" not in self._registry.spec("depth", depth.use).capabilities:
             raise ConfigError(f"the depth provider {depth.use!r} gives no normals")
         return backend.model_copy(update={"use": depth.use, "options": depth.options})
@@ -213,6 +216,16 @@ class _Search:
                 raise ConfigError(f"{dotted((*path, 'options', *key))}: {file} does not exist")
         for weights in self._registry.weights(kind, backend.use, backend.options):
             self._have(weights)
+
+
+def _reason_of(error: InputError) -> Reason:
+    """Return the typed reason why a provider cannot be used."""
+    code = ProviderReason.UNAVAILABLE
+    if isinstance(error, WeightsError):
+        code = ProviderReason.NO_WEIGHTS
+    elif isinstance(error, SettingsError):
+        code = ProviderReason.INCOMPATIBLE
+    return code.because(detail=str(error))
 
 
 class _Downloads:

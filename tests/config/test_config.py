@@ -119,21 +119,21 @@ class TestMerging:
         [
             ("features: {options: {max_keypoints: 7}}", (), True),
             ("depth: {use: files, options: {directory: maps}}", (), True),
-            ("quick: null", (), False),
+            ("fast_pass: null", (), False),
             ("features: {use: xfeat}", (), False),
             ("dense_matcher: {use: loftr}", (), False),
             ("", ("matcher.use=lighterglue",), False),
-            (f"features: {{use: xfeat}}\nquick: {QUICK}", (), True),
-            ("", (f"quick={QUICK}", "matcher.use=lighterglue"), True),
+            (f"features: {{use: xfeat}}\nfast_pass: {QUICK}", (), True),
+            ("", (f"fast_pass={QUICK}", "matcher.use=lighterglue"), True),
         ],
     )
     def test_who_names_a_matcher_wants_that_one(
         self, load: Load, text: str, overrides: Sequence[str], kept: bool
     ) -> None:
-        quick = load(f"extends: fast-cpu\n{text}", *overrides).quick
-        assert (quick is not None) == kept
-        if quick is not None:
-            assert (quick.features.use, quick.matcher.use) == ("sift", "mutual-nearest")
+        fast_pass = load(f"extends: fast-cpu\n{text}", *overrides).fast_pass
+        assert (fast_pass is not None) == kept
+        if fast_pass is not None:
+            assert (fast_pass.features.use, fast_pass.matcher.use) == ("sift", "mutual-nearest")
 
     def test_circles_are_told(self, tmp_path: Path) -> None:
         (tmp_path / "a.yaml").write_text("extends: b.yaml\n")
@@ -211,9 +211,9 @@ class TestErrors:
             ("dense_matcher: {use: lighterglue}\n", ":2: dense_matcher.use: 'lighterglue' is not"),
             ("matcher: null\n", ":2: matcher: a matcher or a dense_matcher is needed"),
             ("features: null\n", ":2: features: is needed by the sparse matcher 'lighterglue'"),
-            ("quick: {matcher: {use: loftr}}\n", ":2: quick.matcher.use: 'loftr' is not a sparse"),
-            ("quick: {features: {use: sfit}}\n", ":2: quick.features.use: no features provider"),
-            ("quick: {}\ndepth: {use: matcher}\n", ": quick: gives no depth, as depth.use: mat"),
+            ("fast_pass: {matcher: {use: loftr}}\n", ":2: fast_pass.matcher.use: 'loftr' is not a sparse"),
+            ("fast_pass: {features: {use: sfit}}\n", ":2: fast_pass.features.use: no features provider"),
+            ("fast_pass: {}\ndepth: {use: matcher}\n", ": fast_pass: gives no depth, as depth.use: mat"),
             (
                 "features: {use: sift}\nmatcher: {use: lighterglue}\n",
                 ":3: matcher.use: 'lighterglue' matches xfeat features, not 'sift'",

@@ -10,11 +10,11 @@ import yaml
 
 from mpsfm_core.config import Config, describe_shipped, load_config, shipped_configs
 from mpsfm_core.data.errors import ConfigError
-from mpsfm_core.data.options import AS_DEPTH, SettingsError, dotted
+from mpsfm_core.data.options import SAME_NETWORK, SettingsError, dotted
 from mpsfm_core.pipeline.provider_resolution import look_up, provide
-from mpsfm_core.providers.first_party import FIRST_PARTY, requirement_for
+from mpsfm_core.providers.first_party import PLUGIN_PROVIDERS, requirement_for
 from mpsfm_core.providers.registry import CORE, Registry
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from mpsfm_core.providers.weights import is_remote
 
 NAMES = sorted(shipped_configs())
@@ -27,7 +27,7 @@ def registry() -> Registry:
     """All plugins; skips where one that a configuration names is not installed."""
     registry = Registry.discover()
     here = {line.distribution for line in registry.status()}
-    missing = {home.partition("[")[0] for home in FIRST_PARTY} - here
+    missing = {home.partition("[")[0] for home in PLUGIN_PROVIDERS} - here
     if missing:
         pytest.skip(f"needs {', '.join(sorted(missing))}")
     return registry
@@ -36,12 +36,12 @@ def registry() -> Registry:
 def closed(config: Config, registry: Registry) -> Config:
     """With the first choice of each block."""
     joint = "joint-normals" in registry.spec("depth", config.depth.use).capabilities
-    for path, _, backend in list(config.backends()):
-        chosen = {"use": backend.use, "otherwise": ()}
-        if backend.use == AS_DEPTH and joint:
+    for path, _, backend in list(config.provider_configs()):
+        chosen = {"use": backend.use, "fallback": ()}
+        if backend.use == SAME_NETWORK and joint:
             chosen |= {"use": config.depth.use, "options": config.depth.options}
-        elif backend.use == AS_DEPTH:
-            chosen["use"] = backend.otherwise[0]
+        elif backend.use == SAME_NETWORK:
+            chosen["use"] = backend.fallback[0]
         config = config.replaced(path, backend.model_copy(update=chosen))
     return config
 
@@ -49,7 +49,7 @@ def closed(config: Config, registry: Registry) -> Config:
 def required(config: Config, registry: Registry) -> list[str]:
     """Options that only the user can know, as ``--set`` names them."""
     found = []
-    for path, kind, backend in closed(config, registry).backends():
+    for path, kind, backend in closed(config, registry).provider_configs():
         given = {key: value for key, value in backend.options.items() if value is not None}
         try:
             registry.validate_options(kind, backend.use, given)
@@ -64,7 +64,7 @@ def test_loads_and_resolves(name: str, registry: Registry) -> None:
     assert describe_shipped()[name]
     complete = load_config(name, [f"{o}=FILE" for o in required(config, registry)], registry)
     complete = closed(complete, registry)
-    for path, kind, backend in complete.backends():
+    for path, kind, backend in complete.provider_configs():
         chosen = [(kind, backend.use), *(("wrapper", w.use) for w in backend.wrap)]
         for each in chosen:
             spec = registry.spec(*each)
@@ -113,9 +113,9 @@ def test_tells_what_to_install(name: str, registry: Registry) -> None:
     config = load_config(name, (), registry, complete=False)
     wanted = [
         (kind, name)
-        for _, kind, backend in config.backends()
-        for name in (backend.use, *backend.otherwise)
-        if AS_DEPTH not in (backend.use, *backend.otherwise)
+        for _, kind, backend in config.provider_configs()
+        for name in (backend.use, *backend.fallback)
+        if SAME_NETWORK not in (backend.use, *backend.fallback)
     ]
     hints = [f"pip install '{home}'" for choice in wanted if (home := requirement_for(*choice))]
     with pytest.raises(ConfigError) as caught:
@@ -140,14 +140,14 @@ def test_is_described(name: str) -> None:
 def test_every_first_party_provider_is_announced_and_in_the_guide(registry: Registry) -> None:
     """What to install for it is known without its plugin."""
     text = GUIDE.read_text(encoding="utf-8")
-    homes = {home.partition("[")[0] for home in FIRST_PARTY}
+    homes = {home.partition("[")[0] for home in PLUGIN_PROVIDERS}
     found = set()
     for line in registry.status():
         if line.distribution in homes and line.kind != "plugin":
             found.add(f"{line.kind}/{line.name}")
             short = line.name.removeprefix("metric3d-v2")
             assert f"`{line.name}`" in text or f"`{short}`" in text, f"{line.kind} {line.name}"
-    assert found == {provider for brought in FIRST_PARTY.values() for provider in brought}
+    assert found == {provider for brought in PLUGIN_PROVIDERS.values() for provider in brought}
 
 
 @pytest.mark.parametrize("name", ["default", "fast-cpu", "demo"])

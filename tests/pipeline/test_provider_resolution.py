@@ -20,7 +20,7 @@ from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera, View
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.pipeline.provider_resolution import ProviderResolution, look_up, provide
 from mpsfm_core.pipeline.run import reconstruct
-from mpsfm_core.providers import ProviderContext, file_named_by, weights
+from mpsfm_core.providers import ProviderContext, weights_from_option, weights
 from mpsfm_core.providers.builtin import plugin as builtin
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
@@ -112,7 +112,7 @@ Configured = Callable[..., Config]
 def configured(tmp_path: Path) -> Configured:
     """The shipped default, of which ``strong`` is the strong public network."""
     path = tmp_path / "run.yaml"
-    path.write_text("extends: default\ndepth: {use: strong, otherwise: [compact, flat]}\n")
+    path.write_text("extends: default\ndepth: {use: strong, fallback: [compact, flat]}\n")
 
     def load(registry: Registry, *overrides: str) -> Config:
         settings = (f"runtime.cache_dir={tmp_path / 'cache'}", "runtime.workers=1", *overrides)
@@ -123,7 +123,7 @@ def configured(tmp_path: Path) -> Configured:
 
 def names(provision: ProviderResolution) -> list[str]:
     """Of the providers, without those of quick matching."""
-    return [c.provider.name for c in provision.choices if not c.block.startswith("quick.")]
+    return [c.provider.name for c in provision.choices if not c.block.startswith("fast_pass.")]
 
 
 class Listener:
@@ -150,7 +150,7 @@ def test_first_and_second_use(room: Room, server: Server, configured: Configured
     assert server.requests == [] and [file.size for file in choice.to_fetch] == [len(CONTENT)]
     first = provide(config, registry)
     assert names(first) == ["sift", "mutual-nearest", "strong", "strong"]
-    assert not any(b.is_open for _, _, b in first.config.backends())
+    assert not any(b.is_open for _, _, b in first.config.provider_configs())
     assert len(server.requests) == 1
     assert listener.progress[-1][0] == "fetch strong.onnx"
     assert listener.notices[0] == f"fetching {server.url}/strong.onnx (0 MB), licence MIT"
@@ -247,7 +247,7 @@ def test_options_say_whose_they_are(
 ) -> None:
     """With the shipped default and nothing else."""
     registry = networks(room, server.url)
-    named = file_named_by("model")
+    named = weights_from_option("model")
     registry.add(ProviderSpec("depth", "onnx", Network, NamedOptions, weights=named))
     (tmp_path / "net.onnx").touch()
     places = {"FILE": str(tmp_path / "net.onnx"), "FOLDER": str(tmp_path)}
@@ -279,7 +279,7 @@ def unreadable(tmp_path: Path, room: Room) -> Path:
         (["depth.use=torchless"], "needs no_such_package, not installed; pip install it"),
         (["depth.calibration=nowhere.yaml"], "nowhere.yaml' cannot be read"),
         (["pairs.mode=retrieval"], "retrieval: is needed by pairs.mode"),
-        (["normals={use: as-depth, otherwise: []}", "depth.use=flat"], "'flat' gives no normals"),
+        (["normals={use: same-network, fallback: []}", "depth.use=flat"], "'flat' gives no normals"),
         (["inputs.masks=nowhere"], "masks folder nowhere does not exist"),
     ],
 )
@@ -289,7 +289,7 @@ def test_what_is_missing_is_told_before_a_photo_is_decoded(
     registry = networks(room, server.url)
     absent: dict[str, Any] = {"requires": ("no_such_package",), "install_hint": "pip install it"}
     registry.add(
-        ProviderSpec("depth", "named", Network, NamedOptions, weights=file_named_by("model")),
+        ProviderSpec("depth", "named", Network, NamedOptions, weights=weights_from_option("model")),
         ProviderSpec("depth", "torchless", Network, **absent),
     )
     settings = [f"runtime.cache_dir={tmp_path}", "depth.use=compact", *overrides]
@@ -313,10 +313,10 @@ def test_config_show_says_what_would_be_chosen(tmp_path: Path) -> None:
     settings = ["--set", f"runtime.cache_dir={tmp_path}", "--offline"]
     shown = CliRunner().invoke(build_app(), ["config", "show", "default", *settings]).output
     config, _, comment = shown.partition("# here and now:\n")
-    assert "otherwise:" in config
+    assert "fallback:" in config
     lines = dict(line[2:].split(": ", 1) for line in comment.splitlines())
-    quick = {"quick.features", "quick.matcher"}
-    assert lines.keys() == quick | {"features", "matcher", "depth", "normals"}
+    fast_pass = {"fast_pass.features", "fast_pass.matcher"}
+    assert lines.keys() == fast_pass | {"features", "matcher", "depth", "normals"}
     assert "not moge-2-small" in lines["depth"]
     (tmp_path / "shown.yaml").write_text(shown)
     assert load_config(tmp_path / "shown.yaml").to_yaml() == config.rstrip("\n") + "\n"

@@ -86,9 +86,9 @@ class PairSelection:
     def _partners(self) -> int:
         """Of each photo that asks for them."""
         config = self._bench.config
-        if self._loose is None or config.quick is None:
+        if self._loose is None or config.fast_pass is None:
             return config.pairs.partners
-        return config.quick.partners
+        return config.fast_pass.partners
 
     def _like(self, pair: Pair) -> float:
         return 0.0 if self._likeness is None else float(self._likeness[pair])

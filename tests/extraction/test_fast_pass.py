@@ -72,7 +72,7 @@ def test_a_pair_that_quick_matching_dropped(world) -> None:
 def test_photos_that_are_held_ask_for_no_partners(world) -> None:
     """The last photo is most like the one before it, which is its neighbour too."""
     pairs = PairOptions(mode="auto", partners=2, overlap=1)
-    quick = TRUTH.model_copy(update={"partners": 1})
+    fast_pass = TRUTH.model_copy(update={"partners": 1})
     images = load_images(world.root / "images", world.root / "intrinsics.yaml")
     first = world.extract()
 
@@ -82,15 +82,15 @@ def test_photos_that_are_held_ask_for_no_partners(world) -> None:
         return both.report["pairs_proposed"] - first.report["pairs_proposed"]
 
     assert asked(3) == 2
-    assert asked(3, quick=quick) == 1
+    assert asked(3, fast_pass=fast_pass) == 1
 
 
-@pytest.mark.parametrize(("quick", "asked"), [(TRUTH, 0), ("weak", 6)])
-def test_photos_that_are_held_are_not_matched_again(world, quick, asked: int) -> None:
-    if quick == "weak":
+@pytest.mark.parametrize(("fast_pass", "asked"), [(TRUTH, 0), ("weak", 6)])
+def test_photos_that_are_held_are_not_matched_again(world, fast_pass, asked: int) -> None:
+    if fast_pass == "weak":
         sift = ProviderConfig(use="sift", options={"max_keypoints": 5})
-        quick = TRUTH.model_copy(update={"features": sift})
-    config = world.config(**DENSE, quick=quick)
+        fast_pass = TRUTH.model_copy(update={"features": sift})
+    config = world.config(**DENSE, fast_pass=fast_pass)
     result = reconstruct(
         world.root / "images",
         config=config,
@@ -100,11 +100,11 @@ def test_photos_that_are_held_are_not_matched_again(world, quick, asked: int) ->
     assert len(result.summary["images"]["registered"]) == 4
     assert world.asked()["dense"] == asked
     blocks = [provider["block"] for provider in result.summary["providers"]]
-    assert blocks == ["quick.features", "quick.matcher", "dense_matcher", "depth", "normals"]
+    assert blocks == ["fast_pass.features", "fast_pass.matcher", "dense_matcher", "depth", "normals"]
 
 
 def test_the_same_features_are_not_found_twice(world) -> None:
     """Where networks cannot be had both are SIFT."""
-    assert not world.config(quick=TRUTH).tries_again
-    assert world.config(**DENSE, quick=TRUTH).tries_again
-    assert not world.config().tries_again
+    assert not world.config(fast_pass=TRUTH).has_second_pass
+    assert world.config(**DENSE, fast_pass=TRUTH).has_second_pass
+    assert not world.config().has_second_pass
