@@ -18,12 +18,12 @@ from benchmarks._scenes import RESULTS, shared_folder, tell
 from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS
 from mpsfm_core.evaluation.report import Row, make_rows
-from mpsfm_core.optimize.losses import Loss
+from mpsfm_core.optimize.options import Loss
 from mpsfm_core.support.yaml_text import write_yaml
 
 VARIANTS: Mapping[str, Mapping[str, object]] = {
     "default": {},
-    "start from a pair": {"initialization": {"all_at_once": False}},
+    "start from a pair": {"initialization": {"global_initialization": False}},
     "reprojection loss not measured": {"refinement": {"measure_keypoint_noise": False}},
     "no lifting": {"registration": {"lifting": False}},
     "bundle adjustment beside refined depth": {"refinement": {"bundle_depth": "refined"}},

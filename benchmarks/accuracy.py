@@ -67,7 +67,7 @@ NETWORK_BUCKETS: Mapping[str, tuple[str, ...]] = {
     "hololens_room": ("leq5", "leq10", "leq30", "all"),
 }
 """Where networks are compared with each other."""
-UNCONFIRMED = "unconfirmed", "mapping: {place_unconfirmed: true}\n"
+UNCONFIRMED = "unconfirmed", "mapping: {register_tentatively: true}\n"
 COMPARISONS: Mapping[str, Comparison] = {
     "rendered_kitchen": Comparison(
         "rendered_kitchen",
@@ -87,7 +87,7 @@ COMPARISONS: Mapping[str, Comparison] = {
         ("minimal", "leq5", "leq10", "all"),
         ("sensor", "config"),
         UNCONFIRMED,
-        note="With `mapping.place_unconfirmed`: images that nothing confirms are placed where "
+        note="With `mapping.register_tentatively`: images that nothing confirms are placed where "
         "their matches fit best, and count.",
     ),
     **{

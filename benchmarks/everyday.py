@@ -27,12 +27,12 @@ from benchmarks._scenes import percent
 from mpsfm_core.evaluation.methods import OURS, MethodRun, Outcome, run_tasks
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.testing.synthetic.halls import QUALITIES, Hall, hall_problem
+from mpsfm_core.testing.synthetic.halls import QUALITIES, HallProblem, make_hall_problem
 
 PEER = "colmap"
 VARIANTS: Mapping[str, Mapping[str, object]] = {
     "default": {},
-    "start from a pair": {"initialization": {"all_at_once": False}},
+    "start from a pair": {"initialization": {"global_initialization": False}},
     "reprojection loss not measured": {"refinement": {"measure_keypoint_noise": False}},
     "evidence not weighed": {"consistency": {"weigh_evidence": False}},
     "no depth check": {"consistency": {"enabled": False}},
@@ -67,7 +67,7 @@ def measured(
     views: int, prior: str, variants: Sequence[str], repeats: int, threads: int = 1
 ) -> list[dict[str, Any]]:
     """A row for COLMAP and one for each variant of ours."""
-    hall = hall_problem(views, QUALITIES[prior])
+    hall = make_hall_problem(views, QUALITIES[prior])
     methods = {PEER: (PEER, MapperOptions())}
     for variant in variants:
         methods[variant] = OURS, MapperOptions.model_validate(dict(VARIANTS[variant]))
@@ -95,7 +95,7 @@ def measured(
     return rows
 
 
-def _row(hall: Hall, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def _row(hall: HallProblem, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """Medians of the repeats; accuracy is that of the first, as it is the same in all."""
     first = outcomes[0]
     found = first.models[0] if first.models else {}

@@ -23,14 +23,18 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.mapping.component import Group
-from mpsfm_core.mapping.consistency.depth_consistency import DepthCheck
+from mpsfm_core.mapping.consistency.depth_consistency import DepthConsistencyCheck
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.maintenance import Upkeep
 from mpsfm_core.mapping.scene.tracks import NO_POINT
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors
-from mpsfm_core.testing.synthetic.two_rooms import SymmetricProblem, moved, twin_room_problem
+from mpsfm_core.testing.synthetic.two_rooms import (
+    SymmetricProblem,
+    make_twin_room_problem,
+    shift_pose,
+)
 
 PRIORS = {"exact, declared 1 %": None, "5 % + 5 % scale, declared 5 %": DepthErrors()}
 HEADER = "| priors | wrong rejected | correct rejected | check, ms |\n|---|---|---|---|"
@@ -53,7 +57,7 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
     everything = scene.registered.copy()
     for image in np.flatnonzero(room >= 0):
         for wrong in (False, True):
-            pose = moved(case.poses[image], 2 * int(room[image]) - 1) if wrong else None
+            pose = shift_pose(case.poses[image], 2 * int(room[image]) - 1) if wrong else None
             truth, seen = scene.translations[image].copy(), scene.tracks.point_of.copy()
             if pose is not None:
                 scene.registered = everything & (room != room[image])
@@ -61,7 +65,9 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
                 # the points that it sees stay where it was
                 scene.tracks.point_of[scene.graph.keypoints_of(int(image))] = NO_POINT
             start = time.perf_counter()
-            check = DepthCheck(scene, options.consistency).of_image(int(image), std_factor)
+            check = DepthConsistencyCheck(scene, options.consistency).check_image(
+                int(image), std_factor
+            )
             seconds = time.perf_counter() - start
             yield wrong, check.share > options.consistency.max_violations, seconds
             scene.translations[image], scene.registered = truth, everything
@@ -127,7 +133,7 @@ def main() -> None:
     arguments = parser.parse_args()
     lines = ["Placed:", "", HEADER]
     for name, errors in PRIORS.items():
-        cases = [twin_room_problem(seed, errors=errors) for seed in range(arguments.seeds)]
+        cases = [make_twin_room_problem(seed, errors=errors) for seed in range(arguments.seeds)]
         rows = [row for case in cases for row in placed(case)]
         milliseconds = 1e3 * float(np.median([seconds for _, _, seconds in rows]))
         lines.append(f"| {name} | {shares([row[:2] for row in rows])} | {milliseconds:.1f} |")
@@ -136,7 +142,7 @@ def main() -> None:
         lines += ["", f"Mapped; pose AUC in percent, convention `{convention.name}`:"]
         lines += [f"{convention.description}.", "", HEADER_MAPPED]
         for name, errors in PRIORS.items():
-            cases = [twin_room_problem(seed, errors=errors) for seed in range(arguments.seeds)]
+            cases = [make_twin_room_problem(seed, errors=errors) for seed in range(arguments.seeds)]
             for enabled in (False, True):
                 runs = [mapped(case, enabled) for case in cases]
                 area = pose_auc(np.concatenate([run[0] for run in runs]), convention)

@@ -8,17 +8,25 @@ from collections.abc import Callable
 import numpy as np
 
 from mpsfm_core.data import Bool, Int64, MappingProblem, VerifiedPair
-from mpsfm_core.mapping.consistency.misregistration import WeakHold, weak_holds
-from mpsfm_core.mapping.consistency.pair_consistency import PairCheck
+from mpsfm_core.data.decisions import ImageReason, Reason
+from mpsfm_core.mapping.consistency.misregistration import Misregistration, detect_misregistrations
+from mpsfm_core.mapping.consistency.pair_consistency import PairConsistencyCheck
 from mpsfm_core.mapping.event_log import Journal
-from mpsfm_core.mapping.initialization.global_initialization import Placement, place_all
-from mpsfm_core.mapping.initialization.initial_pair import Start, Starts, place_first
+from mpsfm_core.mapping.initialization.global_initialization import (
+    GlobalPoses,
+    estimate_global_poses,
+)
+from mpsfm_core.mapping.initialization.initial_pair import (
+    InitialPair,
+    InitialPairSelector,
+    register_first_image,
+)
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.filtering import filter_points, lost_images
 from mpsfm_core.mapping.refinement.maintenance import State, Upkeep
-from mpsfm_core.mapping.registration.incremental import Growth
-from mpsfm_core.mapping.registration.registration import PoseSearch
-from mpsfm_core.mapping.triangulation import complete_and_merge, triangulate_image
+from mpsfm_core.mapping.registration.incremental_registration import IncrementalRegistration
+from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
+from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, triangulate_image
 
 _log = logging.getLogger(__name__)
 
@@ -39,15 +47,19 @@ class Group:
     """
 
     upkeep_type: type[Upkeep] = Upkeep
-    growth_type: type[Growth] = Growth
+    growth_type: type[IncrementalRegistration] = IncrementalRegistration
 
     def __init__(
-        self, problem: MappingProblem, options: MapperOptions, starts: Starts, journal: Journal
+        self,
+        problem: MappingProblem,
+        options: MapperOptions,
+        starts: InitialPairSelector,
+        journal: Journal,
     ) -> None:
         self.upkeep = self.upkeep_type(problem, options, journal)
         self.scene, self.refiner = self.upkeep.scene, self.upkeep.refiner
         self._options, self._starts, self._journal = options, starts, journal
-        self._search = PoseSearch(self.scene, self.refiner, options)
+        self._search = AbsolutePoseEstimator(self.scene, self.refiner, options)
         self.growth = self.growth_type(self.upkeep, self._search)
 
     @property
@@ -60,8 +72,8 @@ class Group:
         group without images."""
         # which poses are tried is no matter of chance that runs should differ by
         options = self._options.model_copy(update={"seed": 0})
-        search = PoseSearch(self.scene, self.refiner, options)
-        return PairCheck(search, options).weighed(self.upkeep.problem, left)
+        search = AbsolutePoseEstimator(self.scene, self.refiner, options)
+        return PairConsistencyCheck(search, options).reweight_pairs(self.upkeep.problem, left)
 
     def start_from_known_poses(self, left: Bool) -> bool:
         """Register all images that came with a pose; False when fewer than two hold together."""
@@ -75,7 +87,7 @@ class Group:
             scene.register(image, *pose)
         fixed = options.known_poses == "fixed"
         self.refiner.fixed[list(known)] = fixed
-        complete_and_merge(scene, options.triangulation, create=True)
+        complete_and_merge_tracks(scene, options.triangulation, create=True)
         self.refiner.scale_together(list(known))
         if not len(scene.tracks):
             _log.warning("images with known poses share no points: %s", _WITHOUT[fixed])
@@ -94,7 +106,7 @@ class Group:
         """
         before = self.scene.snapshot()
         with self._journal.timed("global start"):
-            placed = place_all(self.scene, left)
+            placed = estimate_global_poses(self.scene, left)
             if placed is None:
                 return False
             self._build(placed)
@@ -104,7 +116,7 @@ class Group:
             # the first time was around poses that a wrong focal length bent
             self.upkeep.refine_globally()
         limit = self._options.consistency.max_violations
-        self.upkeep.check_all(limit, "with all images placed at once")
+        self.upkeep.check_all(limit, "global-initialization")
         if self._explained_share(placed.images) < self._options.enough_explained:
             self.upkeep.empty(before)
             return False
@@ -112,7 +124,7 @@ class Group:
             self.upkeep.accept(image)
         return True
 
-    def _build(self, placed: Placement) -> None:
+    def _build(self, placed: GlobalPoses) -> None:
         """Points and a first refinement of images that were placed at once."""
         scene, options = self.scene, self._options
         images = [int(image) for image in placed.images]
@@ -138,53 +150,53 @@ class Group:
     def start_from_pair(self, left: Bool) -> bool:
         """Find the first pair among the images that are left and refine it."""
         with self._journal.timed("initialization"):
-            pairs = self._starts.ranked(self._search, left)
+            pairs = self._starts.rank_pairs(self._search, left)
         snapshot = self.scene.snapshot()
         while True:
             for pair in pairs:
                 with self._journal.timed("initialization"):
                     reason = self._try_pair(pair)
                 if reason is None:
-                    self.upkeep.ladder.reset()
+                    self.upkeep.thresholds.reset()
                     self.upkeep.accept(pair.image_a)
                     self.upkeep.accept(pair.image_b)
                     self.upkeep.refine_globally()
                     return True
                 self._journal.pair_rejected(pair, reason)
                 self.scene.restore(snapshot)
-            if not pairs or not self.upkeep.ladder.relax():
+            if not pairs or not self.upkeep.thresholds.relax():
                 return False
 
-    def _try_pair(self, pair: VerifiedPair) -> str | None:
-        """Start with a pair; None, or why it cannot be the first (remembered if that is final)."""
-        start = self._starts.find(self._search, pair)
-        if isinstance(start, str):
+    def _try_pair(self, pair: VerifiedPair) -> Reason | None:
+        """InitialPair with a pair; None, or why it cannot be the first (remembered if that is final)."""
+        start = self._starts.estimate_pair(self._search, pair)
+        if isinstance(start, Reason):
             return start
-        reason = self.upkeep.ladder.objection(start.pose)
+        reason = self.upkeep.thresholds.check_support(start.pose)
         if reason is None:
             reason = self._grow_start(start)
             if reason:
-                self._starts.refuse(pair, reason)
+                self._starts.reject_pair(pair, reason)
         return reason
 
-    def _grow_start(self, start: Start) -> str | None:
+    def _grow_start(self, start: InitialPair) -> Reason | None:
         """Refine the first two images and their points; None, or why they are rejected."""
         a, b = start.reference, start.image
-        place_first(self.scene, a)
+        register_first_image(self.scene, a)
         self.scene.register(b, start.pose.rotation, start.pose.translation)
         triangulate_image(self.scene, b, self._options.triangulation)
         self.refiner.estimate_scale(b, [])
         self.refiner.adjust([a, b])
         filter_points(self.scene, self._options.triangulation)
         if lost_images(self.scene):
-            return "too few points are left after refinement"
+            return ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()
         self.refiner.estimate_scale(a, [])
         self.refiner.estimate_scale(b, [])
         self.refiner.integrate([a, b])
         self.refiner.adjust([a, b])
         filter_points(self.scene, self._options.triangulation)
         if lost_images(self.scene):
-            return "too few points are left after refinement"
+            return ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()
         return self.upkeep.contradiction(b, self._options.consistency.max_violations_initial)
 
     def grow(
@@ -194,7 +206,7 @@ class Group:
 
         ``wide``: also beside those that they match best, before thresholds give way.
         """
-        while self.growth.register_next(available, wide=wide):
+        while self.growth.register_next_image(available, wide=wide):
             self.upkeep.refresh()
             paused()
 
@@ -229,19 +241,21 @@ class Group:
         """Images that were registered then and are not now."""
         return [int(i) for i in np.flatnonzero(before.scene.registered & ~self.scene.registered)]
 
-    def _take_out(self, hold: WeakHold) -> None:
+    def _take_out(self, hold: Misregistration) -> None:
         """Take weakly held images out, not to be posed again beside those that hold them."""
         upkeep = self.upkeep
-        upkeep.drop(list(hold.images), f"{hold.margin} more matches want it elsewhere")
-        upkeep.drop(lost_images(self.scene), "lost its points when another image was taken out")
-        upkeep.attempts.forget()
-        upkeep.attempts.refuted[hold.links[:, 0], hold.links[:, 1]] = True
+        reason = ImageReason.MISREGISTERED.because(num_matches=int(hold.margin))
+        upkeep.drop(list(hold.images), reason)
+        reason = ImageReason.LOST_POINTS.because(step="re-registration")
+        upkeep.drop(lost_images(self.scene), reason)
+        upkeep.history.clear()
+        upkeep.history.excluded_references[hold.links[:, 0], hold.links[:, 1]] = True
 
-    def _weak_holds(self) -> list[WeakHold]:
+    def _weak_holds(self) -> list[Misregistration]:
         """Weakly held images that may be taken out."""
         guess = self._options.known_poses == "guess"
         stays = np.array([image.known_pose is not None for image in self.upkeep.problem.images])
-        holds = weak_holds(self.scene, self._options.registration.min_inliers)
+        holds = detect_misregistrations(self.scene, self._options.registration.min_inliers)
         return [hold for hold in holds if guess or not stays[list(hold.images)].any()]
 
     def _num_explained(self) -> int:
@@ -255,6 +269,6 @@ class Group:
         self.upkeep.refine_globally()
         consistency = self._options.consistency
         if consistency.enabled and consistency.check_at_end:
-            self.upkeep.check_all(consistency.max_violations_final, "at the end")
+            self.upkeep.check_all(consistency.max_violations_final, "final-check")
         if self._options.refinement.final_robust:
             self.upkeep.refine_globally(final=True)

@@ -14,10 +14,10 @@ from mpsfm_core.mapping.checkpoints import Checkpoints, Keeper
 from mpsfm_core.mapping.component import Group, nothing
 from mpsfm_core.mapping.event_log import Journal
 from mpsfm_core.mapping.events import MappingEvents, NullMappingEvents
-from mpsfm_core.mapping.initialization.initial_pair import Starts
+from mpsfm_core.mapping.initialization.initial_pair import InitialPairSelector
 from mpsfm_core.mapping.model_selection import Run, best, explained_shares, settled, with_all_times
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.registration.tentative import with_unconfirmed
+from mpsfm_core.mapping.registration.tentative_registration import register_tentatively
 from mpsfm_core.mapping.scene.conversion import finished
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.mapping.state import canonical
@@ -57,8 +57,8 @@ def reconstruct(
     keeper.finish(runs)
     chosen = best(runs, options.consistency)
     models = list(chosen.models)
-    if models and options.place_unconfirmed:
-        models[0] = with_unconfirmed(models[0], models[1:], problem, options)
+    if models and options.register_tentatively:
+        models[0] = register_tentatively(models[0], models[1:], problem, options)
     return MappingResult(tuple(models), with_all_times(chosen.report, runs))
 
 
@@ -86,7 +86,7 @@ class Mapper:
         self.journal = Journal(problem, events)
         self.models: list[Reconstruction] = []
         self.left: Bool = np.ones(len(problem.images), dtype=np.bool_)
-        self._starts = Starts(options)
+        self._starts = InitialPairSelector(options)
         self._tried = 0
         self._growing = False
         self._poses_hold = sum(image.known_pose is not None for image in problem.images) >= 2
@@ -153,7 +153,7 @@ class Mapper:
         return self.group.start_from_pair(self.left)
 
     def _start_from_all(self) -> bool:
-        at_once = self.options.initialization.all_at_once
+        at_once = self.options.initialization.global_initialization
         return at_once and self.group.start_from_all(self.left)
 
     def _start_from_known_poses(self) -> bool:
@@ -173,7 +173,7 @@ class Mapper:
         if not largest or group.size < CONTENDER_SHARE * largest:
             return False
         before = group.upkeep.state()
-        group.upkeep.attempts.forget()
+        group.upkeep.history.clear()
         group.grow(np.array([image.known_pose is None for image in self.problem.images]))
         if group.size > largest:
             group.finish()

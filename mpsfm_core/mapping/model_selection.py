@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from mpsfm_core.data import MappingProblem
-from mpsfm_core.mapping.consistency.depth_agreement import agreeing_depth
+from mpsfm_core.mapping.consistency.depth_agreement import measure_depth_agreement
 from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
 
@@ -54,7 +54,7 @@ def best(runs: Sequence[Run], options: ConsistencyOptions) -> Run:
     often = [run for run, count in zip(equal, times, strict=True) if count == max(times)]
     if len(often) == 1 or not most:
         return often[0]
-    return max(often, key=lambda run: (agreeing_depth(run.models[0], options), run.of_largest))
+    return max(often, key=lambda run: (measure_depth_agreement(run.models[0], options), run.of_largest))
 
 
 def _agree(one: Run, other: Run) -> bool:

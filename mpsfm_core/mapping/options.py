@@ -12,15 +12,13 @@ from typing import Literal
 from pydantic import Field
 
 from mpsfm_core.data.options import Options
-from mpsfm_core.optimize.bundle_adjustment import BundleOptions
-from mpsfm_core.optimize.depth_integration import IntegrationOptions
-from mpsfm_core.optimize.losses import Loss
+from mpsfm_core.optimize.options import BundleOptions, IntegrationOptions
 
 
 class InitializationOptions(Options):
     """How a group of images starts."""
 
-    all_at_once: bool = True
+    global_initialization: bool = True
     """Place all well connected images at once
     (:mod:`mpsfm_core.mapping.initialization.global_initialization`), and go on from a first pair
     only where that does not hold."""
@@ -90,17 +88,6 @@ class TriangulationOptions(Options):
     """For refined images: complete, merge, filter (COLMAP; times the keypoints' std)."""
 
 
-class MapperBundleOptions(BundleOptions):
-    """Bundle adjustment inside the mapper.
-
-    Ours: learned keypoints have heavier tails than the reference's SOFT_L1 at 1.5 expects
-    (``benchmarks/ablation.py``).
-    """
-
-    reprojection_loss: Loss = Loss.CAUCHY
-    reprojection_scale: float = Field(0.65, gt=0)
-
-
 class RefinementOptions(Options):
     """Alternation of depth integration and bundle adjustment (paper section 3.3)."""
 
@@ -161,7 +148,7 @@ class RefinementOptions(Options):
     """Multiplies the depth loss scale then (reference: final_robustification)."""
     anchor_min_angle_deg: float = Field(2.0, ge=0)
     """Points of at least this angle anchor the integration (reference: robust_triangles)."""
-    bundle: MapperBundleOptions = MapperBundleOptions()
+    bundle: BundleOptions = BundleOptions()
     integration: IntegrationOptions = IntegrationOptions()
 
 
@@ -224,7 +211,7 @@ class MappingOptions(Options):
     enough_explained: float = Field(0.75, ge=0, le=1)
     """Share of all matches, by score, of which both keypoints see the same point, with which one
     run is enough (ours; rendered_kitchen 0.80 to 0.98, hololens_room 0.5 to 0.9)."""
-    place_unconfirmed: bool = False
+    register_tentatively: bool = False
     """At the end also place the images that are not in the largest component, in that, where their
     matches fit best; those of another component as a whole. The summary lists them; they see no
     points and change nothing else."""

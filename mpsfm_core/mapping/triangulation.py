@@ -22,7 +22,7 @@ def triangulate_image(scene: Scene, image: int, options: TriangulationOptions) -
     create_tracks(scene, edges, max_error, options)
 
 
-def complete_and_merge(
+def complete_and_merge_tracks(
     scene: Scene,
     options: TriangulationOptions,
     *,
@@ -78,7 +78,7 @@ def create_tracks(
     source, target = edges
     free = (tracks.point_of[source] < 0) & (tracks.point_of[target] < 0)
     source, target = source[free], target[free]
-    points, good = hypothesize(scene, source, target, max_error_px, options)
+    points, good = triangulate_or_lift(scene, source, target, max_error_px, options)
     source, target, points = source[good], target[good], points[good]
     if not len(source):
         return
@@ -97,7 +97,7 @@ def create_tracks(
     tracks.add(points[best], keypoints, track)
 
 
-def hypothesize(
+def triangulate_or_lift(
     scene: Scene,
     source: Int64,
     target: Int64,
@@ -112,7 +112,9 @@ def hypothesize(
     image_of = scene.graph.image_of
     centers = scene.centers()
     center_a, center_b = centers[image_of[source]], centers[image_of[target]]
-    points = midpoints(center_a, scene.world_rays(source), center_b, scene.world_rays(target))
+    points = triangulate_midpoints(
+        center_a, scene.world_rays(source), center_b, scene.world_rays(target)
+    )
     low = ~(triangulation_angle_deg(center_a, center_b, points) >= options.min_angle_deg)
     low |= ~_fits(scene, source, target, points, max_error_px)
     from_source, source_valid = scene.lift(source[low])
@@ -196,7 +198,9 @@ def _angle_error_px(scene: Scene, image: int, options: TriangulationOptions) -> 
     return float(scene.intrinsics[image, 0] * np.tan(np.radians(options.max_angle_error_deg)))
 
 
-def midpoints(center_a: Float64, ray_a: Float64, center_b: Float64, ray_b: Float64) -> Float64:
+def triangulate_midpoints(
+    center_a: Float64, ray_a: Float64, center_b: Float64, ray_b: Float64
+) -> Float64:
     """Points halfway between two rays each, (m, 3); NaN for parallel rays."""
     aa, bb = (ray_a * ray_a).sum(axis=1), (ray_b * ray_b).sum(axis=1)
     ab = (ray_a * ray_b).sum(axis=1)

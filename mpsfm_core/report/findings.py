@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from mpsfm_core.report.reasons import NO_MATCH, NOTHING_TO_HOLD_ON, explain, pair_kind
+from mpsfm_core.data.decisions import ImageReason
+from mpsfm_core.report.reasons import explain, explain_image, explain_pair, explain_provider
 
 Level = Literal["bad", "warning", "note"]
 _ORDER: tuple[Level, ...] = ("bad", "warning", "note")
@@ -70,7 +70,9 @@ def _failure(summary: Mapping[str, Any]) -> Iterator[Finding]:
         return
     pairs = summary["pairs"]
     if not pairs["verified"]:
-        kinds = Counter(pair_kind(pair["dropped"]) for pair in pairs["all"] if "dropped" in pair)
+        kinds = Counter(
+            explain_pair(pair["dropped"]).title for pair in pairs["all"] if "dropped" in pair
+        )
         causes = ", ".join(f"{kind} in {_count(n, 'pair')}" for kind, n in kinds.most_common())
         yield Finding(
             "bad",
@@ -82,8 +84,10 @@ def _failure(summary: Mapping[str, Any]) -> Iterator[Finding]:
             "try --config robust; with walls without texture --config dense.",
         )
         return
-    starts = [explain(pair["cannot_start"]) for pair in pairs["all"] if "cannot_start" in pair]
-    usual, count = Counter(start.plain for start in starts).most_common(1)[0] if starts else ("", 0)
+    starts = [
+        explain_image(pair["cannot_start"]) for pair in pairs["all"] if "cannot_start" in pair
+    ]
+    usual, count = Counter(start.text for start in starts).most_common(1)[0] if starts else ("", 0)
     yield Finding(
         "bad",
         "Photos match, but no two of them can be the start",
@@ -97,22 +101,24 @@ def _failure(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _missing(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    groups = defaultdict(list)
+    by_title = defaultdict(list)
     for name, reason in summary["images"]["unregistered"].items():
-        groups[explain(reason).kind].append((name, explain(reason)))
+        by_title[explain_image(reason).title].append((name, explain_image(reason)))
     failed = summary["status"] != "success"
     if failed:  # of course
-        groups.pop(explain(NOTHING_TO_HOLD_ON).kind, None)
+        implied = {ImageReason.NO_REGISTERED_NEIGHBOR}
         if not summary["pairs"]["verified"]:
-            groups.pop(explain(NO_MATCH).kind, None)
-    for kind, members in sorted(groups.items(), key=lambda item: -len(item[1])):
+            implied.add(ImageReason.NO_VERIFIED_MATCHES)
+        for code in implied:
+            by_title.pop(explain(code.because()).title, None)
+    for kind, members in sorted(by_title.items(), key=lambda item: -len(item[1])):
         names = tuple(name for name, _ in members)
         first = members[0][1]
-        alike = all(explained.plain == first.plain for _, explained in members)
-        plain = first.plain if alike else f"{names[0]}, for one: {first.plain}"
+        alike = all(explained.text == first.text for _, explained in members)
+        text = first.text if alike else f"For example {names[0]}: {first.text}"
         title = f"{_count(len(names), 'photo')} missing: {kind}"
         level: Level = "note" if failed else "warning"
-        yield Finding(level, title, plain, "" if failed else first.remedy, names)
+        yield Finding(level, title, text, "" if failed else first.remedy, names)
 
 
 def _unconfirmed(summary: Mapping[str, Any]) -> Iterator[Finding]:
@@ -121,9 +127,8 @@ def _unconfirmed(summary: Mapping[str, Any]) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"{_count(len(names), 'photo')} placed without proof",
-            "They lie where their matches fit best, as mapping.place_unconfirmed asks for. Nothing "
-            "confirms that.",
-            "Do not trust their poses without a look.",
+            "Their matches fit best there (mapping.register_tentatively). Nothing confirms the poses.",
+            "Check their poses before you use them.",
             names,
         )
 
@@ -139,7 +144,9 @@ def _providers(summary: Mapping[str, Any]) -> Iterator[Finding]:
                 "pip install mpsfm-compact, or see mpsfm doctor.",
             )
         elif passed:
-            reasons = "; ".join(f"{name}: {_short(why)}" for name, why in passed.items())
+            reasons = ", ".join(
+                f"{name} ({explain_provider(why).title})" for name, why in passed.items()
+            )
             yield Finding(
                 "note",
                 f"{provider['block']}: {provider['name']} stood in for {', '.join(passed)}",
@@ -237,11 +244,6 @@ def partner_counts(summary: Mapping[str, Any]) -> Counter[str]:
         if "inliers" in pair and registered.issuperset(pair["images"])
         for name in pair["images"]
     )
-
-
-def _short(reason: str) -> str:
-    """The first sentence of a reason, of addresses the file only."""
-    return re.sub(r"\w+://\S*/", "", reason.split(". ")[0]).rstrip(".")
 
 
 def _count(number: int, thing: str) -> str:

@@ -15,7 +15,7 @@ from mpsfm_core.mapping.mapper import Mapper, reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult
 from mpsfm_core.mapping.state import Frozen, canonical, fingerprint, freeze, thaw
-from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
@@ -67,8 +67,8 @@ def thawed_poses(state: Frozen, problem: MappingProblem) -> Frozen:
 @pytest.fixture(scope="module")
 def problem() -> MappingProblem:
     """Two groups that share no matches, with noise: several runs."""
-    noise = Noise(keypoints_px=1.0, depth=0.05)
-    whole = mapping_problem(
+    noise = SyntheticNoise(keypoints_px=1.0, depth=0.05)
+    whole = make_mapping_problem(
         room_scene(), CAMERA, arc_poses(6, 14.0), noise=noise, points_per_view=80, map_width=48
     )
     apart = tuple(p for p in whole.pairs if (p.image_a < 3) == (p.image_b < 3))

@@ -16,20 +16,23 @@ from mpsfm_core.data import (
     NormalPrior,
     PinholeCamera,
 )
-from mpsfm_core.mapping.consistency.depth_consistency import DepthCheck, overlapping_views
+from mpsfm_core.mapping.consistency.depth_consistency import (
+    DepthConsistencyCheck,
+    find_overlapping_images,
+)
 from mpsfm_core.mapping.options import ConsistencyOptions, MapperOptions, TriangulationOptions
 from mpsfm_core.mapping.refinement.refinement import Refiner
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.scene.tracks import Tracks
-from mpsfm_core.mapping.triangulation import complete_and_merge
-from mpsfm_core.testing.synthetic.halls import LOCALLY_WRONG, PriorErrors, hall_problem
+from mpsfm_core.mapping.triangulation import complete_and_merge_tracks
+from mpsfm_core.testing.synthetic.halls import LOCALLY_BIASED_PRIORS, PriorErrors, make_hall_problem
 from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Box, look_at
 from mpsfm_core.testing.synthetic.two_rooms import (
     CAMERA,
-    moved,
-    twin_room_poses,
-    twin_room_problem,
-    twin_rooms,
+    make_twin_room_poses,
+    make_twin_room_problem,
+    make_twin_rooms,
+    shift_pose,
 )
 
 OPTIONS = ConsistencyOptions()
@@ -68,7 +71,7 @@ HERE = np.eye(3, 4)
 
 
 def between(scene: Scene, a: int, b: int, **settings: float) -> float:
-    return DepthCheck(scene, OPTIONS).between(a, b, **settings)
+    return DepthConsistencyCheck(scene, OPTIONS).violation_ratio(a, b, **settings)
 
 
 def test_a_surface_in_seen_empty_space_is_a_violation_and_one_behind_is_not() -> None:
@@ -79,7 +82,7 @@ def test_a_surface_in_seen_empty_space_is_a_violation_and_one_behind_is_not() ->
     box = 5 * 7 / (15 * 20)  # of every second pixel either way
     assert between(scene, 0, 1) == pytest.approx(box)
     assert between(scene, 1, 0) == pytest.approx(box)
-    check = DepthCheck(scene, OPTIONS).of_image(0)
+    check = DepthConsistencyCheck(scene, OPTIONS).check_image(0)
     assert check.other == 1
     assert check.share == pytest.approx(box)
 
@@ -89,20 +92,20 @@ def test_what_a_far_view_sees_in_few_pixels_counts_as_few() -> None:
     behind = np.eye(3, 4)
     behind[2, 3] = 10.0
     scene = posed_scene([wall(1.0), wall(20.0)], [HERE, behind], SMALL)
-    check = DepthCheck(scene, OPTIONS)
-    assert check.between(0, 1) == 1
-    assert check.between(0, 1, once=True) == pytest.approx(1 / 11**2)
-    assert not check.conflicting_images([0, 1], OPTIONS.max_violations)
+    check = DepthConsistencyCheck(scene, OPTIONS)
+    assert check.violation_ratio(0, 1) == 1
+    assert check.violation_ratio(0, 1, once=True) == pytest.approx(1 / 11**2)
+    assert not check.find_conflicting_images([0, 1], OPTIONS.max_violations)
 
 
 def test_an_occluded_surface_is_no_violation() -> None:
     """What the second view sees beside a box lies behind the box for the first."""
-    rooms = twin_rooms()
-    poses, _ = twin_room_poses(0)
+    rooms = make_twin_rooms()
+    poses, _ = make_twin_room_poses(0)
     grid = CAMERA.resized(160, 120)
     maps = [rooms.render(grid, pose).depth for pose in poses[:7]]
     scene = posed_scene(maps, poses[:7], CAMERA)
-    assert max(DepthCheck(scene, OPTIONS).of_image(i).share for i in range(7)) < 0.03
+    assert max(DepthConsistencyCheck(scene, OPTIONS).check_image(i).share for i in range(7)) < 0.03
 
 
 @pytest.mark.parametrize(("gap", "contradicts"), [(0.03, False), (0.10, True)])
@@ -153,11 +156,11 @@ def test_an_error_that_takes_a_pixel_past_an_edge_explains_no_more_than_it_is_li
 
 def hall_at_truth(errors: PriorErrors) -> Scene:
     """Views of a hall with their tracks and scaled priors."""
-    problem, truth, _ = hall_problem(16, errors)
+    problem, truth, _ = make_hall_problem(16, errors)
     scene = Scene(problem)
     for image, pose in enumerate(truth.values()):
         scene.register(image, *pose)
-    complete_and_merge(scene, TriangulationOptions(), create=True)
+    complete_and_merge_tracks(scene, TriangulationOptions(), create=True)
     Refiner(scene, MapperOptions(), np.zeros((16, 16))).scale_together(list(range(16)))
     return scene
 
@@ -165,20 +168,20 @@ def hall_at_truth(errors: PriorErrors) -> Scene:
 def worst(scene: Scene, *, weigh_evidence: bool) -> Float64:
     """(n,) largest share of contradicting pixels of each image."""
     options = OPTIONS.model_copy(update={"weigh_evidence": weigh_evidence})
-    check = DepthCheck(scene, options)
-    return np.array([check.of_image(i).share for i in range(scene.num_images)])
+    check = DepthConsistencyCheck(scene, options)
+    return np.array([check.check_image(i).share for i in range(scene.num_images)])
 
 
 def test_what_points_deny_is_the_fault_of_the_prior() -> None:
     """Unrefined priors that are off by 20 % in a tenth of their area refute no right pose."""
-    scene = hall_at_truth(LOCALLY_WRONG)
+    scene = hall_at_truth(LOCALLY_BIASED_PRIORS)
     assert (worst(scene, weigh_evidence=False) > OPTIONS.max_violations).sum() >= 2
     assert (worst(scene, weigh_evidence=True) < OPTIONS.max_violations).all()
 
 
 def test_what_points_confirm_or_leave_open_is_the_fault_of_the_pose() -> None:
     """Views of one twin room stand in the other, beside right priors; their tracks go along."""
-    case = twin_room_problem(1, keypoint_noise_px=0.2)
+    case = make_twin_room_problem(1, keypoint_noise_px=0.2)
     scene = Scene(case.problem)
     for image, pose in enumerate(case.poses):
         scene.register(image, pose[:, :3], pose[:, 3])
@@ -188,12 +191,15 @@ def test_what_points_confirm_or_leave_open_is_the_fault_of_the_pose() -> None:
     for image in map(int, np.flatnonzero(room == 1)):
         # the view before its twin's surroundings, with the tracks that it finds there
         truth = scene.translations[image].copy()
-        scene.translations[image] = moved(case.poses[image], 1)[:, 3]
+        scene.translations[image] = shift_pose(case.poses[image], 1)[:, 3]
         scene.registered = (room != 1) | (np.arange(len(room)) == image)
         scene.tracks = Tracks(len(scene.keypoints))
-        complete_and_merge(scene, TriangulationOptions(), create=True)
+        complete_and_merge_tracks(scene, TriangulationOptions(), create=True)
         if (scene.tracks.point_of[scene.graph.keypoints_of(image)] >= 0).sum() > 30:
-            wrong.append(DepthCheck(scene, OPTIONS).of_image(image).share > OPTIONS.max_violations)
+            wrong.append(
+                DepthConsistencyCheck(scene, OPTIONS).check_image(image).share
+                > OPTIONS.max_violations
+            )
         scene.translations[image] = truth
     assert len(wrong) >= 4
     assert np.mean(wrong) >= 0.75
@@ -202,48 +208,54 @@ def test_what_points_confirm_or_leave_open_is_the_fault_of_the_pose() -> None:
 def test_views_that_look_elsewhere_do_not_overlap() -> None:
     back = np.column_stack([np.diag([-1.0, 1.0, -1.0]), np.zeros(3)])
     scene = posed_scene([wall(3.0)] * 3, [HERE, back, HERE], SMALL)
-    assert overlapping_views(scene, 0, 5) == [2]
-    assert DepthCheck(scene, OPTIONS).of_image(1).other == -1
+    assert find_overlapping_images(scene, 0, 5) == [2]
+    assert DepthConsistencyCheck(scene, OPTIONS).check_image(1).other == -1
 
 
 def test_the_thinned_map_is_where_the_map_is() -> None:
     """A view against itself from a step aside, at full and at a third of the resolution."""
-    rooms = twin_rooms()
-    pose = twin_room_poses(0)[0][0]
+    rooms = make_twin_rooms()
+    pose = make_twin_room_poses(0)[0][0]
     maps = [rooms.render(CAMERA.resized(480, 360), pose).depth] * 2
     scene = posed_scene(maps, [pose, pose], CAMERA)
     assert between(scene, 0, 1) == 0
     whole = OPTIONS.model_copy(update={"map_width": 480})
-    assert DepthCheck(scene, whole).between(0, 1) == 0
+    assert DepthConsistencyCheck(scene, whole).violation_ratio(0, 1) == 0
 
 
 def test_a_view_in_the_twin_room_is_told_by_what_differs() -> None:
     """Most views of the second room contradict the first; in their own place none does."""
-    rooms = twin_rooms()
-    poses, room = twin_room_poses(1)
+    rooms = make_twin_rooms()
+    poses, room = make_twin_room_poses(1)
     maps = [rooms.render(CAMERA.resized(160, 120), pose).depth for pose in poses]
     wrong = []
     for image in np.flatnonzero(np.array(room) == 1):
         scene = posed_scene(maps, poses, CAMERA)
-        assert DepthCheck(scene, OPTIONS).of_image(int(image)).share < OPTIONS.max_violations
-        scene.translations[image] = moved(poses[image], 1)[:, 3]
+        assert (
+            DepthConsistencyCheck(scene, OPTIONS).check_image(int(image)).share
+            < OPTIONS.max_violations
+        )
+        scene.translations[image] = shift_pose(poses[image], 1)[:, 3]
         scene.registered &= np.array(room) != 1
-        wrong.append(DepthCheck(scene, OPTIONS).of_image(int(image)).share > OPTIONS.max_violations)
+        wrong.append(
+            DepthConsistencyCheck(scene, OPTIONS).check_image(int(image)).share
+            > OPTIONS.max_violations
+        )
     assert np.mean(wrong) >= 0.75
 
 
 def test_what_a_quarter_of_the_pixels_tells_is_what_all_of_them_do() -> None:
     """Of views in their room and in its twin: the same side of the limit, some by fewer pixels."""
-    rooms = twin_rooms()
-    poses, room = twin_room_poses(1)
+    rooms = make_twin_rooms()
+    poses, room = make_twin_room_poses(1)
     maps = [rooms.render(CAMERA.resized(160, 120), pose).depth for pose in poses]
     scene = posed_scene(maps, poses, CAMERA)
     for image in np.flatnonzero(np.array(room) == 1)[::2]:
-        scene.translations[image] = moved(poses[image], 1)[:, 3]
-    check, limit = DepthCheck(scene, OPTIONS), OPTIONS.max_violations
+        scene.translations[image] = shift_pose(poses[image], 1)[:, 3]
+    check, limit = DepthConsistencyCheck(scene, OPTIONS), OPTIONS.max_violations
     pairs = list(combinations(range(len(poses)), 2))
-    every = np.array([check.between(a, b) for a, b in pairs])
-    enough = np.array([check.between(a, b, limit=limit) for a, b in pairs])
+    every = np.array([check.violation_ratio(a, b) for a, b in pairs])
+    enough = np.array([check.violation_ratio(a, b, limit=limit) for a, b in pairs])
     assert ((every > limit) == (enough > limit)).all()
     assert 0.05 < (every > limit).mean() < 0.95
     assert (every != enough).any()
@@ -253,6 +265,8 @@ def test_what_a_quarter_of_the_pixels_tells_is_what_all_of_them_do() -> None:
 def test_the_image_with_most_conflicts_goes() -> None:
     scene = posed_scene([wall(4.0), wall(4.0), wall(2.0), wall(4.0)], [HERE] * 4, SMALL)
     images = scene.registered_images()
-    removed = DepthCheck(scene, OPTIONS).conflicting_images(images, OPTIONS.max_violations)
+    removed = DepthConsistencyCheck(scene, OPTIONS).find_conflicting_images(
+        images, OPTIONS.max_violations
+    )
     assert [image for image, _ in removed] == [2]
     assert removed[0][1] == pytest.approx(1.0)

@@ -13,11 +13,11 @@ from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
-from mpsfm_core.mapping.registration.correspondences import correspondences
-from mpsfm_core.mapping.registration.pose_hypotheses import Hypotheses, Hypothesis
-from mpsfm_core.mapping.registration.registration import find_poses
+from mpsfm_core.mapping.registration.correspondences import find_correspondences
+from mpsfm_core.mapping.registration.pose_estimation import estimate_candidate_poses
+from mpsfm_core.mapping.registration.pose_hypotheses import PoseHypothesis, PoseHypothesisGenerator
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
@@ -29,8 +29,8 @@ def in_units(
     groups: Sequence[int | None], poses: Sequence[Float64] | None = None
 ) -> MappingProblem:
     """Views of the room whose depth is in the unit of their group, with a little noise."""
-    noise = Noise(keypoints_px=0.5, depth=0.02)
-    problem = mapping_problem(
+    noise = SyntheticNoise(keypoints_px=0.5, depth=0.02)
+    problem = make_mapping_problem(
         room_scene(), CAMERA, POSES[: len(groups)], noise=noise, declared_depth_std=0.02
     )
     images = []
@@ -50,10 +50,12 @@ def in_units(
     return MappingProblem(tuple(images), problem.pairs)
 
 
-@pytest.mark.parametrize("all_at_once", [True, False])
-def test_images_of_a_group_share_their_scale(all_at_once: bool) -> None:
+@pytest.mark.parametrize("global_initialization", [True, False])
+def test_images_of_a_group_share_their_scale(global_initialization: bool) -> None:
     options = MapperOptions()
-    initialization = options.initialization.model_copy(update={"all_at_once": all_at_once})
+    initialization = options.initialization.model_copy(
+        update={"global_initialization": global_initialization}
+    )
     options = options.model_copy(update={"initialization": initialization})
     mapper = Mapper(in_units([0, 0, 1, 1]), options, NullMappingEvents())
     mapper.reconstruct_next()
@@ -70,14 +72,17 @@ def test_without_groups_each_image_has_its_own_scale() -> None:
     assert len({depth_map.scale for depth_map in mapper.group.scene.maps}) == 3
 
 
-def proposals(problem: MappingProblem, reference: int = 0, image: int = 1) -> list[Hypothesis]:
+def proposals(problem: MappingProblem, reference: int = 0, image: int = 1) -> list[PoseHypothesis]:
     """What the network proposes beside a reference that is in place at a scale of its own."""
     scene = Scene(problem)
     scene.register(reference, POSES[reference][:, :3], POSES[reference][:, 3])
     scene.maps[reference].set_scale(1 / UNITS[problem.images[reference].depth_group or 0])
     options = RegistrationOptions()
-    found = correspondences(scene, image, [reference], options)
-    made = [estimate() for estimate in Hypotheses(scene, image, found, options, 0).of_all()]
+    found = find_correspondences(scene, image, [reference], options)
+    made = [
+        estimate()
+        for estimate in PoseHypothesisGenerator(scene, image, found, options, 0).generate_from_all()
+    ]
     return [h for h in made if h is not None and h.source == "multi-view network"]
 
 
@@ -102,6 +107,6 @@ def test_a_wrong_proposal_decides_nothing() -> None:
     scene.register(0, POSES[0][:, :3], POSES[0][:, 3])
     scene.maps[0].set_scale(1.0)
     options = RegistrationOptions()
-    found = correspondences(scene, 1, [0], options)
-    best = find_poses(scene, 1, found, options, seed=0, attempt=0)[0]
+    found = find_correspondences(scene, 1, [0], options)
+    best = estimate_candidate_poses(scene, 1, found, options, seed=0, attempt=0)[0]
     assert rotation_angle_deg(best.rotation @ POSES[1][:, :3].T) < 1.0

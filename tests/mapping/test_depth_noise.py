@@ -18,8 +18,8 @@ from mpsfm_core.mapping.refinement.depth_noise import (
     witnesses,
 )
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.mapping.triangulation import complete_and_merge
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.mapping.triangulation import complete_and_merge_tracks
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
@@ -35,7 +35,7 @@ def measured(errors: Errors, scales: tuple[float, ...] = (1.0, 1.0, 1.0)) -> Dep
 
 def scene_with(errors: Errors, scales: tuple[float, ...] = (1.0, 1.0, 1.0)) -> Scene:
     """True poses and their tracks beside such priors."""
-    problem = mapping_problem(
+    problem = make_mapping_problem(
         room_scene(), CAMERA, POSES, points_per_view=400, declared_depth_std=DECLARED
     )
     images = []
@@ -50,7 +50,7 @@ def scene_with(errors: Errors, scales: tuple[float, ...] = (1.0, 1.0, 1.0)) -> S
     for image, (pose, scale) in enumerate(zip(POSES, scales, strict=True)):
         scene.register(image, pose[:, :3], pose[:, 3])
         scene.maps[image].set_scale(scale)
-    complete_and_merge(scene, TriangulationOptions(), create=True)
+    complete_and_merge_tracks(scene, TriangulationOptions(), create=True)
     return scene
 
 
@@ -100,7 +100,7 @@ def test_scales_that_are_off_are_no_noise() -> None:
 
 
 def test_too_few_common_points_leave_the_declaration() -> None:
-    problem = mapping_problem(room_scene(), CAMERA, POSES)
+    problem = make_mapping_problem(room_scene(), CAMERA, POSES)
     assert measure_depth_noise(Scene(problem)) == DepthNoise()
 
 

@@ -14,31 +14,31 @@ from mpsfm_core.data import Float64, Int64, MappingProblem
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_errors_deg
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.initialization.global_initialization import (
-    Placement,
-    agreed,
-    averaged_rotations,
-    on_cycles,
-    place_all,
+    GlobalPoses,
+    average_differences,
+    average_rotations,
+    estimate_global_poses,
+    find_cycle_edges,
 )
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.testing.synthetic.halls import HONEST, Hall, hall_problem
+from mpsfm_core.testing.synthetic.halls import CALIBRATED_PRIORS, HallProblem, make_hall_problem
 
 VIEWS = 16
 
 
 @pytest.fixture(scope="module")
-def hall() -> Hall:
-    return hall_problem(VIEWS, HONEST, seed=2)
+def hall() -> HallProblem:
+    return make_hall_problem(VIEWS, CALIBRATED_PRIORS, seed=2)
 
 
-def place(problem: MappingProblem, left: Float64 | None = None) -> Placement | None:
+def place(problem: MappingProblem, left: Float64 | None = None) -> GlobalPoses | None:
     everything = np.ones(len(problem.images), dtype=np.bool_)
-    return place_all(Scene(problem), everything if left is None else left)
+    return estimate_global_poses(Scene(problem), everything if left is None else left)
 
 
-def worst_deg(placed: Placement, hall: Hall) -> float:
+def worst_deg(placed: GlobalPoses, hall: HallProblem) -> float:
     """Largest error of a placed pair in degrees, robustly: of nine tenths."""
     names = [hall.problem.images[image].name for image in placed.images]
     poses = zip(names, zip(placed.rotations, placed.translations, strict=True), strict=True)
@@ -46,7 +46,7 @@ def worst_deg(placed: Placement, hall: Hall) -> float:
     return float(np.quantile(pose_errors_deg(dict(poses), truth, CONVENTIONS["paper"]), 0.9))
 
 
-def test_all_views_are_placed_near_their_poses(hall: Hall) -> None:
+def test_all_views_are_placed_near_their_poses(hall: HallProblem) -> None:
     placed = place(hall.problem)
     assert placed is not None
     assert len(placed.images) >= VIEWS - 2
@@ -54,7 +54,7 @@ def test_all_views_are_placed_near_their_poses(hall: Hall) -> None:
     assert np.log(placed.scales).std() < 0.1
 
 
-def test_a_wrong_pair_is_outvoted(hall: Hall) -> None:
+def test_a_wrong_pair_is_outvoted(hall: HallProblem) -> None:
     problem = hall.problem
     turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     wrong = replace(problem.pairs[0], rotation=turn @ problem.pairs[0].rotation)
@@ -64,7 +64,7 @@ def test_a_wrong_pair_is_outvoted(hall: Hall) -> None:
     assert worst_deg(placed, hall) < 3
 
 
-def test_images_that_may_not_be_placed_are_left_out(hall: Hall) -> None:
+def test_images_that_may_not_be_placed_are_left_out(hall: HallProblem) -> None:
     left = np.ones(VIEWS, dtype=np.bool_)
     left[3] = False
     placed = place(hall.problem, left)
@@ -72,12 +72,12 @@ def test_images_that_may_not_be_placed_are_left_out(hall: Hall) -> None:
     assert 3 not in placed.images
 
 
-def test_a_chain_of_pairs_is_not_placed(hall: Hall) -> None:
+def test_a_chain_of_pairs_is_not_placed(hall: HallProblem) -> None:
     chain = [p for p in hall.problem.pairs if p.image_b == p.image_a + 1]
     assert place(MappingProblem(hall.problem.images, tuple(chain))) is None
 
 
-def test_a_bridge_holds_nothing(hall: Hall) -> None:
+def test_a_bridge_holds_nothing(hall: HallProblem) -> None:
     """The larger of two groups is placed that a single pair holds together."""
     problem = hall.problem
     first = [p for p in problem.pairs if p.image_b < 10]
@@ -105,10 +105,10 @@ def test_links_on_cycles_are_those_that_can_be_spared(seed: int) -> None:
 
     whole = groups(links)
     spared = [groups(np.delete(links, row, axis=0)) == whole for row in range(len(links))]
-    assert on_cycles(links[:, 0], links[:, 1], count).tolist() == spared
+    assert find_cycle_edges(links[:, 0], links[:, 1], count).tolist() == spared
 
 
-def test_pairs_whose_points_the_prior_bends_weigh_less(hall: Hall) -> None:
+def test_pairs_whose_points_the_prior_bends_weigh_less(hall: HallProblem) -> None:
     """Two of three pairs of an image turn it by 12 degrees, which bends what it sees."""
     problem, image = hall.problem, 5
     tilt = Rotation.from_rotvec([0.0, np.radians(12.0), 0.0]).as_matrix()
@@ -132,7 +132,7 @@ def test_values_agree_with_most_differences() -> None:
     a, b = (np.array(ends) for ends in np.tril_indices(6, -1))
     steps = truth[b] - truth[a]
     steps[4] += 5
-    found = agreed(a, b, steps, np.ones(len(a)), 6)
+    found = average_differences(a, b, steps, np.ones(len(a)), 6)
     np.testing.assert_allclose(found, truth - truth.mean(axis=0), atol=1e-3)
 
 
@@ -146,16 +146,18 @@ def test_rotations_agree_with_those_that_agree() -> None:
     turns = noise.as_matrix() @ truth[b] @ truth[a].transpose(0, 2, 1)
     wrong = rng.random(len(a)) < 0.33
     turns[wrong] = Rotation.random(int(wrong.sum()), rng).as_matrix()
-    found = averaged_rotations(a, b, turns, np.where(wrong, 30.0, 100.0), count)
+    found = average_rotations(a, b, turns, np.where(wrong, 30.0, 100.0), count)
     world = found[0].T @ truth[0]
     off = rotation_angle_deg(found @ world @ truth.transpose(0, 2, 1))
     assert off.max() < 2.5
 
 
-def test_mapping_starts_from_all_images_and_ends_as_well_as_from_a_pair(hall: Hall) -> None:
+def test_mapping_starts_from_all_images_and_ends_as_well_as_from_a_pair(hall: HallProblem) -> None:
     errors = {}
     for at_once in (True, False):
-        options = MapperOptions.model_validate({"initialization": {"all_at_once": at_once}})
+        options = MapperOptions.model_validate(
+            {"initialization": {"global_initialization": at_once}}
+        )
         result = reconstruct(hall.problem, options)
         found = result.reconstructions[0].poses
         assert len(found) == VIEWS
@@ -165,7 +167,7 @@ def test_mapping_starts_from_all_images_and_ends_as_well_as_from_a_pair(hall: Ha
     assert errors[True] < 1.1 * errors[False]
 
 
-def test_matches_that_no_points_explain_make_it_start_from_a_pair(hall: Hall) -> None:
+def test_matches_that_no_points_explain_make_it_start_from_a_pair(hall: HallProblem) -> None:
     rng = np.random.default_rng(0)
     pairs = []
     for pair in hall.problem.pairs:

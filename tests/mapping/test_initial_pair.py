@@ -9,15 +9,15 @@ import pytest
 
 from mpsfm_core.data import Bool, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
-from mpsfm_core.mapping.initialization.initial_pair import Starts, rank_initial_pairs
+from mpsfm_core.mapping.initialization.initial_pair import InitialPairSelector, rank_initial_pairs
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.refinement import Refiner
-from mpsfm_core.mapping.registration.image_selection import pair_score_matrix
-from mpsfm_core.mapping.registration.registration import PoseSearch
+from mpsfm_core.mapping.registration.image_selection import compute_pair_scores
+from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.scene.reconstruction import MappingResult
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
@@ -26,7 +26,7 @@ POSES = arc_poses(2, 14.0)
 
 def pair_problem(matches: int | None = None) -> MappingProblem:
     """Two views, of whose matches only some are left."""
-    problem = mapping_problem(room_scene(), CAMERA, POSES)
+    problem = make_mapping_problem(room_scene(), CAMERA, POSES)
     (pair,) = problem.pairs
     return replace(
         problem,
@@ -83,7 +83,7 @@ def test_images_that_do_not_fit_are_not_started_with() -> None:
 
 
 def test_the_best_supported_of_the_largest_pairs_comes_first() -> None:
-    problem = mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
+    problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
     rng = np.random.default_rng(0)
     pairs = list(problem.pairs)
     largest = max(range(3), key=lambda k: len(pairs[k]))
@@ -95,11 +95,11 @@ def test_the_best_supported_of_the_largest_pairs_comes_first() -> None:
             count = len(matches)
         pairs[k] = replace(pair, matches=matches[:count], scores=pair.scores[:count])
     doubtful = pairs[largest]
-    options, starts = MapperOptions(), Starts(MapperOptions())
+    options, starts = MapperOptions(), InitialPairSelector(MapperOptions())
     scene = Scene(replace(problem, pairs=tuple(pairs)))
-    refiner = Refiner(scene, options, pair_score_matrix(scene, "match-scores"))
-    search = PoseSearch(scene, refiner, options)
+    refiner = Refiner(scene, options, compute_pair_scores(scene, "match-scores"))
+    search = AbsolutePoseEstimator(scene, refiner, options)
     assert rank_initial_pairs(scene)[0] is doubtful
-    assert starts.ranked(search, np.ones(3, dtype=np.bool_))[-1] is doubtful
+    assert starts.rank_pairs(search, np.ones(3, dtype=np.bool_))[-1] is doubtful
     left = np.isin(np.arange(3), [doubtful.image_a, doubtful.image_b])
-    assert starts.ranked(search, left) == [doubtful]
+    assert starts.rank_pairs(search, left) == [doubtful]

@@ -12,7 +12,7 @@ from mpsfm_core.mapping.refinement.keypoint_noise import (
     measure_loss_scale,
 )
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.testing.synthetic.halls import hall_problem
+from mpsfm_core.testing.synthetic.halls import make_hall_problem
 
 SCALE = 0.65
 
@@ -20,7 +20,7 @@ SCALE = 0.65
 def scene_of(noise_px: float, *, tails: bool = False, wrong: float = 0.0) -> Scene:
     """Nine views of a hall at their true poses; with tails, every fourth keypoint errs 8 times as
     much."""
-    hall = hall_problem(9, keypoint_noise_px=noise_px, wrong_matches=wrong, seed=1)
+    hall = make_hall_problem(9, keypoint_noise_px=noise_px, wrong_matches=wrong, seed=1)
     scene = Scene(hall.problem)
     for number, image in enumerate(hall.problem.images):
         scene.register(number, *hall.truth[image.name])

@@ -13,7 +13,7 @@ from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
-from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
@@ -41,7 +41,7 @@ def depth_ratio(image: RegisteredImage, poses: list[Float64]) -> float:
 
 def test_fixed_poses_stay_and_give_the_world_its_unit() -> None:
     poses = arc_poses(4, 14.0)
-    problem = mapping_problem(room_scene(), CAMERA, poses, noise=Noise(scale=0.1))
+    problem = make_mapping_problem(room_scene(), CAMERA, poses, noise=SyntheticNoise(scale=0.1))
     doubled = {i: np.column_stack([p[:, :3], 2 * p[:, 3]]) for i, p in enumerate(poses)}
     fixed = MapperOptions(known_poses="fixed")
     reconstruction = reconstruct(with_poses(problem, doubled), fixed).reconstructions[0]
@@ -55,7 +55,7 @@ def test_fixed_poses_stay_and_give_the_world_its_unit() -> None:
 def test_a_partial_model_is_continued() -> None:
     poses = arc_poses(5, 14.0)
     problem = with_poses(
-        mapping_problem(room_scene(), CAMERA, poses), {i: poses[i] for i in (0, 1, 2)}
+        make_mapping_problem(room_scene(), CAMERA, poses), {i: poses[i] for i in (0, 1, 2)}
     )
     reconstruction = reconstruct(problem).reconstructions[0]
     assert len(reconstruction.images) == 5
@@ -67,7 +67,7 @@ def test_a_partial_model_is_continued() -> None:
 
 def test_fixed_poses_hold_the_scale_of_each_prior() -> None:
     poses = arc_poses(4, 14.0)
-    problem = with_poses(mapping_problem(room_scene(), CAMERA, poses), dict(enumerate(poses)))
+    problem = with_poses(make_mapping_problem(room_scene(), CAMERA, poses), dict(enumerate(poses)))
     first, *others = problem.images
     depth = first.depth
     assert depth.variance is not None
@@ -79,7 +79,7 @@ def test_fixed_poses_hold_the_scale_of_each_prior() -> None:
 
 def test_images_without_a_pose_are_left_out_beside_fixed_ones() -> None:
     poses = arc_poses(4, 14.0)
-    problem = mapping_problem(room_scene(), CAMERA, poses)
+    problem = make_mapping_problem(room_scene(), CAMERA, poses)
     problem = with_poses(problem, {i: poses[i] for i in (0, 1, 2)})
     result = reconstruct(problem, FIXED)
     assert [image.index for image in result.reconstructions[0].images] == [0, 1, 2]
@@ -91,7 +91,7 @@ def test_images_without_a_pose_are_left_out_beside_fixed_ones() -> None:
 def apart() -> tuple[MappingProblem, list[Float64]]:
     """A chain of five images; every other one has a pose, and none of these match."""
     poses = arc_poses(5, 14.0)
-    problem = mapping_problem(room_scene(), CAMERA, poses, links=RING)
+    problem = make_mapping_problem(room_scene(), CAMERA, poses, links=RING)
     return with_poses(problem, {i: poses[i] for i in (0, 2, 4)}), poses
 
 

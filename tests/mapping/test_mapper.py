@@ -13,7 +13,7 @@ from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.optimize import bundle_problem
-from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, look_at, room_scene
 
 CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
@@ -52,7 +52,7 @@ def depth_errors(result: Reconstruction, problem: MappingProblem, poses: list[Fl
 @pytest.fixture(scope="module")
 def exact() -> tuple[MappingProblem, list[Float64], MappingResult]:
     poses = arc_poses(5, 14.0)
-    problem = mapping_problem(room_scene(), CAMERA, poses)
+    problem = make_mapping_problem(room_scene(), CAMERA, poses)
     return problem, poses, reconstruct(problem)
 
 
@@ -85,8 +85,10 @@ def test_the_result_is_the_same_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> 
     """Run by run, and with one thread or two."""
     monkeypatch.setattr(bundle_problem, "RANGE_SIZE", 300)  # several ranges, so several threads
     poses = arc_poses(4, 12.0)
-    noise = Noise(keypoints_px=0.7, scale=0.05, depth=0.02)
-    problem = mapping_problem(room_scene(), CAMERA, poses, noise=noise, declared_depth_std=0.03)
+    noise = SyntheticNoise(keypoints_px=0.7, scale=0.05, depth=0.02)
+    problem = make_mapping_problem(
+        room_scene(), CAMERA, poses, noise=noise, declared_depth_std=0.03
+    )
     defaults = MapperOptions().refinement
     runs = []
     for threads in (1, 2, 2):
@@ -104,8 +106,8 @@ def test_the_result_is_the_same_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_chain_of_two_view_links_is_registered_by_lifting() -> None:
     """No point is seen by three views through matches: COLMAP could not pass the scale on."""
     poses = arc_poses(4, 20.0)
-    noise = Noise(keypoints_px=0.5, scale=0.03, depth=0.01)
-    problem = mapping_problem(
+    noise = SyntheticNoise(keypoints_px=0.5, scale=0.03, depth=0.01)
+    problem = make_mapping_problem(
         room_scene(),
         CAMERA,
         poses,
@@ -127,8 +129,8 @@ def test_a_chain_of_two_view_links_is_registered_by_lifting() -> None:
 def test_pure_rotation_is_solved_by_depth() -> None:
     eye = (-1.5, 0.0, 1.5)
     poses = [look_at(eye, (1.5, y, 0.9)) for y in (-0.6, 0.0, 0.6)]
-    problem = mapping_problem(
-        room_scene(), CAMERA, poses, noise=Noise(keypoints_px=0.3), declared_depth_std=0.01
+    problem = make_mapping_problem(
+        room_scene(), CAMERA, poses, noise=SyntheticNoise(keypoints_px=0.3), declared_depth_std=0.01
     )
     reconstruction = reconstruct(problem).reconstructions[0]
     assert len(reconstruction.images) == 3
@@ -141,7 +143,9 @@ def test_pure_rotation_is_solved_by_depth() -> None:
 
 def test_separate_groups_become_components_largest_first() -> None:
     poses = arc_poses(5, 14.0)
-    problem = mapping_problem(room_scene(), CAMERA, poses, links=[(0, 1), (2, 3), (3, 4), (2, 4)])
+    problem = make_mapping_problem(
+        room_scene(), CAMERA, poses, links=[(0, 1), (2, 3), (3, 4), (2, 4)]
+    )
     result = reconstruct(problem)
     sizes = [[i.index for i in r.images] for r in result.reconstructions]
     assert sizes == [[2, 3, 4], [0, 1]]
@@ -150,7 +154,7 @@ def test_separate_groups_become_components_largest_first() -> None:
 
 def test_unmatched_images_are_reported() -> None:
     poses = arc_poses(3, 14.0)
-    problem = mapping_problem(room_scene(), CAMERA, poses, links=[(0, 1)])
+    problem = make_mapping_problem(room_scene(), CAMERA, poses, links=[(0, 1)])
     result = reconstruct(problem)
     assert list(result.report.image_reasons) == ["view_2.png"]
 
@@ -158,7 +162,7 @@ def test_unmatched_images_are_reported() -> None:
 def test_reasons_say_what_kept_an_image_out() -> None:
     poses = arc_poses(6, 14.0)
     links = [(0, 1), (1, 2), (0, 2), (3, 4)]
-    problem = mapping_problem(room_scene(), CAMERA, poses, links=links)
+    problem = make_mapping_problem(room_scene(), CAMERA, poses, links=links)
     last = problem.images[5]
     nowhere = replace(last.depth, valid=np.zeros_like(last.depth.valid))
     problem = replace(problem, images=(*problem.images[:5], replace(last, depth=nowhere)))
@@ -170,7 +174,7 @@ def test_reasons_say_what_kept_an_image_out() -> None:
 
 
 def test_no_pairs_give_no_reconstruction() -> None:
-    problem = mapping_problem(room_scene(), CAMERA, arc_poses(2, 14.0), links=[])
+    problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(2, 14.0), links=[])
     result = reconstruct(problem)
     assert result.reconstructions == ()
     assert len(result.report.image_reasons) == 2
@@ -178,7 +182,9 @@ def test_no_pairs_give_no_reconstruction() -> None:
 
 def test_a_guessed_focal_length_is_refined_and_shared() -> None:
     poses = arc_poses(5, 14.0)
-    problem = mapping_problem(room_scene(), CAMERA, poses, noise=Noise(keypoints_px=0.3))
+    problem = make_mapping_problem(
+        room_scene(), CAMERA, poses, noise=SyntheticNoise(keypoints_px=0.3)
+    )
     guess = replace(CAMERA, fx=1.08 * CAMERA.fx, fy=1.08 * CAMERA.fy)
     images = tuple(replace(i, camera=guess, focal_known=False) for i in problem.images)
     guessed = MappingProblem(images, problem.pairs)

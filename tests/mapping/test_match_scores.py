@@ -11,12 +11,12 @@ from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
-from mpsfm_core.mapping.registration.correspondences import Correspondences
-from mpsfm_core.mapping.registration.pose_hypotheses import Hypothesis
-from mpsfm_core.mapping.registration.pose_support import rate_pose
+from mpsfm_core.mapping.registration.correspondences import PoseCorrespondences
+from mpsfm_core.mapping.registration.pose_hypotheses import PoseHypothesis
+from mpsfm_core.mapping.registration.pose_support import score_pose
 from mpsfm_core.mapping.scene.graph import MIN_SCORE, CorrespondenceGraph
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
@@ -26,8 +26,13 @@ POSES = arc_poses(3, 14.0)
 def problem_with_doubtful_matches(seed: int = 0) -> MappingProblem:
     """Each match sees a point of its own. Of four keypoints three are off by 2 px (standard
     deviation), and their matches have a low score."""
-    problem = mapping_problem(
-        room_scene(), CAMERA, POSES, noise=Noise(keypoints_px=0.1), two_view_tracks=True, seed=seed
+    problem = make_mapping_problem(
+        room_scene(),
+        CAMERA,
+        POSES,
+        noise=SyntheticNoise(keypoints_px=0.1),
+        two_view_tracks=True,
+        seed=seed,
     )
     rng = np.random.default_rng(seed)
     doubtful = [np.arange(len(image.keypoints)) % 4 > 0 for image in problem.images]
@@ -87,7 +92,7 @@ def test_keypoints_weigh_by_their_best_match_relative_to_the_mean() -> None:
 
 
 def test_adjusted_keypoints_weigh_by_what_is_left_of_their_variance() -> None:
-    problem = mapping_problem(room_scene(), CAMERA, POSES)
+    problem = make_mapping_problem(room_scene(), CAMERA, POSES)
     factor = np.ones(problem.num_keypoints(1))
     factor[::2] = 0.25
     images = list(problem.images)
@@ -104,7 +109,7 @@ def test_adjusted_keypoints_weigh_by_what_is_left_of_their_variance() -> None:
 
 @pytest.mark.parametrize("score", [0.0, 0.3, 1.0])
 def test_equal_scores_are_as_good_as_none(score: float) -> None:
-    problem = mapping_problem(room_scene(), CAMERA, POSES)
+    problem = make_mapping_problem(room_scene(), CAMERA, POSES)
     equal = MappingProblem(
         problem.images,
         tuple(
@@ -119,7 +124,7 @@ def test_equal_scores_are_as_good_as_none(score: float) -> None:
 
 
 def test_support_and_inlier_share_count_scores_and_inliers_count_matches() -> None:
-    problem = mapping_problem(room_scene(), CAMERA, POSES)
+    problem = make_mapping_problem(room_scene(), CAMERA, POSES)
     scene = Scene(problem)
     count = 10
     keypoints = np.arange(count) + scene.graph.offsets[1]
@@ -127,9 +132,11 @@ def test_support_and_inlier_share_count_scores_and_inliers_count_matches() -> No
     points[6:, 0] += 1.0  # but for the last four
     scores = np.where(np.arange(count) < 6, 0.9, 0.1)
     references, known = np.zeros(count, dtype=np.int64), np.ones(count, dtype=np.bool_)
-    found = Correspondences(keypoints, keypoints, points, points, points, references, known, scores)
+    found = PoseCorrespondences(
+        keypoints, keypoints, points, points, points, references, known, scores
+    )
     options = RegistrationOptions(depth_deviations=1e6)
-    pose = rate_pose(scene, found, Hypothesis(np.eye(3), np.zeros(3), "PnP"), options)
+    pose = score_pose(scene, found, PoseHypothesis(np.eye(3), np.zeros(3), "PnP"), options)
     assert pose.num_inliers == 6
     assert pose.support == pytest.approx(5.4)
-    assert pose.inlier_share == pytest.approx(5.4 / 5.8)
+    assert pose.inlier_ratio == pytest.approx(5.4 / 5.8)

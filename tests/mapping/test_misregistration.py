@@ -13,15 +13,15 @@ from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.component import Group
 from mpsfm_core.mapping.consistency import misregistration as module
 from mpsfm_core.mapping.consistency.misregistration import (
-    WeakHold,
-    pair_matches,
-    weak_holds,
-    widest_ways,
+    Misregistration,
+    compute_widest_paths,
+    count_pair_matches,
+    detect_misregistrations,
 )
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
@@ -36,15 +36,15 @@ def symmetric(n: int, entries: dict[tuple[int, int], int]) -> Int64:
 
 def holds(
     matches: Int64, explained: Int64, registered: Bool, monkeypatch: pytest.MonkeyPatch
-) -> list[WeakHold]:
+) -> list[Misregistration]:
     """Of a scene of which nothing but that is known."""
 
     def mask(images: Int64) -> Bool:
         return np.isin(np.arange(len(matches)), images)
 
-    monkeypatch.setattr(module, "pair_matches", lambda scene: (matches, explained))
+    monkeypatch.setattr(module, "count_pair_matches", lambda scene: (matches, explained))
     scene = SimpleNamespace(registered=registered, mask=mask)
-    return weak_holds(scene, 30)  # type: ignore[arg-type]
+    return detect_misregistrations(scene, 30)  # type: ignore[arg-type]
 
 
 def test_a_pair_that_has_more_matches_than_hold_it_apart(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,7 +95,7 @@ def test_widest_ways_are_those_of_all_ways() -> None:
     for _ in range(20):
         upper = np.triu(rng.integers(0, 9, (7, 7)) * (rng.random((7, 7)) < 0.5), 1)
         widest = (upper + upper.T).astype(np.int64)
-        found = widest_ways(widest)
+        found = compute_widest_paths(widest)
         for k, i, j in product(range(7), repeat=3):
             widest[i, j] = max(widest[i, j], min(widest[i, k], widest[k, j]))
         np.fill_diagonal(widest, 0)
@@ -106,7 +106,7 @@ def test_widest_ways_are_those_of_all_ways() -> None:
 @pytest.fixture
 def group() -> Group:
     """All of an exact scene is registered."""
-    problem = mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0))
+    problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0))
     mapper = Mapper(problem, MapperOptions(), NullMappingEvents())
     mapper.reconstruct_next()
     return mapper.group
@@ -124,14 +124,14 @@ def misplace(group: Group, image: int) -> None:
 
 
 def test_an_image_comes_to_where_more_matches_tie_it(group: Group) -> None:
-    assert weak_holds(group.scene, 30) == []
+    assert detect_misregistrations(group.scene, 30) == []
     right = group.scene.rotations.copy()
     misplace(group, 4)
-    assert [hold.images for hold in weak_holds(group.scene, 30)] == [(4,)]
+    assert [hold.images for hold in detect_misregistrations(group.scene, 30)] == [(4,)]
     group.reseat(np.ones(5, np.bool_))
     assert group.scene.registered.all()
     assert rotation_angle_deg(group.scene.rotations @ right.transpose(0, 2, 1)).max() < 0.1
-    matches, explained = pair_matches(group.scene)
+    matches, explained = count_pair_matches(group.scene)
     assert explained[4].sum() > 0.8 * matches[4].sum()
 
 
@@ -152,7 +152,7 @@ def test_an_image_that_nothing_else_holds_stays(
 @pytest.mark.parametrize(("known", "moves"), [("start", False), ("guess", True)])
 def test_images_that_came_with_a_pose_stay_unless_it_is_a_guess(known: str, moves: bool) -> None:
     poses = arc_poses(5, 14.0)
-    problem = mapping_problem(room_scene(), CAMERA, poses)
+    problem = make_mapping_problem(room_scene(), CAMERA, poses)
     named = zip(problem.images, poses, strict=True)
     problem = problem.with_poses({i.name: (p[:, :3].copy(), p[:, 3].copy()) for i, p in named})
     mapper = Mapper(problem, MapperOptions(known_poses=known), NullMappingEvents())  # type: ignore[arg-type]

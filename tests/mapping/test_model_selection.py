@@ -10,12 +10,12 @@ import pytest
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.mapping import mapper
-from mpsfm_core.mapping.consistency.depth_agreement import agreeing_depth
+from mpsfm_core.mapping.consistency.depth_agreement import measure_depth_agreement
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.model_selection import Run, best, explained_score, total_score
 from mpsfm_core.mapping.options import ConsistencyOptions, MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
-from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 OPTIONS = ConsistencyOptions()
@@ -25,8 +25,8 @@ CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 @pytest.fixture(scope="module")
 def problem() -> MappingProblem:
     """Four views on an arc."""
-    return mapping_problem(
-        room_scene(), CAMERA, arc_poses(4, 21.0), noise=Noise(keypoints_px=0.3, depth=0.01)
+    return make_mapping_problem(
+        room_scene(), CAMERA, arc_poses(4, 21.0), noise=SyntheticNoise(keypoints_px=0.3, depth=0.01)
     )
 
 
@@ -148,6 +148,6 @@ def test_of_runs_that_are_alike_that_counts_in_which_depth_agrees(problem: Mappi
     turned = np.diag([-1.0, 1.0, -1.0])
     away = replace(last, rotation=turned @ last.rotation, translation=turned @ last.translation)
     elsewhere = replace(model, images=(*rest, away))
-    assert agreeing_depth(elsewhere, OPTIONS) < agreeing_depth(model, OPTIONS)
+    assert measure_depth_agreement(elsewhere, OPTIONS) < measure_depth_agreement(model, OPTIONS)
     right, wrong = (Run([m], [e], MappingReport()) for m, e in ((model, 0.650), (elsewhere, 0.655)))
     assert best([right, wrong], OPTIONS) is best([wrong, right], OPTIONS) is right

@@ -11,43 +11,43 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import Bool, Float64, MappingProblem, PinholeCamera, VerifiedPair
-from mpsfm_core.mapping.consistency.pair_consistency import PairCheck, Verdict
+from mpsfm_core.mapping.consistency.pair_consistency import PairConsistency, PairConsistencyCheck
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.refinement import Refiner
-from mpsfm_core.mapping.registration.image_selection import pair_score_matrix
-from mpsfm_core.mapping.registration.registration import PoseSearch
+from mpsfm_core.mapping.registration.image_selection import compute_pair_scores
+from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
-from mpsfm_core.testing.synthetic.two_rooms import twin_room_problem
+from mpsfm_core.testing.synthetic.two_rooms import make_twin_room_problem
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
-Check = TypeVar("Check", bound=PairCheck)
+Check = TypeVar("Check", bound=PairConsistencyCheck)
 
 
 def checker(problem: MappingProblem, kind: type[Check]) -> Check:
     options, scene = MapperOptions(), Scene(problem)
-    refiner = Refiner(scene, options, pair_score_matrix(scene, "match-scores"))
-    return kind(PoseSearch(scene, refiner, options), options)
+    refiner = Refiner(scene, options, compute_pair_scores(scene, "match-scores"))
+    return kind(AbsolutePoseEstimator(scene, refiner, options), options)
 
 
 def test_right_pairs_are_allowed_and_many_look_alikes_are_not() -> None:
     """Views of twin rooms, of which the pieces that differ tell."""
-    case = twin_room_problem(0)
-    check, false = checker(case.problem, PairCheck), np.array(case.false)
-    shares = np.array([check.verdict(pair).share for pair in case.problem.pairs])
+    case = make_twin_room_problem(0)
+    check, false = checker(case.problem, PairConsistencyCheck), np.array(case.false)
+    shares = np.array([check.check_pair(pair).share for pair in case.problem.pairs])
     assert (shares[~false] > 0).mean() > 0.97
     assert (shares[false] == 0).mean() > 0.5
 
 
-class Judged(PairCheck):
+class Judged(PairConsistencyCheck):
     """With verdicts that are given, by images."""
 
-    verdicts: Mapping[tuple[int, int], Verdict]
+    verdicts: Mapping[tuple[int, int], PairConsistency]
 
-    def verdict(self, pair: VerifiedPair) -> Verdict:
+    def check_pair(self, pair: VerifiedPair) -> PairConsistency:
         return self.verdicts[pair.image_a, pair.image_b]
 
 
@@ -56,7 +56,7 @@ def weighed(
 ) -> tuple[MappingProblem, MappingProblem]:
     """Three images, and what is left of them: pairs 0-1 and 1-2, which depth allows, and 0-2 with
     a share and turned against them. ``counts``: matches of the pairs 0-1, 0-2 and 1-2."""
-    problem = mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
+    problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
     pairs = [
         replace(pair, matches=pair.matches[:count], scores=pair.scores[:count])
         for pair, count in zip(problem.pairs, counts, strict=True)
@@ -66,11 +66,11 @@ def weighed(
     check = checker(problem, Judged)
     turn: Float64 = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
     check.verdicts = {
-        (0, 1): Verdict(pairs[0].rotation, 1.0),
-        (0, 2): Verdict(turn @ pairs[2].rotation @ pairs[0].rotation, share),
-        (1, 2): Verdict(pairs[2].rotation, 1.0),
+        (0, 1): PairConsistency(pairs[0].rotation, 1.0),
+        (0, 2): PairConsistency(turn @ pairs[2].rotation @ pairs[0].rotation, share),
+        (1, 2): PairConsistency(pairs[2].rotation, 1.0),
     }
-    return problem, check.weighed(problem, np.ones(3, dtype=np.bool_))
+    return problem, check.reweight_pairs(problem, np.ones(3, dtype=np.bool_))
 
 
 def test_what_depth_and_other_pairs_refute_does_not_count() -> None:
@@ -97,23 +97,23 @@ def test_matches_count_as_far_as_an_allowed_pose_is_supported() -> None:
 
 def test_only_pairs_of_images_that_are_left_are_asked() -> None:
     """What lies in groups before is settled, and may be most of what there is."""
-    problem = mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
+    problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
     check = checker(problem, Judged)
-    check.verdicts = {(1, 2): Verdict(np.eye(3), 0.5)}
-    left = check.weighed(problem, np.array([False, True, True]))
+    check.verdicts = {(1, 2): PairConsistency(np.eye(3), 0.5)}
+    left = check.reweight_pairs(problem, np.array([False, True, True]))
     assert left.pairs[:2] == problem.pairs[:2]
     np.testing.assert_allclose(left.pairs[2].scores, 0.5 * problem.pairs[2].scores)
 
 
 def test_well_connected_images_need_no_check(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(self: PairCheck, problem: MappingProblem, left: Bool) -> MappingProblem:
+    def refuse(self: PairConsistencyCheck, problem: MappingProblem, left: Bool) -> MappingProblem:
         raise AssertionError("not to be asked")
 
-    problem = mapping_problem(room_scene(), CAMERA, arc_poses(4, 10.0))
-    monkeypatch.setattr(PairCheck, "weighed", refuse)
+    problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(4, 10.0))
+    monkeypatch.setattr(PairConsistencyCheck, "reweight_pairs", refuse)
     (model,) = reconstruct(problem).reconstructions
     assert len(model.images) == 4
     pair_alone = MapperOptions.model_validate(
-        {"initialization": {"all_at_once": False}, "consistency": {"check_pairs": False}}
+        {"initialization": {"global_initialization": False}, "consistency": {"check_pairs": False}}
     )
     assert reconstruct(problem, pair_alone).reconstructions

@@ -15,10 +15,10 @@ from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.maintenance import Upkeep
-from mpsfm_core.mapping.registration.incremental import Growth
-from mpsfm_core.mapping.registration.pose_support import AbsolutePose
-from mpsfm_core.mapping.registration.registration import distinct
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.mapping.registration.incremental_registration import IncrementalRegistration
+from mpsfm_core.mapping.registration.pose_estimation import select_distinct_poses
+from mpsfm_core.mapping.registration.pose_support import ScoredPose
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
@@ -28,7 +28,7 @@ CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 def group() -> Group:
     """All of an exact scene is registered."""
     mapper = Mapper(
-        mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0)),
+        make_mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0)),
         MapperOptions(),
         NullMappingEvents(),
     )
@@ -51,75 +51,73 @@ def take_out(group: Group, *images: int) -> None:
 
 def test_the_view_that_several_newcomers_contradict_goes_once(group: Group) -> None:
     take_out(group, 0, 4)
-    group.upkeep.attempts.blame(3, 0)
-    group.upkeep.attempts.blame(3, 4)
-    group.upkeep.attempts.blame(1, 4)
-    assert group.growth.displace()
+    group.upkeep.history.record_contradiction(3, 0)
+    group.upkeep.history.record_contradiction(3, 4)
+    group.upkeep.history.record_contradiction(1, 4)
+    assert group.growth.deregister_contradicted_image()
     assert np.flatnonzero(~group.scene.registered).tolist() == [0, 3, 4]
     assert "2 other images contradict" in group.upkeep.journal.image_reasons["view_3.png"]
-    while group.growth.register_next(np.ones(5, dtype=np.bool_)):
+    while group.growth.register_next_image(np.ones(5, dtype=np.bool_)):
         pass
     assert group.scene.registered[3], "it may come back"
     take_out(group, 0, 4)
-    group.upkeep.attempts.blame(3, 0)
-    group.upkeep.attempts.blame(3, 4)
-    assert not group.growth.displace(), "but goes only once"
+    group.upkeep.history.record_contradiction(3, 0)
+    group.upkeep.history.record_contradiction(3, 4)
+    assert not group.growth.deregister_contradicted_image(), "but goes only once"
 
 
 def test_one_newcomer_is_not_believed(group: Group) -> None:
     take_out(group, 4)
-    group.upkeep.attempts.blame(3, 4)
-    assert not group.growth.displace()
+    group.upkeep.history.record_contradiction(3, 4)
+    assert not group.growth.deregister_contradicted_image()
     assert group.scene.registered[3]
 
 
 def test_newcomers_that_were_registered_since_blame_no_more(group: Group) -> None:
-    group.upkeep.attempts.blame(3, 0)
-    group.upkeep.attempts.blame(3, 4)
-    assert not group.growth.displace()
+    group.upkeep.history.record_contradiction(3, 0)
+    group.upkeep.history.record_contradiction(3, 4)
+    assert not group.growth.deregister_contradicted_image()
 
 
 def test_a_refused_pose_is_tried_again_only_in_another_scene(group: Group) -> None:
-    pose = AbsolutePose(np.eye(3), np.zeros(3), "PnP", 1.0, 30, 1.0)
-    group.upkeep.attempts.refuse(2, pose, "it floats")
-    assert group.upkeep.attempts.refusal(2, replace(pose, support=2.0)) == "it floats"
-    assert group.upkeep.attempts.refusal(2, replace(pose, translation=np.ones(3))) is None
-    assert group.upkeep.attempts.refusal(1, pose) is None
+    pose = ScoredPose(np.eye(3), np.zeros(3), "PnP", 1.0, 30, 1.0)
+    group.upkeep.history.reject_pose(2, pose, "it floats")
+    assert group.upkeep.history.pose_rejection(2, replace(pose, support=2.0)) == "it floats"
+    assert group.upkeep.history.pose_rejection(2, replace(pose, translation=np.ones(3))) is None
+    assert group.upkeep.history.pose_rejection(1, pose) is None
     group.upkeep.drop([4], "to change the scene")
-    assert group.upkeep.attempts.refusal(2, pose) is None
+    assert group.upkeep.history.pose_rejection(2, pose) is None
 
 
 def test_of_poses_turned_little_the_best_supported_one_counts() -> None:
-    def pose(degrees: float, support: float) -> AbsolutePose:
+    def pose(degrees: float, support: float) -> ScoredPose:
         turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
-        return AbsolutePose(turn, np.zeros(3), "PnP", support, 30, 1.0)
+        return ScoredPose(turn, np.zeros(3), "PnP", support, 30, 1.0)
 
     poses = [pose(0, 1.0), pose(2, 3.0), pose(90, 2.0), pose(91, 0.5), pose(45, 0.1)]
-    assert [found.support for found in distinct(poses)] == [3.0, 2.0, 0.1]
-    assert [found.support for found in distinct(poses, 2)] == [3.0, 2.0]
-    assert distinct([]) == []
+    assert [found.support for found in select_distinct_poses(poses)] == [3.0, 2.0, 0.1]
+    assert [found.support for found in select_distinct_poses(poses, 2)] == [3.0, 2.0]
+    assert select_distinct_poses([]) == []
 
 
 def test_a_pose_that_was_found_before_is_tried_once(
     group: Group, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The best one of the last attempt is found again by the next search, but for rounding."""
-    scene, attempts = group.scene, group.upkeep.attempts
+    scene, history = group.scene, group.upkeep.history
     turn = Rotation.from_euler("y", 0.1, degrees=True).as_matrix()
-    known = AbsolutePose(
-        turn @ scene.rotations[4], turn @ scene.translations[4], "PnP", 1.0, 30, 1.0
-    )
+    known = ScoredPose(turn @ scene.rotations[4], turn @ scene.translations[4], "PnP", 1.0, 30, 1.0)
     take_out(group, 4)
-    attempts.forget()
-    attempts.remember(4, [3], known, searched=True)
-    tried: list[AbsolutePose] = []
+    history.clear()
+    history.record_attempt(4, [3], known, searched=True)
+    tried: list[ScoredPose] = []
 
-    def contradicted(image: int, pose: AbsolutePose, *rest: object, **more: object) -> str:
+    def contradicted(image: int, pose: ScoredPose, *rest: object, **more: object) -> str:
         tried.append(pose)
         return "it floats"
 
-    monkeypatch.setattr(group.growth, "_try_pose", contradicted)
-    assert group.growth._try_image(4, [3]) == "it floats"
+    monkeypatch.setattr(group.growth, "_extend_model", contradicted)
+    assert group.growth._register_image(4, [3]) == "it floats"
     assert len(tried) == 1
 
 
@@ -160,7 +158,7 @@ def test_an_image_that_only_drift_contradicts_is_registered(
 ) -> None:
     """The image in the middle of a chain sees both halves, and these have drifted apart."""
     links = [(0, 1), (1, 2), (2, 3), (3, 4)]
-    problem = mapping_problem(
+    problem = make_mapping_problem(
         room_scene(), CAMERA, arc_poses(5, 14.0), links=links, declared_depth_std=0.02
     )
     mapper = Mapper(problem, MapperOptions(), NullMappingEvents())
@@ -169,15 +167,15 @@ def test_an_image_that_only_drift_contradicts_is_registered(
     scene = group.scene
     true_centers = scene.centers()
     take_out(group, 2)
-    group.upkeep.attempts.forget()
+    group.upkeep.history.clear()
     observed = np.flatnonzero(scene.tracks.point_of >= 0)
     far = scene.mask([3, 4])[scene.graph.image_of[observed]]
     scene.tracks.xyz[np.unique(scene.tracks.point_of[observed[far]])] += drift
     for image in (3, 4):
         scene.translations[image] -= scene.rotations[image] @ drift
     if not settles:
-        monkeypatch.setattr(group.growth, "_reconsider", lambda available: False)
-    registered = group.growth.register_next(np.ones(5, dtype=np.bool_))
+        monkeypatch.setattr(group.growth, "_register_contradicted_image", lambda available: False)
+    registered = group.growth.register_next_image(np.ones(5, dtype=np.bool_))
     assert registered == scene.registered[2] == settles
     if settles:
         steps = np.linalg.norm(np.diff(scene.centers(), axis=0), axis=1)
@@ -187,14 +185,14 @@ def test_an_image_that_only_drift_contradicts_is_registered(
         assert "contradict the depth" in group.upkeep.journal.image_reasons["view_2.png"]
 
 
-class Few(Growth):
+class Few(IncrementalRegistration):
     """Registers ``limit`` images beside the first pair."""
 
     limit = 0
 
-    def register_next(self, available: Bool, *, wide: bool = False) -> bool:
+    def register_next_image(self, available: Bool, *, wide: bool = False) -> bool:
         self.limit -= 1
-        return self.limit >= 0 and super().register_next(available, wide=wide)
+        return self.limit >= 0 and super().register_next_image(available, wide=wide)
 
 
 class Critical(Upkeep):
@@ -218,8 +216,8 @@ class Limited(Group):
 def test_the_group_that_ends_larger_gets_the_images(
     second_limit: int, kept: int, sizes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem = mapping_problem(room_scene(), CAMERA, arc_poses(6, 14.0))
-    options = MapperOptions.model_validate({"initialization": {"all_at_once": False}})
+    problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(6, 14.0))
+    options = MapperOptions.model_validate({"initialization": {"global_initialization": False}})
     mapper = Mapper(problem, options, NullMappingEvents())
     mapper.group_type = Limited
     monkeypatch.setattr(Critical, "kept", kept)

@@ -13,7 +13,7 @@ from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.depth_noise import DepthNoise
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
@@ -21,7 +21,7 @@ CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 def mapped(declared_depth_std: float, *, nearer: float = 1.0) -> Group:
     """Three registered images, in metres; the prior of the last one is so many times too near."""
-    problem = mapping_problem(
+    problem = make_mapping_problem(
         room_scene(), CAMERA, arc_poses(3, 14.0), declared_depth_std=declared_depth_std
     )
     last = problem.images[-1]
@@ -89,7 +89,7 @@ def test_the_unit_of_the_world_stays_where_one_scale_is_unlike_the_others() -> N
 
 
 def test_a_focal_length_that_runs_away_changes_nothing() -> None:
-    problem = mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
+    problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
     guess = replace(CAMERA, fx=1.1 * CAMERA.fx, fy=1.1 * CAMERA.fy)
     images = tuple(replace(image, camera=guess, focal_known=False) for image in problem.images)
     keep = MapperOptions.model_validate({"refinement": {"refine_focal": False}})

@@ -9,11 +9,11 @@ import pytest
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.mapping.initialization.seed_poses import held_images, starting_from
+from mpsfm_core.mapping.initialization.seed_poses import select_seed_images, with_seed_poses
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, MappingResult, Reconstruction
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
@@ -22,7 +22,7 @@ POSES = arc_poses(5, 14.0)
 
 @pytest.fixture(scope="module")
 def problem() -> MappingProblem:
-    return mapping_problem(room_scene(), CAMERA, POSES)
+    return make_mapping_problem(room_scene(), CAMERA, POSES)
 
 
 @pytest.fixture(scope="module")
@@ -45,17 +45,17 @@ def test_points_that_three_images_see_hold(mapped: MappingResult) -> None:
     ids = [[0, 1, -1, 0], [1, 0, 2], [0, -1, 2, 3], [1, 3]]
     few = in_part(mapped, ids)
     assert few.reconstructions[0].num_multi_view_points().tolist() == [2, 2, 1, 1]
-    assert [image.index for image in held_images(few, 2)] == [0, 1]
-    assert not held_images(in_part(mapped, ids, confirmed=False), 1)
-    assert not held_images(MappingResult((), MappingReport()), 1)
+    assert [image.index for image in select_seed_images(few, 2)] == [0, 1]
+    assert not select_seed_images(in_part(mapped, ids, confirmed=False), 1)
+    assert not select_seed_images(MappingResult((), MappingReport()), 1)
 
 
 def test_it_goes_on_in_metres(problem: MappingProblem, mapped: MappingResult) -> None:
-    held = held_images(mapped, 30)
+    held = select_seed_images(mapped, 30)
     assert len(held) == 4
     tenth = [replace(image, translation=image.translation / 10) for image in held]
     guess = MapperOptions(known_poses="guess")
-    (found,) = reconstruct(starting_from(problem, tenth), guess).reconstructions
+    (found,) = reconstruct(with_seed_poses(problem, tenth), guess).reconstructions
     assert found.metric is not None and found.metric.trusted
     assert [image.index for image in found.images] == [0, 1, 2, 3, 4]
     first, *others = found.images
@@ -75,7 +75,7 @@ def test_refined_focal_lengths_are_those_of_all_images_of_a_camera(
     images = mapped.reconstructions[0].images[:2]
     known = replace(problem.images[4], known_pose=(np.eye(3), np.ones(3)))
     problem = replace(problem, images=(*problem.images[:4], known))
-    started = starting_from(problem, [replace(image, camera=refined) for image in images])
+    started = with_seed_poses(problem, [replace(image, camera=refined) for image in images])
     assert {image.camera for image in started.images} == {refined}
     given = [image.known_pose is not None for image in started.images]
     assert given == [True, True, False, False, True]

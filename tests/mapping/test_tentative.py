@@ -12,13 +12,13 @@ from mpsfm_core.geometry import compose, invert, rotation_angle_deg
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
 POSES = arc_poses(6, 14.0)
 LINKS = [(2, 3), (3, 4), (2, 4), (1, 2), (0, 1)]
-COMPLETE = MapperOptions(place_unconfirmed=True)
+COMPLETE = MapperOptions(register_tentatively=True)
 
 
 def with_few_matches(problem: MappingProblem, weak: tuple[int, int]) -> MappingProblem:
@@ -35,7 +35,7 @@ def with_few_matches(problem: MappingProblem, weak: tuple[int, int]) -> MappingP
 @pytest.fixture(scope="module", params=[True, False], ids=["metric", "up to scale"])
 def problem(request: pytest.FixtureRequest) -> MappingProblem:
     """Three images, two that eight matches hold to them, and one without matches."""
-    whole = with_few_matches(mapping_problem(room_scene(), CAMERA, POSES, links=LINKS), (1, 2))
+    whole = with_few_matches(make_mapping_problem(room_scene(), CAMERA, POSES, links=LINKS), (1, 2))
     images = tuple(
         replace(image, depth=replace(image.depth, metric=request.param)) for image in whole.images
     )
@@ -96,7 +96,7 @@ def test_scales_of_placed_images_fit_the_others(problem: MappingProblem) -> None
 
 
 def test_a_complete_reconstruction_stays_as_it_is() -> None:
-    problem = mapping_problem(room_scene(), CAMERA, POSES[:3])
+    problem = make_mapping_problem(room_scene(), CAMERA, POSES[:3])
     best = reconstruct(problem, COMPLETE).reconstructions[0]
     assert len(best.images) == 3
     assert best.confirmed_images == best.images

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.registration.threshold_schedule import FailureLadder
+from mpsfm_core.mapping.registration.threshold_schedule import ThresholdSchedule
 
 
 def test_depth_has_to_bear_out_what_matches_lack() -> None:
     """Each step asks less of matches and, by the same factor, more of the depth check."""
     options = RegistrationOptions(min_inliers=36, min_inlier_share=0.72, max_relaxations=2)
-    ladder = FailureLadder(options)
+    ladder = ThresholdSchedule(options)
     found = []
     while True:
         found.append((ladder.min_inliers, ladder.min_inlier_share, ladder.max_violations(0.036)))

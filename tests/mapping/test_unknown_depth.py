@@ -11,20 +11,20 @@ from mpsfm_core.data import DepthPrior, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration.correspondences import (
-    WORTH_OF_RAY,
-    Correspondences,
-    correspondences,
+    RAY_MATCH_WEIGHT,
+    PoseCorrespondences,
+    find_correspondences,
 )
-from mpsfm_core.mapping.registration.pose_hypotheses import Hypothesis
-from mpsfm_core.mapping.registration.pose_support import rate_pose
-from mpsfm_core.mapping.registration.registration import find_poses
+from mpsfm_core.mapping.registration.pose_estimation import estimate_candidate_poses
+from mpsfm_core.mapping.registration.pose_hypotheses import PoseHypothesis
+from mpsfm_core.mapping.registration.pose_support import score_pose
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 POSES = arc_poses(2, 14.0)
-TRUTH = Hypothesis(POSES[1][:, :3], POSES[1][:, 3], "truth")
+TRUTH = PoseHypothesis(POSES[1][:, :3], POSES[1][:, 3], "truth")
 OPTIONS = RegistrationOptions()
 Part = tuple[slice, slice]
 NOWHERE: Part = (slice(0), slice(0))
@@ -42,8 +42,8 @@ STRIPS: Mapping[str, Part] = {
 def scene_with_depth_in(part: Part, seed: int = 0) -> Scene:
     """Two views, the first of them in place; depth is known in a part of either alone, and how
     they lie to each other is not."""
-    noise = Noise(keypoints_px=0.7, depth=0.01)
-    problem = mapping_problem(room_scene(), CAMERA, POSES, noise=noise, seed=seed)
+    noise = SyntheticNoise(keypoints_px=0.7, depth=0.01)
+    problem = make_mapping_problem(room_scene(), CAMERA, POSES, noise=noise, seed=seed)
     images = []
     for image in problem.images:
         depth = image.depth
@@ -58,15 +58,15 @@ def scene_with_depth_in(part: Part, seed: int = 0) -> Scene:
     return scene
 
 
-def error_deg(scene: Scene, found: Correspondences) -> float:
+def error_deg(scene: Scene, found: PoseCorrespondences) -> float:
     """Of the best pose that the matches give."""
-    best = find_poses(scene, 1, found, OPTIONS, seed=0, attempt=0)[0]
+    best = estimate_candidate_poses(scene, 1, found, OPTIONS, seed=0, attempt=0)[0]
     return float(rotation_angle_deg(best.rotation @ TRUTH.rotation.T))
 
 
 def test_a_ray_reaches_from_the_nearest_to_the_farthest_depth_that_its_view_knows() -> None:
     scene = scene_with_depth_in(LEFT_HALF)
-    found = correspondences(scene, 1, [0], OPTIONS)
+    found = find_correspondences(scene, 1, [0], OPTIONS)
     depth_map = scene.maps[0]
     rows = found.matched - scene.graph.offsets[0]
     np.testing.assert_array_equal(found.known, depth_map.keypoint_valid[rows])
@@ -81,28 +81,30 @@ def test_a_ray_reaches_from_the_nearest_to_the_farthest_depth_that_its_view_know
 
 def test_rays_count_half() -> None:
     scene = scene_with_depth_in(LEFT_HALF)
-    found = correspondences(scene, 1, [0], OPTIONS)
-    everywhere = correspondences(scene_with_depth_in(EVERYWHERE), 1, [0], OPTIONS)
+    found = find_correspondences(scene, 1, [0], OPTIONS)
+    everywhere = find_correspondences(scene_with_depth_in(EVERYWHERE), 1, [0], OPTIONS)
     np.testing.assert_array_equal(found.keypoints, everywhere.keypoints)
-    np.testing.assert_array_equal(found.worth, np.where(found.known, 1.0, WORTH_OF_RAY))
-    np.testing.assert_allclose(found.weights / found.worth, everywhere.weights / everywhere.worth)
-    pose = rate_pose(scene, found, TRUTH, OPTIONS)
-    alone = rate_pose(scene, found.select(found.known), TRUTH, OPTIONS)
-    rays = rate_pose(scene, found.select(~found.known), TRUTH, OPTIONS)
-    assert rays.num_inliers >= 0.4 * WORTH_OF_RAY * (~found.known).sum()
-    assert rays.num_inliers <= WORTH_OF_RAY * (~found.known).sum()
+    np.testing.assert_array_equal(found.depth_weights, np.where(found.known, 1.0, RAY_MATCH_WEIGHT))
+    np.testing.assert_allclose(
+        found.weights / found.depth_weights, everywhere.weights / everywhere.depth_weights
+    )
+    pose = score_pose(scene, found, TRUTH, OPTIONS)
+    alone = score_pose(scene, found.select(found.known), TRUTH, OPTIONS)
+    rays = score_pose(scene, found.select(~found.known), TRUTH, OPTIONS)
+    assert rays.num_inliers >= 0.4 * RAY_MATCH_WEIGHT * (~found.known).sum()
+    assert rays.num_inliers <= RAY_MATCH_WEIGHT * (~found.known).sum()
     assert alone.num_inliers <= pose.num_inliers <= alone.num_inliers + rays.num_inliers + 1
 
 
 def test_where_a_view_knows_no_depth_there_is_nothing_to_go_by() -> None:
     scene = scene_with_depth_in(NOWHERE)
-    assert not len(correspondences(scene, 1, [0], OPTIONS).keypoints)
+    assert not len(find_correspondences(scene, 1, [0], OPTIONS).keypoints)
 
 
 def test_without_lifting_rays_do_not_count() -> None:
     scene = scene_with_depth_in(LEFT_HALF)
     options = RegistrationOptions(lifting=False)
-    assert not len(correspondences(scene, 1, [0], options).keypoints)
+    assert not len(find_correspondences(scene, 1, [0], options).keypoints)
 
 
 def test_rays_pin_down_what_a_strip_of_known_depth_leaves_loose() -> None:
@@ -110,7 +112,7 @@ def test_rays_pin_down_what_a_strip_of_known_depth_leaves_loose() -> None:
     for part in STRIPS.values():
         for seed in range(3):
             scene = scene_with_depth_in(part, seed)
-            found = correspondences(scene, 1, [0], OPTIONS)
+            found = find_correspondences(scene, 1, [0], OPTIONS)
             assert 0.15 < found.known.mean() < 0.35
             with_rays.append(error_deg(scene, found))
             without.append(error_deg(scene, found.select(found.known)))

@@ -13,7 +13,7 @@ GRID = 24
 """Columns and rows of the pixels of an image that are looked for in the others (ours)."""
 
 
-def agreeing_depth(model: Reconstruction, options: ConsistencyOptions) -> float:
+def measure_depth_agreement(model: Reconstruction, options: ConsistencyOptions) -> float:
     """Pixels of images that lie on the surface another image sees, summed over all pairs of images,
     in terms of the pixels of one; as near as the depth check takes for the same.
 

@@ -66,7 +66,7 @@ MIN_OVERLAP = 0.05
 """Share of those pixels that must fall into another view for a comparison (ours)."""
 
 
-class Inconsistency(NamedTuple):
+class DepthViolation(NamedTuple):
     """The view that contradicts an image most, and the share of contradicting pixels.
 
     ``share``: of the pixels of either map, summed over both directions, as beta in the paper,
@@ -77,7 +77,7 @@ class Inconsistency(NamedTuple):
     other: int
 
 
-class DepthCheck:
+class DepthConsistencyCheck:
     """The check of one scene; remembers what maps are worth as long as they stay what they are.
 
     ``fills_holes``: holes of a pixel or two, as sensors leave, are no gap in what is seen. A right
@@ -93,21 +93,21 @@ class DepthCheck:
         self._fills_holes = fills_holes
         self._grids: dict[int, tuple[_MapState, _Grid]] = {}
 
-    def of_image(
+    def check_image(
         self, image: int, std_factor: float = 1.0, limit: float = math.nan
-    ) -> Inconsistency:
+    ) -> DepthViolation:
         """How much an image contradicts the registered views that it overlaps with most.
 
         ``std_factor``: how many times its declaration the std of depth is on the whole. ``limit``:
         as of :meth:`between`.
         """
         found = [
-            Inconsistency(self.between(image, other, std_factor, limit), other)
-            for other in overlapping_views(self._scene, image, self._options.num_views)
+            DepthViolation(self.violation_ratio(image, other, std_factor, limit), other)
+            for other in find_overlapping_images(self._scene, image, self._options.num_views)
         ]
-        return max(found, default=Inconsistency(0.0, -1))
+        return max(found, default=DepthViolation(0.0, -1))
 
-    def conflicting_images(
+    def find_conflicting_images(
         self, images: Sequence[int] | Int64, limit: float, std_factor: float = 1.0
     ) -> list[tuple[int, float]]:
         """Registered images to leave out so that none of ``images`` and another contradict each
@@ -119,9 +119,9 @@ class DepthCheck:
         scene = self._scene
         shares = np.full((scene.num_images, scene.num_images), np.nan)
         for image in map(int, images):
-            for other in overlapping_views(scene, image, self._options.num_views):
+            for other in find_overlapping_images(scene, image, self._options.num_views):
                 if np.isnan(shares[image, other]):
-                    share = self.between(image, other, std_factor, limit, once=True)
+                    share = self.violation_ratio(image, other, std_factor, limit, once=True)
                     shares[image, other] = shares[other, image] = share
         shares = np.nan_to_num(shares)
         removed = []
@@ -132,7 +132,7 @@ class DepthCheck:
             shares[worst] = shares[:, worst] = 0
         return removed
 
-    def between(
+    def violation_ratio(
         self,
         a: int,
         b: int,
@@ -149,12 +149,12 @@ class DepthCheck:
         scene, options = self._scene, self._options
         rotation = scene.rotations[b] @ scene.rotations[a].T
         translation = scene.translations[b] - rotation @ scene.translations[a]
-        return unexplained_share(
+        return compute_violation_ratio(
             self._grid(a, std_factor),
             self._grid(b, std_factor),
             rotation,
             translation,
-            Terms(options.max_deviation, options.min_gap, once),
+            ViolationCriteria(options.max_deviation, options.min_gap, once),
             limit,
         )
 
@@ -186,7 +186,7 @@ class DepthCheck:
         return _Grid(depth, np.maximum(std, np.float32(1e-6)), valid, nearest, params)
 
 
-def overlapping_views(scene: Scene, image: int, limit: int) -> list[int]:
+def find_overlapping_images(scene: Scene, image: int, limit: int) -> list[int]:
     """Registered images, most overlapping first, into which a good part of a depth map falls."""
     others = scene.registered_images()
     others = others[(others != image) & np.array([scene.maps[i].active for i in others])]
@@ -197,7 +197,7 @@ def overlapping_views(scene: Scene, image: int, limit: int) -> list[int]:
     points = unproject(depth_map.camera, xy, depth_map.depth[at].astype(np.float64))
     world = (points[depth_map.valid[at]] - scene.translations[image]) @ scene.rotations[image]
     sizes = np.array([scene.problem.images[i].camera.size for i in others]).reshape(-1, 2)
-    inside = points_inside(
+    inside = count_visible_points(
         world,
         scene.rotations[others],
         scene.translations[others],
@@ -210,7 +210,7 @@ def overlapping_views(scene: Scene, image: int, limit: int) -> list[int]:
 
 
 @jit.kernel()
-def points_inside(
+def count_visible_points(
     points: Float64, rotations: Float64, translations: Float64, intrinsics: Float64, sizes: Float64
 ) -> Int64:
     """How many of the points (p, 3) project into each of n views, (n,) int64.
@@ -257,7 +257,7 @@ class _MapState(NamedTuple):
     std_factor: float
 
 
-class Terms(NamedTuple):
+class ViolationCriteria(NamedTuple):
     """What a pixel that lies before what another view sees is held to.
 
     ``max_deviation``: errors in terms of their std up to which they are likely. ``min_gap``: share
@@ -270,8 +270,13 @@ class Terms(NamedTuple):
 
 
 @jit.kernel()
-def unexplained_share(
-    one: _Grid, two: _Grid, rotation: Float64, translation: Float64, terms: Terms, limit: float
+def compute_violation_ratio(
+    one: _Grid,
+    two: _Grid,
+    rotation: Float64,
+    translation: Float64,
+    terms: ViolationCriteria,
+    limit: float,
 ) -> float:
     """Share of the pixels of two views that lie before what the other sees, whatever errors of
     depth are likely; summed over both directions.
@@ -295,7 +300,7 @@ def _unexplained(
     target: _Grid,
     rotation: Float64,
     translation: Float64,
-    terms: Terms,
+    terms: ViolationCriteria,
     quarter: int,
 ) -> Float64:
     """How many pixels do in one direction, and of how many: one of four lattices of them."""

@@ -29,7 +29,7 @@ the other as it happens: by so much more must those against an image's place be.
 with 0 right images move too, whose false matches are a few more; ``benchmarks/symmetry.py``.)"""
 
 
-class WeakHold(NamedTuple):
+class Misregistration(NamedTuple):
     """``images``: of the smaller side of a cut. ``links`` (k, 2): one of them and an image of the
     rest beside which it stands. ``margin``: by how many matches what is torn apart has more than
     what holds them."""
@@ -39,29 +39,29 @@ class WeakHold(NamedTuple):
     margin: int
 
 
-def weak_holds(scene: Scene, min_matches: int) -> list[WeakHold]:
+def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistration]:
     """All such groups of registered images, the largest margin first.
 
     ``min_matches``: of two images whose matches are heard.
     """
-    matches, explained = pair_matches(scene)
+    matches, explained = count_pair_matches(scene)
     held = explained > MAX_EXPLAINED * matches
     against = np.where(held | (matches < min_matches), 0, matches)
     apart = _apart(scene.registered, against)
     if not apart.any():
         return []
     flows = csr_array(explained.astype(np.int32))
-    found: dict[tuple[int, ...], WeakHold] = {}
+    found: dict[tuple[int, ...], Misregistration] = {}
 
     def add(inside: Bool, margin: int) -> None:
         images = tuple(map(int, np.flatnonzero(inside)))
         if images not in found or found[images].margin < margin:
             links = np.argwhere(held & inside[:, None] & (scene.registered & ~inside))
-            found[images] = WeakHold(images, links, margin)
+            found[images] = Misregistration(images, links, margin)
 
     for image, margin in _outweighed(scene.registered, against, explained):
         add(scene.mask([image]), margin)
-    for a, b in np.argwhere(np.triu(apart > widest_ways(explained))):
+    for a, b in np.argwhere(np.triu(apart > compute_widest_paths(explained))):
         flow = maximum_flow(flows, int(a), int(b))
         margin = int(apart[a, b] - flow.flow_value)
         if margin <= 0:
@@ -76,7 +76,7 @@ def weak_holds(scene: Scene, min_matches: int) -> list[WeakHold]:
     return sorted(found.values(), key=lambda hold: (-hold.margin, hold.images))
 
 
-def pair_matches(scene: Scene) -> tuple[Int64, Int64]:
+def count_pair_matches(scene: Scene) -> tuple[Int64, Int64]:
     """(n, n) matches of each two images, and those of them that see the same point."""
     graph, n = scene.graph, scene.num_images
     a, b = graph.image_of[graph.source], graph.image_of[graph.target]
@@ -88,7 +88,7 @@ def pair_matches(scene: Scene) -> tuple[Int64, Int64]:
     return matches, explained
 
 
-def widest_ways(held: Int64) -> Int64:
+def compute_widest_paths(held: Int64) -> Int64:
     """(n, n) the most that each two images are held by along one way: its weakest link.
 
     ``held`` (n, n): of each two images; what holds two along all ways is at least this.

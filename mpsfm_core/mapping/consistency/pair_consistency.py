@@ -25,27 +25,27 @@ from scipy.sparse.csgraph import maximum_flow
 
 from mpsfm_core.data import Bool, Float64, MappingProblem, VerifiedPair
 from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.mapping.consistency.depth_consistency import DepthCheck
+from mpsfm_core.mapping.consistency.depth_consistency import DepthConsistencyCheck
 from mpsfm_core.mapping.initialization.global_initialization import (
-    averaged_rotations,
-    linked_groups,
+    average_rotations,
+    label_components,
 )
 from mpsfm_core.mapping.initialization.initial_pair import (
-    Start,
-    place_first,
-    polished_starts,
-    start_from_rays,
-    starts_from_depth,
+    InitialPair,
+    estimate_pairs_from_depth,
+    refine_initial_pairs,
+    register_first_image,
+    scale_verified_pair,
 )
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.registration.correspondences import correspondences
-from mpsfm_core.mapping.registration.registration import PoseSearch
+from mpsfm_core.mapping.registration.correspondences import find_correspondences
+from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 
 MAX_TURN_DEG = 30.0
 """Between what a pair says and what all others do, along a few links of some degrees (ours)."""
 
 
-class Verdict(NamedTuple):
+class PairConsistency(NamedTuple):
     """Of a pair. ``rotation`` (3, 3): ``b_from_a`` of the best pose that depth allows, or else of
     the best; ``share``: how well it is supported in terms of the best, 0 if none is allowed."""
 
@@ -53,20 +53,20 @@ class Verdict(NamedTuple):
     share: float
 
 
-class PairCheck:
+class PairConsistencyCheck:
     """Holds the pairs of a scene without images against depth and against each other."""
 
-    def __init__(self, search: PoseSearch, options: MapperOptions) -> None:
+    def __init__(self, search: AbsolutePoseEstimator, options: MapperOptions) -> None:
         self._search, self._scene, self._options = search, search.scene, options
-        self._check = DepthCheck(search.scene, options.consistency, fills_holes=True)
+        self._check = DepthConsistencyCheck(search.scene, options.consistency, fills_holes=True)
 
-    def weighed(self, problem: MappingProblem, left: Bool) -> MappingProblem:
+    def reweight_pairs(self, problem: MappingProblem, left: Bool) -> MappingProblem:
         """The problem with the matches of pairs as far as depth allows them, and without the pairs
         that depth and others refute; pairs of images that are not ``left`` (n,) stay as they are.
         """
         needed = self._options.registration.min_inliers
         verdicts = {
-            pair: self.verdict(pair)
+            pair: self.check_pair(pair)
             for pair in problem.pairs
             if len(pair) >= needed and left[pair.image_a] and left[pair.image_b]
         }
@@ -74,7 +74,7 @@ class PairCheck:
         links, rotations = _turned(sure, len(problem.images))
         pairs = []
         for pair in problem.pairs:
-            verdict = verdicts.get(pair, Verdict(pair.rotation, 1.0))
+            verdict = verdicts.get(pair, PairConsistency(pair.rotation, 1.0))
             if verdict.share > 0:
                 pairs.append(_times(pair, verdict.share))
                 continue
@@ -85,46 +85,48 @@ class PairCheck:
                 pairs.append(pair)
         return replace(problem, pairs=tuple(pairs))
 
-    def verdict(self, pair: VerifiedPair) -> Verdict:
+    def check_pair(self, pair: VerifiedPair) -> PairConsistency:
         """What depth says of a pair; where nothing gives a pose, it allows the verified one."""
-        verified = start_from_rays(self._scene, pair, self._options.initialization)
+        verified = scale_verified_pair(self._scene, pair, self._options.initialization)
         if verified is not None and self._allows(verified):
-            return Verdict(pair.rotation, 1.0)
+            return PairConsistency(pair.rotation, 1.0)
         search, options = self._search, self._options.registration
-        found = starts_from_depth(search, pair, options, rough=True)
+        found = estimate_pairs_from_depth(search, pair, options, rough=True)
         starts = [start for start in found if start.pose.support > 0]
         if not starts:
-            return Verdict(pair.rotation, 1.0)
+            return PairConsistency(pair.rotation, 1.0)
         allowed = self._best_allowed(starts)
         if allowed is None:
-            starts = polished_starts(search, pair, starts, options)
+            starts = refine_initial_pairs(search, pair, starts, options)
             allowed = self._best_allowed(starts)
         best = max(starts, key=_support)
         if allowed is None:
-            return Verdict(_b_from_a(pair, best), 0.0)
-        return Verdict(_b_from_a(pair, allowed), _support(allowed) / _support(best))
+            return PairConsistency(_b_from_a(pair, best), 0.0)
+        return PairConsistency(_b_from_a(pair, allowed), _support(allowed) / _support(best))
 
-    def _best_allowed(self, starts: Sequence[Start]) -> Start | None:
+    def _best_allowed(self, starts: Sequence[InitialPair]) -> InitialPair | None:
         """The best supported pose that depth allows, if there is one."""
         ranked = sorted(starts, key=_support, reverse=True)
         return next((start for start in ranked if self._allows(start)), None)
 
-    def _allows(self, start: Start) -> bool:
+    def _allows(self, start: InitialPair) -> bool:
         """Whether depth does not contradict a pose."""
         scene, limit = self._scene, self._options.consistency.max_violations_pair
         empty = scene.snapshot()
-        place_first(scene, start.reference)
+        register_first_image(scene, start.reference)
         scale = self._scale_of(start)
         scene.register(start.image, start.pose.rotation, start.pose.translation)
         scene.maps[start.image].set_scale(scale)
-        share = self._check.between(start.reference, start.image, limit=limit)
+        share = self._check.violation_ratio(start.reference, start.image, limit=limit)
         scene.restore(empty)
         return share <= limit
 
-    def _scale_of(self, start: Start) -> float:
+    def _scale_of(self, start: InitialPair) -> float:
         """Scale of the other image's depth that fits the first one's where they match."""
         scene, pose = self._scene, start.pose
-        found = correspondences(scene, start.image, [start.reference], self._options.registration)
+        found = find_correspondences(
+            scene, start.image, [start.reference], self._options.registration
+        )
         depth_map = scene.maps[start.image]
         rows = found.keypoints - scene.graph.offsets[start.image]
         z = found.points @ pose.rotation[2] + pose.translation[2]
@@ -143,20 +145,20 @@ def _turned(turns: Mapping[VerifiedPair, Float64], count: int) -> tuple[csr_arra
     said = np.array(list(turns.values())).reshape(-1, 3, 3)
     ways = np.concatenate([a, b]), np.concatenate([b, a])
     links = csr_array((np.tile(weights, 2), ways), shape=(count, count))
-    group = linked_groups(a, b, count)
+    group = label_components(a, b, count)
     rotations = np.tile(np.eye(3), (count, 1, 1))
     for number in np.unique(group[a]):
         own = group[a] == number
-        found = averaged_rotations(a[own], b[own], said[own], 1.0 * weights[own], count)
+        found = average_rotations(a[own], b[own], said[own], 1.0 * weights[own], count)
         rotations[group == number] = found[group == number]
     return links, rotations
 
 
-def _support(start: Start) -> float:
+def _support(start: InitialPair) -> float:
     return start.pose.support
 
 
-def _b_from_a(pair: VerifiedPair, start: Start) -> Float64:
+def _b_from_a(pair: VerifiedPair, start: InitialPair) -> Float64:
     rotation = start.pose.rotation
     return rotation if start.reference == pair.image_a else rotation.T
 

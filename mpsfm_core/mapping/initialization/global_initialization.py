@@ -26,7 +26,7 @@ from mpsfm_core.data import Bool, Float64, Int64, VerifiedPair
 from mpsfm_core.geometry import camera_center, rotation_angle_deg, triangulation_angle_deg
 from mpsfm_core.geometry.statistics import MAD_TO_STD, group_medians
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.mapping.triangulation import midpoints
+from mpsfm_core.mapping.triangulation import triangulate_midpoints
 
 MIN_ANGLE_DEG = 1.5
 """Between the rays of a match whose depth says how long a baseline is (as for points that are
@@ -43,10 +43,10 @@ PLANAR_WEIGHT = 0.1
 with SIFT on rendered_kitchen 80 % of these are right and 98 % of the others, and all 54 images are
 placed within 0.2 degrees instead of 1.2; from 0.01 to 0.3 much the same."""
 ROUNDS = 20
-"""Of least squares, each of which weighs pairs by how well the last one agreed with them (ours)."""
+"""Of least squares, each of which weighs pairs by how well the last one average_differences with them (ours)."""
 
 
-class Placement(NamedTuple):
+class GlobalPoses(NamedTuple):
     """Images (m,) with their poses, ``cam_from_world``, and the scales of their priors."""
 
     images: Int64
@@ -72,7 +72,7 @@ class _Links(NamedTuple):
         return _Links(*parts)
 
 
-def place_all(scene: Scene, left: Bool) -> Placement | None:
+def estimate_global_poses(scene: Scene, left: Bool) -> GlobalPoses | None:
     """Poses of the images of the largest group that agreeing pairs hold; None without one.
 
     ``left``: (n,) bool, images that may be placed. The scene stays as it is.
@@ -82,14 +82,16 @@ def place_all(scene: Scene, left: Bool) -> Placement | None:
     links = links.select(_well_held(links, scene.num_images))
     if not len(links.a):
         return None
-    rotations = averaged_rotations(links.a, links.b, links.rotation, links.weight, scene.num_images)
+    rotations = average_rotations(links.a, links.b, links.rotation, links.weight, scene.num_images)
     differences = links.log_length[:, 0] - links.log_length[:, 1]
     unit = scene.depth_group_of  # priors in one unit share one scale
-    scales = agreed(unit[links.a], unit[links.b], differences, links.weight, scene.num_images)
+    scales = average_differences(
+        unit[links.a], unit[links.b], differences, links.weight, scene.num_images
+    )
     log_scales = scales[unit]
     lengths = np.exp((log_scales[links.a] + log_scales[links.b] + links.log_length.sum(axis=1)) / 2)
     steps = -np.einsum("nji,nj->ni", rotations[links.b], links.translation) * lengths[:, None]
-    centers = agreed(links.a, links.b, steps, links.weight / lengths, scene.num_images)
+    centers = average_differences(links.a, links.b, steps, links.weight / lengths, scene.num_images)
     turns = rotations[links.b] @ rotations[links.a].transpose(0, 2, 1)
     turned = rotation_angle_deg(turns.transpose(0, 2, 1) @ links.rotation)
     shifts = np.linalg.norm(centers[links.b] - centers[links.a] - steps, axis=1) / lengths
@@ -100,10 +102,10 @@ def place_all(scene: Scene, left: Bool) -> Placement | None:
     if not len(images):
         return None
     translations = -np.einsum("nij,nj->ni", rotations[images], centers[images])
-    return Placement(images, rotations[images], translations, np.exp(log_scales[images]))
+    return GlobalPoses(images, rotations[images], translations, np.exp(log_scales[images]))
 
 
-def averaged_rotations(a: Int64, b: Int64, turns: Float64, weights: Float64, count: int) -> Float64:
+def average_rotations(a: Int64, b: Int64, turns: Float64, weights: Float64, count: int) -> Float64:
     """Rotations (count, 3, 3) that agree best with ``turns`` (m, 3, 3) = ``R[b] @ R[a].T``.
 
     From the tree of heaviest links on, least squares in the tangent space, weighted again and again
@@ -120,7 +122,9 @@ def averaged_rotations(a: Int64, b: Int64, turns: Float64, weights: Float64, cou
     return rotations
 
 
-def agreed(a: Int64, b: Int64, steps: Float64, weights: Float64, count: int) -> Float64:
+def average_differences(
+    a: Int64, b: Int64, steps: Float64, weights: Float64, count: int
+) -> Float64:
     """Values (count, ...) whose differences ``x[b] - x[a]`` agree best with ``steps`` (m, ...).
 
     Least squares, weighted again and again as Cauchy's loss wants it. The mean of the values is 0;
@@ -190,7 +194,7 @@ def _links(scene: Scene, pairs: list[VerifiedPair]) -> _Links:
     target = np.concatenate([empty, *(p.matches[:, 1] + offsets[p.image_b] for p in pairs)])
     centers = camera_center(rotation, translation)[of]
     rays_b = np.einsum("nji,nj->ni", rotation[of], scene.rays(target))
-    points = midpoints(np.zeros_like(rays_b), scene.rays(source), centers, rays_b)
+    points = triangulate_midpoints(np.zeros_like(rays_b), scene.rays(source), centers, rays_b)
     z_a = points[:, 2]
     z_b = np.einsum("nj,nj->n", rotation[of, 2], points) + translation[of, 2]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -216,16 +220,16 @@ def _well_held(links: _Links, count: int) -> Bool:
 
     A link on no cycle always agrees with itself, and nothing else says whether it is right.
     """
-    chosen = on_cycles(links.a, links.b, count)
+    chosen = find_cycle_edges(links.a, links.b, count)
     if chosen.any():
         ends = np.concatenate([links.a[chosen], links.b[chosen]])
-        group = linked_groups(links.a[chosen], links.b[chosen], count)
+        group = label_components(links.a[chosen], links.b[chosen], count)
         sizes = np.bincount(group[np.unique(ends)])
         chosen &= group[links.a] == sizes.argmax()
     return chosen
 
 
-def on_cycles(a: Int64, b: Int64, count: int) -> Bool:
+def find_cycle_edges(a: Int64, b: Int64, count: int) -> Bool:
     """(m,) bool, links without which their images would still hang together.
 
     ``a``, ``b``: (m,) images of each link, no pair twice. Labels drawn at random run through
@@ -233,7 +237,7 @@ def on_cycles(a: Int64, b: Int64, count: int) -> Bool:
     passes is on no cycle.
     """
     root = count  # of the trees of all groups
-    firsts = np.unique(linked_groups(a, b, count), return_index=True)[1]
+    firsts = np.unique(label_components(a, b, count), return_index=True)[1]
     one, other = np.concatenate([a, firsts]), np.concatenate([b, np.full(len(firsts), root)])
     graph = coo_matrix((np.ones(len(one)), (one, other)), shape=(count + 1, count + 1))
     order, parents = breadth_first_order(graph.tocsr(), root, directed=False)
@@ -249,7 +253,7 @@ def on_cycles(a: Int64, b: Int64, count: int) -> Bool:
     return on_cycle[: len(a)]
 
 
-def linked_groups(a: Int64, b: Int64, count: int) -> Int64:
+def label_components(a: Int64, b: Int64, count: int) -> Int64:
     """(count,) number of the group that links hold together, of each image."""
     matrix = coo_matrix((np.ones(len(a)), (a, b)), shape=(count, count))
     group: Int64 = connected_components(matrix, directed=False)[1]

@@ -9,7 +9,7 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, RegisteredImage
 
 
-def held_images(mapping: MappingResult, least: int) -> list[RegisteredImage]:
+def select_seed_images(mapping: MappingResult, least: int) -> list[RegisteredImage]:
     """The confirmed images of the largest reconstruction that see at least ``least`` points which
     three images see."""
     return [
@@ -20,7 +20,7 @@ def held_images(mapping: MappingResult, least: int) -> list[RegisteredImage]:
     ]
 
 
-def starting_from(problem: MappingProblem, held: Collection[RegisteredImage]) -> MappingProblem:
+def with_seed_poses(problem: MappingProblem, held: Collection[RegisteredImage]) -> MappingProblem:
     """The problem with the poses of these images as known, beside those that are, and with their
     focal lengths for all images of their cameras."""
     cameras = {problem.images[image.index].camera: image.camera for image in held}

@@ -8,16 +8,17 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, Int64, MappingProblem
+from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.mapping.consistency.depth_consistency import DepthCheck
+from mpsfm_core.mapping.consistency.depth_consistency import DepthConsistencyCheck
 from mpsfm_core.mapping.event_log import Journal
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.depth_noise import DepthNoise
 from mpsfm_core.mapping.refinement.filtering import disconnected_images, lost_images
 from mpsfm_core.mapping.refinement.refinement import Refiner
-from mpsfm_core.mapping.registration.history import Attempts
-from mpsfm_core.mapping.registration.image_selection import pair_score_matrix
-from mpsfm_core.mapping.registration.threshold_schedule import FailureLadder
+from mpsfm_core.mapping.registration.image_selection import compute_pair_scores
+from mpsfm_core.mapping.registration.registration_history import RegistrationHistory
+from mpsfm_core.mapping.registration.threshold_schedule import ThresholdSchedule
 from mpsfm_core.mapping.scene.scene import Scene, Snapshot
 
 JUMP_DEG = 3.0
@@ -39,11 +40,11 @@ class Upkeep:
     def __init__(self, problem: MappingProblem, options: MapperOptions, journal: Journal) -> None:
         self.problem, self.options, self.journal = problem, options, journal
         self.scene = Scene(problem, weigh_by_score=options.weigh_by_score)
-        self.scores = pair_score_matrix(self.scene, options.registration.next_view)
+        self.scores = compute_pair_scores(self.scene, options.registration.next_view)
         self.refiner = Refiner(self.scene, options, self.scores)
-        self.attempts = Attempts(self.scene.num_images, options.registration)
-        self.ladder = FailureLadder(options.registration)
-        self._check = DepthCheck(self.scene, options.consistency)
+        self.history = RegistrationHistory(self.scene.num_images, options.registration)
+        self.thresholds = ThresholdSchedule(options.registration)
+        self._check = DepthConsistencyCheck(self.scene, options.consistency)
         self._last_size = (0, 0)
         self._checked: Bool = np.zeros(self.scene.num_images, dtype=np.bool_)
 
@@ -67,7 +68,7 @@ class Upkeep:
         self.scene.restore(state.scene)
         self._checked = state.checked.copy()
         self.refiner.noise, self.refiner.loss_scale = state.noise, state.loss_scale
-        self.attempts.forget()
+        self.history.clear()
 
     def empty(self, before: Snapshot) -> None:
         """Return to a scene without images, as if nothing had been."""
@@ -90,12 +91,14 @@ class Upkeep:
             self.refiner.refine_globally(final=final)
             self.scene.tracks.compact()
         self._undo_jump(before)
-        self.attempts.forget()
+        self.history.clear()
         self._last_size = self.size, len(self.scene.tracks)
-        self.drop(lost_images(self.scene), "lost its points in global refinement")
+        self.drop(
+            lost_images(self.scene), ImageReason.LOST_POINTS.because(step="global-refinement")
+        )
         self.journal.scene_changed(self.scene)
 
-    def check_all(self, limit: float, when: str) -> None:
+    def check_all(self, limit: float, step: str) -> None:
         """Deregister images until no two views contradict each other.
 
         Those that held before are not compared with each other again.
@@ -104,34 +107,37 @@ class Upkeep:
         self._checked |= images
         conflicting = self._conflicts(np.flatnonzero(images), limit)
         for image, share in conflicting:
-            self.drop([image], f"{when} {share:.0%} of the pixels contradict another view's")
+            ratio = round(float(share), 4)
+            reason = ImageReason.CONTRADICTS_DEPTH.because(violation_ratio=ratio, step=step)
+            self.drop([image], reason)
         if conflicting:
             apart = disconnected_images(self.scene)
-            self.drop(apart, f"held to the rest only by an image that was dropped {when}")
+            self.drop(apart, ImageReason.CONNECTED_BY_DROPPED_IMAGE.because(step=step))
 
-    def contradiction(self, image: int, limit: float) -> str | None:
+    def contradiction(self, image: int, limit: float) -> Reason | None:
         """Why the depth of an image contradicts that of another view, if it does.
 
         ``limit``: share of pixels at the strict thresholds.
         """
         if not self.options.consistency.enabled:
             return None
-        limit = self.ladder.max_violations(limit)
+        limit = self.thresholds.max_violations(limit)
         with self.journal.timed("depth check"):
-            check = self._check.of_image(image, self.refiner.std_factor, limit)
+            check = self._check.check_image(image, self.refiner.std_factor, limit)
         if check.share <= limit:
             return None
-        self.attempts.blame(check.other, image)
+        self.history.record_contradiction(check.other, image)
         other = self.problem.images[check.other].name
-        return f"{check.share:.0%} of the pixels contradict the depth of {other}"
+        ratio = round(float(check.share), 4)
+        return ImageReason.CONTRADICTS_IMAGE.because(violation_ratio=ratio, other_image=other)
 
     def accept(self, image: int) -> None:
         """Tell of an image that was registered."""
-        self.attempts.scene_changed()
+        self.history.clear_pose_rejections()
         self.journal.registered(image, self.size)
         self.journal.scene_changed(self.scene)
 
-    def drop(self, images: list[int], reason: str) -> None:
+    def drop(self, images: list[int], reason: Reason) -> None:
         """Take images out that were registered before; the run goes on."""
         for image in images:
             if self.refiner.fixed[image]:
@@ -139,7 +145,7 @@ class Upkeep:
             self._checked[image] = False
             self.scene.deregister(image)
             self.refiner.forget(image)
-            self.attempts.scene_changed()
+            self.history.clear_pose_rejections()
             self.journal.rejected(image, reason)
 
     def _undo_jump(self, before: Snapshot) -> None:
@@ -162,4 +168,4 @@ class Upkeep:
         if not self.options.consistency.enabled:
             return []
         with self.journal.timed("depth check"):
-            return self._check.conflicting_images(images, limit, self.refiner.std_factor)
+            return self._check.find_conflicting_images(images, limit, self.refiner.std_factor)

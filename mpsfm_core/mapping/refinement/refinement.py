@@ -16,13 +16,13 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.depth_noise import DepthNoise, measure_depth_noise
 from mpsfm_core.mapping.refinement.filtering import filter_points
 from mpsfm_core.mapping.refinement.keypoint_noise import measure_loss_scale
-from mpsfm_core.mapping.registration.image_selection import local_bundle
+from mpsfm_core.mapping.registration.image_selection import find_local_bundle
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.mapping.triangulation import complete_and_merge, lift_low_parallax
+from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, lift_low_parallax
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
 from mpsfm_core.optimize.covariance import depth_variance_of_points, point_covariances
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
-from mpsfm_core.optimize.losses import Loss
+from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, Loss
 from mpsfm_core.optimize.thinning import (
     thinned_camera,
     thinned_pixels,
@@ -235,15 +235,15 @@ class Refiner:
         Its map was refined when it was registered, and will be again with all others.
         """
         options = self.options
-        bundle = local_bundle(self.scene, image, options.local_images - 1, self.scores)
-        complete_and_merge(self.scene, self.triangulation, images=bundle)
+        bundle = find_local_bundle(self.scene, image, options.local_images - 1, self.scores)
+        complete_and_merge_tracks(self.scene, self.triangulation, images=bundle)
         for _ in range(options.local_iterations):
-            bundle = local_bundle(self.scene, image, options.local_images - 1, self.scores)
+            bundle = find_local_bundle(self.scene, image, options.local_images - 1, self.scores)
             if self._alternates:
                 self.integrate([image])
             self.adjust(bundle, local=True)
             changed = filter_points(self.scene, self.triangulation, bundle)
-            changed += complete_and_merge(self.scene, self.triangulation, images=bundle)
+            changed += complete_and_merge_tracks(self.scene, self.triangulation, images=bundle)
             if changed < options.local_max_change * max(self._num_observations(), 1):
                 break
 
@@ -251,7 +251,7 @@ class Refiner:
         """Refine everything until little changes; ``final`` sharpens the depth loss."""
         options = self.options
         images = [int(i) for i in self.scene.registered_images()]
-        complete_and_merge(self.scene, self.triangulation, create=True)
+        complete_and_merge_tracks(self.scene, self.triangulation, create=True)
         lift_low_parallax(self.scene, self.triangulation)
         if self.focal_is_stable():
             self.adjust(images, focal=True)
@@ -263,7 +263,7 @@ class Refiner:
                 self.integrate(images)
             self.adjust(images, depth_scale=options.final_depth_scale if final else 1.0)
             changed = filter_points(self.scene, self.triangulation)
-            changed += complete_and_merge(self.scene, self.triangulation)
+            changed += complete_and_merge_tracks(self.scene, self.triangulation)
             if changed < options.global_max_change * max(self._num_observations(), 1):
                 break
         self.integrate(images)
@@ -356,7 +356,7 @@ class Refiner:
             replace(prior, variance=prior.variance * np.float32(noise.multiplier**2)),
             thinned_prior(depth_map.normals, step),
             camera,
-            replace(options, independent_depths=worth),
+            options.model_copy(update={"independent_depths": worth}),
         )
         return integrator
 
@@ -448,7 +448,8 @@ class Refiner:
                 obs_point=tracks.point_of[observations],
                 obs_xy=scene.keypoints[observations],
                 obs_std_px=scene.keypoint_std_px[images],
-            )
+            ),
+            SOFT_L1_OPTIONS,
         )
         return covariances, scene.track_angles_deg()
 

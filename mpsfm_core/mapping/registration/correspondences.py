@@ -10,16 +10,16 @@ from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.scene.scene import Scene
 
-MIN_DEPTH_SHARE = 1e-3
+MIN_DEPTH_RATIO = 1e-3
 """Smallest share of its depth that an uncertain depth may shrink to."""
-WORTH_OF_RAY = 0.5
+RAY_MATCH_WEIGHT = 0.5
 """A match of unknown depth: it fixes one of two coordinates. Ours; on hololens_room, where sensor
 depth is known at half of the keypoints, with such matches and without (means of seeds): `all`
 100 instead of 91 of 112 images and AUC@20 47 instead of 44, random 20 of those 28 images 134
 instead of 105 of 160 and 23 instead of 18, leq10 29.0 instead of 27.9, smaller sets as before."""
 
 
-class Correspondences(NamedTuple):
+class PoseCorrespondences(NamedTuple):
     """Keypoints of an image and what they see.
 
     ``keypoints`` (m,): of the image. ``matched`` (m,): their matches in registered images.
@@ -39,19 +39,19 @@ class Correspondences(NamedTuple):
     weights: Float64
 
     @property
-    def worth(self) -> Float64:
-        """(m,) 1, or :data:`WORTH_OF_RAY` where depth is unknown."""
-        return worth_of(self.known)
+    def depth_weights(self) -> Float64:
+        """(m,) 1, or :data:`RAY_MATCH_WEIGHT` where depth is unknown."""
+        return _depth_weights(self.known)
 
-    def select(self, chosen: Int64 | Bool) -> Correspondences:
+    def select(self, chosen: Int64 | Bool) -> PoseCorrespondences:
         """Some of them, by row or mask."""
         parts: list[Any] = [values[chosen] for values in self]
-        return Correspondences(*parts)
+        return PoseCorrespondences(*parts)
 
 
-def correspondences(
+def find_correspondences(
     scene: Scene, image: int, references: list[int], options: RegistrationOptions
-) -> Correspondences:
+) -> PoseCorrespondences:
     """What the matches of an image to some registered images say of its pose.
 
     A matched keypoint gives its 3D point where that has enough parallax; else, with lifting, the
@@ -75,15 +75,15 @@ def correspondences(
     slack = np.where(stable, 0.0, slack[use])
     centers = scene.centers()[graph.image_of[target]]
     along = points - centers
-    near = centers + along * np.maximum(np.exp(-slack), MIN_DEPTH_SHARE)[:, None]
+    near = centers + along * np.maximum(np.exp(-slack), MIN_DEPTH_RATIO)[:, None]
     far = centers + along * np.exp(slack)[:, None]
-    of, weights = graph.image_of[target], scores * worth_of(known)
-    return Correspondences(source, target, points, near, far, of, known, weights)
+    of, weights = graph.image_of[target], scores * _depth_weights(known)
+    return PoseCorrespondences(source, target, points, near, far, of, known, weights)
 
 
-def worth_of(known: Bool) -> Float64:
+def _depth_weights(known: Bool) -> Float64:
     """(m,) what matches count for whose depth is known or not."""
-    return np.where(known, 1.0, WORTH_OF_RAY)
+    return np.where(known, 1.0, RAY_MATCH_WEIGHT)
 
 
 def _depths(

@@ -9,7 +9,7 @@ from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.scene.scene import Scene
 
 
-def pair_score_matrix(scene: Scene, criterion: str) -> Float64:
+def compute_pair_scores(scene: Scene, criterion: str) -> Float64:
     """(n, n) symmetric float64: how well each two images match, 0 for pairs without matches.
 
     ``criterion``: "match-scores" sums the matcher's scores, anything else counts matches.
@@ -27,7 +27,7 @@ def rank_next_images(
 ) -> list[tuple[int, int]]:
     """Unregistered candidates with their best registered image, best first.
 
-    ``scores``: from :func:`pair_score_matrix`. ``candidates``: (n,) bool.
+    ``scores``: from :func:`compute_pair_scores`. ``candidates``: (n,) bool.
     """
     images = np.flatnonzero(candidates & ~scene.registered)
     registered = scene.registered_images()
@@ -41,7 +41,7 @@ def rank_next_images(
     return [(int(images[k]), int(registered[linked[k].argmax()])) for k in order]
 
 
-def local_bundle(scene: Scene, image: int, num_neighbors: int, scores: Float64) -> list[int]:
+def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: Float64) -> list[int]:
     """The image and the registered images that share most points with it.
 
     Where fewer than ``num_neighbors`` share any, the best matching ones follow.

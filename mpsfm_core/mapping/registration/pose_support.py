@@ -13,22 +13,22 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Float64
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.registration.correspondences import Correspondences
-from mpsfm_core.mapping.registration.pose_hypotheses import Hypothesis
+from mpsfm_core.mapping.registration.correspondences import PoseCorrespondences
+from mpsfm_core.mapping.registration.pose_hypotheses import PoseHypothesis
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.optimize.resection import Segments, distances_and_depths, refine_pose
 
-IMPROVEMENT_SCALES = np.maximum(5.0 * 0.8 ** np.arange(12), 1.0)
+REFINEMENT_SCALES = np.maximum(5.0 * 0.8 ** np.arange(12), 1.0)
 """Of the limit up to which a match counts, from one step to the next: a pose of RANSAC from lifted
 points may be off by pixels first (ours)."""
 
 
 @dataclass(frozen=True, eq=False)
-class AbsolutePose:
+class ScoredPose:
     """``cam_from_world``, its source, and the support of the reference image with most of it.
 
     ``support`` is the truncated quadratic score (MSAC) by which hypotheses are compared, in terms
-    of the matches' weights, as is ``inlier_share``; ``num_inliers`` counts what they are worth.
+    of the matches' weights, as is ``inlier_ratio``; ``num_inliers`` counts what they are worth.
     """
 
     rotation: Float64
@@ -36,20 +36,20 @@ class AbsolutePose:
     source: str
     support: float
     num_inliers: int
-    inlier_share: float
+    inlier_ratio: float
 
     @property
-    def hypothesis(self) -> Hypothesis:
+    def hypothesis(self) -> PoseHypothesis:
         """The pose alone, to be rated again."""
-        return Hypothesis(self.rotation, self.translation, self.source)
+        return PoseHypothesis(self.rotation, self.translation, self.source)
 
 
-def rate_pose(
+def score_pose(
     scene: Scene,
-    found: Correspondences,
-    hypothesis: Hypothesis,
+    found: PoseCorrespondences,
+    hypothesis: PoseHypothesis,
     options: RegistrationOptions,
-) -> AbsolutePose:
+) -> ScoredPose:
     """A pose with the support that the correspondences give it."""
     misfit = _misfits(scene, found, hypothesis, options)
     inlier = misfit < 1
@@ -61,17 +61,17 @@ def rate_pose(
     support = per_reference(found.weights * (1 - misfit**2))
     best = int(np.argmax(support))
     total = per_reference(found.weights)[best]
-    return AbsolutePose(
+    return ScoredPose(
         *hypothesis,
         float(support[best]),
-        int(per_reference(found.worth * inlier)[best]),
+        int(per_reference(found.depth_weights * inlier)[best]),
         float(per_reference(found.weights * inlier)[best] / total) if total else 0.0,
     )
 
 
-def improve_pose(
-    scene: Scene, found: Correspondences, pose: AbsolutePose, options: RegistrationOptions
-) -> AbsolutePose:
+def maximize_support(
+    scene: Scene, found: PoseCorrespondences, pose: ScoredPose, options: RegistrationOptions
+) -> ScoredPose:
     """The pose nearby at which keypoints lie nearest to their segments, rated."""
     if not len(found.keypoints):
         return pose
@@ -79,18 +79,18 @@ def improve_pose(
         (pose.rotation, pose.translation),
         _intrinsics(scene, found),
         _segments(scene, found, options),
-        scales=IMPROVEMENT_SCALES,
+        scales=REFINEMENT_SCALES,
     )
-    return rate_pose(scene, found, Hypothesis(rotation, translation, pose.source), options)
+    return score_pose(scene, found, PoseHypothesis(rotation, translation, pose.source), options)
 
 
-def _intrinsics(scene: Scene, found: Correspondences) -> Float64:
+def _intrinsics(scene: Scene, found: PoseCorrespondences) -> Float64:
     """fx, fy, cx, cy of the image that the keypoints are of."""
     intrinsics: Float64 = scene.intrinsics[scene.graph.image_of[found.keypoints[0]]]
     return intrinsics
 
 
-def _segments(scene: Scene, found: Correspondences, options: RegistrationOptions) -> Segments:
+def _segments(scene: Scene, found: PoseCorrespondences, options: RegistrationOptions) -> Segments:
     std = scene.keypoint_std_px[scene.graph.image_of[found.keypoints]]
     return Segments(
         near=found.near,
@@ -103,8 +103,8 @@ def _segments(scene: Scene, found: Correspondences, options: RegistrationOptions
 
 def _misfits(
     scene: Scene,
-    found: Correspondences,
-    pose: Hypothesis,
+    found: PoseCorrespondences,
+    pose: PoseHypothesis,
     options: RegistrationOptions,
 ) -> Float64:
     """(m,) how far each match is from supporting a pose, in terms of the limits; at most 1."""
@@ -121,7 +121,7 @@ def _misfits(
 
 def _depth_misfits(
     scene: Scene,
-    found: Correspondences,
+    found: PoseCorrespondences,
     depth: Float64,
     near: Bool,
     options: RegistrationOptions,

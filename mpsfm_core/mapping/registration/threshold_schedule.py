@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.registration.pose_support import AbsolutePose
+from mpsfm_core.mapping.registration.pose_support import ScoredPose
 
 
-class FailureLadder:
+class ThresholdSchedule:
     """Thresholds that give way step by step and snap back at the next success.
 
     PnP may do with fewer inliers (reference). The depth check does not give way, unlike the
@@ -36,14 +37,19 @@ class FailureLadder:
         """Share of pixels that may contradict another view, ``strict`` before any relaxation."""
         return strict / self._factor
 
-    def objection(self, pose: AbsolutePose, *, certain: bool = False) -> str | None:
+    def check_support(self, pose: ScoredPose, *, certain: bool = False) -> Reason | None:
         """Why too few matches agree with a pose, if so; ``certain``: nearly all have to."""
         needed = self.min_inliers
         share = self._options.confident_share if certain else self.min_inlier_share
         if pose.num_inliers < needed:
-            return f"{pose.num_inliers} matches support its pose, {needed} are needed"
-        if pose.inlier_share < share:
-            return f"{pose.inlier_share:.0%} of the matches support its pose, not {share:.0%}"
+            return ImageReason.TOO_FEW_INLIERS.because(
+                num_inliers=pose.num_inliers, min_inliers=needed
+            )
+        if pose.inlier_ratio < share:
+            return ImageReason.LOW_INLIER_RATIO.because(
+                inlier_ratio=round(float(pose.inlier_ratio), 4),
+                min_inlier_ratio=round(float(share), 4),
+            )
         return None
 
     def relax(self) -> bool:

@@ -9,8 +9,8 @@ from mpsfm_core.mapping.options import TriangulationOptions
 from mpsfm_core.mapping.refinement.filtering import filter_points
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.scene.tracks import Tracks
-from mpsfm_core.mapping.triangulation import complete_and_merge
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.mapping.triangulation import complete_and_merge_tracks
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
@@ -25,11 +25,13 @@ def random_tracks() -> Tracks:
 
 
 def posed_scene() -> Scene:
-    scene = Scene(mapping_problem(room_scene(), CAMERA, POSES, points_per_view=60, map_width=40))
+    scene = Scene(
+        make_mapping_problem(room_scene(), CAMERA, POSES, points_per_view=60, map_width=40)
+    )
     for image, pose in enumerate(POSES):
         scene.register(image, pose[:, :3], pose[:, 3])
         scene.maps[image].set_scale(1.0)
-    complete_and_merge(scene, TriangulationOptions(), create=True)
+    complete_and_merge_tracks(scene, TriangulationOptions(), create=True)
     return scene
 
 

@@ -1,4 +1,4 @@
-"""What attempts to register images have shown: not to be repeated, and which view is to blame."""
+"""What history to register images have shown: not to be repeated, and which view is to blame."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool
+from mpsfm_core.data.decisions import Reason
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.registration.pose_support import AbsolutePose
+from mpsfm_core.mapping.registration.pose_support import ScoredPose
 
-MIN_CONTRADICTED = 2
+MIN_CONTRADICTING_IMAGES = 2
 """Newcomers that contradict a view before it is the one to go (ours)."""
 
 
@@ -19,34 +20,34 @@ class _Attempt(NamedTuple):
     """The images that an image was posed beside, and the best pose that was found."""
 
     references: list[int]
-    pose: AbsolutePose | None
+    pose: ScoredPose | None
 
 
-class Attempts:
-    """Memory of the attempts within one component.
+class RegistrationHistory:
+    """Memory of the history within one component.
 
     ``refuted``: (n, n) bool, an image is not to be posed beside another: their matches led to a
     pose whose depth contradicted the scene.
     """
 
     def __init__(self, num_images: int, options: RegistrationOptions) -> None:
-        self.refuted: Bool = np.zeros((num_images, num_images), dtype=np.bool_)
+        self.excluded_references: Bool = np.zeros((num_images, num_images), dtype=np.bool_)
         self._options = options
         self._searches: dict[int, int] = defaultdict(int)
         self._last: dict[int, _Attempt] = {}
         self._contradicted: dict[int, set[int]] = defaultdict(set)
-        self._refused: dict[tuple[int, bytes], str] = {}
+        self._refused: dict[tuple[int, bytes], Reason] = {}
         self._displaced: set[int] = set()
 
-    def searches(self, image: int) -> int:
+    def num_searches(self, image: int) -> int:
         """How often the pose of an image was searched for."""
         return self._searches[image]
 
-    def best_pose(self, image: int) -> AbsolutePose | None:
+    def last_best_pose(self, image: int) -> ScoredPose | None:
         """The best pose that the last attempt at an image knew."""
         return self._last[image].pose if image in self._last else None
 
-    def exhausted(self, image: int, references: list[int]) -> bool:
+    def is_exhausted(self, image: int, references: list[int]) -> bool:
         """Whether another search for the pose of an image would only repeat the last one.
 
         A few are different in any case: they take other halves of the matches.
@@ -54,18 +55,18 @@ class Attempts:
         several = self._searches[image] >= self._options.resampled_attempts
         return several and image in self._last and self._last[image].references == references
 
-    def remember(
-        self, image: int, references: list[int], best: AbsolutePose | None, *, searched: bool
+    def record_attempt(
+        self, image: int, references: list[int], best: ScoredPose | None, *, searched: bool
     ) -> None:
         """Note an attempt and the best pose known after it."""
         self._searches[image] += searched
         self._last[image] = _Attempt(references, best)
 
-    def blame(self, view: int, newcomer: int) -> None:
+    def record_contradiction(self, view: int, newcomer: int) -> None:
         """Note that the depth of a newcomer contradicts that of a registered view."""
         self._contradicted[view].add(newcomer)
 
-    def take_culprit(self, registered: Bool) -> tuple[int, int] | None:
+    def pop_contradicted_image(self, registered: Bool) -> tuple[int, int] | None:
         """The view that most newcomers contradict who are not registered yet, and their number.
 
         The check blames the newcomer, but several of them may be right and the one view wrong.
@@ -77,30 +78,30 @@ class Attempts:
             if registered[view] and view not in self._displaced
         }
         worst = max(blame, key=lambda view: blame[view], default=-1)
-        if blame.get(worst, 0) < MIN_CONTRADICTED:
+        if blame.get(worst, 0) < MIN_CONTRADICTING_IMAGES:
             return None
         self._contradicted.clear()
         self._displaced.add(worst)
         return worst, blame[worst]
 
-    def refusal(self, image: int, pose: AbsolutePose) -> str | None:
+    def pose_rejection(self, image: int, pose: ScoredPose) -> Reason | None:
         """Why this very pose of an image was refused in the present scene, if it was."""
         return self._refused.get(_key(image, pose))
 
-    def refuse(self, image: int, pose: AbsolutePose, reason: str) -> None:
+    def reject_pose(self, image: int, pose: ScoredPose, reason: Reason) -> None:
         """Note that the scene around a pose of an image did not hold."""
         self._refused[_key(image, pose)] = reason
 
-    def scene_changed(self) -> None:
+    def clear_pose_rejections(self) -> None:
         """Let refused poses be tried again."""
         self._refused.clear()
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Let everything be tried again: the scene may be right now where it was wrong."""
-        self.refuted[:] = False
+        self.excluded_references[:] = False
         self._last.clear()
-        self.scene_changed()
+        self.clear_pose_rejections()
 
 
-def _key(image: int, pose: AbsolutePose) -> tuple[int, bytes]:
+def _key(image: int, pose: ScoredPose) -> tuple[int, bytes]:
     return image, pose.rotation.tobytes() + pose.translation.tobytes()

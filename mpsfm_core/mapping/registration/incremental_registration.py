@@ -7,50 +7,62 @@ from collections.abc import Sequence
 import numpy as np
 
 from mpsfm_core.data import Bool
+from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.refinement.filtering import filter_points, lost_images
 from mpsfm_core.mapping.refinement.maintenance import Upkeep
-from mpsfm_core.mapping.registration.correspondences import Correspondences, correspondences
-from mpsfm_core.mapping.registration.image_selection import local_bundle, rank_next_images
-from mpsfm_core.mapping.registration.pose_support import AbsolutePose, rate_pose
-from mpsfm_core.mapping.registration.registration import PoseSearch, distinct
+from mpsfm_core.mapping.registration.correspondences import (
+    PoseCorrespondences,
+    find_correspondences,
+)
+from mpsfm_core.mapping.registration.image_selection import find_local_bundle, rank_next_images
+from mpsfm_core.mapping.registration.pose_estimation import (
+    AbsolutePoseEstimator,
+    select_distinct_poses,
+)
+from mpsfm_core.mapping.registration.pose_support import ScoredPose, score_pose
 from mpsfm_core.mapping.triangulation import triangulate_image
 
-WIDE_REFERENCES = 10
+NUM_WIDE_REFERENCES = 10
 """Images beside which one is posed that matches want elsewhere (ours; 5 hold fewer images)."""
 
 
-class Growth:
+class IncrementalRegistration:
     """Registers image after image in the scene of a group."""
 
-    def __init__(self, upkeep: Upkeep, search: PoseSearch) -> None:
+    def __init__(self, upkeep: Upkeep, search: AbsolutePoseEstimator) -> None:
         self._upkeep, self._search = upkeep, search
         self._scene, self._scores = upkeep.scene, upkeep.scores
-        self._refiner, self._attempts = upkeep.refiner, upkeep.attempts
-        self._ladder, self._journal, self._options = upkeep.ladder, upkeep.journal, upkeep.options
+        self._refiner, self._history = upkeep.refiner, upkeep.history
+        self._thresholds, self._journal, self._options = (
+            upkeep.thresholds,
+            upkeep.journal,
+            upkeep.options,
+        )
 
-    def register_next(self, available: Bool, *, wide: bool = False) -> bool:
+    def register_next_image(self, available: Bool, *, wide: bool = False) -> bool:
         """Register one more image, relaxing step by step; False when none can be."""
         options = self._options.registration
         while True:
-            trusted = np.where(self._attempts.refuted, 0, self._scores)
+            trusted = np.where(self._history.excluded_references, 0, self._scores)
             ranked = rank_next_images(self._scene, trusted, available, options)
             if self._register_one_of(ranked, wide=False):
                 return True
-            if self.displace():
+            if self.deregister_contradicted_image():
                 continue
             if wide and self._register_one_of(ranked, wide=True):
                 return True
-            if not ranked or not self._ladder.relax():
-                return self._reconsider(available)
+            if not ranked or not self._thresholds.relax():
+                return self._register_contradicted_image(available)
 
-    def displace(self) -> bool:
+    def deregister_contradicted_image(self) -> bool:
         """Take out the image that most newcomers contradicted, if several did; each image once."""
-        culprit = self._attempts.take_culprit(self._scene.registered)
+        culprit = self._history.pop_contradicted_image(self._scene.registered)
         if culprit is None or self._upkeep.size <= 2:
             return False
         image, count = culprit
-        self._upkeep.drop([image], f"{count} other images contradict its depth")
-        self._attempts.forget()
+        reason = ImageReason.CONTRADICTED_BY_IMAGES.because(num_images=count)
+        self._upkeep.drop([image], reason)
+        self._history.clear()
         return True
 
     def _register_one_of(self, ranked: Sequence[tuple[int, int]], *, wide: bool) -> bool:
@@ -59,28 +71,28 @@ class Growth:
             references = self._references(image, reference, wide=wide)
             if self._known_to_fail(image, references):
                 continue
-            reason = self._try_image(image, references)
+            reason = self._register_image(image, references)
             if reason is None:
-                self._ladder.reset()
+                self._thresholds.reset()
                 self._upkeep.accept(image)
                 return True
             self._journal.rejected(image, reason)
         return False
 
-    def _reconsider(self, available: Bool) -> bool:
+    def _register_contradicted_image(self, available: Bool) -> bool:
         """Register a contradicted image, if refining everything around it settles that.
 
         Where a loop closes, drift contradicts a right pose. False when none can be.
         """
-        self._ladder.reset()
-        scores = np.where(self._attempts.refuted, self._scores, 0)
+        self._thresholds.reset()
+        scores = np.where(self._history.excluded_references, self._scores, 0)
         options = self._options.registration
         for image, reference in rank_next_images(self._scene, scores, available, options):
-            self._attempts.refuted[image] = False
+            self._history.excluded_references[image] = False
             references = self._references(image, reference)
-            if self._try_image(image, references, everything=True) is None:
+            if self._register_image(image, references, everything=True) is None:
                 self._upkeep.accept(image)
-                self._attempts.forget()
+                self._history.clear()
                 return True
         return False
 
@@ -93,37 +105,37 @@ class Growth:
         if wide:
             matching = np.flatnonzero(self._scene.registered & (scores[image] > 0))
             order = np.argsort(-scores[image, matching], kind="stable")
-            nearby = matching[order[:WIDE_REFERENCES]].tolist()
+            nearby = matching[order[:NUM_WIDE_REFERENCES]].tolist()
         else:
-            nearby = local_bundle(self._scene, reference, options.num_neighbors, scores)
-        return [other for other in nearby if not self._attempts.refuted[image, other]]
+            nearby = find_local_bundle(self._scene, reference, options.num_neighbors, scores)
+        return [other for other in nearby if not self._history.excluded_references[image, other]]
 
     def _known_to_fail(self, image: int, references: list[int]) -> bool:
         """Whether even the best pose of the same attempt before lacks support still."""
-        if not self._attempts.exhausted(image, references):
+        if not self._history.is_exhausted(image, references):
             return False
-        best = self._attempts.best_pose(image)
-        return best is None or self._ladder.objection(best) is not None
+        best = self._history.last_best_pose(image)
+        return best is None or self._thresholds.check_support(best) is not None
 
     def _find_poses(
-        self, image: int, references: list[int], found: Correspondences
-    ) -> list[AbsolutePose]:
-        """Possible poses of an image, best first, that of earlier attempts among them."""
-        options, attempts = self._options.registration, self._attempts
+        self, image: int, references: list[int], found: PoseCorrespondences
+    ) -> list[ScoredPose]:
+        """Possible poses of an image, best first, that of earlier history among them."""
+        options, history = self._options.registration, self._history
         poses = []
-        known = attempts.best_pose(image)
+        known = history.last_best_pose(image)
         if known:
-            poses.append(rate_pose(self._scene, found, known.hypothesis, options))
-        search = not attempts.exhausted(image, references)
+            poses.append(score_pose(self._scene, found, known.hypothesis, options))
+        search = not history.is_exhausted(image, references)
         if search:
-            poses += self._search.poses(image, found, attempt=attempts.searches(image))
-        poses = distinct(poses)
-        attempts.remember(image, references, poses[0] if poses else None, searched=search)
+            poses += self._search.estimate_poses(image, found, attempt=history.num_searches(image))
+        poses = select_distinct_poses(poses)
+        history.record_attempt(image, references, poses[0] if poses else None, searched=search)
         return poses
 
-    def _try_image(
+    def _register_image(
         self, image: int, references: list[int], *, everything: bool = False
-    ) -> str | None:
+    ) -> Reason | None:
         """Register an image with the first of its possible poses that holds; None, or why not.
 
         ``everything``: refine all before the depth check, not just the image. Only a pose that
@@ -131,42 +143,46 @@ class Growth:
         """
         scene = self._scene
         with self._journal.timed("registration"):
-            found = correspondences(scene, image, references, self._options.registration)
-            most = int(np.bincount(found.references, found.worth, minlength=1).max())
-            if most < self._ladder.min_inliers:
-                return f"{most} matches have a 3D point, {self._ladder.min_inliers} are needed"
+            found = find_correspondences(scene, image, references, self._options.registration)
+            most = int(np.bincount(found.references, found.depth_weights, minlength=1).max())
+            if most < self._thresholds.min_inliers:
+                return ImageReason.TOO_FEW_POINTS.because(
+                    num_matches=most, min_matches=self._thresholds.min_inliers
+                )
             poses = self._find_poses(image, references, found)
         snapshot, noise = scene.snapshot(), self._refiner.noise
-        reason: str | None = "neither PnP nor an essential matrix gives a pose"
+        reason: Reason | None = ImageReason.NO_POSE.because()
         for pose in poses:
-            reason = self._ladder.objection(pose, certain=everything)
+            reason = self._thresholds.check_support(pose, certain=everything)
             if not everything:
-                reason = reason or self._attempts.refusal(image, pose)
+                reason = reason or self._history.pose_rejection(image, pose)
             if reason is None:
-                reason = self._try_pose(image, pose, found, everything=everything)
+                reason = self._extend_model(image, pose, found, everything=everything)
                 if reason is None:
                     return None
-                self._attempts.refuse(image, pose, reason)
+                self._history.reject_pose(image, pose, reason)
                 scene.restore(snapshot)
                 self._refiner.noise = noise
                 self._refiner.forget(image)
         return reason
 
-    def _try_pose(
-        self, image: int, pose: AbsolutePose, found: Correspondences, *, everything: bool
-    ) -> str | None:
+    def _extend_model(
+        self, image: int, pose: ScoredPose, found: PoseCorrespondences, *, everything: bool
+    ) -> Reason | None:
         """Grow and refine the scene around a new pose; None, or why it is rejected."""
         scene, options = self._scene, self._options
         with self._journal.timed("local refinement"):
             scene.register(image, pose.rotation, pose.translation)
             triangulate_image(scene, image, options.triangulation)
-            bundle = local_bundle(scene, image, options.refinement.local_images - 1, self._scores)
+            bundle = find_local_bundle(
+                scene, image, options.refinement.local_images - 1, self._scores
+            )
             self._refiner.estimate_scale(image, bundle[1:])
             wide = options.refinement.first_reprojection_scale
             self._refiner.adjust([image], local=True, reprojection_scale=wide)
             filter_points(scene, options.triangulation, [image])
             if image in lost_images(scene):
-                return "too few points are left after refinement"
+                return ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()
             self._refiner.estimate_scale(image, bundle[1:])
             self._refiner.integrate([image])
         if everything:
@@ -181,14 +197,16 @@ class Growth:
             self._refiner.refine_locally(image)
         lost = lost_images(scene)
         if image in lost:
-            return "too few points are left after refinement"
-        self._upkeep.drop(lost, "lost its points when another image was refined")
+            return ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()
+        self._upkeep.drop(lost, ImageReason.LOST_POINTS.because(step="local-refinement"))
         return None
 
-    def _refute(self, image: int, pose: AbsolutePose, found: Correspondences) -> None:
+    def _refute(self, image: int, pose: ScoredPose, found: PoseCorrespondences) -> None:
         """Try an image no more beside those whose matches led to a contradicted pose."""
         for other in map(int, np.unique(found.references)):
             alone = found.select(found.references == other)
             options = self._options.registration
-            led = rate_pose(self._scene, alone, pose.hypothesis, options)
-            self._attempts.refuted[image, other] |= led.inlier_share >= options.min_inlier_share
+            led = score_pose(self._scene, alone, pose.hypothesis, options)
+            self._history.excluded_references[image, other] |= (
+                led.inlier_ratio >= options.min_inlier_share
+            )

@@ -11,21 +11,21 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.geometry import compose, invert
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.refinement import Refiner
-from mpsfm_core.mapping.registration.correspondences import correspondences
+from mpsfm_core.mapping.registration.correspondences import find_correspondences
 from mpsfm_core.mapping.registration.image_selection import (
-    local_bundle,
-    pair_score_matrix,
+    compute_pair_scores,
+    find_local_bundle,
     rank_next_images,
 )
-from mpsfm_core.mapping.registration.pose_support import AbsolutePose
-from mpsfm_core.mapping.registration.registration import PoseSearch
+from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
+from mpsfm_core.mapping.registration.pose_support import ScoredPose
 from mpsfm_core.mapping.scene.conversion import registered_image
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import triangulate_image
 
 
-def with_unconfirmed(
+def register_tentatively(
     reconstruction: Reconstruction,
     others: Sequence[Reconstruction],
     problem: MappingProblem,
@@ -62,11 +62,11 @@ class _Completion:
     ) -> None:
         self.scene = Scene(problem, weigh_by_score=options.weigh_by_score)
         self._options = options.registration
-        self._scores = pair_score_matrix(self.scene, options.registration.next_view)
+        self._scores = compute_pair_scores(self.scene, options.registration.next_view)
         self._triangulation = options.triangulation
         self._refiner = Refiner(self.scene, options, self._scores)
-        self._search = PoseSearch(self.scene, self._refiner, options)
-        self._found: dict[int, tuple[list[int], AbsolutePose | None]] = {}
+        self._search = AbsolutePoseEstimator(self.scene, self._refiner, options)
+        self._found: dict[int, tuple[list[int], ScoredPose | None]] = {}
         self._groups = {image.index: group for group in others for image in group.images}
         self._scale = float(np.median([image.scale for image in reconstruction.images]))
         self.scene.resume(reconstruction)
@@ -81,7 +81,7 @@ class _Completion:
                 self._place_beside(image, self._groups[image])
         return [int(image) for image in np.flatnonzero(self.scene.registered & ~before)]
 
-    def _place(self, image: int, pose: AbsolutePose) -> None:
+    def _place(self, image: int, pose: ScoredPose) -> None:
         """Register an image and scale its prior to the points that it may see."""
         scene, depth_map = self.scene, self.scene.maps[image]
         before = scene.snapshot()
@@ -106,10 +106,10 @@ class _Completion:
                 scene.register(member.index, *compose((turn, growth * step), placed))
                 scene.maps[member.index].set_scale(growth * member.scale)
 
-    def _best(self) -> tuple[int, AbsolutePose] | None:
+    def _best(self) -> tuple[int, ScoredPose] | None:
         """The image whose pose is supported best."""
         candidates = ~self.scene.registered
-        best: tuple[int, AbsolutePose] | None = None
+        best: tuple[int, ScoredPose] | None = None
         for image, reference in rank_next_images(
             self.scene, self._scores, candidates, self._options
         ):
@@ -118,12 +118,14 @@ class _Completion:
                 best = image, pose
         return best
 
-    def _pose(self, image: int, reference: int) -> AbsolutePose | None:
+    def _pose(self, image: int, reference: int) -> ScoredPose | None:
         """The best pose beside some images; found once as long as these are the same."""
         scene, options = self.scene, self._options
-        references = local_bundle(scene, reference, options.num_neighbors, self._scores)
+        references = find_local_bundle(scene, reference, options.num_neighbors, self._scores)
         if image not in self._found or self._found[image][0] != references:
-            found = correspondences(scene, image, references, options)
-            poses = self._search.poses(image, found, attempt=0) if len(found.keypoints) else []
+            found = find_correspondences(scene, image, references, options)
+            poses = (
+                self._search.estimate_poses(image, found, attempt=0) if len(found.keypoints) else []
+            )
             self._found[image] = references, max(poses, key=lambda p: p.support, default=None)
         return self._found[image][1]
