@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from mpsfm_core.optimize.bundle_adjustment import BundleOptions, adjust_bundle
+from mpsfm_core.optimize.bundle_adjustment import adjust_bundle
 from mpsfm_core.optimize.covariance import DAMPING, point_covariances
+from mpsfm_core.optimize.options import SOFT_L1_OPTIONS
 from tests.optimize.bundle_reference import (
     ceres_adjuster,
     dense_point_information,
@@ -64,12 +65,12 @@ def bench_speed(size: tuple[int, int, float], repeats: int) -> dict[str, float]:
     plain = without_depth(problem)
     reconstructions = [to_pycolmap(problem) for _ in range(repeats)]
     fresh = iter(reconstructions)  # the adjuster does not keep its reconstruction alive
-    threads = BundleOptions(threads=1)
+    threads = SOFT_L1_OPTIONS.model_copy(update={"threads": 1})
     median, results = side_by_side(
         {
             "pycolmap_plain": lambda: ceres_adjuster(next(fresh)).solve(),
-            "depth": lambda: adjust_bundle(problem),
-            "plain": lambda: adjust_bundle(plain),
+            "depth": lambda: adjust_bundle(problem, SOFT_L1_OPTIONS),
+            "plain": lambda: adjust_bundle(plain, SOFT_L1_OPTIONS),
             "depth_one_thread": lambda: adjust_bundle(problem, threads),
         },
         repeats,
@@ -99,7 +100,7 @@ def bench_speed(size: tuple[int, int, float], repeats: int) -> dict[str, float]:
 def bench_optimum(starts: int) -> dict[str, float]:
     """Largest differences to Ceres (depth as a Python cost) over perturbed starts."""
     truth = make_problem(6, 80, 3.5)
-    tight = BundleOptions(function_tolerance=1e-13, max_iterations=1000)
+    tight = SOFT_L1_OPTIONS.model_copy(update={"function_tolerance": 1e-13, "max_iterations": 1000})
     cost, turn, shift = [], [], []
     for seed in range(starts):
         start = perturb(truth, seed, amount=2.0)
@@ -128,13 +129,13 @@ def bench_covariance(repeats: int) -> dict[str, float]:
     information = dense_point_information(small) + DAMPING * np.eye(3 * len(small.points))
     inverse = np.linalg.inv(information).reshape(len(small.points), 3, -1, 3)
     expected = inverse[np.arange(len(small.points)), :, np.arange(len(small.points))]
-    error = np.linalg.norm(point_covariances(small) - expected, axis=(1, 2))
+    error = np.linalg.norm(point_covariances(small, SOFT_L1_OPTIONS) - expected, axis=(1, 2))
     large = replace(make_problem(*SIZES["S"]), obs_log_depth=None)
     rec = to_pycolmap(large)
     options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.POINTS)
     median, results = side_by_side(
         {
-            "ours": lambda: point_covariances(large),
+            "ours": lambda: point_covariances(large, SOFT_L1_OPTIONS),
             "pycolmap": lambda: pycolmap.estimate_ba_covariance(options, rec, ceres_adjuster(rec)),
         },
         repeats,
@@ -158,7 +159,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    elapsed, _ = timed(lambda: adjust_bundle(make_problem(3, 30, 2.5)))
+    elapsed, _ = timed(lambda: adjust_bundle(make_problem(3, 30, 2.5), SOFT_L1_OPTIONS))
     report: dict[str, Any] = {"first_call_seconds": elapsed}
     report["local"] = bench_speed(LOCAL, arguments.repeats)
     for name in arguments.sizes:

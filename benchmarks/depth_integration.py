@@ -30,13 +30,12 @@ from scipy.ndimage import gaussian_filter
 from mpsfm_core import geometry
 from mpsfm_core.data import Bool, DepthPrior, Float64, NormalPrior, PinholeCamera
 from mpsfm_core.optimize.depth_integration import (
-    DEFAULT_OPTIONS,
     Anchors,
     DepthIntegrator,
-    IntegrationOptions,
 )
 from mpsfm_core.optimize.integration_energy import majorise
 from mpsfm_core.optimize.multigrid import Multigrid
+from mpsfm_core.optimize.options import IntegrationOptions
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 from tests.optimize.integration_reference import ReferenceIntegration
 
@@ -57,7 +56,7 @@ class Problem:
     truth: Float64
     known: Bool
 
-    def integrator(self, options: IntegrationOptions = DEFAULT_OPTIONS) -> DepthIntegrator:
+    def integrator(self, options: IntegrationOptions | None = None) -> DepthIntegrator:
         return DepthIntegrator(self.depth, self.normals, self.camera, options)
 
     def errors(self, log_depth: Float64) -> tuple[float, float]:
@@ -220,7 +219,7 @@ def bench_speed(size: tuple[int, int], repeats: int) -> dict[str, float]:
 
 def bench_warm(problem: Problem, repeats: int) -> float:
     """Refining again after all points moved by their deviation, without skipping."""
-    integrator = problem.integrator(replace(DEFAULT_OPTIONS, max_point_growth=0.0))
+    integrator = problem.integrator(IntegrationOptions(max_point_growth=0.0))
     before = integrator.refine(problem.anchors)
     moved = problem.anchors._replace(depth=1.01 * problem.anchors.depth)
     return median_time(partial(integrator.refine, moved, start=before), repeats)
@@ -247,7 +246,9 @@ def bench_scaling(repeats: int) -> dict[str, Any]:
     }
 
 
-def bench_accuracy(problems: list[Problem], options: IntegrationOptions) -> dict[str, float] | None:
+def bench_accuracy(
+    problems: list[Problem], options: IntegrationOptions | None = None
+) -> dict[str, float] | None:
     """Means over images of the errors before and after; None without images."""
     if not problems:
         return None
@@ -323,7 +324,7 @@ def ablation(analytic: list[Problem], real: list[Problem]) -> dict[str, Any]:
     kinds = {"analytic": analytic, "variance / 16": confident, "hololens_room": real}
     report = {}
     for change in changes:
-        options = replace(DEFAULT_OPTIONS, **change)
+        options = IntegrationOptions(**change)
         name = ", ".join(f"{key} {value:g}" for key, value in change.items()) or "default"
         row = {}
         for kind, problems in kinds.items():
@@ -354,8 +355,8 @@ def main() -> None:
     analytic = partial(analytic_problems, SCENES)
     real = partial(real_problems, shared)
     sections: dict[str, Callable[[], Any]] = {
-        "analytic": lambda: bench_accuracy(analytic(), DEFAULT_OPTIONS),
-        "hololens_room": lambda: bench_accuracy(real(), DEFAULT_OPTIONS),
+        "analytic": lambda: bench_accuracy(analytic()),
+        "hololens_room": lambda: bench_accuracy(real()),
         "variance": lambda: bench_variance(arguments.repeats),
         "scaling": lambda: bench_scaling(arguments.repeats),
         **{

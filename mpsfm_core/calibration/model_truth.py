@@ -25,6 +25,7 @@ from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.mapping.scene.kernels import max_triangulation_angles
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
 from mpsfm_core.optimize.covariance import depth_variance_of_points, point_covariances
+from mpsfm_core.optimize.options import SOFT_L1_OPTIONS
 
 MIN_ANGLE_DEG = 2.0
 """Points of a smaller triangulation angle are no truth (reference: robust_triangles)."""
@@ -47,7 +48,7 @@ def model_truth(model: pycolmap.Reconstruction, images: ImageSet) -> dict[str, D
     problem = _triangulate(seen)
     depth = _in_camera(problem)[:, 2]
     variance = depth_variance_of_points(
-        point_covariances(problem)[seen.point], problem.rotations[seen.image]
+        point_covariances(problem, SOFT_L1_OPTIONS)[seen.point], problem.rotations[seen.image]
     )
     std = np.sqrt(variance) / np.maximum(depth, 1e-9)
     good = _well_placed(problem)[seen.point] & (depth > 0) & (std < MAX_LOG_STD)
@@ -139,7 +140,7 @@ def _triangulate(seen: _Seen) -> BundleProblem:
         seen.xy,
         variable_pose=np.zeros(len(seen.focals), dtype=np.bool_),
     )
-    problem = replace(problem, points=adjust_bundle(problem).points)
+    problem = replace(problem, points=adjust_bundle(problem, SOFT_L1_OPTIONS).points)
     return replace(problem, obs_std_px=_noise_px(problem))
 
 

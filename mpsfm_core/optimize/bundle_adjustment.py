@@ -23,16 +23,18 @@ from threadpoolctl import ThreadpoolController
 from mpsfm_core.data import Float64
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.bundle_problem import (
-    BundleOptions,
     BundleProblem,
     Prepared,
     Run,
     prepare,
     workers,
 )
+from mpsfm_core.optimize.options import BundleOptions
 
-__all__ = ["BundleOptions", "BundleProblem", "BundleResult", "adjust_bundle"]
+__all__ = ["BundleProblem", "BundleResult", "adjust_bundle"]
 
+INITIAL_DAMPING = 1e-4
+"""Inverse of Ceres' initial trust-region radius. [Ceres initial_trust_region_radius]"""
 MIN_DAMPING = 1e-10
 """Holds what nothing observes, as the depth of a point that is seen once (our choice)."""
 MAX_DAMPING = 1e16
@@ -96,7 +98,7 @@ def _minimize(p: Prepared, options: BundleOptions, run: Run) -> BundleResult:
     """Levenberg-Marquardt with Nielsen's damping, as Ceres has it."""
     state, trial = p.state, kernels.State(*(np.empty_like(array) for array in p.state))
     normal = _NormalEquations(p, options, run)
-    damping, growth = options.initial_damping, 2.0
+    damping, growth = INITIAL_DAMPING, 2.0
     initial_cost = np.inf
     converged, message = False, "iteration limit reached"
     for iteration in range(1, options.max_iterations + 1):

@@ -10,13 +10,11 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.data.options import Options
 from mpsfm_core.optimize import bundle_kernels as kernels
-from mpsfm_core.optimize.losses import Loss
+from mpsfm_core.optimize.options import BundleOptions
 from mpsfm_core.support.threads import allowed
 
 RANGE_SIZE = 8000
@@ -28,30 +26,6 @@ MAX_BUFFER_BYTES = 1 << 30
 Result = TypeVar("Result")
 Range = tuple[int, int, int]
 """Number of the range, first point, end."""
-
-
-class BundleOptions(Options):
-    """Settings of bundle adjustment. Loss scales are in standard deviations of the residual."""
-
-    reprojection_loss: Loss = Loss.SOFT_L1
-    """Reference: SOFT_L1."""
-    reprojection_scale: float = Field(1.5, gt=0)
-    """Reference: 1.5 x keypoint std with weight 1 / std^2, which is 1.5 on whitened residuals."""
-    depth_loss: Loss = Loss.CAUCHY
-    """Paper and reference: Cauchy; the reference's points-only refinement takes TRIVIAL."""
-    depth_scale: float = Field(2.0, gt=0)
-    """Reference: rob_std 2, times a MAD factor, times 0.125 in the last global adjustment."""
-    function_tolerance: float = Field(1e-6, ge=0)
-    """Stop when a step lowers the cost by at most this part (Ceres, reference: 1e-6)."""
-    max_iterations: int = Field(50, ge=1)
-    """Steps tried, taken or not (Ceres, reference: 50)."""
-    initial_damping: float = Field(1e-4, gt=0)
-    """Inverse of Ceres' initial trust region radius, 1e4."""
-    dense_poses: int = Field(500, ge=0)
-    """Up to this many variable poses the cameras are solved for by a dense Cholesky
-    factorisation, beyond by conjugate gradients (they break even between 300 and 600)."""
-    threads: int | None = Field(None, ge=1)
-    """None: as many as the run may use. The result does not depend on it."""
 
 
 @dataclass(frozen=True, eq=False)

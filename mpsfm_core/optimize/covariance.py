@@ -8,7 +8,8 @@ import numpy as np
 
 from mpsfm_core.data import Float64
 from mpsfm_core.optimize import bundle_kernels as kernels
-from mpsfm_core.optimize.bundle_problem import BundleOptions, BundleProblem, prepare, workers
+from mpsfm_core.optimize.bundle_problem import BundleProblem, prepare, workers
+from mpsfm_core.optimize.options import BundleOptions
 
 DAMPING = 1e-8
 """Added to the information of each coordinate, so that it has an inverse (COLMAP's default)."""

@@ -29,6 +29,7 @@ from mpsfm_core.optimize.integration_energy import (
     normal_terms,
 )
 from mpsfm_core.optimize.multigrid import Multigrid, Solution
+from mpsfm_core.optimize.options import IntegrationOptions
 from mpsfm_core.optimize.thinning import (
     thickened,
     thinned_camera,
@@ -46,55 +47,10 @@ _FINE_ITERATIONS = 3
 # Depth that is continued along normals stays within this factor of what is known (ours): a normal
 # that grazes the line of sight says that the next pixel is at any distance.
 _MAX_CONTINUATION = 100.0
+POINT_MAX_RATIO = 1.5
+"""Largest ratio of a point's depth and the scaled prior for which the point counts. [reference]"""
 # Weight that holds known depth fixed, against couplings below 1e12.
 _FIXED = 1e15
-
-
-@dataclass(frozen=True)
-class IntegrationOptions:
-    """Defaults of the depth refinement, each with its source."""
-
-    independent_depths: float = 100.0
-    """How many independent measurements a depth prior is worth, whatever its resolution.
-
-    Errors of neighbouring pixels are alike, so each of n pixels has the weight min(1, this / n).
-    The reference counts every pixel in full; then hundreds of triangulated points cannot move the
-    map. Ours: `python -m benchmarks.depth_integration --ablation`."""
-    independent_normals: float = 1000.0
-    """The same for the normal map. Ours, as above."""
-    sharpness: float = 2.0
-    """k of the soft minimum: 2 as in bilateral normal integration; the reference has 1."""
-    normal_limit: float = 6.0
-    """Squared residual at which a normal stops linking two pixels. Ours: without it the error of
-    the analytic scenes triples, by depth edges that the prior blurs; flat between 3 and 12."""
-    prior_scale: float = 1.0
-    """Scale of the Charbonnier loss of the depth prior in standard deviations. The paper truncates
-    without a number, the reference is quadratic. Ours: any scale is as good when the variance is
-    right; this one has a third of the quadratic's median error when it is 16 times too small."""
-    point_scale: float = 2.0
-    """Scale of the Cauchy loss of the points in standard deviations: that of the reference's depth
-    term in bundle adjustment."""
-    point_max_ratio: float = 1.5
-    """Points whose depth differs from the scaled prior by more than this factor are ignored
-    (reference)."""
-    max_iterations: int = 10
-    """Re-weightings at most (reference)."""
-    cg_iterations: int = 2
-    """CG iterations per re-weighting. Ours: the fastest that is as accurate as full solves."""
-    over_relaxation: float = 1.4
-    """Steps after the first are this much longer than the minimum of the quadratic, which is
-    pessimistic about a concave energy. Ours: a third fewer re-weightings; flat from 1.3 to 1.6."""
-    tolerance: float = 5e-2
-    """Stop when a re-weighting lowers the energy by less than this fraction (reference). Ours, as
-    above: with 2 % errors are the same within 2 %, mapping 50 photos takes 1.2 times as long."""
-    max_point_growth: float = 1.2
-    """Refining again is skipped while the points' mean energy has not grown by more than this
-    factor since the last solve: points that a map agrees with as well as with those before tell it
-    nothing (ours). The reference skips when the whole energy has changed by less than 5 %; most of
-    ours belongs to depth edges, whatever the points say."""
-
-
-DEFAULT_OPTIONS = IntegrationOptions()
 
 
 class Anchors(NamedTuple):
@@ -171,14 +127,14 @@ class DepthIntegrator:
         depth: DepthPrior,
         normals: NormalPrior,
         camera: PinholeCamera,
-        options: IntegrationOptions = DEFAULT_OPTIONS,
+        options: IntegrationOptions | None = None,
     ) -> None:
         """Raises DataError when grids differ or a variance is missing."""
         if depth.variance is None or normals.variance is None:
             raise DataError("variance", "depth integration needs one for depth and for normals")
         if not depth.shape == normals.shape == (camera.height, camera.width):
             raise DataError("camera", "depth, normals and camera must have one grid")
-        self.options = options
+        self.options = options = options or IntegrationOptions()
         self._normals = normals
         self.camera = camera
         self._active = _reachable(depth.valid, normals.valid)
@@ -314,7 +270,7 @@ class DepthIntegrator:
         usable &= (depth > 0) & (variance > 0) & np.isfinite(depth) & np.isfinite(variance)
         rows, columns = rows[usable].astype(np.int64), columns[usable].astype(np.int64)
         log_depth, log_variance = np.log(depth[usable]), variance[usable] / depth[usable] ** 2
-        near = np.abs(log_depth - prior[rows, columns]) < np.log(self.options.point_max_ratio)
+        near = np.abs(log_depth - prior[rows, columns]) < np.log(POINT_MAX_RATIO)
         near &= self._active[rows, columns]
         precision = 1.0 / np.clip(log_variance[near], MIN_LOG_VARIANCE, MAX_LOG_VARIANCE)
         return PointTerms(rows[near], columns[near], log_depth[near], precision)

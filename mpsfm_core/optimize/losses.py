@@ -11,7 +11,6 @@ its :class:`Loss`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from enum import IntEnum
 from types import MappingProxyType
 from typing import Any
 
@@ -19,17 +18,8 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from mpsfm_core.optimize.options import Loss
 from mpsfm_core.support import jit
-
-
-class Loss(IntEnum):
-    """The losses of the method: reprojection is soft-L1, depth Cauchy, the dense prior truncated
-    (paper, appendix B); trivial is plain least squares."""
-
-    TRIVIAL = 0
-    SOFT_L1 = 1
-    CAUCHY = 2
-    TRUNCATED = 3
 
 
 @register_jitable

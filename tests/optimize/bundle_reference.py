@@ -10,10 +10,16 @@ import pyceres
 import pycolmap
 
 from mpsfm_core.data import Float64
-from mpsfm_core.optimize.bundle_adjustment import BundleOptions, BundleProblem
+from mpsfm_core.optimize.bundle_adjustment import BundleProblem
+from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, BundleOptions
 
 SIZE = (1600, 1200)
 FOCAL = 1300.0
+
+
+def soft_l1(**changes: Any) -> BundleOptions:
+    """Return the options that COLMAP's loss needs, with changes."""
+    return SOFT_L1_OPTIONS.model_copy(update=changes)
 
 
 def rotation(vector: Float64) -> Float64:
@@ -127,7 +133,7 @@ def ceres_adjuster(
     options.refine_focal_length = refine_focal
     options.refine_extra_params = options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = BundleOptions().reprojection_scale
+    options.ceres.loss_function_scale = SOFT_L1_OPTIONS.reprojection_scale
     solver = options.ceres.solver_options
     solver.function_tolerance = tolerance
     solver.gradient_tolerance = min(1e-4, 1e2 * tolerance)
@@ -211,7 +217,7 @@ def solve_with_ceres(
     adjuster = ceres_adjuster(rec, 1e-13, refine_focal=refine_focal, fix_scale=plain)
     if not plain:
         ceres = adjuster.problem
-        loss = pyceres.LossFunction({"name": "cauchy", "params": [BundleOptions().depth_scale]})
+        loss = pyceres.LossFunction({"name": "cauchy", "params": [SOFT_L1_OPTIONS.depth_scale]})
         std = np.broadcast_to(problem.obs_std_log_depth, len(problem.obs_log_depth))
         keep = [loss]
         for k in np.flatnonzero(np.isfinite(problem.obs_log_depth)):
@@ -246,10 +252,10 @@ def whitened_residuals(
     """
     if robust:
         fixed = whitened_residuals(problem, robust=False)
-        b = BundleOptions().reprojection_scale ** 2
+        b = SOFT_L1_OPTIONS.reprojection_scale**2
         weight = np.ones_like(fixed)
         weight[:, :2] = (1 + (fixed[:, :2] ** 2).sum(axis=1, keepdims=True) / b) ** -0.25
-        weight[:, 2] = (1 + fixed[:, 2] ** 2 / BundleOptions().depth_scale ** 2) ** -0.5
+        weight[:, 2] = (1 + fixed[:, 2] ** 2 / SOFT_L1_OPTIONS.depth_scale**2) ** -0.5
         return weight * whitened_residuals(problem, points, robust=False)
     seen = (problem.points if points is None else points)[problem.obs_point]
     image = problem.obs_image

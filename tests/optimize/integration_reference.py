@@ -16,11 +16,11 @@ from scipy.special import logsumexp
 
 from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera
 from mpsfm_core.optimize.depth_integration import (
-    DEFAULT_OPTIONS,
     NO_ANCHORS,
+    POINT_MAX_RATIO,
     Anchors,
-    IntegrationOptions,
 )
+from mpsfm_core.optimize.options import IntegrationOptions
 
 Array = NDArray[np.float64]
 
@@ -68,12 +68,12 @@ class ReferenceIntegration:
         normals: NormalPrior,
         camera: PinholeCamera,
         anchors: Anchors = NO_ANCHORS,
-        options: IntegrationOptions = DEFAULT_OPTIONS,
+        options: IntegrationOptions | None = None,
     ) -> None:
         assert depth.variance is not None
         assert normals.variance is not None
         assert (depth.valid | ~normals.valid).all()
-        self.options = options
+        self.options = options = options or IntegrationOptions()
         self.active = depth.valid.ravel()
         pixels = depth.valid.size
         self.prior = np.log(np.where(depth.valid, depth.depth, 1).astype(np.float64)).ravel()
@@ -89,7 +89,7 @@ class ReferenceIntegration:
         )
         inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
         pixel = np.where(inside, rows * width + columns, 0)
-        near = np.abs(np.log(anchors.depth) - self.prior[pixel]) < np.log(options.point_max_ratio)
+        near = np.abs(np.log(anchors.depth) - self.prior[pixel]) < np.log(POINT_MAX_RATIO)
         kept = inside & near & self.active[pixel]
         self.pixel, self.target = pixel[kept], np.log(anchors.depth[kept])
         self.precision = anchors.depth[kept] ** 2 / anchors.variance[kept]

@@ -10,22 +10,22 @@ from hypothesis import strategies as st
 from mpsfm_core.data import Float64
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.optimize.bundle_adjustment import (
-    BundleOptions,
     BundleProblem,
     BundleResult,
     adjust_bundle,
 )
-from mpsfm_core.optimize.losses import Loss
+from mpsfm_core.optimize.options import Loss
 from tests.optimize.bundle_reference import (
     make_problem,
     perturb,
     rotation,
+    soft_l1,
     solve_with_ceres,
     whitened_residuals,
     without_depth,
 )
 
-TIGHT = BundleOptions(function_tolerance=1e-13, max_iterations=1000)
+TIGHT = soft_l1(function_tolerance=1e-13, max_iterations=1000)
 PARAMETERS = ("rotations", "translations", "log_scales", "intrinsics", "points")
 
 
@@ -255,7 +255,7 @@ def test_result_does_not_depend_on_threads() -> None:
     """Bit for bit, and from run to run; the problem is large enough for several ranges."""
     start = perturb(make_problem(12, 6000, 4.5), 0)
     assert len(start.obs_image) > 24_000
-    results = [adjust_bundle(start, BundleOptions(threads=n)) for n in (1, 2, 3, 2)]
+    results = [adjust_bundle(start, soft_l1(threads=n)) for n in (1, 2, 3, 2)]
     for other in results[1:]:
         for name in (*PARAMETERS, "final_cost", "iterations"):
             np.testing.assert_array_equal(getattr(results[0], name), getattr(other, name))
@@ -269,7 +269,7 @@ def test_order_of_observations_does_not_matter() -> None:
         **{n: getattr(start, n)[order] for n in ("obs_image", "obs_point", "obs_xy")},
         obs_log_depth=start.obs_log_depth[order],
     )
-    first, second = adjust_bundle(start), adjust_bundle(shuffled)
+    first, second = adjust_bundle(start, soft_l1()), adjust_bundle(shuffled, soft_l1())
     for name in PARAMETERS:
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
@@ -281,7 +281,7 @@ def test_input_is_neither_changed_nor_kept() -> None:
     copies = {name: a.copy() for name, a in arrays.items()}
     for array in arrays.values():
         array.flags.writeable = False
-    result = adjust_bundle(start)
+    result = adjust_bundle(start, soft_l1())
     for name, array in arrays.items():
         np.testing.assert_array_equal(array, copies[name])
     for name in PARAMETERS:
@@ -299,7 +299,9 @@ def test_integer_types_and_strides_of_the_input_do_not_matter() -> None:
         obs_xy=np.repeat(start.obs_xy, 2, axis=0)[::2],
         camera_of_image=start.camera_of_image.astype(np.int8),
     )
-    np.testing.assert_array_equal(adjust_bundle(start).points, adjust_bundle(strange).points)
+    np.testing.assert_array_equal(
+        adjust_bundle(start, soft_l1()).points, adjust_bundle(strange, soft_l1()).points
+    )
 
 
 def one_camera(points: Float64, **changes: object) -> BundleProblem:
@@ -325,7 +327,7 @@ def test_lifted_points_go_to_their_depth() -> None:
         obs_log_depth=np.log([2.0, 4.0]),
         obs_std_log_depth=0.05,
     )
-    result = adjust_bundle(start, BundleOptions(depth_loss=Loss.TRIVIAL, function_tolerance=1e-15))
+    result = adjust_bundle(start, soft_l1(depth_loss=Loss.TRIVIAL, function_tolerance=1e-15))
     np.testing.assert_allclose(result.points, [[0, 0, 2], [0, 0, 4]], atol=1e-6)
 
 
@@ -344,7 +346,7 @@ def test_depth_that_is_far_off_does_not_throw_points_behind_the_camera(factor: f
         obs_log_depth=np.log([2.0]),
         obs_std_log_depth=0.05,
     )
-    options = BundleOptions(depth_loss=Loss.TRIVIAL, function_tolerance=1e-15)
+    options = soft_l1(depth_loss=Loss.TRIVIAL, function_tolerance=1e-15)
     result = adjust_bundle(start, options)
     np.testing.assert_allclose(result.points, [[0, 0, 2]], atol=1e-6)
 
@@ -373,7 +375,7 @@ def test_nothing_is_gained_by_leaving_the_view() -> None:
         obs_xy=np.array([[300.0, 500.0], [700.0, 500.0]]),  # the rays meet behind the cameras
         variable_pose=np.zeros(2, dtype=np.bool_),
     )
-    result = adjust_bundle(start)
+    result = adjust_bundle(start, soft_l1())
     assert result.points[0, 2] > 0
     assert 0 < result.final_cost < result.initial_cost
 
@@ -381,8 +383,8 @@ def test_nothing_is_gained_by_leaving_the_view() -> None:
 def test_survives_gross_errors() -> None:
     truth = make_problem(8, 400, 4)
     start = perturb(truth, 0, amount=10.0)
-    result = adjust_bundle(start, BundleOptions(max_iterations=200))
-    good = adjust_bundle(perturb(truth, 0), BundleOptions(max_iterations=200))
+    result = adjust_bundle(start, soft_l1(max_iterations=200))
+    good = adjust_bundle(perturb(truth, 0), soft_l1(max_iterations=200))
     assert result.final_cost < 1.05 * good.final_cost
 
 
@@ -398,14 +400,14 @@ def test_without_observations(points: int) -> None:
         variable_pose=np.array([True]),
         variable_focal=np.array([True]),
     )
-    result = adjust_bundle(start)
+    result = adjust_bundle(start, soft_l1())
     assert_fixed(start, result, PARAMETERS)
     assert (result.initial_cost, result.final_cost, result.converged) == (0, 0, True)
 
 
 def test_iteration_limit_is_reported() -> None:
     start = perturb(make_problem(5, 100, 3), 0)
-    result = adjust_bundle(start, BundleOptions(max_iterations=1, function_tolerance=0))
+    result = adjust_bundle(start, soft_l1(max_iterations=1, function_tolerance=0))
     assert (result.iterations, result.converged) == (1, False)
     assert "limit" in result.message
 
@@ -502,7 +504,7 @@ def test_degenerate_geometry(
     problem: BundleProblem, reprojection_loss: Loss, depth_loss: Loss, dense: bool
 ) -> None:
     """No exception, no warning (they are errors), nothing but finite numbers, no cost increase."""
-    options = BundleOptions(
+    options = soft_l1(
         reprojection_loss=reprojection_loss,
         depth_loss=depth_loss,
         dense_poses=500 if dense else 0,

@@ -7,10 +7,10 @@ import pytest
 
 from mpsfm_core.data import Float64
 from mpsfm_core.optimize import bundle_kernels as kernels
-from mpsfm_core.optimize.bundle_adjustment import BundleOptions, BundleProblem, _NormalEquations
+from mpsfm_core.optimize.bundle_adjustment import BundleProblem, _NormalEquations
 from mpsfm_core.optimize.bundle_problem import Prepared, prepare, workers
-from mpsfm_core.optimize.losses import Loss
-from tests.optimize.bundle_reference import make_problem, perturb, rotation
+from mpsfm_core.optimize.options import Loss
+from tests.optimize.bundle_reference import make_problem, perturb, rotation, soft_l1
 
 STEP = 1e-6
 
@@ -102,7 +102,7 @@ def numeric_jacobian(p: Prepared) -> Float64:
 @pytest.mark.parametrize("depth_loss", Loss)
 @pytest.mark.parametrize("reprojection_loss", Loss)
 def test_gradient_of_every_loss(reprojection_loss: Loss, depth_loss: Loss) -> None:
-    options = BundleOptions(reprojection_loss=reprojection_loss, depth_loss=depth_loss)
+    options = soft_l1(reprojection_loss=reprojection_loss, depth_loss=depth_loss)
     p = prepare(small_problem(), options)
     layout = p.bundle.layout
     with workers(p.ranges, 1) as run:
@@ -152,7 +152,7 @@ def test_one_residual_at_random_poses(kind: str) -> None:
         camera_point = rng.uniform([-1, -1, 0.5], [1, 1, 5])
         world = problem.rotations[0].T @ (camera_point - problem.translations[0])
         problem = replace(problem, points=world[None])
-        trivial = BundleOptions(reprojection_loss=Loss.TRIVIAL, depth_loss=Loss.TRIVIAL)
+        trivial = soft_l1(reprojection_loss=Loss.TRIVIAL, depth_loss=Loss.TRIVIAL)
         p = prepare(problem, trivial)
         jacobian = np.empty((3, 3))
         for a in range(3):
@@ -173,7 +173,7 @@ def test_one_residual_at_random_poses(kind: str) -> None:
 @pytest.mark.parametrize("sparse", [False, True])
 def test_step_solves_the_damped_normal_equations(sparse: bool, monkeypatch) -> None:
     """Elimination, borders, back-substitution and the promised decrease, against dense algebra."""
-    options = BundleOptions(
+    options = soft_l1(
         reprojection_loss=Loss.TRIVIAL,
         depth_loss=Loss.TRIVIAL,
         dense_poses=0 if sparse else 500,
@@ -216,7 +216,7 @@ def test_rotation_near_zero_and_beyond_half_a_turn() -> None:
 
 def test_sorting_is_stable_and_by_point_then_image() -> None:
     problem = small_problem()
-    obs = prepare(problem, BundleOptions()).bundle.obs
+    obs = prepare(problem, soft_l1()).bundle.obs
     order = np.lexsort((np.arange(len(obs.image)), problem.obs_image, problem.obs_point))
     np.testing.assert_array_equal(obs.image, problem.obs_image[order])
     np.testing.assert_array_equal(obs.xy, problem.obs_xy[order])

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mpsfm_core.optimize.bundle_adjustment import BundleOptions, BundleProblem
+from mpsfm_core.optimize.bundle_adjustment import BundleProblem
 from mpsfm_core.optimize.covariance import (
     DAMPING,
     depth_variance_of_points,
@@ -17,6 +17,7 @@ from tests.optimize.bundle_reference import (
     dense_point_information,
     make_problem,
     rotation,
+    soft_l1,
     to_pycolmap,
 )
 
@@ -29,7 +30,7 @@ def test_equals_dense_inverse(depth: bool) -> None:
     information = dense_point_information(problem) + DAMPING * np.eye(3 * count)
     inverse = np.linalg.inv(information).reshape(count, 3, count, 3)
     expected = inverse[np.arange(count), :, np.arange(count)]
-    actual = point_covariances(problem)
+    actual = point_covariances(problem, soft_l1())
     scale = np.linalg.norm(expected, axis=(1, 2), keepdims=True)
     np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-6)
     np.testing.assert_array_equal(actual, actual.transpose(0, 2, 1))
@@ -42,13 +43,17 @@ def test_equals_colmap() -> None:
     adjuster = ceres_adjuster(rec)
     theirs = pycolmap.estimate_ba_covariance(options, rec, adjuster)
     expected = np.stack([theirs.get_point_cov(p + 1) for p in range(300)])
-    np.testing.assert_allclose(point_covariances(problem), expected, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        point_covariances(problem, soft_l1()), expected, rtol=1e-6, atol=1e-12
+    )
 
 
 def test_depth_lowers_the_variance() -> None:
     problem = make_problem(5, 40, 3)
-    with_depth = np.trace(point_covariances(problem), axis1=1, axis2=2)
-    without = np.trace(point_covariances(replace(problem, obs_log_depth=None)), axis1=1, axis2=2)
+    with_depth = np.trace(point_covariances(problem, soft_l1()), axis1=1, axis2=2)
+    without = np.trace(
+        point_covariances(replace(problem, obs_log_depth=None), soft_l1()), axis1=1, axis2=2
+    )
     assert (with_depth < without).all()
 
 
@@ -70,7 +75,7 @@ def test_predicts_the_scatter_of_triangulated_depth() -> None:
     )
     in_camera = np.einsum("nij,j->ni", turns, point) + problem.translations
     xy = 1000 * in_camera[:, :2] / in_camera[:, 2:] + 500
-    trivial = BundleOptions(reprojection_loss=0)
+    trivial = soft_l1(reprojection_loss=0)
     covariance = point_covariances(replace(problem, obs_xy=xy), trivial)
     jacobian = np.empty((4, 3))
     for a in range(3):
@@ -107,7 +112,7 @@ def test_unobserved_directions_have_huge_but_finite_variance() -> None:
         obs_point=np.arange(4),
         obs_xy=np.full((4, 2), 500.0),
     )
-    covariances = point_covariances(problem)
+    covariances = point_covariances(problem, soft_l1())
     assert np.isfinite(covariances).all()
     np.testing.assert_allclose(covariances[3:], np.eye(3) / DAMPING * np.ones((2, 1, 1)))
     values, vectors = np.linalg.eigh(covariances[1])

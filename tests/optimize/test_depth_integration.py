@@ -17,9 +17,9 @@ from mpsfm_core.optimize.depth_integration import (
     NO_ANCHORS,
     Anchors,
     DepthIntegrator,
-    IntegrationOptions,
 )
 from mpsfm_core.optimize.integration_energy import majorise
+from mpsfm_core.optimize.options import IntegrationOptions
 from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Plane, arc_poses, look_at, room_scene
 from tests.optimize.integration_problems import (
     CAMERA,
@@ -269,7 +269,7 @@ def test_a_warm_start_is_cheaper_and_as_good():
     integrator = DepthIntegrator(depth_prior(rough), normal_prior(normals), CAMERA)
     before = integrator.refine(exact_anchors(depth, 40))
     anchors = exact_anchors(depth, 80, seed=1)
-    options = replace(integrator.options, max_point_growth=0.0)
+    options = integrator.options.model_copy(update={"max_point_growth": 0.0})
     eager = DepthIntegrator(depth_prior(rough), normal_prior(normals), CAMERA, options)
     cold, warm = eager.refine(anchors), eager.refine(anchors, start=before)
     assert warm.iterations < cold.iterations
@@ -283,7 +283,7 @@ def test_large_maps_profit_from_a_coarse_start(monkeypatch):
     field = cv2.resize(rng.normal(0, 0.05, (8, 10)), camera.size, interpolation=cv2.INTER_CUBIC)
     tilt = cv2.resize(rng.normal(0, 0.1, (48, 64, 3)), camera.size, interpolation=cv2.INTER_CUBIC)
     normals = normals + tilt
-    options = replace(depth_integration.DEFAULT_OPTIONS, tolerance=1e-2)
+    options = IntegrationOptions(tolerance=1e-2)
     parts = depth_prior(depth * np.exp(field)), normal_prior(normals, 0.1), camera, options
     anchors = exact_anchors(depth, 200)
     started = DepthIntegrator(*parts).refine(anchors)

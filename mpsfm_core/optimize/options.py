@@ -1,0 +1,87 @@
+"""Options of bundle adjustment and of depth integration, with the source of each default.
+
+``[paper ...]`` cites MP-SfM, ``[reference]`` its published code, ``[Ceres ...]`` and
+``[COLMAP ...]`` an option of these libraries, ``[tuned: ...]`` the benchmark that chose the value.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from mpsfm_core.data.options import Options, expert
+
+
+class Loss(IntEnum):
+    """Robust losses; :mod:`mpsfm_core.optimize.losses` implements them."""
+
+    TRIVIAL = 0
+    SOFT_L1 = 1
+    CAUCHY = 2
+    TRUNCATED = 3
+
+
+class BundleOptions(Options):
+    """Options of bundle adjustment; loss scales are in standard deviations of the residual."""
+
+    reprojection_loss: Loss = expert(Loss.CAUCHY)
+    """Loss of reprojection errors. Learned keypoints have heavier tails than the soft-L1 loss of
+    the reference expects. [tuned: benchmarks.ablation]"""
+    reprojection_scale: float = expert(0.65, gt=0)
+    """Scale of that loss; raising it gives outliers more influence. [tuned: benchmarks.ablation]"""
+    depth_loss: Loss = expert(Loss.CAUCHY)
+    """Loss of log-depth errors. [paper appendix B] [reference]"""
+    depth_scale: float = expert(2.0, gt=0)
+    """Scale of that loss; raising it gives wrong depth more influence. [reference rob_std]"""
+    function_tolerance: float = expert(1e-6, ge=0)
+    """Relative decrease of the cost at which the solver stops; raising it stops earlier.
+    [Ceres function_tolerance]"""
+    max_iterations: int = expert(50, ge=1)
+    """Maximum number of steps, accepted or rejected. [Ceres max_num_iterations]"""
+    dense_poses: int = expert(500, ge=0)
+    """Maximum number of variable poses for which a dense Cholesky factorization solves the reduced
+    camera system; above it conjugate gradients do. [tuned: benchmarks.bundle_adjustment]"""
+    threads: int | None = expert(None, ge=1)
+    """Number of threads; null uses all that the run may use. Results do not depend on it."""
+
+
+SOFT_L1_OPTIONS = BundleOptions(reprojection_loss=Loss.SOFT_L1, reprojection_scale=1.5)
+"""Losses of the published system: soft-L1 for reprojection errors. [reference]"""
+
+
+class IntegrationOptions(Options):
+    """Options of depth integration."""
+
+    independent_depths: float = expert(100.0, gt=0)
+    """Number of independent measurements that a depth prior counts as, at any resolution.
+
+    Errors of neighboring pixels are correlated, so each of n pixels has weight ``min(1, this / n)``.
+    Raising it keeps the refined depth closer to the prior. [tuned: benchmarks.depth_integration]"""
+    independent_normals: float = expert(1000.0, gt=0)
+    """Number of independent measurements that a normal prior counts as; raising it follows the
+    normals more closely. [tuned: benchmarks.depth_integration]"""
+    sharpness: float = expert(2.0, gt=0)
+    """k of the soft minimum of both one-sided residuals; raising it makes the choice of a side
+    harder. [bilateral normal integration: 2; reference: 1]"""
+    normal_limit: float = expert(6.0, gt=0)
+    """Squared normal residual above which two pixels are no longer linked; raising it smooths
+    depth discontinuities. [tuned: benchmarks.depth_integration]"""
+    prior_scale: float = expert(1.0, gt=0)
+    """Scale of the Charbonnier loss of the depth prior, in standard deviations; raising it gives
+    wrong depth more influence. [tuned: benchmarks.depth_integration]"""
+    point_scale: float = expert(2.0, gt=0)
+    """Scale of the Cauchy loss of the points, in standard deviations; raising it gives wrong points
+    more influence. [reference rob_std]"""
+    max_iterations: int = expert(10, ge=0)
+    """Maximum number of re-weightings. [reference]"""
+    cg_iterations: int = expert(2, ge=1)
+    """Conjugate-gradient iterations per re-weighting; raising it makes each re-weighting more exact
+    and slower. [tuned: benchmarks.depth_integration]"""
+    over_relaxation: float = expert(1.4, gt=0)
+    """Factor on all steps after the first; the majorizer underestimates how far a concave energy
+    decreases. [tuned: benchmarks.depth_integration]"""
+    tolerance: float = expert(5e-2, ge=0)
+    """Relative decrease of the energy at which re-weighting stops; raising it stops earlier.
+    [reference]"""
+    max_point_growth: float = expert(1.2, ge=0)
+    """Largest growth of the points' mean energy since the last refinement for which a map is not
+    refined again; raising it skips more refinements. [tuned: benchmarks.depth_integration]"""
