@@ -54,8 +54,9 @@ class IntegrationOptions(Options):
     independent_depths: float = expert(100.0, gt=0)
     """Number of independent measurements that a depth prior counts as, at any resolution.
 
-    Errors of neighboring pixels are correlated, so each of n pixels has weight ``min(1, this / n)``.
-    Raising it keeps the refined depth closer to the prior. [tuned: benchmarks.depth_integration]"""
+    Errors of neighboring pixels are correlated, so each of n pixels has weight
+    ``min(1, this / n)``. Raising it keeps the refined depth closer to the prior.
+    [tuned: benchmarks.depth_integration]"""
     independent_normals: float = expert(1000.0, gt=0)
     """Number of independent measurements that a normal prior counts as; raising it follows the
     normals more closely. [tuned: benchmarks.depth_integration]"""

@@ -358,7 +358,7 @@ def test_points_behind_the_camera_count_nothing_and_stay() -> None:
     )
     result = adjust_bundle(start, TIGHT)
     np.testing.assert_array_equal(result.points[[0, 2]], start.points[[0, 2]])
-    assert result.initial_cost == adjust_bundle(one_camera(start.points[1:2])).initial_cost
+    assert result.initial_cost == adjust_bundle(one_camera(start.points[1:2]), TIGHT).initial_cost
     np.testing.assert_allclose(result.points[1], [0, 0, 2], atol=1e-6)
 
 
