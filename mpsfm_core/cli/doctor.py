@@ -14,6 +14,7 @@ import typer
 
 from mpsfm_core.cli.arguments import ConfigName, Offline, settings
 from mpsfm_core.cli.models import CacheDir
+from mpsfm_core.report.reasons import explain
 
 if TYPE_CHECKING:
     from mpsfm_core.pipeline.provider_resolution import ProviderResolution
@@ -57,7 +58,8 @@ def doctor(
     else:
         for choice in provision.choices:
             fetched = ", to be downloaded" if choice.to_fetch else ""
-            _line(choice.block, f"{choice.provider.name} ({choice.reason}{fetched})")
+            why = explain(choice.reason.because()).text
+            _line(choice.block, f"{choice.provider.name} ({why}{fetched})")
         advice = [*_better_choices(provision), *advice]
     if "none" in _gpu():
         advice.append("a GPU with CUDA makes networks and dense matching many times faster")
@@ -86,10 +88,10 @@ def _print_plugins(registry: Registry) -> bool:
 
 def _missing_plugins(registry: Registry) -> Iterator[str]:
     """Our own plugins that are not installed."""
-    from mpsfm_core.providers.first_party import FIRST_PARTY
+    from mpsfm_core.providers.first_party import PLUGIN_PROVIDERS
 
     installed = {line.distribution for line in registry.status()}
-    for requirement, brings in FIRST_PARTY.items():
+    for requirement, brings in PLUGIN_PROVIDERS.items():
         if requirement.partition("[")[0] not in installed:
             yield f"pip install '{requirement}' brings {', '.join(brings)}"
 
@@ -98,7 +100,7 @@ def _better_choices(provision: ProviderResolution) -> Iterator[str]:
     """What the configuration prefers, and why it cannot be had."""
     for choice in provision.choices:
         for name, why in choice.passed_over.items():
-            yield f"{choice.block}: {name} would be better: {why}"
+            yield f"{choice.block}: {name} would be better: {explain(why).text}"
         for file in choice.to_fetch:
             yield f"mpsfm models fetch {choice.provider.name} gets {file.uri} before a run needs it"
 

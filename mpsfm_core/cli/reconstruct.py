@@ -10,6 +10,7 @@ import typer
 
 from mpsfm_core.cli.arguments import ConfigName, Offline, Overrides, Quiet, ViewerName, settings
 from mpsfm_core.cli.errors import heed_termination
+from mpsfm_core.report.reasons import explain_image
 
 if TYPE_CHECKING:
     from mpsfm_core.pipeline.run import ReconstructionResult
@@ -148,13 +149,13 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
         if finding.level == "warning" and not finding.title.endswith("missing"):
             _row("warning", f"{finding.title}: {finding.text}")
     for name, reason in images["unconfirmed"].items():
-        _row("guessed", f"not confirmed: {name}: {reason}")
+        _row("guessed", f"not confirmed: {name}: {explain_image(reason).text}")
     for name, reason in images["left_out"].items():
         _row("missing", f"left out: {name}: {reason}")
     for name, reason in images["failed"].items():
         _row("missing", f"a provider failed: {name}: {reason}")
     for name, reason in images["unregistered"].items():
-        _row("missing", f"not registered: {name}: {reason}")
+        _row("missing", f"not registered: {name}: {explain_image(reason).text}")
     if (output / "report.html").is_file():
         _row("open", f"{output}/report.html")
     seconds = sum(stage["seconds"] for stage in result.summary["stages"].values())

@@ -27,7 +27,7 @@ def describe(
     """
     names = bench.images.names
     pairs = [
-        _pair(names, matches, outcome)
+        _pair(names, matches, outcome, bench.config.verification.min_inliers)
         for matches, outcome in zip(candidates, outcomes, strict=True)
     ]
     return {
@@ -73,11 +73,14 @@ def _pair_of_both(first: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]
     return {**best, **{key: first[key] + more[key] for key in ("matches", "inliers")}}
 
 
-def _pair(names: list[str], matches: Candidates, outcome: TwoView) -> dict[str, Any]:
+def _pair(
+    names: list[str], matches: Candidates, outcome: TwoView, min_matches: int
+) -> dict[str, Any]:
     a, b = matches.pair
     described: dict[str, Any] = {"images": [names[a], names[b]], "matches": len(matches)}
-    if outcome.reason:
-        return {**described, "dropped": outcome.reason}
+    if outcome.dropped:
+        reason = outcome.drop_reason(len(matches), min_matches)
+        return {**described, "dropped": reason.to_json()}
     return {**described, "inliers": len(outcome.inliers), "geometry": outcome.configuration}
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 from mpsfm_core.data import MappingProblem, VerifiedPair
+from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.events import MappingEvents
 from mpsfm_core.mapping.scene.conversion import current
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
@@ -21,7 +22,7 @@ class Journal:
         self.image_reasons = _first_reasons(problem)
         self._problem = problem
         self._events = events
-        self._pair_reasons: dict[str, str] = {}
+        self._pair_reasons: dict[str, Reason] = {}
         self._seconds: dict[str, float] = defaultdict(float)
         self._counts: dict[str, int] = defaultdict(int)
 
@@ -34,13 +35,13 @@ class Journal:
         """Images or points have moved; who wants to see them now pays for a copy."""
         self._events.scene_changed(lambda: current(scene))
 
-    def rejected(self, image: int, reason: str) -> None:
+    def rejected(self, image: int, reason: Reason) -> None:
         """An image was not registered, or is no longer."""
         name = self._problem.images[image].name
         self.image_reasons[name] = reason
         self._events.image_rejected(name, reason)
 
-    def pair_rejected(self, pair: VerifiedPair, reason: str) -> None:
+    def pair_rejected(self, pair: VerifiedPair, reason: Reason) -> None:
         """A pair could not start a group."""
         names = [self._problem.images[image].name for image in (pair.image_a, pair.image_b)]
         self._pair_reasons[" ".join(names)] = reason
@@ -62,15 +63,15 @@ class Journal:
         return MappingReport(reasons, self._pair_reasons, dict(self._seconds), dict(self._counts))
 
 
-def _first_reasons(problem: MappingProblem) -> dict[str, str]:
+def _first_reasons(problem: MappingProblem) -> dict[str, Reason]:
     """Why each image is not registered, before any was tried."""
     matched = {index for pair in problem.pairs for index in (pair.image_a, pair.image_b)}
     reasons = {}
     for index, image in enumerate(problem.images):
-        reason = "nothing that it matches could be registered"
+        reason = ImageReason.NO_REGISTERED_NEIGHBOR.because()
         if not image.depth.valid.any():
-            reason = "its depth is valid nowhere"
+            reason = ImageReason.NO_VALID_DEPTH.because()
         elif index not in matched:
-            reason = "no verified match with another image"
+            reason = ImageReason.NO_VERIFIED_MATCHES.because()
         reasons[image.name] = reason
     return reasons

@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mpsfm_core.data import SceneState
+from mpsfm_core.data.decisions import Reason
 from mpsfm_core.providers.registry import Registry
+from mpsfm_core.report.reasons import explain
 
 _PROC = Path("/proc/self")
 
@@ -98,9 +100,10 @@ class Stages:
         """Images or points have moved."""
         self._registry.call_hook("mpsfm_scene_changed", scene=scene)
 
-    def image_rejected(self, name: str, reason: str) -> None:
+    def image_rejected(self, name: str, reason: Reason) -> None:
         """The mapper tried an image and rejected it."""
-        self._registry.call_hook("mpsfm_image_rejected", name=name, reason=reason)
+        text = explain(reason).text
+        self._registry.call_hook("mpsfm_image_rejected", name=name, reason=reason, text=text)
 
 
 def _reset_peak_memory() -> None:

@@ -1,139 +1,232 @@
-"""The reasons that a run records, in plain words and with what to do about each."""
+"""Render the typed reasons of a run into words and a remedy for users.
+
+The reasons are defined in :mod:`mpsfm_core.data.decisions`. This module is the only place that
+knows words for them: terminal, report page and exceptions all call :func:`explain`.
+"""
 
 from __future__ import annotations
 
-import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-NO_MATCH = "no verified match with another image"
-NOTHING_TO_HOLD_ON = "nothing that it matches could be registered"
+from mpsfm_core.data.decisions import (
+    CameraReason,
+    ChoiceReason,
+    ImageReason,
+    PairReason,
+    ProviderReason,
+    Reason,
+    ReasonCode,
+    reason_from_json,
+)
 
-_MORE_OVERLAP = (
-    "Take photos between it and its neighbours, each sharing about half of its view with the next; "
-    "or let other features try: --config robust."
+_ADD_OVERLAP = (
+    "Take photos between this photo and its neighbors, each sharing about half of its view with "
+    "the next, or try other features: --config robust."
 )
-_LOOK_ALIKE = (
-    "Look at its matches and its prior depth below. Matches on look-alike places (repeated "
-    "furniture, windows) or wrong depth do this. A photo from nearby, or a better depth network, "
-    "settles it."
+_CHECK_DEPTH = (
+    "Look at its matches and its prior depth below. Repeated structure (furniture, windows) or a "
+    "wrong depth prior causes this. Add a photo from nearby, or use a better depth network."
 )
+_CHECK_MATCHES = (
+    "Look at its matches below. If they lie on moving or repeated objects, add a photo from "
+    "nearby. If they look right, give the true focal length with --intrinsics."
+)
+_NO_REMEDY = ""
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """``kind``: photos with the same are told of together. ``plain``: what happened. ``remedy``:
-    what to do."""
+    """A reason in words."""
 
-    kind: str
-    plain: str
+    title: str
+    """A phrase without numbers; photos with the same title are reported together."""
+    text: str
+    """One sentence that says what happened."""
     remedy: str
+    """The next step for the user; empty if there is none."""
 
 
-_IMAGES: tuple[tuple[str, str, str, str], ...] = (
-    (
-        NO_MATCH,
-        "nothing in common with another photo",
-        "No match with any other photo is geometrically possible.",
-        _MORE_OVERLAP + " A blurred or very dark photo matches nothing: leave it out.",
+_TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
+    ImageReason.NO_VERIFIED_MATCHES: (
+        "no verified matches",
+        "No match with any other photo passes geometric verification.",
+        _ADD_OVERLAP + " Leave out blurred or very dark photos.",
     ),
-    (
-        NOTHING_TO_HOLD_ON,
-        "in common only with photos that are missing too",
-        "There are matches with other photos, but none of those has a place in the reconstruction.",
-        "Add a photo that overlaps both with these and with the registered ones.",
+    ImageReason.NO_REGISTERED_NEIGHBOR: (
+        "matches only with unregistered photos",
+        "It matches other photos, but none of them is registered.",
+        "Add a photo that overlaps with these photos and with the registered ones.",
     ),
-    (
-        r"its depth is valid nowhere",
-        "no depth",
-        "The depth provider gives no valid depth.",
-        "Look at the mask and at the files or the network of the depth provider.",
+    ImageReason.NO_VALID_DEPTH: (
+        "no valid depth",
+        "The depth provider returned no valid depth.",
+        "Check the mask, and the files or the network of the depth provider.",
     ),
-    (
-        r"(?P<have>\d+) matches have a 3D point, (?P<need>\d+) are needed",
-        "too little in common with the reconstructed part",
-        "Only {have} matches are points of the reconstruction; {need} are needed.",
-        _MORE_OVERLAP,
+    ImageReason.TOO_FEW_POINTS: (
+        "too little overlap with the model",
+        "Only {num_matches} matches have a 3D point; {min_matches} are needed.",
+        _ADD_OVERLAP,
     ),
-    (
-        r"(?P<have>\d+) matches support its pose, (?P<need>\d+) are needed"
-        r"|(?P<share>[\d.]+%) of the matches support its pose, not .*"
-        r"|neither PnP nor an essential matrix gives a pose|nothing gives a pose",
-        "matches that do not agree",
-        "The matches do not agree on one place where the camera could have stood.",
-        "Look at its matches below. If they lie on moving or repeated things, add a photo from "
-        "nearby; if they look right, give the true focal length (--intrinsics).",
+    ImageReason.NO_POSE: (
+        "inconsistent matches",
+        "Neither PnP nor the essential matrix gives a pose.",
+        _CHECK_MATCHES,
     ),
-    (
-        r"too few points are left after refinement|lost its points .*",
-        "a place that did not hold",
-        "There was a place, but too few points fitted once everything was refined.",
-        _MORE_OVERLAP,
+    ImageReason.TOO_FEW_INLIERS: (
+        "inconsistent matches",
+        "Only {num_inliers} matches are inliers of its pose; {min_inliers} are needed.",
+        _CHECK_MATCHES,
     ),
-    (
-        r"(at the end )?(?P<share>[\d.]+%) of the pixels contradict (the depth of (?P<other>.+)"
-        r"|another view's)",
-        "in contradiction to another photo",
-        "Where the matches put it, {share} of what the photo sees contradicts what another sees.",
-        _LOOK_ALIKE,
+    ImageReason.LOW_INLIER_RATIO: (
+        "inconsistent matches",
+        "Only {inlier_ratio:.0%} of its matches are inliers of its pose; {min_inlier_ratio:.0%} "
+        "are needed.",
+        _CHECK_MATCHES,
     ),
-    (
-        r"(?P<count>\d+) other images contradict its depth",
-        "in contradiction to other photos",
-        "{count} other photos contradict what the photo sees where its matches put it.",
-        _LOOK_ALIKE,
+    ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT: (
+        "too few points after refinement",
+        "Too few points had small reprojection errors after bundle adjustment.",
+        _ADD_OVERLAP,
     ),
-    (
-        r"held to the rest only by an image that was dropped at the end",
-        "held only by a photo that was dropped",
-        "The only link to the others was a photo that was dropped in the end.",
-        _MORE_OVERLAP,
+    ImageReason.LOST_POINTS: (
+        "too few points after refinement",
+        "It was registered, and lost its points in the {step}.",
+        _ADD_OVERLAP,
     ),
-    (
-        r"only (?P<have>\d+) images are connected, (?P<need>\d+) are wanted",
-        "in a group that is too small",
-        "Only {have} photos hang together here; {need} are asked for.",
-        "Add photos of this place, or accept small groups: --set mapping.min_model_size=2.",
+    ImageReason.CONTRADICTS_IMAGE: (
+        "contradicted by the depth of another photo",
+        "At its pose, {violation_ratio:.0%} of the pixels contradict the depth of {other_image}.",
+        _CHECK_DEPTH,
     ),
-    (
-        r"not connected to the others; in components/(?P<number>\d+)",
-        "in a reconstruction of its own",
-        "The group was reconstructed (components/{number}), but what it matches in the others does "
-        "not suffice to join them.",
-        "Add photos that overlap with both groups.",
+    ImageReason.CONTRADICTS_DEPTH: (
+        "contradicted by the depth of another photo",
+        "In the {step}, {violation_ratio:.0%} of its pixels contradict the depth of another photo.",
+        _CHECK_DEPTH,
     ),
-    (
-        r"not tried: there are (?P<count>\d+) groups",
-        "not tried",
-        "The photos fall apart into more groups than are tried ({count}).",
-        "Add photos that link the groups, or raise mapping.max_components.",
+    ImageReason.CONTRADICTED_BY_IMAGES: (
+        "contradicted by the depth of several photos",
+        "{num_images} other photos contradict its depth at its pose.",
+        _CHECK_DEPTH,
     ),
-    (
-        r"has no known pose, and known poses are fixed",
+    ImageReason.MISREGISTERED: (
+        "more matches against its pose than for it",
+        "{num_matches} more matches contradict its pose than support it.",
+        _CHECK_MATCHES,
+    ),
+    ImageReason.CONNECTED_BY_DROPPED_IMAGE: (
+        "connected only by a removed photo",
+        "Only a photo that was removed in the {step} connected it to the model.",
+        _ADD_OVERLAP,
+    ),
+    ImageReason.COMPONENT_TOO_SMALL: (
+        "component too small",
+        "Its component has only {num_images} photos; {min_images} are needed.",
+        "Add photos of this place, or accept small components: --set mapping.min_model_size=2.",
+    ),
+    ImageReason.COMPONENT_LIMIT: (
+        "too many components",
+        "The photos form more components than are reconstructed ({max_components}).",
+        "Add photos that connect the components, or raise mapping.max_components.",
+    ),
+    ImageReason.OTHER_COMPONENT: (
+        "in another component",
+        "It is registered in a model of its own, components/{component}: too few matches connect "
+        "the two models.",
+        "Add photos that overlap with both components.",
+    ),
+    ImageReason.NO_KNOWN_POSE: (
         "no known pose",
-        "Poses were given and kept fixed, and there is none for this photo.",
+        "Known poses are fixed, and this photo has none.",
         "Leave out --set mapping.known_poses=fixed, or give its pose.",
     ),
+    ImageReason.NOT_RECORDED: (
+        "no recorded reason",
+        "The run recorded no reason.",
+        _ADD_OVERLAP,
+    ),
+    PairReason.TOO_FEW_MATCHES: (
+        "too few matches",
+        "{num_matches} matches; {min_matches} are needed.",
+        _NO_REMEDY,
+    ),
+    PairReason.TOO_FEW_INLIERS: (
+        "too few inliers",
+        "Only {num_inliers} of {num_matches} matches are inliers.",
+        _NO_REMEDY,
+    ),
+    PairReason.DEGENERATE: (
+        "degenerate two-view geometry",
+        "The two-view geometry is {geometry} ({num_inliers} of {num_matches} matches are inliers).",
+        _NO_REMEDY,
+    ),
+    PairReason.EXPLAINED_BY_CHANCE: (
+        "inliers explained by chance",
+        "Random matches reach {num_inliers} inliers of {num_matches} as well.",
+        _NO_REMEDY,
+    ),
+    PairReason.NO_RELATIVE_POSE: (
+        "no relative pose",
+        "The two-view geometry gives no relative pose.",
+        _NO_REMEDY,
+    ),
+    ProviderReason.UNAVAILABLE: ("provider unavailable", "{detail}", "Run mpsfm doctor."),
+    ProviderReason.INCOMPATIBLE: ("provider incompatible", "{detail}", "Run mpsfm doctor."),
+    ProviderReason.NO_WEIGHTS: ("weights missing", "{detail}", "Run mpsfm doctor."),
+    ChoiceReason.CONFIGURED: ("configured", "as configured", _NO_REMEDY),
+    ChoiceReason.FIRST_CHOICE: ("first choice", "the first choice", _NO_REMEDY),
+    ChoiceReason.FALLBACK: ("fallback", "a fallback", _NO_REMEDY),
+    CameraReason.TOO_FEW_IMAGES: (
+        "too few images",
+        "{num_images} images of the camera are registered; {min_images} are needed.",
+        "Add photos, or give the focal length with --intrinsics.",
+    ),
+    CameraReason.NOT_OBSERVABLE: (
+        "focal length not observable",
+        "The photos leave a standard deviation of {focal_length_std_ratio:.0%} of the focal "
+        "length.",
+        "Add photos from other directions, or give the focal length with --intrinsics.",
+    ),
+    CameraReason.OUT_OF_RANGE: (
+        "implausible focal length",
+        "Bundle adjustment ends at {focal_length_px:.0f} px, which no lens has.",
+        "Give the focal length with --intrinsics.",
+    ),
+}
+
+
+def explain(reason: Reason) -> Explanation:
+    """Return the title, text and remedy of a reason."""
+    title, text, remedy = _TEMPLATES[reason.code]
+    values = {name: _readable(value) for name, value in reason.values.items()}
+    return Explanation(title, text.format(**values), remedy)
+
+
+def explain_image(stored: Mapping[str, Any]) -> Explanation:
+    """Explain a reason of an image as ``summary.json`` stores it."""
+    return explain(reason_from_json(ImageReason, stored))
+
+
+def explain_pair(stored: Mapping[str, Any]) -> Explanation:
+    """Explain a reason of a dropped pair as ``summary.json`` stores it."""
+    return explain(reason_from_json(PairReason, stored))
+
+
+def explain_provider(stored: Mapping[str, Any]) -> Explanation:
+    """Explain why a provider was passed over, as ``summary.json`` stores it."""
+    return explain(reason_from_json(ProviderReason, stored))
+
+
+def _readable(value: str | int | float) -> str | int | float:
+    """Return the value; the code of a step becomes words."""
+    return value.replace("-", " ") if isinstance(value, str) and value in _STEPS else value
+
+
+_STEPS = (
+    "local-refinement",
+    "global-refinement",
+    "re-registration",
+    "global-initialization",
+    "final-check",
 )
-
-_PAIRS: tuple[tuple[str, str], ...] = (
-    (r"\d+ matches, at least \d+ are needed", "too few matches"),
-    (r"\d+ inliers of \d+ matches fit by chance", "matches that fit by chance alone"),
-    (r"\d+ inliers of \d+ matches( \(.+\))?", "matches that are geometrically impossible"),
-    (r"no relative pose", "no relative pose"),
-)
-
-
-def explain(reason: str) -> Explanation:
-    """What the recorded reason of a missing image means; an unknown one stands for itself."""
-    for pattern, kind, plain, remedy in _IMAGES:
-        found = re.fullmatch(pattern, reason)
-        if found:
-            values = {key: value for key, value in found.groupdict().items() if value}
-            return Explanation(kind, plain.format(**values), remedy)
-    return Explanation("another reason", reason[:1].upper() + reason[1:] + ".", _MORE_OVERLAP)
-
-
-def pair_kind(reason: str) -> str:
-    """The recorded reason of a dropped pair, without its numbers."""
-    found = (kind for pattern, kind in _PAIRS if re.fullmatch(pattern, reason))
-    return next(found, reason)

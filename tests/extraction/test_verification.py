@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from mpsfm_core.data.decisions import PairReason
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.extraction.matching.verification import verify
 from mpsfm_core.extraction.options import VerificationOptions
@@ -47,7 +48,7 @@ def test_pose_and_inliers(camera_b) -> None:
     xy_a, xy_b, good = add_outliers(*points, 100, camera_b)
     found = verify(CAMERA, camera_b, xy_a, xy_b, VerificationOptions())
     rotation, translation = relative_pose()
-    assert (found.reason, found.configuration) == ("", "calibrated")
+    assert (found.dropped, found.configuration) == ("", "calibrated")
     assert rotation_angle_deg(found.rotation @ rotation.T) < 0.3
     assert angle_between_deg(found.translation, translation) < 1.5
     assert np.linalg.norm(found.translation) == pytest.approx(1)
@@ -114,8 +115,11 @@ def test_pure_rotation() -> None:
 def test_too_few_matches() -> None:
     xy = np.zeros((14, 2))
     found = verify(CAMERA, CAMERA, xy, xy, VerificationOptions())
-    assert found.reason == "14 matches, at least 15 are needed" and not len(found.inliers)
-    assert verify(CAMERA, CAMERA, xy[:0], xy[:0], VerificationOptions()).reason
+    assert found.drop_reason(14, 15) == PairReason.TOO_FEW_MATCHES.because(
+        num_matches=14, min_matches=15
+    )
+    assert not len(found.inliers)
+    assert verify(CAMERA, CAMERA, xy[:0], xy[:0], VerificationOptions()).dropped
 
 
 @pytest.mark.parametrize("count", [20, 40, 250])
@@ -124,11 +128,11 @@ def test_random_matches_are_dropped(count: int) -> None:
     rng = np.random.default_rng(count)
     xy_a, xy_b = rng.uniform(0, 1, (2, count, 2)) * CAMERA.size
     dropped = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
-    assert "matches" in dropped.reason and not len(dropped.inliers)
+    assert dropped.dropped and not len(dropped.inliers)
     if count > 100:
         lenient = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(max_chance=1.0))
-        assert not lenient.reason  # what the number of inliers alone would say
-        assert "by chance" in dropped.reason
+        assert not lenient.dropped  # what the number of inliers alone would say
+        assert dropped.dropped == PairReason.EXPLAINED_BY_CHANCE.value
 
 
 def test_noisier_keypoints_have_a_larger_threshold() -> None:

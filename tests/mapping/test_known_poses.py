@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.mapper import reconstruct
@@ -84,7 +85,7 @@ def test_images_without_a_pose_are_left_out_beside_fixed_ones() -> None:
     result = reconstruct(problem, FIXED)
     assert [image.index for image in result.reconstructions[0].images] == [0, 1, 2]
     reasons = result.report.image_reasons
-    assert reasons == {"view_3.png": "has no known pose, and known poses are fixed"}
+    assert reasons == {"view_3.png": ImageReason.NO_KNOWN_POSE.because()}
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data import Float64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
 from mpsfm_core.mapping.mapper import reconstruct
@@ -167,10 +168,12 @@ def test_reasons_say_what_kept_an_image_out() -> None:
     nowhere = replace(last.depth, valid=np.zeros_like(last.depth.valid))
     problem = replace(problem, images=(*problem.images[:5], replace(last, depth=nowhere)))
     reasons = reconstruct(problem, MapperOptions(min_model_size=3)).report.image_reasons
-    assert reasons["view_3.png"] == "only 2 images are connected, 3 are wanted"
-    assert reasons["view_5.png"] == "its depth is valid nowhere"
+    assert reasons["view_3.png"] == ImageReason.COMPONENT_TOO_SMALL.because(
+        num_images=2, min_images=3
+    )
+    assert reasons["view_5.png"] == ImageReason.NO_VALID_DEPTH.because()
     reasons = reconstruct(problem, MapperOptions(max_components=1)).report.image_reasons
-    assert reasons["view_3.png"] == "not tried: there are 1 groups"
+    assert reasons["view_3.png"] == ImageReason.COMPONENT_LIMIT.because(max_components=1)
 
 
 def test_no_pairs_give_no_reconstruction() -> None:

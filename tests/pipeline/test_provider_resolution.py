@@ -203,8 +203,8 @@ def test_the_run_goes_on_with_our_own_network(
     assert len(told["images"]["registered"]) == COUNT
     depth, normals = (p for p in told["providers"] if p["block"] in ("depth", "normals"))
     assert depth["name"] == normals["name"] == "compact"
-    assert depth["chosen"] == "as strong cannot be had" and depth["accuracy"] == "measured"
-    assert why in depth["passed_over"]["strong"]
+    assert depth["chosen"] == "fallback" and depth["accuracy"] == "measured"
+    assert why in depth["passed_over"]["strong"]["detail"]
     assert told["config"]["depth"]["use"] == "compact"
 
 
@@ -230,7 +230,7 @@ def test_the_core_alone_reconstructs(room: Room, tmp_path: Path) -> None:
     assert len(result.summary["images"]["registered"]) == COUNT
     (depth,) = [p for p in result.summary["providers"] if p["block"] == "depth"]
     assert depth["name"] == "flat" and depth["accuracy"].startswith("none")
-    assert "pip install 'mpsfm-compact'" in depth["passed_over"]["compact"]
+    assert "pip install 'mpsfm-compact'" in depth["passed_over"]["compact"]["detail"]
 
 
 @pytest.mark.parametrize(

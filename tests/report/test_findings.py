@@ -2,62 +2,68 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from typing import Any
 
 import pytest
 
-from mpsfm_core.report.findings import findings, verdict
-from mpsfm_core.report.reasons import explain, pair_kind
-
-UNKNOWN = explain("something new").kind
-
-IMAGE_REASONS = [
-    "no verified match with another image",
-    "nothing that it matches could be registered",
-    "its depth is valid nowhere",
-    "12 matches have a 3D point, 30 are needed",
-    "12 matches support its pose, 30 are needed",
-    "9% of the matches support its pose, not 25%",
-    "neither PnP nor an essential matrix gives a pose",
-    "nothing gives a pose",
-    "too few points are left after refinement",
-    "lost its points when another image was refined",
-    "lost its points in global refinement",
-    "10% of the pixels contradict the depth of indoor_DSC02912.JPG",
-    "at the end 10% of the pixels contradict another view's",
-    "3 other images contradict its depth",
-    "held to the rest only by an image that was dropped at the end",
-    "only 2 images are connected, 3 are wanted",
-    "not connected to the others; in components/1",
-    "not tried: there are 20 groups",
-    "has no known pose, and known poses are fixed",
-]
-
-
-@pytest.mark.parametrize("reason", IMAGE_REASONS)
-def test_every_reason_of_the_mapper_is_explained(reason: str) -> None:
-    explained = explain(reason)
-    assert explained.kind != UNKNOWN
-    assert explained.remedy
-    assert "{" not in explained.plain + explained.remedy
-
-
-def test_a_reason_that_is_not_known_stands_for_itself() -> None:
-    assert explain("the moon was in the way").plain == "The moon was in the way."
-
-
-@pytest.mark.parametrize(
-    "reason",
-    [
-        "5 matches, at least 15 are needed",
-        "10 inliers of 40 matches",
-        "10 inliers of 40 matches (watermark)",
-        "10 inliers of 40 matches fit by chance",
-        "no relative pose",
-    ],
+from mpsfm_core.data.decisions import (
+    ImageReason,
+    PairReason,
+    ProviderReason,
+    Reason,
+    ReasonCode,
+    reason_from_json,
 )
-def test_every_reason_of_the_verification_is_known(reason: str) -> None:
-    assert not any(character.isdigit() for character in pair_kind(reason))
+from mpsfm_core.data.errors import DataError
+from mpsfm_core.report.findings import findings, verdict
+from mpsfm_core.report.reasons import explain
+
+CODES = [code for codes in ReasonCode.__subclasses__() for code in codes]
+EXAMPLES: dict[str, str | float] = {
+    "other_image": "b.jpg",
+    "step": "final-check",
+    "geometry": "degenerate",
+    "detail": "not installed",
+}
+
+
+def example(code: ReasonCode) -> Reason:
+    """Return a reason with plausible values for all fields of its code."""
+    return Reason(code, {name: EXAMPLES.get(name, 0.25) for name in code.fields})
+
+
+@pytest.mark.parametrize("code", CODES, ids=str)
+def test_every_code_is_explained_with_all_its_fields(code: ReasonCode) -> None:
+    explained = explain(example(code))
+    assert explained.title and explained.text
+    assert "{" not in explained.text + explained.remedy
+    assert not any(character.isdigit() for character in explained.title)
+    for name in code.fields:
+        values = {**example(code).values, name: "final-check" if name == "step" else 0.75}
+        other = {**values, name: "re-registration" if name == "step" else 0.5}
+        with contextlib.suppress(ValueError):  # a text field takes no number format
+            assert explain(Reason(code, values)).text != explain(Reason(code, other)).text
+
+
+@pytest.mark.parametrize("code", ImageReason, ids=str)
+def test_every_image_reason_has_a_remedy(code: ImageReason) -> None:
+    assert explain(example(code)).remedy
+
+
+@pytest.mark.parametrize("code", CODES, ids=str)
+def test_reason_stored_as_json_is_read_back(code: ReasonCode) -> None:
+    stored = json.loads(json.dumps(example(code).to_json()))
+    assert reason_from_json(type(code), stored) == example(code)
+
+
+def test_codes_are_unique_and_unknown_or_incomplete_reasons_are_refused() -> None:
+    assert len({code.value for code in ImageReason}) == len(ImageReason)
+    with pytest.raises(DataError, match="no known code"):
+        reason_from_json(ImageReason, {"code": "moon"})
+    with pytest.raises(DataError, match="needs num_inliers, min_inliers, got num_inliers"):
+        ImageReason.TOO_FEW_INLIERS.because(num_inliers=3)
 
 
 def summary(**changes: Any) -> dict[str, Any]:
@@ -96,18 +102,19 @@ def test_the_worst_comes_first() -> None:
     said = summary()
     said["images"]["details"]["a"]["focal_length_from"] = "default"
     said["images"]["registered"].remove("c")
-    said["images"]["unregistered"]["c"] = "its depth is valid nowhere"
-    gone = "https://host/a/file.onnx is gone. Run 'mpsfm models fetch https://host/a/file.onnx'"
-    said["providers"][0]["passed_over"] = {"better": gone}
+    said["images"]["unregistered"]["c"] = ImageReason.NO_VALID_DEPTH.because().to_json()
+    missing = ProviderReason.NO_WEIGHTS.because(detail="https://host/a/file.onnx is gone")
+    said["providers"][0]["passed_over"] = {"better": missing.to_json()}
     found = findings(said)
     assert [finding.level for finding in found] == ["warning", "warning", "note"]
-    assert found[-1].text.endswith("better: file.onnx is gone.")
+    assert found[-1].text.endswith("better (weights missing).")
     assert verdict(said).text == "2 of 3 photos have their place, 1 not."
 
 
 def test_a_run_that_matched_nothing() -> None:
+    few = PairReason.TOO_FEW_MATCHES.because(num_matches=5, min_matches=15)
     dropped = [
-        {"images": pair, "matches": 5, "dropped": "5 matches, at least 15 are needed"}
+        {"images": pair, "matches": 5, "dropped": few.to_json()}
         for pair in (["a", "b"], ["a", "c"], ["b", "c"])
     ]
     said = summary(status="failed", pairs={"matched": 3, "verified": 0, "all": dropped})

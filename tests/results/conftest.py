@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data import (
     DepthPrior,
     MappingImage,
@@ -69,7 +70,9 @@ def solved() -> Solved:
         tuple(registered[:3]), everything, np.zeros(len(everything)), MetricScale(1, 0.01, 3, True)
     )
     report = MappingReport(
-        {names[3]: "too few matches"}, {f"{names[0]} {names[3]}": "no parallax"}, {"total": 1.0}
+        {names[3]: ImageReason.NO_VERIFIED_MATCHES.because()},
+        {f"{names[0]} {names[3]}": ImageReason.NO_POSE.because()},
+        {"total": 1.0},
     )
     return Solved(
         MappingProblem(tuple(problem_images)), MappingResult((reconstruction,), report), views

@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.geometry import project, transform
 from mpsfm_core.inputs.images import FocalSource, ImageSet, SourceImage
@@ -234,15 +235,20 @@ def test_the_summary_tells_which_images_nothing_confirms(solved, tmp_path: Path)
     guessed = [replace(image, confirmed=False) for image in (second, third)]
     best = replace(reconstruction, images=(first, *guessed))
     other = replace(reconstruction, images=(third,))
-    report = MappingReport({"images/1.png": "its depth contradicts", "images/3.png": "no match"})
+    report = MappingReport(
+        {
+            "images/1.png": ImageReason.NO_VALID_DEPTH.because(),
+            "images/3.png": ImageReason.NO_POSE.because(),
+        }
+    )
     extraction = {"images": {name: {} for name in images.names}}
     described = describe_images(images, extraction, MappingResult((best, other), report))
     assert described["registered"] == ["images/0.png"]
     assert described["unconfirmed"] == {
-        "images/1.png": "its depth contradicts",
-        "images/2.png": "not connected to the others; in components/1",
+        "images/1.png": {"code": "no-valid-depth"},
+        "images/2.png": {"code": "other-component", "component": 1},
     }
-    assert described["unregistered"] == {"images/3.png": "no match"}
+    assert described["unregistered"] == {"images/3.png": {"code": "no-pose"}}
 
 
 def test_a_failed_run_leaves_its_summary_and_the_earlier_model(solved, tmp_path: Path) -> None:
@@ -272,7 +278,7 @@ def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path)
     described = describe_images(images, extraction, mapping)
     assert described["total"] == 4
     assert described["registered"] == ["images/0.png", "images/1.png", "images/2.png"]
-    assert described["unregistered"] == {"images/3.png": "too few matches"}
+    assert described["unregistered"] == {"images/3.png": {"code": "no-verified-matches"}}
     assert described["unconfirmed"] == {}
     details = described["details"]["images/0.png"]
     assert details == {
@@ -281,7 +287,7 @@ def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path)
         "keypoints": 46,
     }
     (pair,) = describe_pairs(extraction, mapping)["all"]
-    assert pair == {**extraction["pairs"][0], "cannot_start": "no parallax"}
+    assert pair == {**extraction["pairs"][0], "cannot_start": {"code": "no-pose"}}
     (numbers,) = describe_reconstructions(mapping, [model])
     assert (numbers["images"], numbers["points"], numbers["observations"]) == (3, 40, 120)
     assert numbers["mean_track_length"] == 3

@@ -45,7 +45,7 @@ class TwoView:
     def drop_reason(self, num_matches: int, min_matches: int) -> Reason:
         """Return the reason why the pair is dropped, with its numbers."""
         code = PairReason(self.dropped)
-        values = {
+        values: dict[str, str | int] = {
             "num_matches": num_matches,
             "min_matches": min_matches,
             "num_inliers": self.num_inliers,

@@ -102,8 +102,8 @@
     const look = el("div", { class: "look" });
     const know = el("div");
     aside.append(el("div", {}, el("h3", {}, photo.name), el("div", { class: `status ${photo.status}` }, STATUS[photo.status]), look), know);
-    if (photo.plain)
-      look.append(el("div", { class: "why" }, el("p", {}, photo.plain), el("p", { class: "hint" }, photo.remedy)));
+    if (photo.explanation)
+      look.append(el("div", { class: "why" }, el("p", {}, photo.explanation), el("p", { class: "hint" }, photo.remedy)));
     const there = MAPS.filter(([key]) => photo.pictures[key]);
     if (there.length) {
       if (!photo.pictures[shownMap]) shownMap = there[0][0];

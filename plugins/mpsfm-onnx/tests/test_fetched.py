@@ -18,7 +18,7 @@ from mpsfm_core.pipeline.provider_resolution import provide
 from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.providers import weights
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 from mpsfm_core.providers.weights import file_sha256
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 from tests.support.file_server import serving
@@ -115,4 +115,4 @@ def test_without_it_the_run_goes_on(server, registry, config, photos, tmp_path, 
     assert summary["status"] == "success"
     (depth,) = [line for line in summary["providers"] if line["block"] == "depth"]
     assert depth["name"] == "compact" and list(depth["passed_over"]) == ["moge-2-small"]
-    assert PATH in depth["passed_over"]["moge-2-small"]
+    assert PATH in depth["passed_over"]["moge-2-small"]["detail"]

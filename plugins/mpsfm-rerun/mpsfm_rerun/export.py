@@ -6,7 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from mpsfm_core.data import PosedImage, SceneState
-from mpsfm_core.report.viewing import ColoredPoints, pictures_from_photos, scene_from_model, pictures_from_results
+from mpsfm_core.report.viewing import (
+    ColoredPoints,
+    pictures_from_photos,
+    scene_from_model,
+    pictures_from_results,
+)
 from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_rerun.viewer import RerunViewer
 

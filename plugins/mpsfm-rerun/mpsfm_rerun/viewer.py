@@ -45,10 +45,9 @@ class RerunViewer:
         self._recording.log("log", rerun.TextLog(text))
 
     @hookimpl
-    def mpsfm_image_rejected(self, name: str, reason: str) -> None:
+    def mpsfm_image_rejected(self, name: str, text: str) -> None:
         """Into the log of the recording."""
-        text = f"{name}: {reason}"
-        self._recording.log("log", rerun.TextLog(text, level=rerun.TextLogLevel.WARN))
+        self._recording.log("log", rerun.TextLog(f"{name}: {text}", level=rerun.TextLogLevel.WARN))
 
     def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
         """The next step. Depth is shown as points of the world, or beside ``cloud`` as maps."""

@@ -46,7 +46,9 @@ def test_a_run_is_recorded_step_by_step(tmp_path: Path) -> None:
     registry.register(viewer, name="viewer")
     for count in (2, 3):
         registry.call_hook("mpsfm_scene_changed", scene=lambda count=count: scene(count))
-    registry.call_hook("mpsfm_image_rejected", name="room/9.jpg", reason="too few matches")
+    registry.call_hook(
+        "mpsfm_image_rejected", name="room/9.jpg", reason=None, text="too few matches"
+    )
     assert str(tmp_path / RECORDING) in viewer.finish()
     rows = recorded(tmp_path / RECORDING)
     cameras = [path for path in rows if path.startswith("/world/cameras/") and "photo" not in path]

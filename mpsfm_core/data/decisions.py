@@ -1,0 +1,143 @@
+"""Typed reasons of the decisions that a run makes about images, pairs and providers.
+
+A reason is a code with the fields that its code declares. It is created where the decision is made
+and stored in ``summary.json`` as ``{"code": ..., field: ...}``. Only
+:mod:`mpsfm_core.report.reasons` renders a reason into words and a remedy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, TypeVar
+
+from mpsfm_core.data.errors import DataError
+
+Value = str | int | float
+Code = TypeVar("Code", bound="ReasonCode")
+
+
+class ReasonCode(Enum):
+    """Base of the enumerations: a code for ``summary.json`` and the names of its fields."""
+
+    fields: tuple[str, ...]
+
+    def __new__(cls, code: str, *fields: str) -> ReasonCode:
+        """Create a member from its code and the names of its fields."""
+        member = object.__new__(cls)
+        member._value_ = code
+        member.fields = fields
+        return member
+
+    def because(self, **values: Value) -> Reason:
+        """Return the reason with this code; ``values`` has exactly the fields of the code."""
+        return Reason(self, values)
+
+
+class ImageReason(ReasonCode):
+    """Why an image is not registered, or why a pair cannot initialize a component."""
+
+    NO_VERIFIED_MATCHES = ("no-verified-matches",)
+    NO_REGISTERED_NEIGHBOR = ("no-registered-neighbor",)
+    NO_VALID_DEPTH = ("no-valid-depth",)
+    TOO_FEW_POINTS = ("too-few-points", "num_matches", "min_matches")
+    """Too few matches have a 3D point."""
+    NO_POSE = ("no-pose",)
+    """No estimator returns a pose."""
+    TOO_FEW_INLIERS = ("too-few-inliers", "num_inliers", "min_inliers")
+    LOW_INLIER_RATIO = ("low-inlier-ratio", "inlier_ratio", "min_inlier_ratio")
+    TOO_FEW_POINTS_AFTER_REFINEMENT = ("too-few-points-after-refinement",)
+    LOST_POINTS = ("lost-points", "step")
+    """The image lost its points in a step: local-refinement, global-refinement, re-registration."""
+    CONTRADICTS_IMAGE = ("contradicts-image", "violation_ratio", "other_image")
+    """The depth of another image contradicts the pose: share of contradicting pixels."""
+    CONTRADICTS_DEPTH = ("contradicts-depth", "violation_ratio", "step")
+    """The same in a check of all images: after global-initialization, or in the final-check."""
+    CONTRADICTED_BY_IMAGES = ("contradicted-by-images", "num_images")
+    MISREGISTERED = ("misregistered", "num_matches")
+    """So many more matches contradict the pose than support it."""
+    CONNECTED_BY_DROPPED_IMAGE = ("connected-by-dropped-image", "step")
+    COMPONENT_TOO_SMALL = ("component-too-small", "num_images", "min_images")
+    COMPONENT_LIMIT = ("component-limit", "max_components")
+    OTHER_COMPONENT = ("other-component", "component")
+    """Registered in a model of its own, in the folder components/<component>."""
+    NO_KNOWN_POSE = ("no-known-pose",)
+    """Known poses are fixed, and the image has none."""
+    NOT_RECORDED = ("not-recorded",)
+
+
+class PairReason(ReasonCode):
+    """Why geometric verification drops an image pair."""
+
+    TOO_FEW_MATCHES = ("too-few-matches", "num_matches", "min_matches")
+    TOO_FEW_INLIERS = ("too-few-inliers", "num_inliers", "num_matches")
+    DEGENERATE = ("degenerate", "num_inliers", "num_matches", "geometry")
+    """COLMAP classifies the two-view geometry as degenerate, watermark or undefined."""
+    EXPLAINED_BY_CHANCE = ("explained-by-chance", "num_inliers", "num_matches")
+    """Random matches reach as many inliers (a-contrario test)."""
+    NO_RELATIVE_POSE = ("no-relative-pose",)
+
+
+class ProviderReason(ReasonCode):
+    """Why a preferred provider is passed over for its fallback."""
+
+    UNAVAILABLE = ("unavailable", "detail")
+    """The plugin is missing or broken, or the options do not fit it."""
+    INCOMPATIBLE = ("incompatible", "detail")
+    """The provider does not fit the other chosen providers."""
+    NO_WEIGHTS = ("no-weights", "detail")
+
+
+class ChoiceReason(ReasonCode):
+    """Why a block of the configuration uses its provider."""
+
+    CONFIGURED = ("configured",)
+    FIRST_CHOICE = ("first-choice",)
+    FALLBACK = ("fallback",)
+
+
+class CameraReason(ReasonCode):
+    """Why the guessed focal length of a camera is not refined."""
+
+    TOO_FEW_IMAGES = ("too-few-images", "num_images", "min_images")
+    NOT_OBSERVABLE = ("not-observable", "focal_length_std_ratio")
+    """The images do not constrain the focal length; its relative std after adjustment."""
+    OUT_OF_RANGE = ("out-of-range", "focal_length_px")
+    """The refined value is no plausible focal length."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One reason: a code and the values of its fields."""
+
+    code: ReasonCode
+    values: Mapping[str, Value] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check that the values are those that the code declares."""
+        if set(self.values) != set(self.code.fields):
+            wanted = ", ".join(self.code.fields) or "no field"
+            raise DataError(self.code.value, f"needs {wanted}, got {', '.join(self.values)}")
+
+    def to_json(self) -> dict[str, Value]:
+        """Return the reason as stored in ``summary.json``."""
+        return {"code": self.code.value, **self.values}
+
+
+def reason_from_json(codes: type[Code], stored: Mapping[str, Any]) -> Reason:
+    """Return the reason that :meth:`Reason.to_json` stored.
+
+    Args:
+        codes: The enumeration of the code.
+        stored: The code and its fields.
+
+    Raises:
+        DataError: The code is unknown, or its fields are incomplete.
+    """
+    values = {name: value for name, value in stored.items() if name != "code"}
+    try:
+        code = codes(stored["code"])
+    except (KeyError, ValueError) as error:
+        raise DataError("reason", f"has no known code: {stored}") from error
+    return Reason(code, values)
