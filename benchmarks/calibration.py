@@ -28,8 +28,8 @@ from mpsfm_core.evaluation.prior_quality import prior_settings
 from mpsfm_core.evaluation.report import Row, make_rows
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.providers.uncertainty.file import load_calibration
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration_file import load_calibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 from mpsfm_core.support.yaml_text import write_yaml
 
 FACTOR = 5.0

@@ -23,7 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from mpsfm_core.mapping import mapper
 from mpsfm_core.pipeline.stages import peak_memory_mb
-from mpsfm_core.testing.synthetic.halls import HONEST, hall_problem
+from mpsfm_core.testing.synthetic.halls import CALIBRATED_PRIORS, make_hall_problem
 
 MAP_WIDTH = 387
 """As the extraction room leaves maps (``extraction.integration_size``)."""
@@ -90,7 +90,7 @@ def main() -> None:
 
 def _measured(views: int) -> dict[str, float]:
     """CPU seconds of each step, of all threads together, and ``peak`` in MiB."""
-    problem = hall_problem(views, HONEST, map_width=MAP_WIDTH).problem
+    problem = make_hall_problem(views, CALIBRATED_PRIORS, map_width=MAP_WIDTH).problem
     profile = cProfile.Profile(time.process_time)
     with threadpool_limits(1):
         profile.enable()

@@ -23,7 +23,7 @@ from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing.leak_probe import Held, held_after_each
+from mpsfm_core.testing.leak_probe import ProcessUsage, measure_usage
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
@@ -35,10 +35,10 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200)
     count = parser.parse_args().count
     with tempfile.TemporaryDirectory() as folder:
-        runs = held_after_each(reconstruction(Path(folder)), count)
-        held = np.fromiter(runs, np.dtype((float, len(Held._fields))), count)
+        runs = measure_usage(reconstruction(Path(folder)), count)
+        held = np.fromiter(runs, np.dtype((float, len(ProcessUsage._fields))), count)
     later = np.arange(count // 2, count)
-    slopes = Held(*np.polyfit(later, held[later], 1)[0])
+    slopes = ProcessUsage(*np.polyfit(later, held[later], 1)[0])
     lines = [
         f"# {count} reconstructions in one process",
         "",

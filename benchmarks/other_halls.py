@@ -24,21 +24,21 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.evaluation.methods import OURS, MethodRun, Outcome, run_tasks
 from mpsfm_core.evaluation.pose_auc import pose_auc, pose_errors_deg
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.testing.synthetic.halls import HONEST, QUALITIES, Hall, PriorErrors, hall_problem
+from mpsfm_core.testing.synthetic.halls import CALIBRATED_PRIORS, QUALITIES, HallProblem, PriorErrors, make_hall_problem
 
 
 @dataclass(frozen=True)
 class Matches:
-    """What sets the matches of halls apart. ``options``: of :func:`hall_problem`. ``share``: of the
+    """What sets the matches of halls apart. ``options``: of :func:`make_hall_problem`. ``share``: of the
     pairs that are kept, at random. ``reach``: views along the walk up to which pairs are kept."""
 
     options: Mapping[str, float] = field(default_factory=dict)
     share: float = 1.0
     reach: int = 10**9
 
-    def hall(self, views: int, errors: PriorErrors, seed: int) -> Hall:
+    def hall(self, views: int, errors: PriorErrors, seed: int) -> HallProblem:
         """A hall of this kind."""
-        hall = hall_problem(views, errors, seed=seed, **self.options)  # type: ignore[arg-type]
+        hall = make_hall_problem(views, errors, seed=seed, **self.options)  # type: ignore[arg-type]
         rng = np.random.default_rng(seed)
         kept = [
             pair
@@ -57,7 +57,7 @@ MATCHES = {
     "three neighbours": Matches(reach=3),
 }
 PRIORS = QUALITIES | {
-    "wrong by half in a tenth": replace(HONEST, patch=0.5),
+    "wrong by half in a tenth": replace(CALIBRATED_PRIORS, patch=0.5),
     "of a weak network": PriorErrors(scale=0.2, field=0.12, declared=0.2),
 }
 
@@ -89,14 +89,14 @@ def main() -> None:
         arguments.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def compared(halls: Sequence[Hall], workers: int) -> str:
+def compared(halls: Sequence[HallProblem], workers: int) -> str:
     """Cells of a line: images, accuracy and time of both on some halls."""
     tasks = [
         MethodRun(f"{number}", method, hall.problem, MapperOptions())
         for number, hall in enumerate(halls)
         for method in (PEER, OURS)
     ]
-    found: dict[str, list[tuple[Hall, Outcome]]] = {PEER: [], OURS: []}
+    found: dict[str, list[tuple[HallProblem, Outcome]]] = {PEER: [], OURS: []}
     for task, outcome in run_tasks(tasks, workers):
         found[task.method].append((halls[int(task.label)], outcome))
     of_peer, of_ours = _summed(found[PEER]), _summed(found[OURS])
@@ -106,7 +106,7 @@ def compared(halls: Sequence[Hall], workers: int) -> str:
     return " | ".join([*cells, f"{of_ours['seconds'] / of_peer['seconds']:.2f}x"])
 
 
-def _summed(outcomes: Sequence[tuple[Hall, Outcome]]) -> dict[str, Any]:
+def _summed(outcomes: Sequence[tuple[HallProblem, Outcome]]) -> dict[str, Any]:
     models = [outcome.models[0] if outcome.models else {} for _, outcome in outcomes]
     errors = [
         pose_errors_deg(model, hall.truth, CONVENTION)

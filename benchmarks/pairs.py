@@ -33,13 +33,13 @@ from mpsfm_core.evaluation.scene_folder import read_scene
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.events import NullExtractionEvents
 from mpsfm_core.extraction.features import FeatureTable
-from mpsfm_core.extraction.matching.matching import PairMatcher, PairVerifier
+from mpsfm_core.extraction.matching.pair_matching import PairMatcher, PairVerifier
 from mpsfm_core.extraction.options import PairOptions
 from mpsfm_core.extraction.pairs import similarity as first_look
-from mpsfm_core.extraction.pairs.candidates import Pair, most_alike, neighbours
+from mpsfm_core.extraction.pairs.pairing import Pair, most_alike, neighbours
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing.synthetic.halls import hall_problem
+from mpsfm_core.testing.synthetic.halls import make_hall_problem
 
 SCENES = ("rendered_kitchen", "hololens_room", "hall")
 OVERLAPS = (0.1, 0.25, 0.4)
@@ -140,7 +140,7 @@ def _real(name: str, output: Path) -> Case:
 
 def _hall(seed: int = 0) -> Case:
     """The views of a hall, in no order that their names tell."""
-    hall = hall_problem(VIEWS, seed=seed)
+    hall = make_hall_problem(VIEWS, seed=seed)
     images = hall.problem.images
     depths = {image.name: image.depth.depth for image in images}
     rng = np.random.default_rng(seed)

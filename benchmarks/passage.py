@@ -17,7 +17,7 @@ import psutil
 
 from mpsfm_core import DepthPrior, PinholeCamera, View
 from mpsfm_core.providers.environments import worker
-from mpsfm_core.providers.environments.process import Worker
+from mpsfm_core.providers.environments.worker_process import Worker
 
 _SIDE = 1000
 _CALLS, _ROUNDS = 100, 5
@@ -38,7 +38,7 @@ class _Holding:
         return self._answers[view.name]
 
 
-class _Service(worker.Service):
+class _Service(worker.ProviderServer):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._provider = _Holding()
@@ -78,7 +78,7 @@ def _cpu_ms(asked: Worker, call: dict[str, Any]) -> float:
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
-        worker.Service = _Service  # type: ignore[misc]
+        worker.ProviderServer = _Service  # type: ignore[misc]
         worker.main()
     else:
         main()

@@ -2,7 +2,7 @@
 
     python -m benchmarks.resources [CASE ...]
 
-Rendered photos: a walk through a hall, which ends in one group, or rooms that nothing joins, each a
+Rendered photos: a walk through a make_hall, which ends in one group, or rooms that nothing joins, each a
 group. SIFT with 1024 keypoints, exact depth of files as prior, pairs of neighbours. Prints a line
 for each case as it ends; docs/robustness.md has the table.
 """
@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks._scenes import MPSFM
 from mpsfm_core.data import Float64, PinholeCamera
-from mpsfm_core.testing.synthetic.halls import hall
+from mpsfm_core.testing.synthetic.halls import make_hall
 from mpsfm_core.testing.synthetic.scenes import AnalyticScene, arc_poses, room_scene
 
 ARC_DEG = 120.0
@@ -40,7 +40,7 @@ runtime: {{workers: {workers}, cache_dir: {folder}/cache}}
 
 @dataclass(frozen=True)
 class Case:
-    """``rooms``: 0 for a hall. ``size``: (width, height) of the photos; ``grid``: of the priors."""
+    """``rooms``: 0 for a make_hall. ``size``: (width, height) of the photos; ``grid``: of the priors."""
 
     count: int
     rooms: int
@@ -51,7 +51,7 @@ class Case:
     def photos(self) -> Iterable[tuple[AnalyticScene, Float64]]:
         """A scene and a pose for each."""
         if not self.rooms:
-            poses, scene = hall(self.count, np.random.default_rng(0))
+            poses, scene = make_hall(self.count, np.random.default_rng(0))
             yield from ((scene, pose) for pose in poses)
         for seed in range(self.rooms):
             each = self.count // self.rooms
@@ -61,7 +61,7 @@ class Case:
 
 CASES = {
     "room": Case(5, 1, (320, 240), 96, 1),
-    "hall": Case(60, 0, (320, 240), 160, 1),
+    "make_hall": Case(60, 0, (320, 240), 160, 1),
     "large photos": Case(24, 0, (640, 480), 256, 2),
     "many photos": Case(140, 0, (320, 240), 128, 1),
     "three rooms": Case(60, 3, (320, 240), 160, 1),

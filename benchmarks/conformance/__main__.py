@@ -27,8 +27,8 @@ from benchmarks.conformance.networks import HOSTED, NETWORKS, Hosted, Network
 from benchmarks.conformance.shared import AUTHORS, photos
 from mpsfm_core import ProviderContext, View
 from mpsfm_core.data.errors import MpsfmError, ProviderError
-from mpsfm_core.providers.environments.store import find_environment
-from mpsfm_core.providers.model_export.run import compared, run_script
+from mpsfm_core.providers.environments.environment import find_environment
+from mpsfm_core.providers.model_export.export import compare_with_original, run_script
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 
@@ -73,7 +73,7 @@ def main() -> int:
 
 
 def _missing(wanted: Mapping[str, tuple[str, str]], checkouts: Path | None) -> str:
-    """Why it cannot be compared here, or an empty text. ``wanted``: repository and commit of each
+    """Why it cannot be compare_with_original here, or an empty text. ``wanted``: repository and commit of each
     folder."""
     if checkouts is None:
         return "skipped: no --checkouts"
@@ -113,7 +113,7 @@ def _through_file(network: Network, checkouts: Path) -> dict[str, float]:
         except ProviderError as error:
             needs = f" (needs {', '.join(network.packages)})" if network.packages else ""
             raise ProviderError(f"the authors' code fails: {error}{needs}") from None
-        return {"file": max(compared(made).values()), **_differences(network, made, views)}
+        return {"file": max(compare_with_original(made).values()), **_differences(network, made, views)}
 
 
 def _differences(network: Network, made: Path, views: Sequence[View]) -> dict[str, float]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.conformance.shared import photos, run_authors
 from mpsfm_core import ProviderContext
-from mpsfm_core.providers.environments.store import Environment
+from mpsfm_core.providers.environments.environment import Environment
 from mpsfm_core.providers.registry import Registry
 
 _CAMERAS = ((640, 480, 500.0), (333, 500, 500.0), (1601, 1203, 500.0), (900, 1300, 500.0))

@@ -14,7 +14,7 @@ from benchmarks.conformance import netvlad, roma
 from mpsfm_core import DepthPrior, NormalPrior, PairMatches
 from mpsfm_core.data import Bool
 from mpsfm_core.geometry import resize_map
-from mpsfm_core.providers.environments.store import Environment
+from mpsfm_core.providers.environments.environment import Environment
 
 Arrays = Mapping[str, NDArray[Any]]
 Differences = dict[str, float]

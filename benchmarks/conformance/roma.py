@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.conformance.shared import photos, run_authors
 from mpsfm_core import ProviderContext
-from mpsfm_core.providers.environments.store import Environment
+from mpsfm_core.providers.environments.environment import Environment
 from mpsfm_core.providers.registry import Registry
 
 

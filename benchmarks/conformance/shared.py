@@ -12,7 +12,7 @@ import numpy as np
 
 from mpsfm_core import PinholeCamera, View
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.providers.environments.store import Environment
+from mpsfm_core.providers.environments.environment import Environment
 
 AUTHORS = Path(__file__).parent / "authors"
 _SAMPLES = Path(__file__).parents[2] / "examples" / "sample_scene" / "images"

@@ -1,7 +1,7 @@
 """Calibrate a provider on a folder of photos: with true maps, with a model, or with nothing.
 
 This stands above the pipeline, which it uses; the model of calibrations itself
-(:mod:`mpsfm_core.providers.uncertainty.model`) is below all providers.
+(:mod:`mpsfm_core.providers.uncertainty.calibration`) is below all providers.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from mpsfm_core.pipeline.provider_resolution import provide
 from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry, core_version
-from mpsfm_core.providers.uncertainty.file import CalibratedKind, CalibrationFile, Provenance
-from mpsfm_core.providers.uncertainty.model import Calibration
+from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind, CalibrationFile, Provenance
+from mpsfm_core.providers.uncertainty.calibration import Calibration
 
 _log = logging.getLogger(__name__)
 

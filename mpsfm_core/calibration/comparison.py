@@ -24,8 +24,8 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.priors.raw_priors import RawPriors
-from mpsfm_core.providers.uncertainty.file import CalibratedKind
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 Samples = TypeVar("Samples", DepthSamples, NormalSamples)
 

@@ -23,7 +23,7 @@ from mpsfm_core.calibration.samples import (
     normal_residuals,
 )
 from mpsfm_core.data import Float64, Int64
-from mpsfm_core.providers.uncertainty.model import Calibration, DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import Calibration, DepthCalibration, NormalCalibration
 
 Alignment = Literal["scale", "scale-shift", "disparity"]
 """What an image's depth is unknown up to: a factor; and a shift of depth, or of inverse depth."""

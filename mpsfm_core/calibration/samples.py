@@ -16,7 +16,7 @@ from mpsfm_core.geometry import (
     sample_nearest,
     scale_pixels,
 )
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, medians
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, depth_medians
 
 MIN_SAMPLES = 20
 """An image with fewer says nothing about its scale and is left out (ours)."""
@@ -54,7 +54,7 @@ class DepthSamples:
     """Prior and true depth at ``n`` pixels of one image; all (n,) float64.
 
     ``network_std`` is None when the network gives none. ``step``: largest step of log depth to a
-    neighbour. ``medians``: of depth and of inverse depth over the prior's map.
+    neighbour. ``depth_medians``: of depth and of inverse depth over the prior's map.
     """
 
     name: str
@@ -63,7 +63,7 @@ class DepthSamples:
     step: Float64
     truth: Float64
     truth_std: Float64
-    medians: tuple[float, float]
+    depth_medians: tuple[float, float]
     metric: bool
 
 
@@ -143,7 +143,7 @@ def compare_depth(
         step.astype(np.float64),
         truth.depth[ok],
         truth.std[ok],
-        medians(prior),
+        depth_medians(prior),
         prior.metric,
     )
 
@@ -173,7 +173,7 @@ def depth_residuals(
     network = all(image.network_std is not None for image in samples)
     parts, scales = [], []
     for number, image in enumerate(samples):
-        shifted, gain, ok = model.shift_depth(image.prior, image.medians)
+        shifted, gain, ok = model.shift_depth(image.prior, image.depth_medians)
         depth, gain = shifted[ok], gain[ok]
         log_ratio = np.log(image.truth[ok] / depth)
         scale = float(np.median(log_ratio)) if ok.any() else 0.0

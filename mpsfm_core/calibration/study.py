@@ -18,7 +18,7 @@ from mpsfm_core.calibration.samples import Residuals, join
 from mpsfm_core.data import Float64, Int64
 from mpsfm_core.data.options import Options
 from mpsfm_core.geometry.statistics import MAD_TO_STD
-from mpsfm_core.providers.uncertainty.model import Calibration
+from mpsfm_core.providers.uncertainty.calibration import Calibration
 
 FEW_IMAGES = 10
 """Fewer images than these do not show how images differ (ours)."""

@@ -14,7 +14,7 @@ from mpsfm_core.data.options import ProviderConfig, parse_settings
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.geometry import pixel_centers, sample_nearest, scale_pixels
 from mpsfm_core.providers import validation
-from mpsfm_core.providers.builtin.arrays import find_file
+from mpsfm_core.providers.builtin.map_files import find_file
 from mpsfm_core.providers.builtin.options import DepthFileOptions, FileOptions, NormalFileOptions
 
 EXACT = 1e-4

@@ -18,7 +18,7 @@ def create(
     python: Annotated[str | None, typer.Option(help="Interpreter, by default this one.")] = None,
 ) -> None:
     """Make an environment with these packages beside the core, and show what it brings."""
-    from mpsfm_core.providers.environments.store import create_environment
+    from mpsfm_core.providers.environments.environment import create_environment
 
     environment, found = create_environment(name, packages, python)
     typer.echo(f"{environment.folder}")
@@ -28,7 +28,7 @@ def create(
 @app.command("list")
 def list_environments() -> None:
     """List the environments and their providers."""
-    from mpsfm_core.providers.environments.store import all_environments
+    from mpsfm_core.providers.environments.environment import all_environments
 
     for environment in all_environments():
         typer.echo(f"{environment.name}: {environment.folder}")
@@ -38,7 +38,7 @@ def list_environments() -> None:
 @app.command()
 def refresh(name: Name) -> None:
     """Look again what an environment brings, after a change in it."""
-    from mpsfm_core.providers.environments.store import find_environment
+    from mpsfm_core.providers.environments.environment import find_environment
 
     _print_providers(name, find_environment(name).refresh())
 
@@ -46,7 +46,7 @@ def refresh(name: Name) -> None:
 @app.command()
 def remove(name: Name) -> None:
     """Remove an environment with all that is in it."""
-    from mpsfm_core.providers.environments.store import remove_environment
+    from mpsfm_core.providers.environments.environment import remove_environment
 
     remove_environment(name)
 

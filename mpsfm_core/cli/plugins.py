@@ -17,7 +17,7 @@ import typer
 
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.providers import Kind
-from mpsfm_core.providers.discovery import same_path
+from mpsfm_core.providers.discovery import subprocess_environment
 
 if TYPE_CHECKING:
     from mpsfm_core.providers.registry import ProviderStatus
@@ -68,9 +68,9 @@ def check(
     from mpsfm_core.testing.contract import (
         find_plugin,
         find_providers,
-        known_checks,
+        parse_check_ids,
         run_checks,
-        setup_from,
+        parse_setup,
     )
 
     registry = Registry.discover(probe=True)
@@ -82,14 +82,14 @@ def check(
             f"{hooks}, all of them known; it has no provider whose contract could be checked"
         )
         return
-    wanted = None if only is None else known_checks(only)
+    wanted = None if only is None else parse_check_ids(only)
     results: list[CheckResult] = []
     for kind, provider in find_providers(registry, name):
         results += run_checks(
             registry,
             kind,
             provider,
-            setup_from(options or []),
+            parse_setup(options or []),
             only=wanted,
             device=device,
             on_result=None if as_json else _print_result,
@@ -122,7 +122,7 @@ def new(
 def _elsewhere(name: str, arguments: list[str]) -> int:
     """Check in another process, which a crashing provider may end; returns the exit code."""
     command = [sys.executable, "-m", "mpsfm_core"]
-    environment = {**same_path(), _CHECKING: "1"}
+    environment = {**subprocess_environment(), _CHECKING: "1"}
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
             [*command, "plugins", "check", *arguments],

@@ -25,7 +25,7 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.pipeline.stages import peak_memory_mb
 from mpsfm_core.support.threads import limited
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 OURS = "ours"
@@ -147,5 +147,5 @@ def _prepare() -> None:
     otherwise count for the first set."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     camera = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
-    problem = mapping_problem(room_scene(), camera, arc_poses(3, 8.0))
+    problem = make_mapping_problem(room_scene(), camera, arc_poses(3, 8.0))
     run_method(MethodRun(OURS, OURS, problem, MapperOptions()))

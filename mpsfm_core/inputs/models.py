@@ -1,4 +1,4 @@
-"""Models with cameras and poses, of COLMAP or as ``transforms.json``, and whose images they are."""
+"""Reader of models with cameras and poses, and matching of their image names to files."""
 
 from __future__ import annotations
 
@@ -15,17 +15,19 @@ from mpsfm_core.inputs.nerfstudio import read_transforms
 
 
 def read_poses(path: Path) -> dict[str, Pose]:
-    """``cam_from_world`` of the registered images of a model, by image name.
+    """Read ``cam_from_world`` of the registered images of a model, by image name.
 
-    Raises what :func:`read_model` raises.
+    Raises:
+        InputError: as :func:`read_model`.
     """
     return reconstruction_poses(read_model(path))
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
-    """The COLMAP model of a folder (see :func:`find_model_folder`), or a ``transforms.json``.
+    """Read a COLMAP model (see :func:`find_model_folder`) or a ``transforms.json``.
 
-    Raises :class:`~mpsfm_core.data.errors.InputError` when it is not there or cannot be read.
+    Raises:
+        InputError: the model does not exist or cannot be read.
     """
     if path.suffix == ".json":
         return read_transforms(path)
@@ -34,25 +36,26 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         check_binary_model(folder)
         model = pycolmap.Reconstruction(str(folder))
         for image in model.images.values():
-            str(image.name)  # decoded when asked for
+            str(image.name)  # pycolmap decodes a name on access, and this can fail
     except (OSError, RuntimeError, ValueError, IndexError) as error:
-        raise InputError(f"{folder}: not a readable COLMAP model: {error}") from error
+        raise InputError(f"{folder}: the COLMAP model cannot be read: {error}") from error
     return model
 
 
 def find_model_folder(folder: Path) -> Path:
-    """Where a COLMAP model (binary or text) lies: here, in ``sparse`` or in ``sparse/0``.
+    """Find a COLMAP model (binary or text) in a folder, its ``sparse`` or ``sparse/0``.
 
-    Raises :class:`~mpsfm_core.data.errors.InputError` when there is none.
+    Raises:
+        InputError: there is none.
     """
     for candidate in (folder, folder / "sparse", folder / "sparse" / "0"):
         if any((candidate / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):
             return candidate
-    raise InputError(f"{folder}: no COLMAP model here (images.bin or images.txt)")
+    raise InputError(f"{folder} has no COLMAP model (images.bin or images.txt)")
 
 
 def reconstruction_poses(model: pycolmap.Reconstruction) -> dict[str, Pose]:
-    """``cam_from_world`` of the registered images, by name, in the order of their names."""
+    """Return ``cam_from_world`` of the registered images by name, sorted by name."""
     poses = {}
     for image in sorted(model.images.values(), key=lambda image: str(image.name)):
         if image.has_pose:
@@ -62,11 +65,17 @@ def reconstruction_poses(model: pycolmap.Reconstruction) -> dict[str, Pose]:
 
 
 def match_names(wanted: Iterable[str], available: Iterable[str]) -> dict[str, str]:
-    """Wanted name -> the one available name that means it.
+    """Match image names to the names in another source, such as a model or a database.
 
-    That is the name itself, else with another extension or none, else in some folder: lists of
-    images in the wild hold stems, and paths from elsewhere. Names that nothing or more than one
-    thing answers to are left out, and an available name that is itself wanted answers to no other.
+    A name matches itself, else the same name with another extension, else the same name in another
+    folder. An available name that is itself wanted matches nothing else.
+
+    Args:
+        wanted: names of the images of the run.
+        available: names in the other source.
+
+    Returns:
+        Wanted name -> available name, without names that have no match or an ambiguous one.
     """
     asked, names = list(wanted), set(available)
     by_stem: dict[str, list[str]] = {}

@@ -22,7 +22,7 @@ from mpsfm_core.dense.densify import densify
 from mpsfm_core.geometry.patch_alignment import align_patches
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import InitializationOptions, MapperOptions
-from mpsfm_core.optimize.bundle_kernels import step_points
+from mpsfm_core.optimize.bundle_kernels import update_points
 from mpsfm_core.optimize.depth_integration import DepthIntegrator
 from mpsfm_core.providers.builtin.mutual_nearest import mutual_nearest
 from mpsfm_core.results.options import ResultOptions
@@ -84,7 +84,7 @@ def compile_kernels(end: str) -> None:
 
 def _stamp() -> Path | None:
     """Beside the compiled kernels; its name holds all that they depend on."""
-    folder = step_points.stats.cache_path  # type: ignore[attr-defined]
+    folder = update_points.stats.cache_path  # type: ignore[attr-defined]
     if folder is None:
         return None
     found = hashlib.sha256(f"{sys.version} {numba.__version__}".encode())

@@ -25,10 +25,10 @@ from mpsfm_core.providers.protocols import (
     ProviderSpec,
     RetrievalProvider,
     WeightsFile,
-    file_named_by,
     hookimpl,
     hookspec,
-    required_features,
+    require_features,
+    weights_from_option,
 )
 
 __all__ = [
@@ -56,8 +56,8 @@ __all__ = [
     "ProviderSpec",
     "RetrievalProvider",
     "WeightsFile",
-    "file_named_by",
+    "weights_from_option",
     "hookimpl",
     "hookspec",
-    "required_features",
+    "require_features",
 ]

@@ -41,7 +41,7 @@ _REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 
 @dataclass(frozen=True)
-class Plugin:
+class LoadedPlugin:
     """What an entry point gave: its object and what it returned, or why it gave nothing."""
 
     name: str
@@ -55,7 +55,7 @@ class Plugin:
     hint: str = ""
 
 
-def new_manager() -> pluggy.PluginManager:
+def create_plugin_manager() -> pluggy.PluginManager:
     """A plugin manager that knows our hooks and no plugin."""
     manager = pluggy.PluginManager("mpsfm")
     manager.add_hookspecs(Hooks)
@@ -64,7 +64,7 @@ def new_manager() -> pluggy.PluginManager:
 
 def installed_plugins(
     timeout_s: float, crashing: Collection[tuple[str, str]] = ()
-) -> Iterator[Plugin]:
+) -> Iterator[LoadedPlugin]:
     """Load every entry point of the group ``mpsfm.plugins``, in the order of their names.
 
     ``crashing``: (name, module) of those that are not loaded: see :func:`crashing_plugins`.
@@ -75,7 +75,7 @@ def installed_plugins(
         if (entry.name, entry.value) in crashing:
             hint = f"reinstall or uninstall {name}"
             fault = "ends the whole process when it is loaded"
-            yield Plugin(entry.name, name, version, fault=fault, hint=hint)
+            yield LoadedPlugin(entry.name, name, version, fault=fault, hint=hint)
         else:
             yield _load(entry, name, version, timeout_s)
 
@@ -91,7 +91,11 @@ def crashing_plugins(timeout_s: float) -> set[tuple[str, str]]:
     while left:
         command = [sys.executable, "-c", _TRIAL, json.dumps(sorted(left)), str(timeout_s)]
         ended = subprocess.run(
-            command, env=same_path(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=False
+            command,
+            env=subprocess_environment(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            check=False,
         )
         named = [line for line in ended.stdout.decode().splitlines() if line.startswith("[")]
         if ended.returncode >= 0 or not named:
@@ -104,7 +108,7 @@ def crashing_plugins(timeout_s: float) -> set[tuple[str, str]]:
 
 _TRIAL = """
 import json, os, sys
-from mpsfm_core import discovery
+from mpsfm_core.providers import discovery
 wanted = [tuple(pair) for pair in json.loads(sys.argv[1])]
 for entry in discovery.metadata.entry_points(group=discovery.ENTRY_POINT_GROUP):
     if (entry.name, entry.value) in wanted:
@@ -114,14 +118,14 @@ os._exit(0)
 """
 
 
-def same_path() -> dict[str, str]:
+def subprocess_environment() -> dict[str, str]:
     """An environment in which another interpreter finds the modules that this one finds."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
-def inspect_plugin(module: object, name: str, distribution: str, version: str) -> Plugin:
+def inspect_plugin(module: object, name: str, distribution: str, version: str) -> LoadedPlugin:
     """Ask an imported plugin for what it has; raises what the plugin raises."""
-    manager = new_manager()
+    manager = create_plugin_manager()
     manager.register(module, name)
     callers = manager.get_hookcallers(module) or []
     if not callers:
@@ -137,10 +141,10 @@ def inspect_plugin(module: object, name: str, distribution: str, version: str) -
         near = did_you_mean(unknown[0], (n for n in vars(Hooks) if n.startswith("mpsfm_")))
         fault = f"implements the unknown hook {unknown[0]!r}, which nobody calls{near}"
     hooks = tuple(caller.name.removeprefix("mpsfm_") for caller in known)
-    return Plugin(name, distribution, version, module, tuple(answer), hooks, fault)
+    return LoadedPlugin(name, distribution, version, module, tuple(answer), hooks, fault)
 
 
-def spec_fault(spec: ProviderSpec) -> tuple[str, str]:
+def find_spec_fault(spec: ProviderSpec) -> tuple[str, str]:
     """Why a provider cannot be used, and what to do about it; two empty texts when it can."""
     if not isinstance(spec.api_version, int) or spec.api_version > API_VERSION:
         return (
@@ -170,8 +174,10 @@ def _distribution(entry: metadata.EntryPoint) -> tuple[str, str]:
     return "unknown distribution", "unknown"
 
 
-def _load(entry: metadata.EntryPoint, distribution: str, version: str, timeout_s: float) -> Plugin:
-    outcome: list[Plugin | BaseException] = []
+def _load(
+    entry: metadata.EntryPoint, distribution: str, version: str, timeout_s: float
+) -> LoadedPlugin:
+    outcome: list[LoadedPlugin | BaseException] = []
 
     def work() -> None:
         try:
@@ -187,13 +193,13 @@ def _load(entry: metadata.EntryPoint, distribution: str, version: str, timeout_s
         fault = f"did not load within {timeout_s:g} s"
         _log.warning("plugin %r of %s %s %s", entry.name, distribution, version, fault)
         hint = f"pip uninstall {distribution}, or raise MPSFM_PLUGIN_TIMEOUT_S"
-        return Plugin(entry.name, distribution, version, fault=fault, hint=hint)
+        return LoadedPlugin(entry.name, distribution, version, fault=fault, hint=hint)
     result = outcome[0]
-    if isinstance(result, Plugin):
+    if isinstance(result, LoadedPlugin):
         return result
     fault = f"fails to load: {type(result).__name__}: {result}"
     hint = _hint(result, distribution)
-    return Plugin(entry.name, distribution, version, fault=fault, hint=hint)
+    return LoadedPlugin(entry.name, distribution, version, fault=fault, hint=hint)
 
 
 def _hint(error: BaseException, distribution: str) -> str:

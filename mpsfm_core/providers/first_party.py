@@ -8,7 +8,7 @@ from types import MappingProxyType
 _ONNX = ("onnx", "onnx-joint", "moge-2-small")
 _METRIC3D = ("metric3d-v2-small", "metric3d-v2-large", "metric3d-v2-giant2")
 
-FIRST_PARTY: Mapping[str, tuple[str, ...]] = MappingProxyType(
+PLUGIN_PROVIDERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "mpsfm-compact": ("depth/compact", "normals/compact", "mask/compact"),
         "mpsfm-onnx": tuple(f"{k}/{n}" for k in ("depth", "normals") for n in _ONNX),
@@ -80,4 +80,4 @@ def install_hint(homes: Mapping[str, str], name: str) -> str:
 def requirement_for(kind: str, name: str) -> str:
     """What to install for a provider, empty if it is none of ours."""
     provider = f"{kind}/{name}"
-    return next((home for home, brought in FIRST_PARTY.items() if provider in brought), "")
+    return next((home for home, brought in PLUGIN_PROVIDERS.items() if provider in brought), "")

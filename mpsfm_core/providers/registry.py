@@ -30,17 +30,17 @@ from mpsfm_core.providers import (
 )
 from mpsfm_core.providers.builtin import plugin as builtin
 from mpsfm_core.providers.discovery import (
-    Plugin,
+    LoadedPlugin,
     crashing_plugins,
+    create_plugin_manager,
+    find_spec_fault,
     inspect_plugin,
     installed_plugins,
-    new_manager,
-    spec_fault,
 )
-from mpsfm_core.providers.environments.remote import EnvironmentHooks, remote_providers
-from mpsfm_core.providers.environments.store import all_environments
+from mpsfm_core.providers.environments.environment import all_environments
+from mpsfm_core.providers.environments.remote_provider import EnvironmentHooks, remote_providers
 from mpsfm_core.providers.first_party import requirement_for
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 _log = logging.getLogger(__name__)
 
@@ -102,7 +102,7 @@ class Registry:
     def __init__(self) -> None:
         self._entries: list[_Entry] = []
         self._plugins: list[ProviderStatus] = []
-        self._manager = new_manager()
+        self._manager = create_plugin_manager()
         self._muted: set[tuple[str, str]] = set()
 
     @classmethod
@@ -151,7 +151,7 @@ class Registry:
     ) -> None:
         """Add single providers of this process; their factory may be a callable."""
         for spec in specs:
-            self._entries.append(_Entry(spec, distribution, version, *spec_fault(spec)))
+            self._entries.append(_Entry(spec, distribution, version, *find_spec_fault(spec)))
 
     def status(self) -> tuple[ProviderStatus, ...]:
         """All providers by kind and name, then plugins that are broken or have hooks only."""
@@ -308,7 +308,7 @@ class Registry:
         if remotes:
             self._manager.register(EnvironmentHooks(remotes), "environments")
 
-    def _add(self, plugin: Plugin) -> None:
+    def _add(self, plugin: LoadedPlugin) -> None:
         origin = (plugin.distribution, plugin.version)
         status = ProviderStatus("plugin", plugin.name, *origin, capabilities=plugin.hooks)
         fault = plugin.fault
@@ -318,7 +318,7 @@ class Registry:
             self._manager.register(plugin.module, _label(plugin))
             for spec in plugin.specs:
                 if isinstance(spec, ProviderSpec):
-                    self._entries.append(_Entry(spec, *origin, *spec_fault(spec)))
+                    self._entries.append(_Entry(spec, *origin, *find_spec_fault(spec)))
                 else:
                     fault = f"lists a {type(spec).__name__} among its providers"
         if fault:
@@ -399,7 +399,7 @@ class _NoOptions(Options):
     """For a provider that has no options: refuses every key."""
 
 
-def _label(plugin: Plugin) -> str:
+def _label(plugin: LoadedPlugin) -> str:
     return f"{plugin.distribution}: {plugin.name}"
 
 

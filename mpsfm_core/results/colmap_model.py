@@ -1,4 +1,4 @@
-"""The reconstruction as a COLMAP model."""
+"""Conversion of a reconstruction to a COLMAP model, and its files."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from mpsfm_core.inputs.colmap_files import check_binary_model
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 
 MIN_TRACK_LENGTH = 2
-"""COLMAP and its users take a point for triangulated: one seen once, lifted from depth, is not."""
+"""Minimum track length of exported points: points lifted from one image are not triangulated."""
 
 _BLOCK = 1 << 20
+"""Bytes that are written together to test the free space."""
 
 Keypoints = Sequence[Float64]
-"""For each registered image its keypoints (n, 2), float64, in the pixels of the model's camera."""
+"""Keypoints (n, 2) float64 of each registered image, pixels of its camera in the model."""
 
 
 def build_model(
@@ -30,11 +31,19 @@ def build_model(
     keypoints: Keypoints,
     colors: UInt8,
 ) -> pycolmap.Reconstruction:
-    """A model of the registered images, with all keypoints and the points seen at least twice.
+    """Build a COLMAP model of the registered images.
 
-    ``cameras``: for each registered image; equal ones become one camera of the model. ``colors``:
-    (p, 3) RGB of the points. Image ids are positions in the problem plus one. Point errors are
-    reprojection errors in the pixels of ``cameras``.
+    The model has all keypoints, and all points with at least :data:`MIN_TRACK_LENGTH`
+    observations. Image ids are indices in the mapping problem plus one.
+
+    Args:
+        reconstruction: poses, points and tracks.
+        cameras: camera of each registered image; equal cameras are shared in the model.
+        keypoints: keypoints of each registered image in pixels of ``cameras``.
+        colors: (p, 3) RGB of the points.
+
+    Returns:
+        The model; point errors are reprojection errors in pixels of ``cameras``.
     """
     model = pycolmap.Reconstruction()
     ids: dict[str, int] = {}
@@ -59,44 +68,53 @@ def build_model(
 
 
 def write_model(folder: Path, model: pycolmap.Reconstruction, *, text: bool = False) -> None:
-    """Write a model, binary or text.
+    """Write a model as binary or text files.
 
-    Raises ``OSError`` when the disk has no room or fails. COLMAP's writer does not notice either,
-    so the room is tried before and the files are measured after.
+    COLMAP's writer does not report a full disk. The free space is therefore tested before, and the
+    sizes of the files are checked after writing.
+
+    Raises:
+        OSError: the disk is full or fails.
     """
     folder.mkdir(parents=True, exist_ok=True)
     keypoints = sum(image.num_points2D() for image in model.images.values())
     records = model.num_images() + model.num_cameras() + model.num_points3D()
     observations = model.compute_num_observations()
-    _try_room(
-        folder / "room", 512 * records + (32 if not text else 96) * (keypoints + observations)
+    _check_free_space(
+        folder / "free_space", 512 * records + (32 if not text else 96) * (keypoints + observations)
     )
     try:
         (model.write_text if text else model.write_binary)(str(folder))
     except (RuntimeError, ValueError) as error:
         raise OSError(errno.EIO, f"COLMAP cannot write {folder.name}/: {error}") from error
-    if not (_whole_text if text else _whole_binary)(folder, model):
-        raise OSError(errno.EIO, f"the disk did not take all of {folder.name}/")
+    if not (_is_text_complete if text else _is_binary_complete)(folder, model):
+        raise OSError(errno.EIO, f"the files of {folder.name}/ are incomplete: is the disk full?")
 
 
 def average_point_colors(
     reconstruction: Reconstruction, keypoints: Keypoints, view_of: Callable[[str], View]
 ) -> UInt8:
-    """Mean RGB colour (p, 3) of each point over its observations, black without any.
+    """Average the image colors of each point over its observations.
 
-    ``keypoints``: of each registered image, in the pixels of its view.
+    Args:
+        reconstruction: points and observations.
+        keypoints: keypoints of each registered image in pixels of its view.
+        view_of: returns the undistorted view of an image name.
+
+    Returns:
+        (p, 3) uint8 RGB; points without an observation are black.
     """
     total = np.zeros((len(reconstruction.points), 3))
     count = np.zeros(len(reconstruction.points))
     for image, xy in zip(reconstruction.images, keypoints, strict=True):
-        seen = image.point_ids >= 0
-        rows = image.point_ids[seen]
-        np.add.at(total, rows, sample_nearest(view_of(image.name).image, xy[seen]))
+        observed = image.point_ids >= 0
+        rows = image.point_ids[observed]
+        np.add.at(total, rows, sample_nearest(view_of(image.name).image, xy[observed]))
         np.add.at(count, rows, 1)
     return np.round(total / np.maximum(count, 1)[:, None]).astype(np.uint8)
 
 
-def _whole_binary(folder: Path, model: pycolmap.Reconstruction) -> bool:
+def _is_binary_complete(folder: Path, model: pycolmap.Reconstruction) -> bool:
     try:
         check_binary_model(folder)
     except (OSError, ValueError):
@@ -106,15 +124,15 @@ def _whole_binary(folder: Path, model: pycolmap.Reconstruction) -> bool:
     return bool(size == 8 + 24 * model.num_cameras() + 8 * params)
 
 
-def _whole_text(folder: Path, model: pycolmap.Reconstruction) -> bool:
-    wanted = {
+def _is_text_complete(folder: Path, model: pycolmap.Reconstruction) -> bool:
+    num_records = {
         "cameras.txt": model.num_cameras(),
         "images.txt": 2 * model.num_reg_images(),
         "points3D.txt": model.num_points3D(),
         "frames.txt": model.num_reg_frames(),
         "rigs.txt": model.num_rigs(),
     }
-    for name, count in wanted.items():
+    for name, count in num_records.items():
         data = (folder / name).read_bytes()
         lines = [line for line in data.split(b"\n")[:-1] if not line.startswith(b"#")]
         if not data.endswith(b"\n") or len(lines) != count:
@@ -122,7 +140,7 @@ def _whole_text(folder: Path, model: pycolmap.Reconstruction) -> bool:
     return True
 
 
-def _try_room(path: Path, size: int) -> None:
+def _check_free_space(path: Path, size: int) -> None:
     """Raise ``OSError`` unless a file of this many bytes can be written."""
     try:
         with path.open("wb") as file:
@@ -137,7 +155,7 @@ def _with_id(camera: pycolmap.Camera, camera_id: int) -> pycolmap.Camera:
 
 
 def _tracks(reconstruction: Reconstruction) -> list[list[tuple[int, int]]]:
-    """For each point its observations: (image id of the model, keypoint row)."""
+    """Return the observations of each point: (image id in the model, keypoint row)."""
     tracks: list[list[tuple[int, int]]] = [[] for _ in reconstruction.points]
     for image in reconstruction.images:
         for keypoint in np.flatnonzero(image.point_ids >= 0):

@@ -6,22 +6,22 @@ A plugin's test file is::
 
     test_contract = contract_tests("depth", "my-depth")
 
-See docs/contract.md for the checks, and :class:`Setup` for how a provider is put under test.
+See docs/contract.md for the checks, and :class:`ContractSetup` for how a provider is put under test.
 """
 
 from __future__ import annotations
 
-from mpsfm_core.testing.case import Case, Setup
 from mpsfm_core.testing.contract import CheckResult, run_checks
+from mpsfm_core.testing.contract_case import ContractCase, ContractSetup
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.pytest_tests import contract_tests
 
 __all__ = [
-    "Case",
+    "ContractCase",
     "CheckFailed",
     "CheckResult",
     "CheckSkipped",
-    "Setup",
+    "ContractSetup",
     "contract_tests",
     "run_checks",
 ]

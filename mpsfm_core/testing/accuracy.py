@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import DenseMatches, Features, Float64, PairMatches
-from mpsfm_core.testing import measure
-from mpsfm_core.testing.case import Case, depth_in
+from mpsfm_core.testing import map_errors
+from mpsfm_core.testing.contract_case import ContractCase, depth_in
 from mpsfm_core.testing.examples import Example
-from mpsfm_core.testing.measure import Shift
+from mpsfm_core.testing.map_errors import MapShift
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 DEPTH_TOLERANCE = 0.05
@@ -20,30 +20,30 @@ NORMALS_TOLERANCE_DEG = 5.0
 """Of 80 % of the pixels. Ours: a painted view has 0.7 degrees, planes fitted to exact depth 1."""
 MASK_TOLERANCE = 0.05
 """Share of pixels, two pixels and more away from the border of the surface."""
-MATCH_TOLERANCE = 3.0
+MATCH_TOLERANCE_STD = 3.0
 """Median distance from the true position, in ``std_px``; at least 3 pixels."""
 SHIFT_TOLERANCE_PX = 0.25
 """Of the view, or of the map where its pixels are larger. Half of the shift that taking integers
 for pixel centres makes. Ours: right resizing stays below 0.1, also at half and a quarter size."""
-FEWEST_MATCHES = 8
+MIN_MATCHES = 8
 """Fewer say nothing."""
 
 
-def judge(case: Case, example: Example, answer: Any) -> str:
+def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str:
     """Raise ``CheckFailed`` unless the answer is right; a remark if nobody can tell."""
-    unknown = case.knows == "nothing" or case.kind in ("features", "retrieval")
-    if unknown or (case.kind == "matcher" and case.knows == "painted"):
+    unknown = case.truth_source == "none" or case.kind in ("features", "retrieval")
+    if unknown or (case.kind == "matcher" and case.truth_source == "painted"):
         return "answered; whether it is right is not known"
     if case.kind in ("depth", "multiview"):
         answer = depth_in(answer)
-        scale_free = not answer.metric or case.can("intrinsics-aware")
-        errors = measure.log_errors(answer, example, any_scale=scale_free)
-        error = _limit("relative error", measure.typical(errors), DEPTH_TOLERANCE)
-        return f"{error}, {_placed(case, example, measure.depth_shift(answer, example), answer)}"
+        scale_free = not answer.metric or case.declares("intrinsics-aware")
+        errors = map_errors.log_errors(answer, example, any_scale=scale_free)
+        error = _limit("relative error", map_errors.error_quantile(errors), DEPTH_TOLERANCE)
+        return f"{error}, {_placed(case, example, map_errors.estimate_depth_shift(answer, example), answer)}"
     if case.kind == "normals":
-        angles = measure.angles_deg(answer, example)
-        error = _limit("angle in degrees", measure.typical(angles), NORMALS_TOLERANCE_DEG)
-        return f"{error}, {_placed(case, example, measure.normals_shift(answer, example), answer)}"
+        angles = map_errors.angle_errors_deg(answer, example)
+        error = _limit("angle in degrees", map_errors.error_quantile(angles), NORMALS_TOLERANCE_DEG)
+        return f"{error}, {_placed(case, example, map_errors.estimate_normals_shift(answer, example), answer)}"
     if case.kind == "mask":
         truth = example.truth()
         wrong = (answer != truth.valid)[truth.edge_free]
@@ -54,7 +54,9 @@ def judge(case: Case, example: Example, answer: Any) -> str:
     return _judge_matches(case, example, answer)
 
 
-def accept_shift(case: Case, example: Example, shift: Shift, shape: tuple[int, int]) -> str:
+def require_small_shift(
+    case: ContractCase, example: Example, shift: MapShift, shape: tuple[int, int]
+) -> str:
     """Raise ``CheckFailed`` if a map of this shape is shifted by too much, ``CheckSkipped`` if it
     is too coarse to know.
 
@@ -67,14 +69,14 @@ def accept_shift(case: Case, example: Example, shift: Shift, shape: tuple[int, i
     if shift.std > limit / 2:
         raise CheckSkipped(f"a map of {shape[1]} x {shape[0]} is too coarse to see a shift")
     text = f"shifted by ({shift.x:+.2f}, {shift.y:+.2f}) px"
-    found = max(abs(shift.x), abs(shift.y)) if case.knows == "seen" else shift.largest
+    found = max(abs(shift.x), abs(shift.y)) if case.truth_source == "image" else shift.largest
     if found > limit:
         border = f"and by another ({shift.stretch_x:+.2f}, {shift.stretch_y:+.2f}) px at the border"
         raise CheckFailed(f"content is {text} of the view {border}; {limit:.2f} is allowed")
     return text
 
 
-def match_points(case: Case, a: Example, b: Example, answer: PairMatches) -> DenseMatches:
+def match_points(case: ContractCase, a: Example, b: Example, answer: PairMatches) -> DenseMatches:
     """The matches as pairs of positions: the dense ones, or the keypoints of the sparse ones."""
     if answer.dense is not None:
         return answer.dense
@@ -98,19 +100,19 @@ def match_errors(a: Example, b: Example, matches: DenseMatches) -> Float64:
     return errors
 
 
-def _judge_matches(case: Case, example: Example, answer: PairMatches) -> str:
+def _judge_matches(case: ContractCase, example: Example, answer: PairMatches) -> str:
     other = example.partner
     matches = match_points(case, example, other, answer)
-    if len(matches) < FEWEST_MATCHES:
+    if len(matches) < MIN_MATCHES:
         return f"only {len(matches)} matches; whether they are right is not known"
-    limit = MATCH_TOLERANCE * max(1.0, matches.std_px)
+    limit = MATCH_TOLERANCE_STD * max(1.0, matches.std_px)
     median = float(np.median(match_errors(example, other, matches)))
     return _limit("median distance in pixels", median, limit)
 
 
-def _placed(case: Case, example: Example, shift: Shift, answer: Any) -> str:
+def _placed(case: ContractCase, example: Example, shift: MapShift, answer: Any) -> str:
     try:
-        return accept_shift(case, example, shift, answer.shape)
+        return require_small_shift(case, example, shift, answer.shape)
     except CheckSkipped as skipped:
         return str(skipped)
 

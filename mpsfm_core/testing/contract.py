@@ -14,7 +14,6 @@ from mpsfm_core.data.errors import InputError, MpsfmError, ProviderError, did_yo
 from mpsfm_core.providers import Kind, ProviderSpec
 from mpsfm_core.providers.registry import ProviderStatus, Registry
 from mpsfm_core.support.yaml_text import parse_yaml
-from mpsfm_core.testing.case import Case, Setup, setup_of
 from mpsfm_core.testing.checks import depth as checks_depth
 from mpsfm_core.testing.checks import features as checks_features
 from mpsfm_core.testing.checks import mask as checks_mask
@@ -30,11 +29,12 @@ from mpsfm_core.testing.checks.common import (
     check_output_rules,
     check_specification,
 )
+from mpsfm_core.testing.contract_case import ContractCase, ContractSetup, load_setup
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
-Check = Callable[[Case], str | None]
+Check = Callable[[ContractCase], str | None]
 Status = Literal["pass", "fail", "skip", "xfail"]
-SetupSource = Setup | Callable[[Path], Setup] | None
+SetupSource = ContractSetup | Callable[[Path], ContractSetup] | None
 
 CHECKS_BY_KIND: Mapping[Kind, tuple[Check, ...]] = MappingProxyType(
     {
@@ -103,7 +103,7 @@ class Contract:
         self._folder = folder
         self._setup = setup
         self._device = device
-        self._cases: dict[str, Case] = {}
+        self._cases: dict[str, ContractCase] = {}
         self._faults: dict[str, str] = {}
 
     @property
@@ -113,7 +113,7 @@ class Contract:
 
     def tasks(self) -> list[CheckTask]:
         """The checks in the order to run them; knows them without making anything."""
-        return tasks_of(self.spec)
+        return schedule_checks(self.spec)
 
     def run(self, task: CheckTask) -> CheckResult:
         """Run one check."""
@@ -132,8 +132,8 @@ class Contract:
         seconds = time.perf_counter() - started
         return CheckResult(self.provider, task.around, task.id, status, message, seconds)
 
-    def _outcome(self, case: Case, task: CheckTask) -> tuple[Status, str]:
-        check = check_of(task.id)
+    def _outcome(self, case: ContractCase, task: CheckTask) -> tuple[Status, str]:
+        check = find_check(task.id)
         if check not in REQUIRED and check not in STANDALONE:
             fault = self._fault(case, task.around)
             if fault:
@@ -147,26 +147,26 @@ class Contract:
         except Exception as error:  # of the provider, where it is called directly
             return "fail", f"{type(error).__name__}: {error}"
 
-    def _fault(self, case: Case, around: str) -> str:
+    def _fault(self, case: ContractCase, around: str) -> str:
         """The first of the checks without which the others mean nothing that fails."""
         if around not in self._faults:
-            failed = (id_of(check) for check in REQUIRED if not _passes(check, case))
+            failed = (check_id(check) for check in REQUIRED if not _passes(check, case))
             self._faults[around] = next(failed, "")
         return self._faults[around]
 
-    def _case(self, around: str) -> Case:
+    def _case(self, around: str) -> ContractCase:
         if around not in self._cases:
             setup = self._setup
             if setup is None:
-                setup = setup_of(self.spec, self._folder)
-            elif not isinstance(setup, Setup):
+                setup = load_setup(self.spec, self._folder)
+            elif not isinstance(setup, ContractSetup):
                 setup = setup(self._folder)
             known = {task.id for task in self.tasks()}
             for name in setup.expected_failures:
                 if name not in known:
                     raise ProviderError(f"expected failure {name!r}{did_you_mean(name, known)}")
             behaves_as = next((kind for kind in CHECKS_BY_KIND if kind == around), None)
-            self._cases[around] = Case(
+            self._cases[around] = ContractCase(
                 self._registry,
                 self.spec,
                 setup,
@@ -233,7 +233,7 @@ def find_plugin(registry: Registry, name: str) -> ProviderStatus | None:
     return next((line for line in plugins if name in (line.name, line.distribution)), None)
 
 
-def setup_from(assignments: Sequence[str]) -> Setup | None:
+def parse_setup(assignments: Sequence[str]) -> ContractSetup | None:
     """The setup of a provider with options given as ``key=value`` (or ``a.b=value``) with YAML
     values; None if there are none, which means what the plugin says.
 
@@ -249,10 +249,10 @@ def setup_from(assignments: Sequence[str]) -> Setup | None:
         for parent in parents:
             place = place.setdefault(parent, {})
         place[key] = parse_yaml(value, text)
-    return Setup(options=options) if options else None
+    return ContractSetup(options=options) if options else None
 
 
-def tasks_of(spec: ProviderSpec) -> list[CheckTask]:
+def schedule_checks(spec: ProviderSpec) -> list[CheckTask]:
     """The checks of a provider of this specification, in the order to run them."""
     wrapped = [kind for kind in ("depth", "normals") if f"wraps-{kind}" in spec.capabilities]
     tasks = []
@@ -260,37 +260,37 @@ def tasks_of(spec: ProviderSpec) -> list[CheckTask]:
         special = [*CHECKS_BY_KIND[spec.kind]]
         special += next((checks for kind, checks in CHECKS_BY_KIND.items() if kind == around), ())
         checks = [*STANDALONE, check_output_rules, *special, *COMMON]
-        tasks += [CheckTask(id_of(check), around) for check in checks]
+        tasks += [CheckTask(check_id(check), around) for check in checks]
     return tasks
 
 
-def all_checks() -> list[Check]:
+def list_checks() -> list[Check]:
     """Every check of the kit, the common ones first."""
     special = dict.fromkeys(check for checks in CHECKS_BY_KIND.values() for check in checks)
     return [*STANDALONE, check_output_rules, *COMMON, *special]
 
 
-def check_of(id: str) -> Check:
+def find_check(id: str) -> Check:
     """The check with an id."""
-    return next(check for check in all_checks() if id_of(check) == id)
+    return next(check for check in list_checks() if check_id(check) == id)
 
 
-def known_checks(ids: Collection[str]) -> set[str]:
+def parse_check_ids(ids: Collection[str]) -> set[str]:
     """The ids as a set; raises :class:`~mpsfm_core.data.errors.InputError` for one that is no
     check."""
-    known = [id_of(check) for check in all_checks()]
+    known = [check_id(check) for check in list_checks()]
     for name in ids:
         if name not in known:
             raise InputError(f"no check {name!r}{did_you_mean(name, known)}")
     return set(ids)
 
 
-def id_of(check: Check) -> str:
+def check_id(check: Check) -> str:
     """The check's name in reports: ``check_depth_is_z`` is ``depth-is-z``."""
     return check.__name__.removeprefix("check_").replace("_", "-")
 
 
-def _passes(check: Check, case: Case) -> bool:
+def _passes(check: Check, case: ContractCase) -> bool:
     try:
         check(case)
     except CheckSkipped:

@@ -10,21 +10,21 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64, PinholeCamera, UInt8, View
 from mpsfm_core.geometry import pixel_centers
-from mpsfm_core.testing.painting import MAX_SLOPE, paint
+from mpsfm_core.testing.painted_views import MAX_SLOPE, paint
 from mpsfm_core.testing.synthetic.scenes import (
     AnalyticScene,
     Box,
-    Correspondences,
     Plane,
     Sphere,
     Texture,
+    TrueCorrespondences,
     arc_poses,
     look_at,
     room_scene,
 )
 
-Look = Literal["painted", "textured"]
-"""``painted``: colours say depth and normals, see :mod:`mpsfm_core.testing.painting`.
+Appearance = Literal["painted", "textured"]
+"""``painted``: colours say depth and normals, see :mod:`mpsfm_core.testing.painted_views`.
 ``textured``: colours of a photo, with corners to find and match."""
 
 _SKY = ((120, 170, 235), (200, 220, 245))
@@ -34,7 +34,7 @@ _CREASE = np.cos(np.deg2rad(20.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class TrueMaps:
     """The exact answer on a grid (h, w) that covers the view.
 
     ``depth``: (h, w), z in metres, 0 where there is no surface. ``normals``: (h, w, 3).
@@ -62,7 +62,7 @@ class Example:
     scene: AnalyticScene
     camera: PinholeCamera
     pose: Float64
-    look: Look
+    look: Appearance
     mirrored: bool = False
 
     @cached_property
@@ -77,7 +77,7 @@ class Example:
 
     def truth(
         self, shape: tuple[int, int] | None = None, offset_px: tuple[float, float] = (0.0, 0.0)
-    ) -> Truth:
+    ) -> TrueMaps:
         """The exact answer on a grid of ``(rows, columns)``, by default one pixel a pixel.
 
         ``offset_px``: moves the grid by so many pixels of the view.
@@ -97,9 +97,9 @@ class Example:
         if self.mirrored:
             normals = normals * (-1.0, 1.0, 1.0)
         parts = (depth, normals, valid, smooth, edge_free)
-        return Truth(*(np.ascontiguousarray(self._turned(part)) for part in parts))
+        return TrueMaps(*(np.ascontiguousarray(self._turned(part)) for part in parts))
 
-    def correspondences(self, other: Example, xy: Float64) -> Correspondences:
+    def correspondences(self, other: Example, xy: Float64) -> TrueCorrespondences:
         """Where points seen through pixels (n, 2) of this view lie in the other one."""
         return self.scene.correspondences(self.camera, self.pose, other.camera, other.pose, xy)
 
@@ -132,7 +132,7 @@ class Example:
         return values[:, ::-1] if self.mirrored else values
 
 
-def outdoor_example(look: Look, size: tuple[int, int] = (192, 144)) -> Example:
+def outdoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Example:
     """Ground, a slanted wall and two balls below an open sky: everything a map can get wrong.
 
     The camera looks down and to the side and is rolled, so that no axis of the world is one of
@@ -155,7 +155,7 @@ def outdoor_example(look: Look, size: tuple[int, int] = (192, 144)) -> Example:
     return Example("outdoor.png", scene, camera, _rolled(pose, 15.0), look)
 
 
-def indoor_example(look: Look, size: tuple[int, int] = (192, 144)) -> Example:
+def indoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Example:
     """The furnished room, full of texture."""
     width, height = size
     focal = 0.9 * width

@@ -11,10 +11,10 @@ from mpsfm_core.data import Bool, DepthPrior, Float64, NormalPrior, View
 from mpsfm_core.data.options import Options
 from mpsfm_core.providers import Kind, ProviderContext, ProviderSpec
 from mpsfm_core.testing.examples import Example
-from mpsfm_core.testing.painting import NORMALS_STD, RELATIVE_STD, read_depth, read_normals
+from mpsfm_core.testing.painted_views import NORMALS_STD, RELATIVE_STD, read_depth, read_normals
 
 
-class OracleOptions(Options):
+class GroundTruthOptions(Options):
     """What the wrapped provider is like."""
 
     variance: bool = True
@@ -25,7 +25,7 @@ class OracleOptions(Options):
     """Of its depth."""
 
 
-class Oracle:
+class GroundTruth:
     """Knows the examples it was told, their mirror images, and what is painted in any other view
     (a wrapper may cut, turn or blur what it was given)."""
 
@@ -34,13 +34,13 @@ class Oracle:
         """The depth that came with each question about normals."""
         self._examples: list[Example] = []
 
-    def tell(self, example: Example) -> None:
+    def add_example(self, example: Example) -> None:
         """Learn the truth about an example."""
         self._examples.append(example)
 
-    def factory(self, kind: Kind) -> Callable[[OracleOptions, ProviderContext], object]:
+    def factory(self, kind: Kind) -> Callable[[GroundTruthOptions, ProviderContext], object]:
         """The factory of a provider of this kind that asks this oracle."""
-        make = OracleDepth if kind == "depth" else OracleNormals
+        make = GroundTruthDepth if kind == "depth" else GroundTruthNormals
         return lambda options, context: make(self, options)
 
     def answer(self, view: View) -> tuple[Float64, Float64, Bool]:
@@ -63,10 +63,10 @@ class Oracle:
         return None
 
 
-class OracleDepth:
+class GroundTruthDepth:
     """Depth of the oracle."""
 
-    def __init__(self, oracle: Oracle, options: OracleOptions) -> None:
+    def __init__(self, oracle: GroundTruth, options: GroundTruthOptions) -> None:
         self._oracle = oracle
         self._options = options
 
@@ -78,10 +78,10 @@ class OracleDepth:
         return DepthPrior.from_arrays(depth, variance, valid, metric=self._options.metric)
 
 
-class OracleNormals:
+class GroundTruthNormals:
     """Normals of the oracle."""
 
-    def __init__(self, oracle: Oracle, options: OracleOptions) -> None:
+    def __init__(self, oracle: GroundTruth, options: GroundTruthOptions) -> None:
         self._oracle = oracle
         self._options = options
 
@@ -94,10 +94,10 @@ class OracleNormals:
 
 
 def _spec(kind: Kind, factory: type) -> ProviderSpec:
-    return ProviderSpec(kind, "oracle", f"{__name__}:{factory.__name__}", OracleOptions)
+    return ProviderSpec(kind, "oracle", f"{__name__}:{factory.__name__}", GroundTruthOptions)
 
 
-ORACLE_SPECS: Mapping[Kind, ProviderSpec] = MappingProxyType(
-    {"depth": _spec("depth", OracleDepth), "normals": _spec("normals", OracleNormals)}
+GROUND_TRUTH_SPECS: Mapping[Kind, ProviderSpec] = MappingProxyType(
+    {"depth": _spec("depth", GroundTruthDepth), "normals": _spec("normals", GroundTruthNormals)}
 )
 """The specifications; a factory that asks an oracle takes the place of theirs."""

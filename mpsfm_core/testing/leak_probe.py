@@ -11,7 +11,7 @@ from typing import NamedTuple
 import psutil
 
 
-class Held(NamedTuple):
+class ProcessUsage(NamedTuple):
     """Resident memory without what is free in it (MB, 1e6 bytes), objects that Python's collector
     knows, open files, threads."""
 
@@ -21,7 +21,7 @@ class Held(NamedTuple):
     threads: int
 
 
-def held_after_each(run: Callable[[], object], count: int) -> Iterator[Held]:
+def measure_usage(run: Callable[[], object], count: int) -> Iterator[ProcessUsage]:
     """What this process holds after each of ``count`` calls. POSIX only."""
     process = psutil.Process()
     for _ in range(count):
@@ -30,4 +30,4 @@ def held_after_each(run: Callable[[], object], count: int) -> Iterator[Held]:
         if sys.platform == "linux":  # else what is freed counts where the library keeps it
             ctypes.CDLL(None).malloc_trim(0)
         memory = process.memory_info().rss / 1e6
-        yield Held(memory, len(gc.get_objects()), process.num_fds(), process.num_threads())
+        yield ProcessUsage(memory, len(gc.get_objects()), process.num_fds(), process.num_threads())

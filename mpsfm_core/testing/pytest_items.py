@@ -12,7 +12,7 @@ import pytest
 
 from mpsfm_core.data.errors import MpsfmError
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing.contract import CheckTask, Contract, find_providers, setup_from
+from mpsfm_core.testing.contract import CheckTask, Contract, find_providers, parse_setup
 from mpsfm_core.testing.pytest_tests import report
 
 
@@ -30,7 +30,7 @@ class ContractCollection:
     ) -> None:
         """Collect without constructing any provider."""
         try:
-            setup = setup_from(self._options)
+            setup = parse_setup(self._options)
             registry = Registry.discover()
             found = [p for name in self._names for p in find_providers(registry, name)]
             contracts = [Contract(registry, *p, self._folder, setup) for p in dict.fromkeys(found)]

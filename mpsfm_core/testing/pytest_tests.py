@@ -6,7 +6,13 @@ from collections.abc import Callable
 
 from mpsfm_core.providers import Kind
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing.contract import CheckResult, CheckTask, Contract, SetupSource, tasks_of
+from mpsfm_core.testing.contract import (
+    CheckResult,
+    CheckTask,
+    Contract,
+    SetupSource,
+    schedule_checks,
+)
 
 
 def contract_tests(
@@ -17,12 +23,12 @@ def contract_tests(
         test_contract = contract_tests("depth", "my-depth")
 
     ``setup``: by default what the plugin's specification says, see
-    :class:`~mpsfm_core.testing.Setup`. ``registry``: by default all installed plugins.
+    :class:`~mpsfm_core.testing.ContractSetup`. ``registry``: by default all installed plugins.
     """
     import pytest
 
     registry = registry or Registry.discover()
-    tasks = tasks_of(registry.spec(kind, name))
+    tasks = schedule_checks(registry.spec(kind, name))
     contracts: list[Contract] = []
 
     def test_contract(task: CheckTask, tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 from mpsfm_core.calibration.report import write_report
 from mpsfm_core.cli import build_app
 from mpsfm_core.config import load_config
-from mpsfm_core.providers.uncertainty.file import load_calibration
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration_file import load_calibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from mpsfm_core.support.yaml_text import parse_yaml
 from tests.calibration.scene_model import write_model
 

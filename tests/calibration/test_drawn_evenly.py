@@ -9,7 +9,7 @@ from mpsfm_core.calibration.fitting import DepthData, winner
 from mpsfm_core.calibration.model_truth import REACH, drawn_evenly
 from mpsfm_core.calibration.samples import DepthSamples, DepthTruth, compare_depth
 from mpsfm_core.data import DepthPrior, Float64
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 SIZE = WIDTH, HEIGHT = 200, 150
 

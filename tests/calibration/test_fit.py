@@ -17,7 +17,7 @@ from mpsfm_core.calibration.samples import (
     tangent_errors,
 )
 from mpsfm_core.data import Float64
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from tests.calibration.simulation import Simulated, simulate
 
 PLAIN = Simulated()
@@ -178,11 +178,11 @@ def test_residuals_of_normals_have_both_directions() -> None:
 def _unshift(samples: DepthSamples, alignment: str, share: float) -> DepthSamples:
     """The same with a share of the map's median taken off depth or inverse depth."""
     space = 0 if alignment == "scale-shift" else 1
-    median = samples.medians[space]
+    median = samples.depth_medians[space]
     quantity = samples.prior if space == 0 else 1 / samples.prior
     keep = quantity > 1.05 * share * median
     moved = quantity[keep] - share * median
-    medians = list(samples.medians)
+    medians = list(samples.depth_medians)
     medians[space] = (1 - share) * median
     return replace(
         samples,

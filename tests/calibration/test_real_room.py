@@ -18,7 +18,7 @@ from mpsfm_core.inputs.images import load_images
 from mpsfm_core.pipeline.provider_resolution import provide
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 from mpsfm_core.support.threads import limited
 
 pytest.importorskip("mpsfm_onnx")

@@ -9,7 +9,7 @@ import pytest
 
 from mpsfm_core.calibration.fitting import DepthData
 from mpsfm_core.calibration.study import Study, StudyOptions, study
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 from tests.calibration.simulation import Simulated, simulate
 
 PRIOR = Simulated(network=False, relative_std=0.1, std_floor=0.0, gross=0.02)

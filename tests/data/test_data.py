@@ -7,7 +7,7 @@ import pytest
 
 from mpsfm_core import Features, SparseMatches
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.providers import required_features
+from mpsfm_core.providers import require_features
 
 FEATURES = Features(np.zeros((0, 2)), np.zeros((0, 8), np.float32), np.zeros(0, np.float32))
 
@@ -27,6 +27,6 @@ def test_of_several_matches_of_a_feature_the_most_certain_stays() -> None:
 
 
 def test_a_matcher_that_needs_features_says_so() -> None:
-    assert required_features("x matches features", FEATURES, FEATURES) == (FEATURES, FEATURES)
+    assert require_features("x matches features", FEATURES, FEATURES) == (FEATURES, FEATURES)
     with pytest.raises(ProviderError, match="x matches features: choose a features provider"):
-        required_features("x matches features", FEATURES, None)
+        require_features("x matches features", FEATURES, None)

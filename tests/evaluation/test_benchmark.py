@@ -19,7 +19,7 @@ from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.records import read_record, read_records
 from mpsfm_core.evaluation.report import CLOUD
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 from tests.evaluation.conftest import CAMERA
 
@@ -198,7 +198,7 @@ def test_two_scenes_of_one_name_are_refused(scene_folder: Path, tmp_path: Path) 
 
 
 def small_task(method: str = "ours") -> MethodRun:
-    problem = mapping_problem(room_scene(), CAMERA, arc_poses(3, 10.0))
+    problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 10.0))
     return MethodRun(method, method, problem, MapperOptions())
 
 

@@ -8,7 +8,7 @@ from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.evaluation import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.chained_pnp import chained_poses
 from mpsfm_core.evaluation.records import Record
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(640, 480, 520.0, 515.0, 318.0, 242.0)
@@ -17,7 +17,7 @@ TRUTH = {f"view_{i}.png": (pose[:, :3], pose[:, 3]) for i, pose in enumerate(POS
 
 
 def problem(links: list[tuple[int, int]]) -> MappingProblem:
-    return mapping_problem(room_scene(), CAMERA, POSES, links=links)
+    return make_mapping_problem(room_scene(), CAMERA, POSES, links=links)
 
 
 def test_a_chain_carries_poses_from_pair_to_pair_in_either_direction() -> None:

@@ -10,7 +10,7 @@ from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.evaluation import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.peers import PEERS, run_peer, write_database
 from mpsfm_core.support.threads import limited
-from mpsfm_core.testing.synthetic.problems import Noise, mapping_problem
+from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(640, 480, 520.0, 515.0, 318.0, 242.0)
@@ -19,8 +19,8 @@ POSES = arc_poses(6, 9.0)
 
 @pytest.fixture(scope="module")
 def problem() -> MappingProblem:
-    return mapping_problem(
-        room_scene(), CAMERA, POSES, map_width=16, noise=Noise(keypoints_px=0.2), seed=3
+    return make_mapping_problem(
+        room_scene(), CAMERA, POSES, map_width=16, noise=SyntheticNoise(keypoints_px=0.2), seed=3
     )
 
 

@@ -18,11 +18,11 @@ from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import DataError, PinholeCamera
 from mpsfm_core.data.errors import ConfigError, InputError, ProviderOutputError, ReconstructionError
 from mpsfm_core.data.options import ProviderConfig
-from mpsfm_core.extraction.execution import Step
+from mpsfm_core.extraction.remote_execution import Step
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing.case import difference
+from mpsfm_core.testing.contract_case import describe_difference
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
@@ -92,7 +92,7 @@ def run(tmp_path: Path, plugin: Plugin) -> Callable[..., Extraction]:
 
 def test_results_are_those_of_threads(run: Callable[..., Extraction], plugin: Plugin) -> None:
     here, there = run("threads"), run("pickled")
-    assert not difference(here.problem, there.problem)
+    assert not describe_difference(here.problem, there.problem)
     executor = plugin.executor
     assert executor.stages["features"] == 3 and executor.stages["matching"] == 3
     assert executor.closed
@@ -106,7 +106,7 @@ def test_masks_and_retrieval(run: Callable[..., Extraction], plugin: Plugin) -> 
         "pairs": {"mode": "retrieval", "top_k": 1},
     }
     here, there = run("threads", **changes), run("pickled", **changes)
-    assert not difference(here.problem, there.problem)
+    assert not describe_difference(here.problem, there.problem)
     assert plugin.executor.stages["masks"] == plugin.executor.stages["retrieval"] == 3
 
 

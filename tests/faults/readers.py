@@ -29,9 +29,9 @@ from mpsfm_core.inputs.matches import matches_from_database, matches_from_hloc
 from mpsfm_core.inputs.models import read_model, read_poses
 from mpsfm_core.inputs.options import InputOptions, VideoOptions
 from mpsfm_core.pipeline.run import _depths_of_points
-from mpsfm_core.providers.environments.codec import Packed, unpack
-from mpsfm_core.providers.environments.store import Environment
-from mpsfm_core.providers.uncertainty.file import load_calibration
+from mpsfm_core.providers.environments.codec import EncodedMessage, decode_message
+from mpsfm_core.providers.environments.environment import Environment
+from mpsfm_core.providers.uncertainty.calibration_file import load_calibration
 from mpsfm_core.providers.weights import load_torch_state
 from mpsfm_core.report.page import write_report
 from mpsfm_core.report.viewing import read_scene as read_view
@@ -263,13 +263,13 @@ def weights() -> Table:
     pickled = io.BytesIO()
     torch.save({"model": tensors}, pickled)
     said = {"features": Features(np.ones((4, 2)), np.ones((4, 8), np.float32)), "path": Path("a")}
-    packed = Packed(said)
+    packed = EncodedMessage(said)
     block = np.zeros(packed.size, np.uint8)
     packed.write(memoryview(block))
     return {
         "a.pt": (pickled.getvalue(), load_torch_state),
         "a.safetensors": (save_safetensors(tensors), load_torch_state),
-        "message": (packed.text, lambda path: unpack(path.read_bytes(), block, copy=True)),
+        "message": (packed.text, lambda path: decode_message(path.read_bytes(), block, copy=True)),
     }
 
 

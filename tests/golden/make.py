@@ -41,11 +41,11 @@ from mpsfm_core.inputs import video
 from mpsfm_core.inputs.options import VideoOptions
 from mpsfm_core.mapping.state import freeze
 from mpsfm_core.pipeline import checkpoints
-from mpsfm_core.providers.environments import store
+from mpsfm_core.providers.environments.environment import Environment
 from mpsfm_core.providers.environments.worker import _description
 from mpsfm_core.providers.registry import Registry, core_version
-from mpsfm_core.providers.uncertainty.file import CalibrationFile, Provenance
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration_file import CalibrationFile, Provenance
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.support.files import replacing
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
@@ -178,7 +178,7 @@ def write_others(output: Path) -> None:
     origin = {"sha256": video._digest(clip), "options": options.model_dump(mode="json")}
     origin = {video.VERSION: video.FORMAT, **origin}
     (folder / video._LIST).write_text(json.dumps(origin))
-    environment = store.Environment(output / "environment")
+    environment = Environment(output / "environment")
     environment.ask = lambda **_: _description(Registry.discover(environments=False))  # type: ignore[method-assign,assignment]
     environment.refresh()
     exchange = output / "exchange"

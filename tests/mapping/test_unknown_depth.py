@@ -68,13 +68,13 @@ def test_a_ray_reaches_from_the_nearest_to_the_farthest_depth_that_its_view_know
     scene = scene_with_depth_in(LEFT_HALF)
     found = find_correspondences(scene, 1, [0], OPTIONS)
     depth_map = scene.maps[0]
-    rows = found.matched - scene.graph.offsets[0]
-    np.testing.assert_array_equal(found.known, depth_map.keypoint_valid[rows])
-    rays = ~found.known
+    rows = found.matched_keypoints - scene.graph.offsets[0]
+    np.testing.assert_array_equal(found.depth_known, depth_map.keypoint_valid[rows])
+    rays = ~found.depth_known
     assert 20 < rays.sum() < len(rays) - 20
     known = depth_map.at_keypoints()[depth_map.keypoint_valid]
-    for ends, depth in ((found.near, known.min()), (found.far, known.max())):
-        errors_px, z = scene.project(found.matched[rays], ends[rays])
+    for ends, depth in ((found.near_points, known.min()), (found.far_points, known.max())):
+        errors_px, z = scene.project(found.matched_keypoints[rays], ends[rays])
         np.testing.assert_allclose(z, depth)
         assert errors_px.max() < 1e-9, "on the ray of the keypoint"
 
@@ -84,15 +84,15 @@ def test_rays_count_half() -> None:
     found = find_correspondences(scene, 1, [0], OPTIONS)
     everywhere = find_correspondences(scene_with_depth_in(EVERYWHERE), 1, [0], OPTIONS)
     np.testing.assert_array_equal(found.keypoints, everywhere.keypoints)
-    np.testing.assert_array_equal(found.depth_weights, np.where(found.known, 1.0, RAY_MATCH_WEIGHT))
+    np.testing.assert_array_equal(found.depth_weights, np.where(found.depth_known, 1.0, RAY_MATCH_WEIGHT))
     np.testing.assert_allclose(
         found.weights / found.depth_weights, everywhere.weights / everywhere.depth_weights
     )
     pose = score_pose(scene, found, TRUTH, OPTIONS)
-    alone = score_pose(scene, found.select(found.known), TRUTH, OPTIONS)
-    rays = score_pose(scene, found.select(~found.known), TRUTH, OPTIONS)
-    assert rays.num_inliers >= 0.4 * RAY_MATCH_WEIGHT * (~found.known).sum()
-    assert rays.num_inliers <= RAY_MATCH_WEIGHT * (~found.known).sum()
+    alone = score_pose(scene, found.select(found.depth_known), TRUTH, OPTIONS)
+    rays = score_pose(scene, found.select(~found.depth_known), TRUTH, OPTIONS)
+    assert rays.num_inliers >= 0.4 * RAY_MATCH_WEIGHT * (~found.depth_known).sum()
+    assert rays.num_inliers <= RAY_MATCH_WEIGHT * (~found.depth_known).sum()
     assert alone.num_inliers <= pose.num_inliers <= alone.num_inliers + rays.num_inliers + 1
 
 
@@ -113,7 +113,7 @@ def test_rays_pin_down_what_a_strip_of_known_depth_leaves_loose() -> None:
         for seed in range(3):
             scene = scene_with_depth_in(part, seed)
             found = find_correspondences(scene, 1, [0], OPTIONS)
-            assert 0.15 < found.known.mean() < 0.35
+            assert 0.15 < found.depth_known.mean() < 0.35
             with_rays.append(error_deg(scene, found))
-            without.append(error_deg(scene, found.select(found.known)))
+            without.append(error_deg(scene, found.select(found.depth_known)))
     assert np.mean(with_rays) < 0.75 * np.mean(without)

@@ -15,7 +15,7 @@ from mpsfm_core.pipeline import checkpoints as module
 from mpsfm_core.pipeline.checkpoints import DiskCheckpoints
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing.synthetic.problems import mapping_problem
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 STATE = {"a": np.arange(3), "b": "text"}
@@ -36,7 +36,7 @@ class Notices(Stages):
 def problem() -> MappingProblem:
     camera = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
     poses = arc_poses(2, 10.0)
-    return mapping_problem(room_scene(), camera, poses, points_per_view=20, map_width=24)
+    return make_mapping_problem(room_scene(), camera, poses, points_per_view=20, map_width=24)
 
 
 def opened(folder: Path, problem: MappingProblem, every_s: float = 0.0, **options: Any) -> Any:

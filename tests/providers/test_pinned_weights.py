@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.providers.first_party import FIRST_PARTY
+from mpsfm_core.providers.first_party import PLUGIN_PROVIDERS
 from mpsfm_core.providers.registry import Registry
 
 NOT_PINNED = {
@@ -24,7 +24,7 @@ NOT_PINNED = {
 
 def test_what_is_downloaded_is_pinned() -> None:
     registry = Registry.discover()
-    ours = {name.partition("[")[0] for name in FIRST_PARTY}
+    ours = {name.partition("[")[0] for name in PLUGIN_PROVIDERS}
     found = set()
     for line in registry.status():
         if line.distribution not in ours or not line.available or line.kind == "plugin":

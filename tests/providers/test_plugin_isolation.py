@@ -23,7 +23,7 @@ InstallPlugin = Callable[..., str]
 
 HEALTHY = """
     from mpsfm_core import ProviderSpec, hookimpl
-    from mpsfm_core.testing.reference import PaintedDepth
+    from tests.support.reference_providers import PaintedDepth
 
     @hookimpl
     def mpsfm_providers():

@@ -25,7 +25,7 @@ from mpsfm_core import (
 from mpsfm_core.data.errors import InputError, ProviderError, WeightsError
 from mpsfm_core.data.options import ProviderConfig, SettingsError
 from mpsfm_core.providers.registry import CORE, ProviderStatus, Registry
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 InstallPlugin = Callable[..., str]
 

@@ -31,7 +31,7 @@ from mpsfm_core.data.options import Options
 from mpsfm_core.geometry import pixel_centers, resize_map
 from mpsfm_core.providers import ProviderContext
 from mpsfm_core.testing.examples import Example, indoor_example
-from mpsfm_core.testing.painting import NORMALS_STD, RELATIVE_STD, read_depth, read_normals
+from mpsfm_core.testing.painted_views import NORMALS_STD, RELATIVE_STD, read_depth, read_normals
 
 _THUMBNAIL = 8
 _GRID_PX = 12

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mpsfm_core
-from mpsfm_core.testing.leak_probe import Held, held_after_each
+from mpsfm_core.testing.leak_probe import ProcessUsage, measure_usage
 
 RUNS = 20
 MOST_MB = 15.0
@@ -34,8 +34,8 @@ def test_a_process_holds_no_more_after_many_reconstructions(photo_scene, tmp_pat
             overrides=[f"runtime.cache_dir={tmp_path}", *settings],
         )
 
-    held = np.fromiter(held_after_each(run, RUNS), np.dtype((float, len(Held._fields))), RUNS)
-    middle, end = Held(*held[RUNS // 2 - 1]), Held(*held[-1])
+    held = np.fromiter(measure_usage(run, RUNS), np.dtype((float, len(ProcessUsage._fields))), RUNS)
+    middle, end = ProcessUsage(*held[RUNS // 2 - 1]), ProcessUsage(*held[-1])
     assert (end.objects, end.files, end.threads) == (middle.objects, middle.files, middle.threads)
     first, second = held[: RUNS // 2, 0], held[RUNS // 2 :, 0]
     assert np.median(second) - np.median(first) < MOST_MB

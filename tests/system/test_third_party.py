@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from mpsfm_core.testing.contract import all_checks, id_of
+from mpsfm_core.testing.contract import list_checks, check_id
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "third-party-depth"
@@ -35,10 +35,10 @@ def test_the_tutorial_shows_the_files_of_the_example() -> None:
 def test_every_check_stands_in_the_documentation() -> None:
     document = (ROOT / "docs" / "contract.md").read_text(encoding="utf-8")
     shown = dict(re.findall(r"^\| `([a-z-]+)` \| (.*) \|$", document, re.MULTILINE))
-    for check in all_checks():
+    for check in list_checks():
         text = " ".join((inspect.getdoc(check) or "").replace("``", "`").split())
-        assert shown[id_of(check)] == text, f"docs/contract.md: | `{id_of(check)}` | {text} |"
-    assert f"by {len(all_checks())} small functions" in document
+        assert shown[check_id(check)] == text, f"docs/contract.md: | `{check_id(check)}` | {text} |"
+    assert f"by {len(list_checks())} small functions" in document
 
 
 @pytest.fixture(scope="module")

@@ -11,17 +11,17 @@ from mpsfm_core import ProviderContext, ProviderSpec, View
 from mpsfm_core.data.errors import InputError, ProviderError
 from mpsfm_core.providers import KINDS
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing import Setup, run_checks
+from mpsfm_core.testing import ContractSetup, run_checks
 from mpsfm_core.testing.contract import (
     CHECKS_BY_KIND,
-    all_checks,
-    check_of,
+    check_id,
+    find_check,
     find_providers,
-    id_of,
+    list_checks,
 )
 from tests.support.reference_providers import PaintedDepth, depth_prior
 
-PAINTED = Setup(knows="painted")
+PAINTED = ContractSetup(truth_source="painted")
 
 
 class Millimetres(PaintedDepth):
@@ -43,7 +43,9 @@ def outcomes(factory: Any, setup: Any, *only: str) -> dict[str, tuple[str, str]]
 
 
 def test_an_expected_failure_is_told_with_its_reason() -> None:
-    setup = Setup(knows="painted", expected_failures={"depth-scale": "the network is in mm"})
+    setup = ContractSetup(
+        truth_source="painted", expected_failures={"depth-scale": "the network is in mm"}
+    )
     found = outcomes(Millimetres, setup, "depth-scale", "depth-is-z")
     assert found["depth-is-z"][0] == "pass"
     status, message = found["depth-scale"]
@@ -52,7 +54,9 @@ def test_an_expected_failure_is_told_with_its_reason() -> None:
 
 
 def test_an_expected_failure_that_passes_is_a_failure() -> None:
-    setup = Setup(knows="painted", expected_failures={"depth-scale": "the network is in mm"})
+    setup = ContractSetup(
+        truth_source="painted", expected_failures={"depth-scale": "the network is in mm"}
+    )
     status, message = outcomes(PaintedDepth, setup, "depth-scale")["depth-scale"]
     assert status == "fail"
     assert message == "passes, and was expected to fail: the network is in mm"
@@ -60,16 +64,16 @@ def test_an_expected_failure_that_passes_is_a_failure() -> None:
 
 def test_expected_failures_need_a_reason_and_a_check() -> None:
     with pytest.raises(ValueError, match="'depth-scale' needs a reason"):
-        Setup(expected_failures={"depth-scale": " "})
-    setup = Setup(expected_failures={"depth-scal": "because"})
+        ContractSetup(expected_failures={"depth-scale": " "})
+    setup = ContractSetup(expected_failures={"depth-scal": "because"})
     status, message = outcomes(PaintedDepth, setup, "depth-scale")["depth-scale"]
     assert status == "fail"
     assert "did you mean 'depth-scale'" in message
 
 
 def test_told_needs_somebody_to_tell() -> None:
-    with pytest.raises(ValueError, match="needs tell"):
-        Setup(knows="told")
+    with pytest.raises(ValueError, match="needs prepare"):
+        ContractSetup(truth_source="prepared")
 
 
 def test_without_a_known_answer_accuracy_is_skipped_not_passed() -> None:
@@ -84,7 +88,7 @@ def test_without_a_known_answer_accuracy_is_skipped_not_passed() -> None:
 def test_the_plugin_says_how_it_is_tested(tmp_path: Path) -> None:
     folders = []
 
-    def contract(folder: Path) -> Setup:
+    def contract(folder: Path) -> ContractSetup:
         folders.append(folder)
         assert folder.is_dir()
         return PAINTED
@@ -99,7 +103,7 @@ def test_the_plugin_says_how_it_is_tested(tmp_path: Path) -> None:
     ("contract", "message"),
     [
         ("no_such_module:contract", "No module named 'no_such_module'"),
-        (lambda folder: {"weights": 1}, "returns a dict, not a Setup"),
+        (lambda folder: {"weights": 1}, "returns a dict, not a ContractSetup"),
     ],
 )
 def test_a_contract_that_fails(contract: Any, message: str) -> None:
@@ -155,9 +159,9 @@ def test_an_unavailable_provider_says_why() -> None:
 
 
 def test_ids_are_unique_and_every_check_says_what_it_is_about() -> None:
-    checks = all_checks()
-    ids = [id_of(check) for check in checks]
+    checks = list_checks()
+    ids = [check_id(check) for check in checks]
     assert len(set(ids)) == len(ids)
-    assert all(check_of(name) is check for name, check in zip(ids, checks, strict=True))
+    assert all(find_check(name) is check for name, check in zip(ids, checks, strict=True))
     assert all((check.__doc__ or "").strip().endswith(".") for check in checks)
     assert set(CHECKS_BY_KIND) == set(KINDS)

@@ -6,19 +6,19 @@ import numpy as np
 
 from mpsfm_core.geometry import project, transform
 from mpsfm_core.testing.synthetic.halls import (
-    EXACT,
-    HONEST,
-    LOCALLY_WRONG,
-    Hall,
+    CALIBRATED_PRIORS,
+    EXACT_PRIORS,
+    LOCALLY_BIASED_PRIORS,
+    HallProblem,
     PriorErrors,
-    hall_problem,
+    make_hall_problem,
 )
 
 VIEWS = 9
 
 
-def hall(errors: PriorErrors = EXACT) -> Hall:
-    return hall_problem(VIEWS, errors, points_per_view=30, map_width=80)
+def hall(errors: PriorErrors = EXACT_PRIORS) -> HallProblem:
+    return make_hall_problem(VIEWS, errors, points_per_view=30, map_width=80)
 
 
 def log_errors(errors: PriorErrors) -> list[np.ndarray]:
@@ -57,20 +57,20 @@ def test_relative_poses_are_estimated_and_good() -> None:
 
 
 def test_honest_priors_are_off_as_declared() -> None:
-    errors = log_errors(HONEST)
+    errors = log_errors(CALIBRATED_PRIORS)
     assert 0.02 < np.std(np.concatenate([(e - e.mean()).ravel() for e in errors])) < 0.06
-    assert np.std([e.mean() for e in errors]) < 3 * HONEST.scale
+    assert np.std([e.mean() for e in errors]) < 3 * CALIBRATED_PRIORS.scale
 
 
 def test_locally_wrong_priors_are_off_by_more_in_a_tenth_of_the_area() -> None:
-    plain = log_errors(PriorErrors(patch=LOCALLY_WRONG.patch))
+    plain = log_errors(PriorErrors(patch=LOCALLY_BIASED_PRIORS.patch))
     for error in plain:
         assert abs(np.mean(np.abs(error) > 0.1) - 0.1) < 0.01
         np.testing.assert_allclose(np.abs(error).max(), np.log(1.2), rtol=1e-3)
 
 
 def test_the_same_seed_gives_the_same_hall() -> None:
-    first, second = hall(HONEST).problem, hall(HONEST).problem
+    first, second = hall(CALIBRATED_PRIORS).problem, hall(CALIBRATED_PRIORS).problem
     for a, b in zip(first.images, second.images, strict=True):
         np.testing.assert_array_equal(a.keypoints, b.keypoints)
         np.testing.assert_array_equal(a.depth.depth, b.depth.depth)

@@ -13,13 +13,13 @@ import pytest
 
 from mpsfm_core import DepthPrior, Options, ProviderContext, ProviderSpec, View
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing import Setup, run_checks
+from mpsfm_core.testing import ContractSetup, run_checks
 from mpsfm_core.testing.checks.common import COMMON, STANDALONE
-from mpsfm_core.testing.contract import id_of
-from mpsfm_core.testing.painting import read_depth
+from mpsfm_core.testing.contract import check_id
+from mpsfm_core.testing.painted_views import read_depth
 from tests.support.reference_providers import PaintedDepth, depth_prior
 
-PAINTED = Setup(knows="painted")
+PAINTED = ContractSetup(truth_source="painted")
 
 
 class Changed(PaintedDepth):
@@ -263,4 +263,4 @@ def test_a_plugin_that_imports_what_it_does_not_need(install_plugin: Callable[..
 def test_every_common_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
     """But for the one that cannot fail."""
     caught = named(test_caught) | {"specification", "construction", "light-import"}
-    assert {id_of(check) for check in (*COMMON, *STANDALONE)} - caught == {"speed"}
+    assert {check_id(check) for check in (*COMMON, *STANDALONE)} - caught == {"speed"}

@@ -12,10 +12,10 @@ import pytest
 
 from mpsfm_core import DepthPrior, NormalPrior, View
 from mpsfm_core.geometry import pixel_centers, rays
-from mpsfm_core.testing import Setup
-from mpsfm_core.testing.contract import CHECKS_BY_KIND, id_of
+from mpsfm_core.testing import ContractSetup
+from mpsfm_core.testing.contract import CHECKS_BY_KIND, check_id
 from mpsfm_core.testing.examples import outdoor_example
-from mpsfm_core.testing.painting import RELATIVE_STD, read_depth, read_normals
+from mpsfm_core.testing.painted_views import RELATIVE_STD, read_depth, read_normals
 from tests.support.reference_providers import (
     PaintedDepth,
     PaintedNormals,
@@ -24,7 +24,7 @@ from tests.support.reference_providers import (
     normal_prior,
 )
 
-PAINTED = Setup(knows="painted")
+PAINTED = ContractSetup(truth_source="painted")
 
 
 def ray_lengths(view: View) -> np.ndarray:
@@ -400,5 +400,5 @@ def test_wrappers(
 
 def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
     kinds = ("depth", "normals", "wrapper")
-    checks = {id_of(check) for kind in kinds for check in CHECKS_BY_KIND[kind]}
+    checks = {check_id(check) for kind in kinds for check in CHECKS_BY_KIND[kind]}
     assert checks - named(test_depth, test_normals, test_wrappers) == set()

@@ -23,12 +23,12 @@ from mpsfm_core import (
 from mpsfm_core.providers.builtin.mutual_nearest import MutualNearest
 from mpsfm_core.providers.builtin.options import MutualNearestOptions, SiftOptions
 from mpsfm_core.providers.builtin.sift import Sift
-from mpsfm_core.testing import Setup
-from mpsfm_core.testing.contract import CHECKS_BY_KIND, id_of
+from mpsfm_core.testing import ContractSetup
+from mpsfm_core.testing.contract import CHECKS_BY_KIND, check_id
 from mpsfm_core.testing.examples import Example
 from tests.support.reference_providers import PaintedMask, Thumbnail, ToldMatcher, ToldOptions, tell
 
-PAINTED = Setup(knows="painted")
+PAINTED = ContractSetup(truth_source="painted")
 
 
 class Detector(Sift):
@@ -225,8 +225,8 @@ class DepthOfRays(ToldMatcher):
 def test_dense_matchers(
     caught: Callable[..., None], factory: type, check: str, message: str
 ) -> None:
-    def told(folder: Path) -> Setup:
-        return Setup({"folder": folder}, "told", lambda example: tell(folder, example))
+    def told(folder: Path) -> ContractSetup:
+        return ContractSetup({"folder": folder}, "prepared", lambda example: tell(folder, example))
 
     caught("matcher", factory, check, message, told, "dense", "pair-depth", options=ToldOptions)
 
@@ -321,6 +321,6 @@ def test_masks(caught: Callable[..., None], factory: type, check: str, message: 
 
 def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
     kinds = ("features", "matcher", "retrieval", "mask")
-    checks = {id_of(check) for kind in kinds for check in CHECKS_BY_KIND[kind]}
+    checks = {check_id(check) for kind in kinds for check in CHECKS_BY_KIND[kind]}
     tests = (test_features, test_sparse_matchers, test_dense_matchers, test_retrieval, test_masks)
     assert checks - named(*tests) == set()

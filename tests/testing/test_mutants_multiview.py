@@ -12,20 +12,20 @@ import pytest
 
 from mpsfm_core import DepthPrior, GroupPrior, View
 from mpsfm_core.geometry import invert, pixel_centers, rays
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 from mpsfm_core.testing.checks.depth import OF_MAPS
-from mpsfm_core.testing.contract import CHECKS_BY_KIND, id_of
+from mpsfm_core.testing.contract import CHECKS_BY_KIND, check_id
 from tests.support import reference_providers as ref
 from tests.support.reference_providers import ToldGroup, depth_prior
 
 EVERYTHING = ("metric", "variance", "proposes-poses", "proposes-intrinsics")
 
 
-def told(folder: Path) -> Setup:
-    return Setup(
+def told(folder: Path) -> ContractSetup:
+    return ContractSetup(
         options={"folder": folder},
-        knows="told",
-        tell=lambda example: ref.tell_group(folder, example),
+        truth_source="prepared",
+        prepare=lambda example: ref.tell_group(folder, example),
     )
 
 
@@ -224,5 +224,5 @@ def test_multiview(caught: Callable[..., None], factory: type, check: str, messa
 
 
 def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
-    checks = {id_of(check) for check in CHECKS_BY_KIND["multiview"] if check not in OF_MAPS}
+    checks = {check_id(check) for check in CHECKS_BY_KIND["multiview"] if check not in OF_MAPS}
     assert checks - named(test_multiview) == set()

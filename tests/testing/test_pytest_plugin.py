@@ -31,7 +31,7 @@ SOURCE = """
 
     def contract(folder):
         from mpsfm_core.testing import Setup
-        return Setup(knows="painted", expected_failures={"flat": "is too honest to pass"})
+        return Setup(truth_source="painted", expected_failures={"flat": "is too honest to pass"})
 
     @hookimpl
     def mpsfm_providers():

@@ -9,25 +9,29 @@ import pytest
 
 from mpsfm_core.providers import Kind, ProviderSpec
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing import Setup, run_checks
+from mpsfm_core.testing import ContractSetup, run_checks
 from tests.support import reference_providers as ref
 
-PAINTED = Setup(knows="painted")
+PAINTED = ContractSetup(truth_source="painted")
 JOINT = frozenset({"metric", "variance", "joint-normals", "estimates-focal"})
 EVERYTHING = ("metric", "variance", "proposes-poses", "proposes-intrinsics")
 MODULE = ref.__name__
 
 
-def told(folder: Path) -> Setup:
-    return Setup(
-        options={"folder": folder}, knows="told", tell=lambda example: ref.tell(folder, example)
+def told(folder: Path) -> ContractSetup:
+    return ContractSetup(
+        options={"folder": folder},
+        truth_source="prepared",
+        prepare=lambda example: ref.tell(folder, example),
     )
 
 
-def told_group(folder: Path) -> Setup:
+def told_group(folder: Path) -> ContractSetup:
     tell = ref.tell_group
-    return Setup(
-        options={"folder": folder}, knows="told", tell=lambda example: tell(folder, example)
+    return ContractSetup(
+        options={"folder": folder},
+        truth_source="prepared",
+        prepare=lambda example: tell(folder, example),
     )
 
 
@@ -78,7 +82,9 @@ def spec(kind: Kind, name: str, *capabilities: str, options: str | None = None) 
     ids=lambda value: value.kind if isinstance(value, ProviderSpec) else "",
 )
 def test_correct_providers_pass(
-    given: ProviderSpec, setup: Setup | Callable[[Path], Setup] | None, skipped: set[str]
+    given: ProviderSpec,
+    setup: ContractSetup | Callable[[Path], ContractSetup] | None,
+    skipped: set[str],
 ) -> None:
     registry = Registry()
     registry.add(given)

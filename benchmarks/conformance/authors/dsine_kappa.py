@@ -8,11 +8,11 @@ from mpsfm_dsine.export import ENCODERS, export, network
 from torch.nn.functional import pad
 from utils import utils
 
-from mpsfm_core.providers.model_export.authors import Job
+from mpsfm_core.providers.model_export.author_script import ExportJob
 
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
-job = Job.given()
+job = ExportJob.from_arguments()
 model = network(ENCODERS[job.size])
 for index, (image, camera) in enumerate(photos(job)):
     rgb = torch.tensor(image).permute(2, 0, 1)[None].float() / 255

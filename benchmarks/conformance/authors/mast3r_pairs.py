@@ -12,7 +12,7 @@ from common import photos, save
 from mpsfm_mast3r.export import export, network
 from PIL import Image
 
-from mpsfm_core.providers.model_export.authors import Job
+from mpsfm_core.providers.model_export.author_script import ExportJob
 
 for name in ("torchvision", "torchvision.transforms"):  # of it the authors' code uses these three
     sys.modules[name] = ModuleType(name)
@@ -42,7 +42,7 @@ def answers(model: Any, first: Any, second: Any) -> dict[str, Any]:
     return {**maps, "matches_a": at_a, "matches_b": at_b}
 
 
-job = Job.given()
+job = ExportJob.from_arguments()
 model = network(job.size)
 files, sizes = [], []
 for index, (image, _) in enumerate(photos(job)):

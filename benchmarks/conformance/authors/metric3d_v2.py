@@ -7,11 +7,11 @@ import torch
 from common import photos, save
 from mpsfm_metric3d_onnx.export import SIZE, export, network
 
-from mpsfm_core.providers.model_export.authors import Job
+from mpsfm_core.providers.model_export.author_script import ExportJob
 
 _PADDING = (123.675, 116.28, 103.53)
 
-job = Job.given()
+job = ExportJob.from_arguments()
 model = network(job.size)
 last = model.model.depth_model.decoder.normal_predictor[-1]
 last.bias.data += torch.tensor([0.0, 0.0, -10.0])  # facing the camera, as trained ones do

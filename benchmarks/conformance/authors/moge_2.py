@@ -10,7 +10,7 @@ from moge.model.v2 import MoGeModel
 from moge.utils.geometry_torch import normalized_view_plane_uv
 from mpsfm_onnx.export_moge import TOKENS, export, small_with_normals
 
-from mpsfm_core.providers.model_export.authors import Job
+from mpsfm_core.providers.model_export.author_script import ExportJob
 
 _SHIFT, _FOCAL = 0.7, 1.4
 
@@ -27,7 +27,7 @@ class Seeing(MoGeModel):
         return torch.cat([0.1 * points[..., :2] + uv * (z + _SHIFT) / _FOCAL, z], dim=-1)
 
 
-job = Job.given()
+job = ExportJob.from_arguments()
 model = Seeing(**small_with_normals()).eval()
 for block in model.encoder.backbone.blocks:  # else it starts as the identity
     torch.nn.init.constant_(block.ls1.gamma, 1.0)

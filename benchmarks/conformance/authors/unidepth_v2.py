@@ -8,9 +8,9 @@ from common import photos, save
 from mpsfm_onnx.export_unidepth import SIZE, export, network
 from unidepth.utils.constants import IMAGENET_DATASET_MEAN, IMAGENET_DATASET_STD
 
-from mpsfm_core.providers.model_export.authors import Job
+from mpsfm_core.providers.model_export.author_script import ExportJob
 
-job = Job.given()
+job = ExportJob.from_arguments()
 model = network(job.size)
 last = model.pixel_decoder.depth_layer.to_confidence_hr[-1]
 torch.nn.init.constant_(last.bias, 1.0)  # an error, which is positive

@@ -1,7 +1,7 @@
 import numpy as np
 
-from mpsfm_core.testing import Setup
-from mpsfm_core.testing.painting import decoder
+from mpsfm_core.testing import ContractSetup
+from mpsfm_core.testing.painted_views import decoder
 
 
 def contract(folder):
@@ -15,4 +15,4 @@ def contract(folder):
         phases=np.zeros(1),
         weights=np.concatenate([255 * colours[0], np.zeros(10), [bias[0], 0]]),
     )
-    return Setup(options={"weights": str(folder / "tiny.npz")}, knows="painted")
+    return ContractSetup(options={"weights": str(folder / "tiny.npz")}, truth_source="painted")

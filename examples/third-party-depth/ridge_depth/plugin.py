@@ -1,5 +1,5 @@
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 
 @hookimpl

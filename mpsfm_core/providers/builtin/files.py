@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Bool, DepthPrior, NormalPrior, View
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.providers import ProviderContext
-from mpsfm_core.providers.builtin.arrays import check_map, find_file, read_arrays
+from mpsfm_core.providers.builtin.map_files import check_map, find_file, read_arrays
 from mpsfm_core.providers.builtin.options import (
     DepthFileOptions,
     MaskFileOptions,

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpsfm_core.data import Features, Float32, Int64, PairMatches, SparseMatches, View
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.providers import ProviderContext, required_features
+from mpsfm_core.providers import ProviderContext, require_features
 from mpsfm_core.providers.builtin.options import MutualNearestOptions
 from mpsfm_core.support.jit import kernel
 
@@ -40,7 +40,7 @@ class MutualNearest:
         features_b: Features | None = None,
     ) -> PairMatches:
         """Sparse matches, each feature in at most one."""
-        features_a, features_b = required_features(
+        features_a, features_b = require_features(
             "mutual-nearest matches features", features_a, features_b
         )
         a, b = features_a.descriptors, features_b.descriptors

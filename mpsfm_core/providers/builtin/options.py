@@ -83,7 +83,7 @@ class MaskFileOptions(FileOptions):
     """Pixels that are 0 may be used instead."""
 
 
-class FromDepthOptions(Options):
+class NormalsFromDepthOptions(Options):
     """Normals from the depth prior."""
 
     radius: float = Field(0.012, gt=0)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from mpsfm_core.providers import ProviderSpec, hookimpl
 from mpsfm_core.providers.builtin.options import (
     DepthFileOptions,
-    FromDepthOptions,
     MaskFileOptions,
     MutualNearestOptions,
     NormalFileOptions,
+    NormalsFromDepthOptions,
     SiftOptions,
 )
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 _LICENSE = "Apache-2.0"
 
@@ -62,7 +62,7 @@ def _depth() -> list[ProviderSpec]:
         ProviderSpec(
             kind="depth",
             name="flat",
-            factory="mpsfm_core.providers.builtin.flat:Flat",
+            factory="mpsfm_core.providers.builtin.constant_depth:ConstantDepth",
             summary="a plane parallel to the image: no prior at all, for photos with much overlap",
             code_license=_LICENSE,
             accuracy="none: it does not look at the photo (a network: pip install mpsfm-compact)",
@@ -108,8 +108,8 @@ def _normals() -> list[ProviderSpec]:
         ProviderSpec(
             kind="normals",
             name="from-depth",
-            factory="mpsfm_core.providers.builtin.from_depth:FromDepth",
-            options=FromDepthOptions,
+            factory="mpsfm_core.providers.builtin.normals_from_depth:NormalsFromDepth",
+            options=NormalsFromDepthOptions,
             capabilities=frozenset({"needs-depth", "variance", "intrinsics-aware"}),
             summary="normals of planes fitted to the depth prior",
             code_license=_LICENSE,

@@ -18,7 +18,7 @@ from typing import IO, Any
 import numpy as np
 
 from mpsfm_core.data import UInt8
-from mpsfm_core.providers.environments.codec import Packed, unpack
+from mpsfm_core.providers.environments.codec import EncodedMessage, decode_message
 
 _IN_MEMORY = Path("/dev/shm")
 _HEADER = struct.Struct("<IIQ")
@@ -28,7 +28,7 @@ _LARGEST_TEXT = 1 << 28
 _EMPTY = np.empty(0, dtype=np.uint8)
 
 
-class Closed(Exception):
+class ChannelClosed(Exception):
     """The other side is gone."""
 
 
@@ -58,8 +58,8 @@ class Channel:
         self._target, self._wanted = 0, 0
 
     def send(self, value: Any) -> None:
-        """Send a value; raises :class:`Closed` when nobody is there."""
-        packed = Packed(value)
+        """Send a value; raises :class:`ChannelClosed` when nobody is there."""
+        packed = EncodedMessage(value)
         if packed.size:
             block = self._written.get(self._target) or _Block(Path(f"{self._own}{self._target}"))
             self._written[self._target] = block
@@ -72,16 +72,18 @@ class Channel:
             self._writer.write(header + packed.text)
             self._writer.flush()
         except (OSError, ValueError) as error:
-            raise Closed from error
+            raise ChannelClosed from error
 
     def receive(self) -> Any:
-        """The next value; raises :class:`Closed` when none comes any more."""
+        """The next value; raises :class:`ChannelClosed` when none comes any more."""
         length, self._target, size = _HEADER.unpack(self._read(_HEADER.size))
         if length > _LARGEST_TEXT:
-            raise Closed  # somebody else writes into the pipe
+            raise ChannelClosed  # somebody else writes into the pipe
         text = self._read(length)
         block = self._inbox[self._wanted].for_reading(size) if size else _EMPTY
-        return unpack(text, block, copy=self._lends and self._wanted == len(self._inbox) - 1)
+        return decode_message(
+            text, block, copy=self._lends and self._wanted == len(self._inbox) - 1
+        )
 
     def close(self) -> None:
         """Give the memory back; the files go with their folder."""
@@ -91,7 +93,7 @@ class Channel:
     def _read(self, count: int) -> bytes:
         data = self._reader.read(count)
         if data is None or len(data) < count:
-            raise Closed
+            raise ChannelClosed
         return data
 
 
@@ -114,7 +116,7 @@ class _Block:
         if size > self._size:
             self.close()
             with self._path.open("a+b") as file:
-                reserve(file.fileno(), size)
+                reserve_space(file.fileno(), size)
             self._open(size)
         assert self._map is not None
         return memoryview(self._map)[:size]
@@ -139,7 +141,7 @@ class _Block:
         self._size = size
 
 
-def reserve(descriptor: int, size: int) -> None:
+def reserve_space(descriptor: int, size: int) -> None:
     """Make a file this long, with room for all of it: what is missing when a map is written to
     would kill the process."""
     if hasattr(os, "posix_fallocate"):
@@ -148,7 +150,7 @@ def reserve(descriptor: int, size: int) -> None:
         os.truncate(descriptor, size)
 
 
-def memory_folder(needed: int) -> tempfile.TemporaryDirectory[str]:
+def create_shared_folder(needed: int) -> tempfile.TemporaryDirectory[str]:
     """A folder for the files, in memory where ``needed`` bytes fit there."""
     place = None
     if _IN_MEMORY.is_dir() and os.access(_IN_MEMORY, os.W_OK):

@@ -23,7 +23,7 @@ from mpsfm_core import data
 from mpsfm_core.data import UInt8
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.providers import WeightsFile
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 _ALIGNMENT = 64
 _TYPES: Mapping[str, type] = MappingProxyType(
@@ -48,7 +48,7 @@ _TYPES: Mapping[str, type] = MappingProxyType(
 )
 
 
-class Packed:
+class EncodedMessage:
     """A value ready to be sent: ``text`` and the arrays that it refers to, in their order."""
 
     def __init__(self, value: Any) -> None:
@@ -91,13 +91,13 @@ class Packed:
         return [array.dtype.str, list(array.shape), start]
 
 
-def unpack(text: bytes, block: UInt8, copy: bool) -> Any:
+def decode_message(text: bytes, block: UInt8, copy: bool) -> Any:
     """The value again. Its arrays are read-only views of the block, or copies if so asked.
 
     Data types are put together without the checks of their values: the other side's constructors
     made them, and :mod:`mpsfm_core.providers.validation` checks every answer of a provider,
     wherever it lives. Raises :class:`~mpsfm_core.data.errors.DataError` for what is no value of a
-    type above. """
+    type above."""
 
     try:
         return _Unpacking(block, copy).build(json.loads(text))

@@ -15,13 +15,13 @@ from typing import Any
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.providers import API_VERSION, ProviderContext
-from mpsfm_core.providers.environments.channel import Channel, Closed
-from mpsfm_core.providers.environments.process import PROTOCOL, described, error_of
+from mpsfm_core.providers.environments.channel import Channel, ChannelClosed
+from mpsfm_core.providers.environments.worker_process import PROTOCOL, decode_error, encode_error
 from mpsfm_core.providers.registry import CORE, Registry, core_version
 from mpsfm_core.support.threads import limited
 
 
-class Service:
+class ProviderServer:
     """Answers the questions of a main process."""
 
     def __init__(self, channel: Channel) -> None:
@@ -47,10 +47,10 @@ class Service:
                 answer = {"value": self._answer(request)}
                 del request
                 self._channel.send(answer)
-            except Closed:
+            except ChannelClosed:
                 raise
             except Exception as error:
-                self._channel.send({"error": described(error)})
+                self._channel.send({"error": encode_error(error)})
 
     def _answer(self, request: Mapping[str, Any]) -> Any:
         what = request["do"]
@@ -96,7 +96,7 @@ class Service:
         self._channel.send({"resolve": [uri, sha256]})
         answer = self._channel.receive()
         if "error" in answer:
-            raise error_of(answer["error"])
+            raise decode_error(answer["error"])
         path: Path = answer["value"]
         return path
 
@@ -136,17 +136,17 @@ def _description(registry: Registry) -> list[dict[str, Any]]:
 
 def _setup(registry: Registry, kind: Any, name: str, folder: Path) -> dict[str, Any]:
     """What the contract kit needs to know, without what would have to be told here."""
-    from mpsfm_core.testing.case import setup_of
+    from mpsfm_core.testing.contract_case import load_setup
 
-    setup = setup_of(registry.spec(kind, name), folder)
-    if setup.tell is not None:
+    setup = load_setup(registry.spec(kind, name), folder)
+    if setup.prepare is not None:
         raise ProviderError(
             f"the stand-in of {name!r} is told about views by a function, which cannot be done "
             f"from another environment: check it in its own"
         )
     return {
         "options": dict(setup.options),
-        "knows": setup.knows,
+        "truth_source": setup.truth_source,
         "expected_failures": dict(setup.expected_failures),
     }
 
@@ -160,8 +160,8 @@ def main() -> None:
     os.dup2(nothing, 0)
     folder = Path(sys.argv[1])
     try:
-        Service(Channel(reader, writer, folder, "worker", "main")).serve()
-    except Closed:
+        ProviderServer(Channel(reader, writer, folder, "worker", "main")).serve()
+    except ChannelClosed:
         return
 
 

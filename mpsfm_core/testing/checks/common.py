@@ -84,37 +84,37 @@ def check_light_import(case: ContractCase) -> None:
 def check_output_rules(case: ContractCase) -> None:
     """The answer passes the validator: type, dtype, shape, finite, positive, unit, inside of the
     view, and all that the capabilities promise. Without this no other check asks anything."""
-    case.ask(case.main)
+    case.run(case.example)
 
 
 def check_deterministic(case: ContractCase) -> None:
     """The same view gives the same answer, bit by bit, from one instance and from another: results
     are cached, and a run with a seed can be repeated."""
-    first = case.ask(case.main)
-    _same(first, case.ask(case.main), "asked twice")
-    _same(first, case.ask(case.main, case.make()), "asked a second instance")
+    first = case.run(case.example)
+    _same(first, case.run(case.example), "asked twice")
+    _same(first, case.run(case.example, case.create_provider()), "asked a second instance")
 
 
 def check_no_state(case: ContractCase) -> None:
     """An answer does not depend on the views seen before: a batch, in any order, gives what single
     views give (the interface has no batches; this is what they would have to obey)."""
-    others = [case.main.sized(104, 120), case.main.partner]
-    alone = case.ask(case.main, case.make())
+    others = [case.example.sized(104, 120), case.example.partner]
+    alone = case.run(case.example, case.create_provider())
     for other in others:
-        case.ask(other)
-    _same(alone, case.ask(case.main), "asked after other views")
+        case.run(other)
+    _same(alone, case.run(case.example), "asked after other views")
 
 
 def check_inputs_unchanged(case: ContractCase) -> None:
     """The view, and depth or features that come with it, are the same afterwards: other providers
     see them too."""
-    example = case.main.sized(*case.main.camera.size)
+    example = case.example.sized(*case.example.camera.size)
     image = np.array(example.view.image)
     view = View(example.name, image, example.camera, np.ones(image.shape[:2], np.bool_))
-    case.tell(example)
-    extra = case.extra(view, example)
+    case.prepare(example)
+    extra = case.make_auxiliary_input(view, example)
     before = pickle.loads(pickle.dumps((image, view.mask, extra)))
-    case.ask_about(view, example, extra=extra)
+    case.run_on_view(view, example, extra=extra)
     for what, old, new in zip(
         ("image", "mask", "depth or features"), before, (image, view.mask, extra), strict=True
     ):
@@ -126,25 +126,27 @@ def check_inputs_unchanged(case: ContractCase) -> None:
 def check_name_does_not_matter(case: ContractCase) -> None:
     """The answer does not depend on the view's name, as the cache goes by pixels; providers that
     read files declare the capability ``uncached``."""
-    if case.can("uncached"):
+    if case.declares("uncached"):
         raise CheckSkipped("declares 'uncached'")
-    if case.setup.tell is not None:
+    if case.setup.prepare is not None:
         raise CheckSkipped("is told about views by their names")
-    expected = case.ask(case.main)
-    renamed = replace(case.main.view, name="another/name.jpg")
-    _same(expected, case.ask_about(renamed, case.main), "asked about a renamed view")
+    expected = case.run(case.example)
+    renamed = replace(case.example.view, name="another/name.jpg")
+    _same(expected, case.run_on_view(renamed, case.example), "asked about a renamed view")
 
 
 def check_intrinsics_declared(case: ContractCase) -> None:
     """The answer changes with the focal length only if the provider declares
     ``intrinsics-aware``: otherwise the cache would return what was made for another camera."""
-    if case.can("intrinsics-aware"):
+    if case.declares("intrinsics-aware"):
         raise CheckSkipped("declares 'intrinsics-aware'")
-    if case.can("uncached"):
+    if case.declares("uncached"):
         raise CheckSkipped("declares 'uncached'")
-    expected = case.ask(case.main)
-    camera = replace(case.main.camera, fx=1.3 * case.main.camera.fx, fy=1.3 * case.main.camera.fy)
-    found = case.ask_about(replace(case.main.view, camera=camera), case.main)
+    expected = case.run(case.example)
+    camera = replace(
+        case.example.camera, fx=1.3 * case.example.camera.fx, fy=1.3 * case.example.camera.fy
+    )
+    found = case.run_on_view(replace(case.example.view, camera=camera), case.example)
     if isinstance(expected, NormalPrior):  # which normals face the camera depends on it, no more
         expected, found = _valid_in_both(expected, found)
     changed = describe_difference(expected, found)
@@ -154,9 +156,9 @@ def check_intrinsics_declared(case: ContractCase) -> None:
 
 def check_threads(case: ContractCase) -> None:
     """Two instances in two threads at once answer as they do alone: a run has one in each."""
-    examples = [case.main, case.main.sized(*case.main.camera.size).partner]
-    alone = [case.ask(example) for example in examples]
-    instances = [case.make() for _ in examples]
+    examples = [case.example, case.example.sized(*case.example.camera.size).partner]
+    alone = [case.run(example) for example in examples]
+    instances = [case.create_provider() for _ in examples]
     start = threading.Barrier(len(examples))
     together: list[Any] = [None] * len(examples)
 
@@ -164,10 +166,12 @@ def check_threads(case: ContractCase) -> None:
         start.wait()
         for _ in range(2):
             try:
-                together[index] = case.ask(examples[index], instances[index])
+                together[index] = case.run(examples[index], instances[index])
             except Exception as error:
                 together[index] = error
-            if isinstance(together[index], Exception) or describe_difference(alone[index], together[index]):
+            if isinstance(together[index], Exception) or describe_difference(
+                alone[index], together[index]
+            ):
                 return
 
     threads = [threading.Thread(target=work, args=(index,)) for index in range(len(examples))]
@@ -184,7 +188,7 @@ def check_threads(case: ContractCase) -> None:
 def check_pickles(case: ContractCase) -> None:
     """Factory, options and answers survive pickling, so that process pools can work with them."""
     options = case.registry.validate_options(case.spec.kind, case.spec.name, case.setup.options)
-    answer = case.ask(case.main)
+    answer = case.run(case.example)
     for what, value in (("factory", case.spec.factory), ("options", options), ("answer", answer)):
         try:
             copy = pickle.loads(pickle.dumps(value))
@@ -200,7 +204,7 @@ def check_offline(case: ContractCase) -> None:
     case.provider  # noqa: B018 - fetches the weights, where they are not here yet
     with _no_sockets() as attempts:
         try:
-            case.ask(case.main, case.make())
+            case.run(case.example, case.create_provider())
         except Exception as error:
             if not attempts:
                 raise
@@ -212,19 +216,19 @@ def check_offline(case: ContractCase) -> None:
 def check_memory_released(case: ContractCase) -> str:
     """Views and answers are not kept: what Python and numpy allocate does not grow with the number
     of views (the memory of native libraries is not seen)."""
-    examples = [_renamed(case.main, f"memory/{number}.png") for number in range(_CALLS + 2)]
+    examples = [_renamed(case.example, f"memory/{number}.png") for number in range(_CALLS + 2)]
     for example in examples:
-        case.tell(example)
-    questions = [(e.view, case.extra(e.view, case.main)) for e in examples]
-    provider = case.make()
+        case.prepare(example)
+    questions = [(e.view, case.make_auxiliary_input(e.view, case.example)) for e in examples]
+    provider = case.create_provider()
     tracemalloc.start()
     try:
         for view, extra in questions[:2]:
-            case.ask_about(view, case.main, provider, extra)
+            case.run_on_view(view, case.example, provider, extra)
         gc.collect()
         before = tracemalloc.get_traced_memory()[0]
         for view, extra in questions[2:]:
-            case.ask_about(view, case.main, provider, extra)
+            case.run_on_view(view, case.example, provider, extra)
         gc.collect()
         kept = (tracemalloc.get_traced_memory()[0] - before) / _CALLS
     finally:
@@ -237,13 +241,13 @@ def check_memory_released(case: ContractCase) -> str:
 def check_speed(case: ContractCase) -> str:
     """How long it takes; never fails."""
     started = time.perf_counter()
-    provider = case.make()
+    provider = case.create_provider()
     constructed = time.perf_counter()
-    case.ask(case.main, provider)
+    case.run(case.example, provider)
     first = time.perf_counter()
-    case.ask(case.main, provider)
+    case.run(case.example, provider)
     again = time.perf_counter() - first
-    width, height = case.main.camera.size
+    width, height = case.example.camera.size
     times = (constructed - started, first - constructed, again)
     return "{:.3f} s to construct, {:.3f} s for the first and {:.3f} s for the next {} x {}".format(
         *times, width, height
@@ -252,39 +256,39 @@ def check_speed(case: ContractCase) -> str:
 
 def check_odd_size(case: ContractCase) -> str:
     """A view whose sides no network likes, 149 x 107, is answered, and as well as any other."""
-    return _judged(case, case.main.sized(149, 107))
+    return _judged(case, case.example.sized(149, 107))
 
 
 def check_portrait(case: ContractCase) -> str:
     """A view that is higher than wide is answered, and as well as any other."""
-    width, height = case.main.camera.size
-    return _judged(case, case.main.sized(height, width))
+    width, height = case.example.camera.size
+    return _judged(case, case.example.sized(height, width))
 
 
 def check_one_pixel(case: ContractCase) -> None:
     """A view of one pixel gives an answer, not a crash."""
-    case.ask(case.main.sized(1, 1))
+    case.run(case.example.sized(1, 1))
 
 
 def check_thin_view(case: ContractCase) -> None:
     """A view of 5 x 120 pixels gives an answer, not a crash."""
-    case.ask(case.main.sized(5, 120))
+    case.run(case.example.sized(5, 120))
 
 
 def check_grayscale(case: ContractCase) -> None:
     """A gray photo gives an answer; it comes as three equal channels."""
-    gray = np.asarray(case.main.view.image).mean(axis=-1, keepdims=True)
-    _ask_about_image(case, np.broadcast_to(gray.astype(np.uint8), case.main.view.image.shape))
+    gray = np.asarray(case.example.view.image).mean(axis=-1, keepdims=True)
+    _ask_about_image(case, np.broadcast_to(gray.astype(np.uint8), case.example.view.image.shape))
 
 
 def check_sixteen_bit(case: ContractCase) -> None:
     """A gray photo of 16 bit gives an answer; the core makes 8 bit and three channels of it."""
     import cv2  # not at the top: pytest loads this module when it collects
 
-    from mpsfm_core.inputs.image_header import ImageHeader
     from mpsfm_core.inputs.image_decoding import decode_rgb
+    from mpsfm_core.inputs.image_header import ImageHeader
 
-    wide = case.main.view.image[..., 0].astype(np.uint16) * 257
+    wide = case.example.view.image[..., 0].astype(np.uint16) * 257
     data = cv2.imencode(".png", wide)[1].tobytes()
     _ask_about_image(case, decode_rgb(data, ImageHeader(None, 1, {}), Path("gray16.png")))
 
@@ -292,16 +296,16 @@ def check_sixteen_bit(case: ContractCase) -> None:
 def check_flat(case: ContractCase) -> None:
     """Black, white and gray views without any content give an answer."""
     for value in (0, 128, 255):
-        _ask_about_image(case, np.full(case.main.view.image.shape, value, np.uint8))
+        _ask_about_image(case, np.full(case.example.view.image.shape, value, np.uint8))
 
 
 def check_masked(case: ContractCase) -> None:
     """A view with a mask, partly or wholly False, gives an answer."""
-    for visible in (case.main.camera.width // 2, 0):
-        mask = np.zeros(case.main.view.image.shape[:2], np.bool_)
+    for visible in (case.example.camera.width // 2, 0):
+        mask = np.zeros(case.example.view.image.shape[:2], np.bool_)
         mask[:, :visible] = True
-        case.tell(case.main)
-        case.ask_about(replace(case.main.view, mask=mask), case.main)
+        case.prepare(case.example)
+        case.run_on_view(replace(case.example.view, mask=mask), case.example)
 
 
 STANDALONE = (check_specification, check_construction, check_light_import)
@@ -346,12 +350,12 @@ def _valid_in_both(first: NormalPrior, second: NormalPrior) -> tuple[object, obj
 
 
 def _judged(case: ContractCase, example: Example) -> str:
-    return compare_with_truth(case, example, case.ask(example))
+    return compare_with_truth(case, example, case.run(example))
 
 
 def _ask_about_image(case: ContractCase, image: UInt8) -> None:
-    case.tell(case.main)
-    case.ask_about(replace(case.main.view, image=np.ascontiguousarray(image)), case.main)
+    case.prepare(case.example)
+    case.run_on_view(replace(case.example.view, image=np.ascontiguousarray(image)), case.example)
 
 
 def _renamed(example: Example, name: str) -> Example:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mpsfm_core.data import Features, Float64, Int64
-from mpsfm_core.testing.case import Case
+from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 PIXEL_TOLERANCE = 0.25
@@ -26,16 +26,16 @@ _RIGHT_SHARE = 0.3
 view and its partner: SIFT 0.6, learned features 0.7 and more, shuffled descriptors 0.01."""
 
 
-def check_features_axes(case: Case) -> str:
+def check_features_axes(case: ContractCase) -> str:
     """Keypoints are (x, y): they lie where the view has texture, which here is a low and wide part
     in the upper right corner."""
-    case.needs("seen", "told")
-    view = case.main.view
+    case.require_truth("image", "prepared")
+    view = case.example.view
     height, width = view.image.shape[:2]
     left, bottom = int(0.45 * width), int(0.45 * height)
     image = np.full_like(view.image, 128)
     image[:bottom, left:] = view.image[:bottom, left:]
-    found = case.ask_about(replace(view, image=image), case.main)
+    found = case.run_on_view(replace(view, image=image), case.example)
     _enough(found)
     margin = 3 * found.std_px
     x, y = found.keypoints.T
@@ -47,15 +47,15 @@ def check_features_axes(case: Case) -> str:
     return f"{inside:.0%} of the keypoints are where there is texture"
 
 
-def check_features_pixel_convention(case: Case) -> str:
+def check_features_pixel_convention(case: ContractCase) -> str:
     """The centre of the first pixel is (0.5, 0.5). In the view turned by 180 degrees a keypoint
     (x, y) lies at (width - x, height - y) only if that is so. A wrong convention shifts x and y
     alike; some networks have a bias of their own in one of them, and then the check is skipped."""
-    case.needs("seen")
-    view = case.main.view
-    found: Features = case.ask(case.main)
+    case.require_truth("image")
+    view = case.example.view
+    found: Features = case.run(case.example)
     turned = replace(view, image=np.ascontiguousarray(view.image[::-1, ::-1]))
-    back = np.array(case.main.camera.size) - case.ask_about(turned, case.main).keypoints
+    back = np.array(case.example.camera.size) - case.run_on_view(turned, case.example).keypoints
     _enough(found)
     reach = _SAME_PX * max(1.0, found.std_px)
     offsets = _offsets(found.keypoints, back, reach) / 2
@@ -72,16 +72,16 @@ def check_features_pixel_convention(case: Case) -> str:
     raise CheckSkipped(f"the detector is not symmetric, keypoints are {text}: nothing can be said")
 
 
-def check_features_descriptors(case: Case) -> str:
+def check_features_descriptors(case: ContractCase) -> str:
     """Descriptors belong to their keypoints: mutual nearest neighbours between the view and the
     same scene from a little to the side are the same surface points."""
-    case.needs("seen", "told")
-    a: Features = case.ask(case.main)
-    b: Features = case.ask(case.main.partner)
+    case.require_truth("image", "prepared")
+    a: Features = case.run(case.example)
+    b: Features = case.run(case.example.partner)
     _enough(a)
     _enough(b)
     rows, columns = _mutual_nearest(a, b)
-    true = case.main.correspondences(case.main.partner, a.keypoints[rows])
+    true = case.example.correspondences(case.example.partner, a.keypoints[rows])
     distance = np.linalg.norm(b.keypoints[columns] - true.xy_b, axis=1)
     right = (distance < 3 * max(1.0, a.std_px, b.std_px))[true.visible]
     if len(right) < _FEWEST:
@@ -91,10 +91,10 @@ def check_features_descriptors(case: Case) -> str:
     return f"{right.mean():.0%} of the nearest descriptors are the same point"
 
 
-def check_features_dimension(case: Case) -> str:
+def check_features_dimension(case: ContractCase) -> str:
     """Descriptors have the same length for every view, also where nothing is found."""
-    flat = replace(case.main.view, image=np.full_like(case.main.view.image, 128))
-    some, none = case.ask(case.main), case.ask_about(flat, case.main)
+    flat = replace(case.example.view, image=np.full_like(case.example.view.image, 128))
+    some, none = case.run(case.example), case.run_on_view(flat, case.example)
     lengths = {features.descriptors.shape[1] for features in (some, none)}
     if len(lengths) > 1:
         raise CheckFailed(f"descriptors have {' and '.join(map(str, sorted(lengths)))} values")

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, NormalPrior
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.geometry import resize_map
-from mpsfm_core.testing.case import Case
-from mpsfm_core.testing.examples import Example, Truth
+from mpsfm_core.testing.contract_case import ContractCase
+from mpsfm_core.testing.examples import Example, TrueMaps
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 STD_FACTOR = 1.25
@@ -21,7 +21,7 @@ VALIDITY_TOLERANCE = 0.05
 """Share of pixels away from edges, for networks whose padding or blur costs some."""
 
 
-def accept_std(variance: Float32, expected_std: Float64) -> str:
+def require_reported_std(variance: Float32, expected_std: Float64) -> str:
     """Raise ``CheckFailed`` unless the variance is the square of what was reported."""
     factor = float(np.median(np.sqrt(variance.astype(np.float64)) / expected_std))
     if 1 / STD_FACTOR < factor < STD_FACTOR:
@@ -31,7 +31,7 @@ def accept_std(variance: Float32, expected_std: Float64) -> str:
     raise CheckFailed(f"the std is {factor:.2g} times what the stand-in reports")
 
 
-def accept_validity(valid: Bool, truth: Truth) -> str:
+def require_true_validity(valid: Bool, truth: TrueMaps) -> str:
     """Raise ``CheckFailed`` where valid pixels show no surface, or surfaces are not valid."""
     empty, full = truth.edge_free & ~truth.valid, truth.smooth
     if not (empty.any() and full.any()):
@@ -44,7 +44,7 @@ def accept_validity(valid: Bool, truth: Truth) -> str:
     return f"{wrong:.1%} wrongly valid, {lost:.1%} lost"
 
 
-def accept_calibration(case: Case, prior: DepthPrior | NormalPrior) -> None:
+def require_monotonic_calibration(case: ContractCase, prior: DepthPrior | NormalPrior) -> None:
     """Raise ``CheckFailed`` if the declared calibration loses the variance or turns it round."""
     calibration = case.calibration()
 
@@ -66,6 +66,6 @@ def accept_calibration(case: Case, prior: DepthPrior | NormalPrior) -> None:
             raise CheckFailed("a ten times larger network std changes nothing after calibration")
 
 
-def painted_backwards(example: Example, shape: tuple[int, int]) -> NDArray[Any]:
+def swap_painted_channels(example: Example, shape: tuple[int, int]) -> NDArray[Any]:
     """The painted image with its channels in the wrong order, on the grid of a map."""
     return resize_map(example.view.image[..., ::-1], shape[1], shape[0])

@@ -4,34 +4,34 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpsfm_core.testing.accuracy import MASK_TOLERANCE, judge
-from mpsfm_core.testing.case import Case
-from mpsfm_core.testing.checks.maps import painted_backwards
+from mpsfm_core.testing.accuracy import MASK_TOLERANCE, compare_with_truth
+from mpsfm_core.testing.checks.maps import swap_painted_channels
+from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.outcome import CheckFailed
-from mpsfm_core.testing.painting import read_depth
+from mpsfm_core.testing.painted_views import read_depth
 
 
-def check_mask_polarity(case: Case) -> str:
+def check_mask_polarity(case: ContractCase) -> str:
     """True is a pixel that may be used, False one that may not."""
-    case.needs("painted", "told", "seen")
-    answer, truth = case.ask(case.main), case.main.truth()
+    case.require_truth("painted", "prepared", "image")
+    answer, truth = case.run(case.example), case.example.truth()
     agreement = float((answer == truth.valid)[truth.edge_free].mean())
     if agreement < MASK_TOLERANCE:
         raise CheckFailed(f"is inverted: {1 - agreement:.0%} of the pixels have the wrong value")
     return f"{agreement:.1%} of the pixels agree"
 
 
-def check_mask_place(case: Case) -> str:
+def check_mask_place(case: ContractCase) -> str:
     """The mask covers the whole view at its place: it is not shifted, turned or of another part."""
-    case.needs("painted", "told", "seen")
-    return judge(case, case.main, case.ask(case.main))
+    case.require_truth("painted", "prepared", "image")
+    return compare_with_truth(case, case.example, case.run(case.example))
 
 
-def check_mask_channel_order(case: Case) -> None:
+def check_mask_channel_order(case: ContractCase) -> None:
     """The network gets RGB, not BGR."""
-    case.needs("painted")
-    answer, truth = case.ask(case.main), case.main.truth()
-    swapped = read_depth(painted_backwards(case.main, answer.shape)) > 0
+    case.require_truth("painted")
+    answer, truth = case.run(case.example), case.example.truth()
+    swapped = read_depth(swap_painted_channels(case.example, answer.shape)) > 0
     right, backwards = (
         float((answer == expected)[truth.edge_free].mean()) for expected in (truth.valid, swapped)
     )
@@ -39,10 +39,10 @@ def check_mask_channel_order(case: Case) -> None:
         raise CheckFailed("follows the blue channel where it should follow the red one")
 
 
-def check_mask_flip(case: Case) -> str:
+def check_mask_flip(case: ContractCase) -> str:
     """The mirrored view has the mirrored mask."""
-    answer, mirrored = case.ask(case.main), case.ask(case.main.mirror())
-    where = case.main.truth().edge_free
+    answer, mirrored = case.run(case.example), case.run(case.example.mirror())
+    where = case.example.truth().edge_free
     wrong = float((answer != np.asarray(mirrored)[:, ::-1])[where].mean())
     if wrong > MASK_TOLERANCE:
         raise CheckFailed(f"differs at {wrong:.0%} of the pixels of the mirrored view")

@@ -14,10 +14,10 @@ from mpsfm_core.geometry import (
     rotation_angle_deg,
     transform,
 )
-from mpsfm_core.testing import measure
-from mpsfm_core.testing.accuracy import DEPTH_TOLERANCE, accept_shift
-from mpsfm_core.testing.case import Case
+from mpsfm_core.testing import map_errors
+from mpsfm_core.testing.accuracy import DEPTH_TOLERANCE, require_small_shift
 from mpsfm_core.testing.checks import depth as checks_depth
+from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
@@ -33,21 +33,21 @@ _ENLARGED = (1.5, 2.7)
 """Focal length at twice the size over that at the size itself, for a network that guesses."""
 
 
-def check_multiview_order(case: Case) -> None:
+def check_multiview_order(case: ContractCase) -> None:
     """The answer has the order of the views: with the views exchanged, the maps are exchanged."""
-    case.needs("painted", "told", "seen")
+    case.require_truth("painted", "prepared", "image")
     examples = _group(case)[::-1]
-    group = case.ask_group(*examples)
+    group = case.run_on_group(*examples)
     right = max(map(_spread, group.depth, examples))
     if max(map(_spread, group.depth[::-1], examples)) < 0.5 * right:
         raise CheckFailed("the maps come in another order than the views")
 
 
-def check_multiview_own_axis(case: Case) -> str:
+def check_multiview_own_axis(case: ContractCase) -> str:
     """The depth of each view is along its own optical axis, not along that of the first."""
-    case.needs("painted", "told", "seen")
+    case.require_truth("painted", "prepared", "image")
     examples = _group(case)
-    group = case.ask_group(*examples)
+    group = case.run_on_group(*examples)
     errors = list(map(_spread, group.depth, examples))
     if max(errors) > DEPTH_TOLERANCE:
         first = [
@@ -62,18 +62,18 @@ def check_multiview_own_axis(case: Case) -> str:
     return f"relative error {max(errors):.2g}"
 
 
-def check_multiview_one_unit(case: Case) -> str:
+def check_multiview_one_unit(case: ContractCase) -> str:
     """The maps of a group share one unit: the mapper gives them one scale."""
-    case.needs("painted", "told", "seen")
+    case.require_truth("painted", "prepared", "image")
     examples = _group(case)
-    factors = _log_factors(case.ask_group(*examples), examples)
+    factors = _log_factors(case.run_on_group(*examples), examples)
     spread = float(np.ptp(factors))
     if spread > DEPTH_TOLERANCE:
         raise CheckFailed(f"the maps of one group differ in their unit, by {np.expm1(spread):.0%}")
     return f"units differ by {np.expm1(spread):.1%}"
 
 
-def check_multiview_poses(case: Case) -> str:
+def check_multiview_poses(case: ContractCase) -> str:
     """Poses are ``cam_from_group``, of cameras that look along z with y down."""
     poses, examples = _poses(case)
     worst = 0.0
@@ -90,10 +90,10 @@ def check_multiview_poses(case: Case) -> str:
     return f"off by {worst:.2g} degrees"
 
 
-def check_multiview_pose_unit(case: Case) -> str:
+def check_multiview_pose_unit(case: ContractCase) -> str:
     """The lengths of poses are in the unit of depth."""
     poses, examples = _poses(case)
-    unit = float(np.exp(np.median(_log_factors(case.ask_group(*examples), examples))))
+    unit = float(np.exp(np.median(_log_factors(case.run_on_group(*examples), examples))))
     true = _relative(_true_poses(examples), len(examples) - 1)[1]
     found = _relative(poses, len(examples) - 1)[1]
     factor = float(np.linalg.norm(found) / np.linalg.norm(true)) / unit
@@ -102,15 +102,15 @@ def check_multiview_pose_unit(case: Case) -> str:
     return f"factor {factor:.3f}"
 
 
-def check_multiview_intrinsics(case: Case) -> str:
+def check_multiview_intrinsics(case: ContractCase) -> str:
     """Intrinsics are in pixels of each view, not of the network's grid or of another view."""
-    if not case.can("proposes-intrinsics"):
+    if not case.declares("proposes-intrinsics"):
         raise CheckSkipped("does not declare 'proposes-intrinsics'")
-    width, height = case.main.camera.size
-    examples = (case.main, case.main.sized(2 * width, 2 * height))
-    found = case.ask_group(*examples).intrinsics
+    width, height = case.example.camera.size
+    examples = (case.example, case.example.sized(2 * width, 2 * height))
+    found = case.run_on_group(*examples).intrinsics
     assert found is not None  # the validator saw to it
-    if case.knows == "nothing":
+    if case.truth_source == "none":
         ratio = float(found[1, 0] / found[0, 0])
         if not _ENLARGED[0] < ratio < _ENLARGED[1]:
             raise CheckFailed(f"the focal length grows {ratio:.2g} times in a view twice as large")
@@ -123,24 +123,30 @@ def check_multiview_intrinsics(case: Case) -> str:
     return f"off by {np.expm1(off.max()):.1%}"
 
 
-def check_multiview_alone(case: Case) -> None:
+def check_multiview_alone(case: ContractCase) -> None:
     """One view is a group too: a photo that shares nothing with others is shown alone."""
-    case.ask_group(case.main)
+    case.run_on_group(case.example)
 
 
-def check_multiview_sizes(case: Case) -> str:
+def check_multiview_sizes(case: ContractCase) -> str:
     """Views of different sizes, high ones beside wide ones, are answered, each on its place."""
-    width, height = case.main.camera.size
-    examples = (case.main, case.main.partner.sized(height, width), case.main.sized(149, 107))
-    group = case.ask_group(*examples)
-    if case.knows == "nothing":
+    width, height = case.example.camera.size
+    examples = (
+        case.example,
+        case.example.partner.sized(height, width),
+        case.example.sized(149, 107),
+    )
+    group = case.run_on_group(*examples)
+    if case.truth_source == "none":
         return "whether it is right is not known"
     for prior, example in _pairs(group, examples):
         error = _spread(prior, example)
         if error > DEPTH_TOLERANCE:
             size = "{} x {}".format(*example.camera.size)
             raise CheckFailed(f"the {size} view beside others has a relative error of {error:.2g}")
-        accept_shift(case, example, measure.depth_shift(prior, example), prior.shape)
+        require_small_shift(
+            case, example, map_errors.estimate_depth_shift(prior, example), prior.shape
+        )
     return ""
 
 
@@ -157,8 +163,8 @@ CHECKS = (
 )
 
 
-def _group(case: Case) -> tuple[Example, ...]:
-    return case.main, case.main.partner, case.main.partner.partner
+def _group(case: ContractCase) -> tuple[Example, ...]:
+    return case.example, case.example.partner, case.example.partner.partner
 
 
 def _pairs(group: GroupPrior, examples: tuple[Example, ...]) -> list[tuple[DepthPrior, Example]]:
@@ -167,13 +173,13 @@ def _pairs(group: GroupPrior, examples: tuple[Example, ...]) -> list[tuple[Depth
 
 def _spread(prior: DepthPrior, example: Example) -> float:
     """Relative error after one factor, of 80 % of the pixels."""
-    return measure.typical(measure.log_errors(prior, example, any_scale=True))
+    return map_errors.error_quantile(map_errors.log_errors(prior, example, any_scale=True))
 
 
 def _spread_of(prior: DepthPrior, example: Example, expected: Float64) -> float:
-    where = measure.comparable(prior.valid, example.truth(prior.shape)) & (expected > 0)
+    where = map_errors.select_comparable(prior.valid, example.truth(prior.shape)) & (expected > 0)
     error = np.log(prior.depth[where] / expected[where])
-    return measure.typical(error - np.median(error))
+    return map_errors.error_quantile(error - np.median(error))
 
 
 def _z_of_first(example: Example, first: Example, shape: tuple[int, int]) -> Float64:
@@ -187,16 +193,16 @@ def _z_of_first(example: Example, first: Example, shape: tuple[int, int]) -> Flo
 
 
 def _log_factors(group: GroupPrior, examples: tuple[Example, ...]) -> list[float]:
-    errors = [measure.log_errors(p, e, any_scale=False) for p, e in _pairs(group, examples)]
+    errors = [map_errors.log_errors(p, e, any_scale=False) for p, e in _pairs(group, examples)]
     return [float(np.median(error)) for error in errors]
 
 
-def _poses(case: Case) -> tuple[Float64, tuple[Example, ...]]:
-    if not case.can("proposes-poses"):
+def _poses(case: ContractCase) -> tuple[Float64, tuple[Example, ...]]:
+    if not case.declares("proposes-poses"):
         raise CheckSkipped("does not declare 'proposes-poses'")
-    case.needs("told", "seen")
+    case.require_truth("prepared", "image")
     examples = _group(case)
-    poses = case.ask_group(*examples).poses
+    poses = case.run_on_group(*examples).poses
     assert poses is not None  # the validator saw to it
     return poses, examples
 

@@ -10,17 +10,17 @@ import numpy as np
 
 from mpsfm_core.data import Float64, NormalPrior
 from mpsfm_core.geometry import angle_between_deg
-from mpsfm_core.testing import measure
-from mpsfm_core.testing.accuracy import NORMALS_TOLERANCE_DEG, accept_shift
-from mpsfm_core.testing.case import Case
+from mpsfm_core.testing import map_errors
+from mpsfm_core.testing.accuracy import NORMALS_TOLERANCE_DEG, require_small_shift
 from mpsfm_core.testing.checks.maps import (
-    accept_calibration,
-    accept_std,
-    accept_validity,
-    painted_backwards,
+    require_monotonic_calibration,
+    require_reported_std,
+    require_true_validity,
+    swap_painted_channels,
 )
+from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
-from mpsfm_core.testing.painting import NORMALS_STD, read_normals
+from mpsfm_core.testing.painted_views import NORMALS_STD, read_normals
 
 FLIP_TOLERANCE_DEG = 15.0
 """For networks whose truth is not known."""
@@ -36,88 +36,88 @@ _AXES: Mapping[str, tuple[int, int, int]] = MappingProxyType(
 )
 
 
-def check_normals_frame(case: Case) -> str:
+def check_normals_frame(case: ContractCase) -> str:
     """Normals are in the camera frame: x right, y down, z forward; not in the world's, not in
     OpenGL's, not with a sign or an axis exchanged."""
-    case.needs("painted", "told", "seen")
+    case.require_truth("painted", "prepared", "image")
     prior = _ask(case)
-    angle = measure.typical(measure.angles_deg(prior, case.main))
+    angle = map_errors.error_quantile(map_errors.angle_errors_deg(prior, case.example))
     if angle > NORMALS_TOLERANCE_DEG:
         raise CheckFailed(f"normals are {angle:.0f} degrees off{_explanation(prior, case)}")
     return f"angle {angle:.2f} degrees"
 
 
-def check_normals_channel_order(case: Case) -> None:
+def check_normals_channel_order(case: ContractCase) -> None:
     """The network gets RGB, not BGR."""
-    case.needs("painted")
+    case.require_truth("painted")
     prior = _ask(case)
-    truth = case.main.truth(prior.shape)
-    swapped = read_normals(painted_backwards(case.main, prior.shape))
+    truth = case.example.truth(prior.shape)
+    swapped = read_normals(swap_painted_channels(case.example, prior.shape))
     where = prior.valid & truth.smooth
     angles = [_angle(prior.normals[where], values[where]) for values in (truth.normals, swapped)]
     if angles[1] < angles[0]:
         raise CheckFailed("follows the channels in the order blue, green, red")
 
 
-def check_normals_pixel_convention(case: Case) -> str:
+def check_normals_pixel_convention(case: ContractCase) -> str:
     """The value at [row, col] belongs to the pixel centre (col + 0.5, row + 0.5)."""
-    case.needs("painted", "told", "seen")
+    case.require_truth("painted", "prepared", "image")
     prior = _ask(case)
-    shift = measure.normals_shift(prior, case.main)
-    return accept_shift(case, case.main, shift, prior.shape)
+    shift = map_errors.estimate_normals_shift(prior, case.example)
+    return require_small_shift(case, case.example, shift, prior.shape)
 
 
-def check_normals_validity(case: Case) -> str:
+def check_normals_validity(case: ContractCase) -> str:
     """Pixels without a surface are not valid, those with one are; for providers that can tell
     (painted views have a normal everywhere)."""
-    case.needs("told")
+    case.require_truth("prepared")
     prior = _ask(case)
-    return accept_validity(prior.valid, case.main.truth(prior.shape))
+    return require_true_validity(prior.valid, case.example.truth(prior.shape))
 
 
-def check_normals_flip(case: Case) -> str:
+def check_normals_flip(case: ContractCase) -> str:
     """The mirrored view has the mirrored normals: mirrored in the map, and x negated."""
-    prior, mirrored = _ask(case), case.ask(case.main.mirror())
+    prior, mirrored = _ask(case), case.run(case.example.mirror())
     if prior.shape != mirrored.shape:
         raise CheckFailed(f"has shape {mirrored.shape} on the mirrored view, else {prior.shape}")
-    both = prior.valid & mirrored.valid[:, ::-1] & case.main.truth(prior.shape).smooth
+    both = prior.valid & mirrored.valid[:, ::-1] & case.example.truth(prior.shape).smooth
     if not both.any():
         raise CheckFailed("has no pixel that is valid in the view and in the mirrored one")
     back = mirrored.normals[:, ::-1] * (-1.0, 1.0, 1.0)
     angle = _angle(prior.normals[both], back[both])
-    limit = FLIP_TOLERANCE_DEG if case.knows == "nothing" else NORMALS_TOLERANCE_DEG
+    limit = FLIP_TOLERANCE_DEG if case.truth_source == "none" else NORMALS_TOLERANCE_DEG
     if angle > limit:
         raise CheckFailed(f"differs by {angle:.0f} degrees on the mirrored view")
     return f"angle {angle:.2g} degrees"
 
 
-def check_normals_same_in_larger_view(case: Case) -> str:
+def check_normals_same_in_larger_view(case: ContractCase) -> str:
     """The same scene with twice the pixels and twice the focal length has the same normals."""
-    case.needs("painted", "told", "seen")
-    width, height = case.main.camera.size
-    large = case.main.sized(2 * width, 2 * height)
-    angle = measure.typical(measure.angles_deg(case.ask(large), large))
+    case.require_truth("painted", "prepared", "image")
+    width, height = case.example.camera.size
+    large = case.example.sized(2 * width, 2 * height)
+    angle = map_errors.error_quantile(map_errors.angle_errors_deg(case.run(large), large))
     if angle > NORMALS_TOLERANCE_DEG:
         raise CheckFailed(f"normals are {angle:.0f} degrees off in an enlarged view")
     return f"angle {angle:.2f} degrees"
 
 
-def check_normals_variance(case: Case) -> str:
+def check_normals_variance(case: ContractCase) -> str:
     """The variance is one: the square of the angular std that the stand-in reports, in rad^2."""
-    case.needs("painted", "told")
+    case.require_truth("painted", "prepared")
     if case.spec.kind == "wrapper":
         raise CheckSkipped("a wrapper may change the variance")
     prior = _ask(case)
     if prior.variance is None:
         raise CheckSkipped("has no variance")
-    where = measure.comparable(prior.valid, case.main.truth(prior.shape))
-    return accept_std(prior.variance[where], np.full(int(where.sum()), NORMALS_STD))
+    where = map_errors.select_comparable(prior.valid, case.example.truth(prior.shape))
+    return require_reported_std(prior.variance[where], np.full(int(where.sum()), NORMALS_STD))
 
 
-def check_normals_calibration(case: Case) -> None:
+def check_normals_calibration(case: ContractCase) -> None:
     """The declared calibration gives every valid pixel a positive variance, and a larger one for a
     larger scale of the std."""
-    accept_calibration(case, _ask(case))
+    require_monotonic_calibration(case, _ask(case))
 
 
 CHECKS = (
@@ -132,26 +132,26 @@ CHECKS = (
 )
 
 
-def _ask(case: Case) -> NormalPrior:
-    prior: NormalPrior = case.ask(case.main)
+def _ask(case: ContractCase) -> NormalPrior:
+    prior: NormalPrior = case.run(case.example)
     return prior
 
 
 def _angle(found: Any, expected: Any) -> float:
     if not len(found):
         raise CheckFailed("has no valid normals where the truth is known")
-    return measure.typical(angle_between_deg(found.astype(np.float64), expected))
+    return map_errors.error_quantile(angle_between_deg(found.astype(np.float64), expected))
 
 
-def _explanation(prior: NormalPrior, case: Case) -> str:
+def _explanation(prior: NormalPrior, case: ContractCase) -> str:
     """What turns the normals into the true ones, if it is a known mistake."""
-    truth = case.main.truth(prior.shape)
+    truth = case.example.truth(prior.shape)
     where = prior.valid & truth.smooth
     found, expected = prior.normals[where].astype(np.float64), truth.normals[where]
     for text, signs in _AXES.items():
         if _angle(found * signs, expected) < NORMALS_TOLERANCE_DEG:
             return f": {text}"
-    camera_from_world: Float64 = case.main.pose[:, :3]
+    camera_from_world: Float64 = case.example.pose[:, :3]
     if _angle(found @ camera_from_world.T, expected) < NORMALS_TOLERANCE_DEG:
         return ": they are in the world's frame"
     return ""

@@ -27,7 +27,11 @@ from mpsfm_core.data import (
     VerifiedPair,
 )
 from mpsfm_core.geometry import camera_center
-from mpsfm_core.testing.synthetic.problems import Noise, verified_pair, view_of
+from mpsfm_core.testing.synthetic.problems import (
+    SyntheticNoise,
+    make_verified_pair,
+    render_mapping_image,
+)
 from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Box, Surface, look_at, project
 
 CAMERA = PinholeCamera(640, 480, 420.0, 420.0, 320.0, 240.0)
@@ -61,13 +65,17 @@ class PriorErrors:
     declared: float = 0.01
 
 
-EXACT = PriorErrors()
-HONEST = PriorErrors(scale=0.05, field=0.04, declared=0.06)
-LOCALLY_WRONG = replace(HONEST, patch=0.2)
-QUALITIES = {"exact": EXACT, "honest": HONEST, "locally wrong": LOCALLY_WRONG}
+EXACT_PRIORS = PriorErrors()
+CALIBRATED_PRIORS = PriorErrors(scale=0.05, field=0.04, declared=0.06)
+LOCALLY_BIASED_PRIORS = replace(CALIBRATED_PRIORS, patch=0.2)
+QUALITIES = {
+    "exact": EXACT_PRIORS,
+    "honest": CALIBRATED_PRIORS,
+    "locally wrong": LOCALLY_BIASED_PRIORS,
+}
 
 
-class Hall(NamedTuple):
+class HallProblem(NamedTuple):
     """A mapping problem with its true poses, ``cam_from_world`` by image name, and the numbers of
     the surface points that the keypoints of each image belong to, (n,) each."""
 
@@ -76,32 +84,34 @@ class Hall(NamedTuple):
     points: tuple[Int64, ...]
 
 
-def hall_problem(
+def make_hall_problem(
     views: int,
-    errors: PriorErrors = EXACT,
+    errors: PriorErrors = EXACT_PRIORS,
     *,
     points_per_view: int = 60,
     map_width: int = 160,
     keypoint_noise_px: float = 0.7,
     wrong_matches: float = 0.05,
     seed: int = 0,
-) -> Hall:
-    """A hall with so many views, whose priors have errors.
+) -> HallProblem:
+    """A make_hall with so many views, whose priors have errors.
 
     ``points_per_view``: surface points that each view adds; its keypoints are all points it sees.
     ``wrong_matches``: share of the matches of each pair that join keypoints at random.
     """
     rng = np.random.default_rng(seed)
-    poses, scene = hall(views, rng)
+    poses, scene = make_hall(views, rng)
     eyes = np.array([camera_center(pose[:, :3], pose[:, 3]) for pose in poses])
     parts = [_in_sight(scene, pose) for pose in poses]
     numbers, pixels = _keypoints(parts, poses, eyes, points_per_view, rng)
-    noise = Noise(keypoints_px=keypoint_noise_px)
+    noise = SyntheticNoise(keypoints_px=keypoint_noise_px)
     images = []
     for i, (pose, xy) in enumerate(zip(poses, pixels, strict=True)):
         noisy = xy + keypoint_noise_px * rng.normal(size=xy.shape)
         name = f"view_{i:04d}.png"
-        image = view_of(name, parts[i], CAMERA, pose, noisy, map_width, 0.01, 2.0, noise, rng)
+        image = render_mapping_image(
+            name, parts[i], CAMERA, pose, noisy, map_width, 0.01, 2.0, noise, rng
+        )
         depth = _with_errors(image.depth.depth, errors, rng)
         prior = DepthPrior.from_arrays(depth, (errors.declared * depth) ** 2)
         images.append(replace(image, depth=prior))
@@ -110,16 +120,16 @@ def hall_problem(
         _, rows_a, rows_b = np.intersect1d(numbers[a], numbers[b], return_indices=True)
         if len(rows_a) >= MIN_MATCHES:
             matches = np.stack([rows_a, rows_b], axis=1)
-            pair = _spoilt(verified_pair(a, b, matches, poses), wrong_matches, rng)
+            pair = _spoilt(make_verified_pair(a, b, matches, poses), wrong_matches, rng)
             pairs.append(_estimated(pair, images[a].keypoints, images[b].keypoints))
     truth = {
         image.name: (pose[:, :3], pose[:, 3]) for image, pose in zip(images, poses, strict=True)
     }
-    return Hall(MappingProblem(tuple(images), tuple(pairs)), truth, tuple(numbers))
+    return HallProblem(MappingProblem(tuple(images), tuple(pairs)), truth, tuple(numbers))
 
 
-def hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], AnalyticScene]:
-    """Views on a square grid, and a hall with boxes between them."""
+def make_hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], AnalyticScene]:
+    """Views on a square grid, and a make_hall with boxes between them."""
     side = int(np.ceil(np.sqrt(views)))
     row, column = np.divmod(np.arange(views), side)
     # the walk turns at the end of each row, so that consecutive views are neighbours

@@ -21,7 +21,7 @@ from mpsfm_core.data import (
 from mpsfm_core.testing.synthetic.scenes import AnalyticScene
 
 
-class Noise(NamedTuple):
+class SyntheticNoise(NamedTuple):
     """Standard deviations: keypoints in pixels, relative depth per image and per pixel."""
 
     keypoints_px: float = 0.0
@@ -29,7 +29,7 @@ class Noise(NamedTuple):
     depth: float = 0.0
 
 
-def mapping_problem(
+def make_mapping_problem(
     scene: AnalyticScene,
     camera: PinholeCamera,
     poses: Sequence[Float64],
@@ -38,7 +38,7 @@ def mapping_problem(
     map_width: int = 160,
     declared_depth_std: float = 0.01,
     declared_normal_std_deg: float = 1.0,
-    noise: Noise | None = None,
+    noise: SyntheticNoise | None = None,
     links: Sequence[tuple[int, int]] | None = None,
     two_view_tracks: bool = False,
     seed: int = 0,
@@ -50,7 +50,7 @@ def mapping_problem(
     pairs that have matches, by default all with at least 15 points in common.
     ``two_view_tracks``: no point is matched in more than one pair.
     """
-    noise = noise or Noise()
+    noise = noise or SyntheticNoise()
     rng = np.random.default_rng(seed)
     views = range(len(poses))
     ids: list[list[Int64]] = [[] for _ in views]
@@ -67,7 +67,7 @@ def mapping_problem(
     keypoints = [np.concatenate(part) for part in xys]
     keypoints = [xy + noise.keypoints_px * rng.normal(size=xy.shape) for xy in keypoints]
     images = [
-        view_of(
+        render_mapping_image(
             f"view_{i}.png",
             scene,
             camera,
@@ -89,11 +89,11 @@ def mapping_problem(
             mine = common % len(all_links) == link
             rows_a, rows_b = rows_a[mine], rows_b[mine]
         if len(rows_a) >= 15:
-            pairs.append(verified_pair(a, b, np.stack([rows_a, rows_b], axis=1), poses))
+            pairs.append(make_verified_pair(a, b, np.stack([rows_a, rows_b], axis=1), poses))
     return MappingProblem(tuple(images), tuple(pairs))
 
 
-def view_of(
+def render_mapping_image(
     name: str,
     scene: AnalyticScene,
     camera: PinholeCamera,
@@ -102,7 +102,7 @@ def view_of(
     map_width: int,
     depth_std: float,
     normal_std_deg: float,
-    noise: Noise,
+    noise: SyntheticNoise,
     rng: np.random.Generator,
 ) -> MappingImage:
     """A view of a scene with keypoints (n, 2) and the priors that noise leaves of the truth."""
@@ -122,7 +122,7 @@ def view_of(
     )
 
 
-def verified_pair(a: int, b: int, matches: Int64, poses: Sequence[Float64]) -> VerifiedPair:
+def make_verified_pair(a: int, b: int, matches: Int64, poses: Sequence[Float64]) -> VerifiedPair:
     """Matches (m, 2) of two views with their relative pose; ``poses``: (3, 4), by view."""
     rotation = poses[b][:, :3] @ poses[a][:, :3].T
     translation = poses[b][:, 3] - rotation @ poses[a][:, 3]

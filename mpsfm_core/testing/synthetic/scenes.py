@@ -157,7 +157,7 @@ class Rendering:
         return self._colors()
 
 
-class Samples(NamedTuple):
+class SurfaceSamples(NamedTuple):
     """Surface points seen through given pixels; entries are 0 where `valid` is false."""
 
     points: Float64  # (n, 3), world
@@ -167,7 +167,7 @@ class Samples(NamedTuple):
     valid: Bool  # (n,)
 
 
-class Correspondences(NamedTuple):
+class TrueCorrespondences(NamedTuple):
     """Exact positions in view b of points seen in view a."""
 
     xy_b: Float64  # (n, 2), pixels; 0 where not visible
@@ -194,7 +194,9 @@ class AnalyticScene:
             surface[nearer] = index
         return t, normals, surface
 
-    def sample(self, camera: PinholeCamera, cam_from_world: ArrayLike, xy: ArrayLike) -> Samples:
+    def sample(
+        self, camera: PinholeCamera, cam_from_world: ArrayLike, xy: ArrayLike
+    ) -> SurfaceSamples:
         """What is seen through pixels `xy` (n, 2) of a camera."""
         rotation, origin = _split_pose(cam_from_world)
         pixels = np.asarray(xy, np.float64).reshape(-1, 2)
@@ -203,7 +205,7 @@ class AnalyticScene:
         valid = np.isfinite(depth)
         depth = np.where(valid, depth, 0.0)
         points = np.where(valid[:, None], origin + depth[:, None] * directions, 0.0)
-        return Samples(points, depth, normals @ rotation.T, surface, valid)
+        return SurfaceSamples(points, depth, normals @ rotation.T, surface, valid)
 
     def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
         """Depth, normals and colours at every pixel centre."""
@@ -229,7 +231,7 @@ class AnalyticScene:
         camera_b: PinholeCamera,
         b_from_world: ArrayLike,
         xy_a: ArrayLike,
-    ) -> Correspondences:
+    ) -> TrueCorrespondences:
         """Where the points seen through pixels `xy_a` (n, 2) of view a lie in view b."""
         seen = self.sample(camera_a, a_from_world, xy_a)
         xy_b, depth_b = project(camera_b, b_from_world, seen.points)
@@ -237,7 +239,7 @@ class AnalyticScene:
         t, _, _ = self.first_hit(origin, seen.points - origin)
         visible = seen.valid & (depth_b > 0) & geometry.inside(xy_b, camera_b.size)
         visible &= np.abs(t - 1.0) < 1e-6
-        return Correspondences(np.where(visible[:, None], xy_b, 0.0), seen.points, visible)
+        return TrueCorrespondences(np.where(visible[:, None], xy_b, 0.0), seen.points, visible)
 
 
 def project(

@@ -17,7 +17,11 @@ import numpy as np
 from mpsfm_core.data import Bool, DepthPrior, Float64, Int64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import camera_center, inside, pixel_centers
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors, degrade_depth
-from mpsfm_core.testing.synthetic.problems import Noise, verified_pair, view_of
+from mpsfm_core.testing.synthetic.problems import (
+    SyntheticNoise,
+    make_verified_pair,
+    render_mapping_image,
+)
 from mpsfm_core.testing.synthetic.scenes import (
     AnalyticScene,
     Box,
@@ -49,7 +53,7 @@ class SymmetricProblem(NamedTuple):
     false: list[bool]
 
 
-def twin_rooms() -> AnalyticScene:
+def make_twin_rooms() -> AnalyticScene:
     """Rooms of 5 x 4 x 2.6 m, x in [0, 5] and [5.2, 10.2], and a corridor at y < 0."""
     shell = Box((5.1, 1.2, 1.3), (5.1, 2.8, 1.3))
     walls = [
@@ -74,7 +78,7 @@ def twin_rooms() -> AnalyticScene:
     return AnalyticScene((shell, *walls, *lintels, *same, *different))
 
 
-def twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], list[int]]:
+def make_twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], list[int]]:
     """Views around both rooms, and a walk through the corridor; each seed stands a bit elsewhere.
 
     Whoever would stand inside the furniture stands in front of it.
@@ -109,7 +113,7 @@ def twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], list[i
     room += [0, *[-1] * (len(walk) - 2), 1]
     jitter = rng.normal(0, 0.08, (2, len(eyes), 3))
     looks = zip(eyes + jitter[0], targets + jitter[1], strict=True)
-    scene = twin_rooms()
+    scene = make_twin_rooms()
     return [_in_the_open(scene, eye, target) for eye, target in looks], room
 
 
@@ -125,7 +129,7 @@ def _in_the_open(scene: AnalyticScene, eye: Float64, target: Float64) -> Float64
         eye = eye + step
 
 
-def twin_room_problem(
+def make_twin_room_problem(
     seed: int = 0,
     *,
     errors: DepthErrors | None = None,
@@ -140,15 +144,15 @@ def twin_room_problem(
     geometry leaves the more frequent of the two. ``errors``: of the depth priors, declared
     honestly; None: exact, declared good to 1 %.
     """
-    scene = twin_rooms()
-    poses, room = twin_room_poses(seed, per_room)
+    scene = make_twin_rooms()
+    poses, room = make_twin_room_poses(seed, per_room)
     rng = np.random.default_rng([seed, 1])
     numbers, keypoints = _keypoints(scene, poses, points_per_view, rng)
-    noise = Noise(keypoints_px=keypoint_noise_px)
+    noise = SyntheticNoise(keypoints_px=keypoint_noise_px)
     images = []
     for i, (pose, xy) in enumerate(zip(poses, keypoints, strict=True)):
         noisy = xy + keypoint_noise_px * rng.normal(size=xy.shape)
-        image = view_of(
+        image = render_mapping_image(
             f"view_{i}.png", scene, CAMERA, pose, noisy, map_width, 0.01, 2.0, noise, rng
         )
         if errors:
@@ -166,8 +170,8 @@ def twin_room_problem(
         if found:
             _, _, shift, matches = max(found, key=lambda item: item[:2])
             views = list(poses)
-            views[b] = moved(poses[b], shift)
-            pairs.append(verified_pair(a, b, matches, views))
+            views[b] = shift_pose(poses[b], shift)
+            pairs.append(make_verified_pair(a, b, matches, views))
             false.append(shift != 0)
     return SymmetricProblem(MappingProblem(tuple(images), tuple(pairs)), poses, room, false)
 
@@ -193,7 +197,7 @@ def _keypoints(
     return [np.concatenate(n) for n in numbers], [np.concatenate(p) for p in pixels]
 
 
-def moved(pose: Float64, shift: int) -> Float64:
+def shift_pose(pose: Float64, shift: int) -> Float64:
     """The pose (3, 4) of a view that stands ``shift`` rooms further back than it does."""
     return np.column_stack([pose[:, :3], pose[:, 3] + shift * pose[:, :3] @ SHIFT])
 

@@ -9,10 +9,10 @@ from mpsfm_onnx.contract import stand_in
 
 from mpsfm_compact.options import CompactOptions
 from mpsfm_compact.provider import describe
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 
 
-def setup(folder: Path) -> Setup:
+def setup(folder: Path) -> ContractSetup:
     """A network with the same tensors that reads painted views."""
     model = stand_in(describe(CompactOptions()), folder)
-    return Setup(options={"weights": str(model)}, knows="painted")
+    return ContractSetup(options={"weights": str(model)}, truth_source="painted")

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from mpsfm_compact.options import WEIGHTS, CompactOptions
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
-from mpsfm_core.providers import Capability, Kind, file_named_by
-from mpsfm_core.providers.uncertainty.file import CalibratedKind, load_calibration
-from mpsfm_core.providers.uncertainty.model import Calibration
+from mpsfm_core.providers import Capability, Kind, weights_from_option
+from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind, load_calibration
+from mpsfm_core.providers.uncertainty.calibration import Calibration
 
 _LICENSE = "Apache-2.0"
 _ACCURACY: dict[Kind, str] = {
@@ -41,7 +41,7 @@ def _spec(kind: Kind, factory: str, summary: str, *capabilities: Capability) -> 
         install_hint="pip install mpsfm-compact",
         code_license=_LICENSE,
         weights_license=_LICENSE,
-        weights=file_named_by("weights", WeightsFile(WEIGHTS, license=_LICENSE)),
+        weights=weights_from_option("weights", WeightsFile(WEIGHTS, license=_LICENSE)),
         accuracy=_ACCURACY[kind],
         calibration=None if kind == "mask" else _calibration(kind),
         contract="mpsfm_compact.contract:setup",

@@ -9,7 +9,7 @@ import pytest
 from mpsfm_dask.executor import DaskExecutor
 
 from mpsfm_core.data.errors import ConfigError
-from mpsfm_core.testing import executors
+from mpsfm_core.testing import executor_contract
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # of the cluster's own threads at its end
 
@@ -22,27 +22,27 @@ def executor() -> Iterator[DaskExecutor]:
 
 
 def test_items(executor: DaskExecutor, tmp_path: Path) -> None:
-    executors.check_items(executor, tmp_path / "items")
+    executor_contract.check_items(executor, tmp_path / "items")
 
 
 def test_errors(executor: DaskExecutor) -> None:
-    executors.check_errors(executor)
+    executor_contract.check_errors(executor)
 
 
 def test_a_lost_worker_loses_nothing(executor: DaskExecutor, tmp_path: Path) -> None:
-    executors.check_lost_worker(executor, tmp_path / "items")
+    executor_contract.check_lost_worker(executor, tmp_path / "items")
 
 
 def test_extraction(tmp_path: Path) -> None:
-    executors.check_extraction("dask", {"workers": 2}, tmp_path)
+    executor_contract.check_extraction("dask", {"workers": 2}, tmp_path)
 
 
 def test_a_failing_provider(tmp_path: Path) -> None:
-    executors.check_failing_provider("dask", {"workers": 2}, tmp_path)
+    executor_contract.check_failing_provider("dask", {"workers": 2}, tmp_path)
 
 
 def test_options() -> None:
-    executors.check_options(DaskExecutor)
+    executor_contract.check_options(DaskExecutor)
 
 
 def test_no_cluster() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_model
 
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 from mpsfm_depth_anything_3.provider import as_published, network_of
 
 SIDE = 56
@@ -18,10 +18,10 @@ _ANGLE = 1.0
 """Of view, in radians: random ones have no tangent."""
 
 
-def contract(folder: Path) -> Setup:
+def contract(folder: Path) -> ContractSetup:
     """It answers, and means nothing."""
     path = write_weights(folder / "model.safetensors")
-    return Setup(options={"weights": str(path), "resize": SIDE}, knows="nothing")
+    return ContractSetup(options={"weights": str(path), "resize": SIDE}, truth_source="none")
 
 
 def write_weights(path: Path) -> Path:

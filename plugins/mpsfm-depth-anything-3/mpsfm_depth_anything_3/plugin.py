@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, hookimpl
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 from mpsfm_depth_anything_3.options import LICENSES, DepthAnything3Options, weights
 
 

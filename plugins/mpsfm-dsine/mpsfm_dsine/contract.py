@@ -6,12 +6,12 @@ from pathlib import Path
 
 from mpsfm_onnx.contract import stand_in
 
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 from mpsfm_dsine.options import DsineOptions
 from mpsfm_dsine.provider import describe
 
 
-def setup(folder: Path) -> Setup:
+def setup(folder: Path) -> ContractSetup:
     """A network that reads painted views and is told the camera."""
     model = stand_in(describe(DsineOptions(model="")), folder)
-    return Setup(options={"model": str(model)}, knows="painted")
+    return ContractSetup(options={"model": str(model)}, truth_source="painted")

@@ -10,7 +10,7 @@ import geffnet
 import torch
 from models.dsine import v02_kappa
 
-from mpsfm_core.providers.model_export.authors import Job
+from mpsfm_core.providers.model_export.author_script import ExportJob
 
 ENCODERS = {"": 5, "b0": 0, "b5": 5}
 _SIDES = ((96, 128), (160, 96))
@@ -60,7 +60,7 @@ def network(encoder: int) -> Last:
     return Last(v02_kappa.DSINE_v02_kappa(settings)).eval()
 
 
-def export(job: Job, model: Last) -> None:
+def export(job: ExportJob, model: Last) -> None:
     """Images of any size in steps of 32, and their intrinsics."""
     examples = []
     for height, width in _SIDES:
@@ -73,7 +73,7 @@ def export(job: Job, model: Last) -> None:
 
 def main() -> None:
     """Export the network of the checkpoint."""
-    job = Job.given()
+    job = ExportJob.from_arguments()
     model = network(ENCODERS[job.size])
     if job.weights is not None:
         state = job.checkpoint()["model"]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
-from mpsfm_core.providers import ModelExport, file_named_by
-from mpsfm_core.providers.uncertainty.model import NormalCalibration
+from mpsfm_core.providers import ModelExport, weights_from_option
+from mpsfm_core.providers.uncertainty.calibration import NormalCalibration
 from mpsfm_dsine.options import DsineOptions
 
 
@@ -23,7 +23,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint="pip install mpsfm-dsine",
             code_license="Apache-2.0",
             weights_license="of the authors' checkpoint (code MIT)",
-            weights=file_named_by("model", WeightsFile("export:dsine", license="of the authors")),
+            weights=weights_from_option("model", WeightsFile("export:dsine", license="of the authors")),
             calibration=NormalCalibration(std_scale=1.0, std_floor_deg=1.0),
             contract="mpsfm_dsine.contract:setup",
         )

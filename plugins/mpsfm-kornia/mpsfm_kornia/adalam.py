@@ -10,7 +10,7 @@ from kornia.feature.adalam.adalam import AdalamFilter, get_adalam_default_config
 
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.providers import required_features
+from mpsfm_core.providers import require_features
 from mpsfm_core.providers.torch_runtime import inference, use_threads
 from mpsfm_kornia.options import AdalamOptions
 
@@ -39,7 +39,7 @@ class AdalamMatcher:
         features_b: Features | None = None,
     ) -> PairMatches:
         """Matches that others around them support, each feature once."""
-        features_a, features_b = required_features(
+        features_a, features_b = require_features(
             "adalam matches features", features_a, features_b
         )
         if features_a.descriptors.shape[1] != features_b.descriptors.shape[1]:

@@ -10,11 +10,11 @@ from pathlib import Path
 import torch
 from kornia.feature import DeDoDe, LightGlue, LoFTR
 
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 from mpsfm_kornia.lightglue import LIGHTGLUE_256
 
 
-def loftr(folder: Path) -> Setup:
+def loftr(folder: Path) -> ContractSetup:
     """Saved as the published weights are."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
@@ -23,10 +23,10 @@ def loftr(folder: Path) -> Setup:
     state = {f"matcher.{name}": value for name, value in network.state_dict().items()}
     torch.save({"state_dict": state}, path)
     options = {"weights": str(path), "resize": 128, "match_threshold": 0.0}
-    return Setup(options=options, knows="nothing")
+    return ContractSetup(options=options, truth_source="none")
 
 
-def dedode(folder: Path) -> Setup:
+def dedode(folder: Path) -> ContractSetup:
     """Detector and descriptor in files of their own, as the published ones are."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
@@ -35,14 +35,16 @@ def dedode(folder: Path) -> Setup:
     for path, module in zip(paths, (network.detector, network.descriptor), strict=True):
         torch.save(module.state_dict(), path)
     options = {"detector_weights": str(paths[0]), "weights": str(paths[1]), "resize": 96}
-    return Setup(options={**options, "max_keypoints": 200}, knows="nothing")
+    return ContractSetup(options={**options, "max_keypoints": 200}, truth_source="none")
 
 
-def lightglue_dedode(folder: Path) -> Setup:
+def lightglue_dedode(folder: Path) -> ContractSetup:
     """LightGlue for 256 dimensions."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = LightGlue(None, **LIGHTGLUE_256, weights=None).eval()  # type: ignore[arg-type]
     path = folder / "dedode_lightglue.pth"
     torch.save(network.state_dict(), path)
-    return Setup(options={"weights": str(path), "filter_threshold": 0.0}, knows="nothing")
+    return ContractSetup(
+        options={"weights": str(path), "filter_threshold": 0.0}, truth_source="none"
+    )

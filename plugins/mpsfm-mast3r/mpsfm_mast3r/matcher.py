@@ -22,7 +22,7 @@ from mpsfm_core import (
 )
 from mpsfm_core.data import Float32, Int64
 from mpsfm_core.geometry import inside
-from mpsfm_core.providers import required_features
+from mpsfm_core.providers import require_features
 from mpsfm_mast3r.neighbours import mutual, reciprocal
 from mpsfm_mast3r.network import OnnxPairNetwork, PairNetwork, Seen
 from mpsfm_mast3r.options import DenseSearch, SparseSearch
@@ -90,7 +90,7 @@ class SparseMatcher:
         features_b: Features | None = None,
     ) -> PairMatches:
         """Matches of keypoints by the mean similarity of both passes."""
-        features_a, features_b = required_features(
+        features_a, features_b = require_features(
             "mast3r-sparse matches keypoints", features_a, features_b
         )
         passes = self._network.both(view_a, view_b)

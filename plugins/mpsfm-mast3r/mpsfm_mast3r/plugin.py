@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
 from mpsfm_core.data.options import Options
-from mpsfm_core.providers import Capability, ModelExport, file_named_by
+from mpsfm_core.providers import Capability, ModelExport, weights_from_option
 from mpsfm_mast3r.options import DenseOptions, SparseOptions
 
 _LICENSE = "CC-BY-NC-SA-4.0"
@@ -45,6 +45,6 @@ def _spec(name: str, how: Capability, options: type[Options], summary: str) -> P
         install_hint="pip install mpsfm-mast3r",
         code_license="Apache-2.0",
         weights_license=_LICENSE,
-        weights=file_named_by("model", WeightsFile("export:mast3r", license=_LICENSE)),
+        weights=weights_from_option("model", WeightsFile("export:mast3r", license=_LICENSE)),
         contract=f"mpsfm_mast3r.contract:{how}",
     )

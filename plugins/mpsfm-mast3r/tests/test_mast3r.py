@@ -12,7 +12,7 @@ from mpsfm_core import Features, PinholeCamera, View
 from mpsfm_core.data.errors import ConfigError, ProviderError
 from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 SIZE = (80, 60)  # of the views; the network sees 64 x 48 of it, without a border
 

@@ -6,12 +6,14 @@ from pathlib import Path
 
 from mpsfm_onnx.contract import stand_in
 
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 from mpsfm_metric3d_onnx.options import Metric3dOptions
 from mpsfm_metric3d_onnx.provider import describe
 
 
-def setup(folder: Path) -> Setup:
+def setup(folder: Path) -> ContractSetup:
     """An export with confidence that reads painted views."""
     model = stand_in(describe(Metric3dOptions(weights="", confidence=True)), folder)
-    return Setup(options={"weights": str(model), "confidence": True}, knows="painted")
+    return ContractSetup(
+        options={"weights": str(model), "confidence": True}, truth_source="painted"
+    )

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from mpsfm_core.providers.model_export.authors import Job
+from mpsfm_core.providers.model_export.author_script import ExportJob
 
 for _name in ("mmcv", "mmcv.utils", "timm", "timm.models", "timm.models.layers"):
     sys.modules[_name] = ModuleType(_name)  # of what follows nothing is called here
@@ -80,7 +80,7 @@ def network(size: str) -> Named:
     return Named(model).eval()
 
 
-def export(job: Job, model: Named) -> None:
+def export(job: ExportJob, model: Named) -> None:
     """Images of the one size, 0 to 255."""
     given = [{"pixel_values": torch.rand(1, 3, *SIZE) * 255} for _ in range(2)]
     outputs = ["predicted_depth", "predicted_normal", "normal_confidence", "confidence"]
@@ -89,7 +89,7 @@ def export(job: Job, model: Named) -> None:
 
 def main() -> None:
     """Export the network of the checkpoint."""
-    job = Job.given()
+    job = ExportJob.from_arguments()
     model = network(job.size)
     if job.weights is not None:
         job.load(model.model, job.checkpoint()["model_state_dict"])

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mpsfm_core import Options, WeightsFile
-from mpsfm_core.providers import file_named_by
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers import weights_from_option
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 WEIGHTS_LICENSE = "CC0-1.0 (export; the authors name none for their weights)"
 
@@ -72,7 +72,7 @@ class Size:
     def files(self, options: Metric3dOptions) -> tuple[WeightsFile, ...]:
         """The files that these options mean."""
         companions = (WeightsFile(uri, license=WEIGHTS_LICENSE) for uri in options.companions)
-        return (*companions, *file_named_by("weights", *self.weights)(options))
+        return (*companions, *weights_from_option("weights", *self.weights)(options))
 
     @property
     def calibration_alone(self) -> DepthCalibration:

@@ -6,7 +6,7 @@ from pydantic import BaseModel
 
 from mpsfm_core import ProviderSpec, hookimpl
 from mpsfm_core.providers import Kind, ModelExport
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from mpsfm_metric3d_onnx.options import SIZES, WEIGHTS_LICENSE, Metric3dOptions, Size
 
 _NORMALS = NormalCalibration(std_scale=1.0, std_floor_deg=1.0)

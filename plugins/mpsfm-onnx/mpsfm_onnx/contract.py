@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from onnx import TensorProto, helper, numpy_helper
 
 from mpsfm_core.data import Float64
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 from mpsfm_core.testing.examples import outdoor_example
-from mpsfm_core.testing.painting import NORMALS_STD, RELATIVE_STD, decoder
+from mpsfm_core.testing.painted_views import NORMALS_STD, RELATIVE_STD, decoder
 from mpsfm_onnx.canvas import Canvas
 from mpsfm_onnx.description import Description, ImageInput, load_description
 from mpsfm_onnx.stand_in import save_model
@@ -71,14 +71,16 @@ moge (float[1,3,h,w] image, int64 num_tokens) => (
 """
 
 
-def setup(folder: Path) -> Setup:
+def setup(folder: Path) -> ContractSetup:
     """A network with a canonical camera, padding, a confidence and a concentration."""
-    return Setup(options=_tiny(folder), knows="painted")
+    return ContractSetup(options=_tiny(folder), truth_source="painted")
 
 
-def moge(folder: Path) -> Setup:
+def moge(folder: Path) -> ContractSetup:
     """A network with the tensors of MoGe-2's published file."""
-    return Setup(options={"weights": str(moge_stand_in(folder / "moge.onnx"))}, knows="nothing")
+    return ContractSetup(
+        options={"weights": str(moge_stand_in(folder / "moge.onnx"))}, truth_source="none"
+    )
 
 
 def moge_stand_in(path: Path) -> Path:

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from mpsfm_core import Options, WeightsFile
 from mpsfm_core.data.errors import ConfigError, WeightsError, did_you_mean
 from mpsfm_core.data.options import parse_settings
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from mpsfm_core.support.yaml_text import parse_yaml
 
 _FOLDER = Path(__file__).parent / "descriptions"

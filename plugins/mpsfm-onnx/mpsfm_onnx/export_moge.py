@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from moge.model.v2 import MoGeModel
 
-from mpsfm_core.providers.model_export.authors import Job
+from mpsfm_core.providers.model_export.author_script import ExportJob
 
 _DIMS = [384, 64, 32, 16, 8]
 _NONE = {"res_block_in_norm": "none", "res_block_hidden_norm": "none"}
@@ -53,7 +53,7 @@ def small_with_normals() -> dict[str, Any]:
     }
 
 
-def export(job: Job, model: torch.nn.Module) -> None:
+def export(job: ExportJob, model: torch.nn.Module) -> None:
     """Images of any size, and how many tokens they are made to."""
     model.onnx_compatible_mode = True
     tokens = torch.tensor(TOKENS)
@@ -64,7 +64,7 @@ def export(job: Job, model: torch.nn.Module) -> None:
 
 def main() -> None:
     """Export the network of the checkpoint, which says its own architecture."""
-    job = Job.given()
+    job = ExportJob.from_arguments()
     if job.weights is None:
         export(job, MoGeModel(**small_with_normals()))
         return

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mpsfm_core.providers.model_export.authors import Job
+from mpsfm_core.providers.model_export.author_script import ExportJob
 
 
 def _unused(name: str, **has: Any) -> None:
@@ -50,7 +50,7 @@ def network(size: str) -> UniDepthV2ONNXcam:
     return UniDepthV2ONNXcam(config).eval()
 
 
-def export(job: Job, model: UniDepthV2ONNXcam) -> None:
+def export(job: ExportJob, model: UniDepthV2ONNXcam) -> None:
     """Images of the one size, and the unit rays that their pixels see."""
     given = []
     for focal in (400.0, 700.0):
@@ -68,7 +68,7 @@ def _linspace(start: float, end: float, steps: int, **_: Any) -> torch.Tensor:
 
 def main() -> None:
     """Export the network of the checkpoint."""
-    job = Job.given()
+    job = ExportJob.from_arguments()
     model = network(job.size)
     if job.weights is not None:
         job.load(model, {**dict(model.named_buffers()), **job.checkpoint()})

@@ -6,7 +6,7 @@ from pydantic import BaseModel
 
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
 from mpsfm_core.providers import Capability, Kind, ModelExport
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from mpsfm_onnx.description import load_description
 from mpsfm_onnx.options import MOGE_2, Moge2Options, OnnxOptions
 

@@ -17,7 +17,7 @@ from mpsfm_core.data.errors import ConfigError, WeightsError
 from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.geometry import pixel_centers, rays, resize_map, unproject
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 IDENTITY_INPUT = {"size": {"mode": "longest", "side": 64, "enlarge": False}}
 RED = "tiny (float[1,3,h,w] image) => (float[1,1,h,w] out) { out = Gather <axis = 1> (image, red) }"

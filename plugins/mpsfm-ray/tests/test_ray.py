@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mpsfm_core.testing import executors
+from mpsfm_core.testing import executor_contract
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
 from mpsfm_ray.executor import RayExecutor
@@ -25,24 +25,24 @@ class TestOneCluster:
         executor.close()
 
     def test_items(self, executor: RayExecutor, tmp_path: Path) -> None:
-        executors.check_items(executor, tmp_path / "items")
+        executor_contract.check_items(executor, tmp_path / "items")
 
     def test_errors(self, executor: RayExecutor) -> None:
-        executors.check_errors(executor)
+        executor_contract.check_errors(executor)
 
     def test_a_lost_worker_loses_nothing(self, executor: RayExecutor, tmp_path: Path) -> None:
-        executors.check_lost_worker(executor, tmp_path / "items")
+        executor_contract.check_lost_worker(executor, tmp_path / "items")
 
 
 @pytest.mark.slow  # starts clusters
 def test_extraction(tmp_path: Path) -> None:
-    executors.check_extraction("ray", {"workers": 2}, tmp_path)
+    executor_contract.check_extraction("ray", {"workers": 2}, tmp_path)
 
 
 @pytest.mark.slow  # starts clusters
 def test_a_failing_provider(tmp_path: Path) -> None:
-    executors.check_failing_provider("ray", {"workers": 2}, tmp_path)
+    executor_contract.check_failing_provider("ray", {"workers": 2}, tmp_path)
 
 
 def test_options() -> None:
-    executors.check_options(RayExecutor)
+    executor_contract.check_options(RayExecutor)

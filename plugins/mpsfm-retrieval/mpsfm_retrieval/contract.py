@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mpsfm_onnx.stand_in import save_model
 
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 
 _COARSE = """
 coarse (float[b,3,h,w] image) => (float[b,d] descriptor) {
@@ -17,7 +17,9 @@ coarse (float[b,3,h,w] image) => (float[b,d] descriptor) {
 """
 
 
-def network(folder: Path) -> Setup:
+def network(folder: Path) -> ContractSetup:
     """As EigenPlaces, with a fixed size."""
     model = save_model(_COARSE, folder / "coarse.onnx")
-    return Setup(options={"model": str(model), "network": "eigenplaces"}, knows="seen")
+    return ContractSetup(
+        options={"model": str(model), "network": "eigenplaces"}, truth_source="image"
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, hookimpl
-from mpsfm_core.providers import file_named_by
+from mpsfm_core.providers import weights_from_option
 from mpsfm_retrieval.options import DINOV2, AppearanceOptions, NetworkOptions
 
 
@@ -21,7 +21,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint="pip install mpsfm-retrieval",
             code_license="Apache-2.0",
             weights_license=f"{DINOV2.license} (DINOv2), else of the chosen model",
-            weights=file_named_by("model", DINOV2),
+            weights=weights_from_option("model", DINOV2),
             contract="mpsfm_retrieval.contract:network",
         ),
         ProviderSpec(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mpsfm_onnx.stand_in import save_model
 
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 
 _GRID = (42, 56)
 _SIDE = 5
@@ -49,14 +49,18 @@ roma (float[b,3,h,w] im_A, float[b,3,h,w] im_B) => (
 """
 
 
-def dense(folder: Path) -> Setup:
+def dense(folder: Path) -> ContractSetup:
     """Symmetric, with every position of the coarse grid."""
-    return Setup(options={**_stand_in(folder), "cell": 1, "min_certainty": 0.5}, knows="seen")
+    return ContractSetup(
+        options={**_stand_in(folder), "cell": 1, "min_certainty": 0.5}, truth_source="image"
+    )
 
 
-def sparse(folder: Path) -> Setup:
+def sparse(folder: Path) -> ContractSetup:
     """The coarse grid needs a wider reach than RoMa's sub-pixel warp."""
-    return Setup(options={**_stand_in(folder), "snap_px": 3.0, "min_certainty": 0.5}, knows="seen")
+    return ContractSetup(
+        options={**_stand_in(folder), "snap_px": 3.0, "min_certainty": 0.5}, truth_source="image"
+    )
 
 
 def _stand_in(folder: Path) -> dict[str, Any]:

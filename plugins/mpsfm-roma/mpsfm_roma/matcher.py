@@ -17,7 +17,7 @@ from mpsfm_core import (
     View,
 )
 from mpsfm_core.data import Float32, Float64, Int64
-from mpsfm_core.providers import required_features
+from mpsfm_core.providers import require_features
 from mpsfm_roma.network import OnnxWarpNetwork, Warp, WarpNetwork
 from mpsfm_roma.options import DenseSearch, SparseSearch
 
@@ -73,7 +73,7 @@ class SparseMatcher:
         features_b: Features | None = None,
     ) -> PairMatches:
         """The most certain ones first, each keypoint once."""
-        features_a, features_b = required_features(
+        features_a, features_b = require_features(
             "roma-sparse matches keypoints", features_a, features_b
         )
         there, back = self._network.warps(view_a, view_b)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, hookimpl
 from mpsfm_core.data.options import Options
-from mpsfm_core.providers import Capability, file_named_by
+from mpsfm_core.providers import Capability, weights_from_option
 from mpsfm_roma.options import DenseOptions, SparseOptions
 
 
@@ -29,6 +29,6 @@ def _spec(name: str, how: Capability, options: type[Options], summary: str) -> P
         install_hint="pip install mpsfm-roma",
         code_license="Apache-2.0",
         weights_license="MIT",
-        weights=file_named_by("model"),
+        weights=weights_from_option("model"),
         contract=f"mpsfm_roma.contract:{how}",
     )

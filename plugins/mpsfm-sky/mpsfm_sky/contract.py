@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mpsfm_onnx.stand_in import save_model
 
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 
 _PAINTED_SKY = """
 sky (float[b,3,h,w] image) => (float[b,1,h,w] d0)
@@ -20,12 +20,14 @@ sky (float[b,3,h,w] image) => (float[b,1,h,w] d0)
 """1 where the red of a painted view, which is its depth, is 0."""
 
 
-def network(folder: Path) -> Setup:
+def network(folder: Path) -> ContractSetup:
     """The network's stand-in takes for sky what has no depth painted."""
     path = save_model(_PAINTED_SKY, folder / "sky.onnx")
-    return Setup(options={"model": str(path), "network": "skysegsmall"}, knows="painted")
+    return ContractSetup(
+        options={"model": str(path), "network": "skysegsmall"}, truth_source="painted"
+    )
 
 
-def simple(folder: Path) -> Setup:
+def simple(folder: Path) -> ContractSetup:
     """It sees the blue sky of the textured views."""
-    return Setup(knows="seen")
+    return ContractSetup(truth_source="image")

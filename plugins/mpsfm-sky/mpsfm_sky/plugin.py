@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_core import ProviderSpec, hookimpl
-from mpsfm_core.providers import file_named_by
+from mpsfm_core.providers import weights_from_option
 from mpsfm_sky.options import SKYSEG, SimpleSkyOptions, SkyOptions
 
 
@@ -21,7 +21,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint="pip install mpsfm-sky",
             code_license="Apache-2.0",
             weights_license="of the chosen model (skyseg: MIT)",
-            weights=file_named_by("model", SKYSEG),
+            weights=weights_from_option("model", SKYSEG),
             contract="mpsfm_sky.contract:network",
         ),
         ProviderSpec(

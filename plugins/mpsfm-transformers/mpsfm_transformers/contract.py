@@ -7,20 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 from mpsfm_core.testing.examples import Example
 from mpsfm_transformers import stand_in
 
 
-def transformers(folder: Path) -> Setup:
+def transformers(folder: Path) -> ContractSetup:
     """Depth Pro, which depends on the focal length and tells it."""
-    return Setup(options={"model": str(stand_in.depth_pro(folder / "depth_pro"))}, knows="nothing")
+    return ContractSetup(
+        options={"model": str(stand_in.depth_pro(folder / "depth_pro"))}, truth_source="none"
+    )
 
 
-def prompt_depth_anything(folder: Path) -> Setup:
+def prompt_depth_anything(folder: Path) -> ContractSetup:
     """The sensor sees the truth, coarsely."""
 
-    def tell(example: Example) -> None:
+    def write_depth(example: Example) -> None:
         path = (folder / "sensor" / example.view.name).with_suffix(".npy")
         path.parent.mkdir(parents=True, exist_ok=True)
         truth = example.truth()
@@ -28,31 +30,37 @@ def prompt_depth_anything(folder: Path) -> Setup:
 
     model = stand_in.prompt_depth_anything(folder / "prompt_depth_anything")
     options = {"model": str(model), "directory": str(folder / "sensor")}
-    return Setup(options=options, knows="nothing", tell=tell)
+    return ContractSetup(options=options, truth_source="none", prepare=write_depth)
 
 
-def superpoint_hub(folder: Path) -> Setup:
+def superpoint_hub(folder: Path) -> ContractSetup:
     """A detector that finds something everywhere."""
     model = stand_in.superpoint(folder / "superpoint")
-    return Setup(options={"model": str(model), "max_keypoints": 300}, knows="nothing")
+    return ContractSetup(options={"model": str(model), "max_keypoints": 300}, truth_source="none")
 
 
-def lightglue_superpoint_hub(folder: Path) -> Setup:
+def lightglue_superpoint_hub(folder: Path) -> ContractSetup:
     """For descriptors of SuperPoint."""
-    return Setup(options={"model": str(stand_in.lightglue(folder / "lightglue"))}, knows="nothing")
+    return ContractSetup(
+        options={"model": str(stand_in.lightglue(folder / "lightglue"))}, truth_source="none"
+    )
 
 
-def superglue(folder: Path) -> Setup:
+def superglue(folder: Path) -> ContractSetup:
     """For descriptors of SuperPoint."""
-    return Setup(options={"model": str(stand_in.superglue(folder / "superglue"))}, knows="nothing")
+    return ContractSetup(
+        options={"model": str(stand_in.superglue(folder / "superglue"))}, truth_source="none"
+    )
 
 
-def efficient_loftr(folder: Path) -> Setup:
+def efficient_loftr(folder: Path) -> ContractSetup:
     """On small images."""
     model = stand_in.efficient_loftr(folder / "efficient_loftr")
-    return Setup(options={"model": str(model), "resize": 128}, knows="nothing")
+    return ContractSetup(options={"model": str(model), "resize": 128}, truth_source="none")
 
 
-def dino(folder: Path) -> Setup:
+def dino(folder: Path) -> ContractSetup:
     """A few random layers still tell a room from another."""
-    return Setup(options={"model": str(stand_in.dino(folder / "dino"))}, knows="nothing")
+    return ContractSetup(
+        options={"model": str(stand_in.dino(folder / "dino"))}, truth_source="none"
+    )

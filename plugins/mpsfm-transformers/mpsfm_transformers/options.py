@@ -10,7 +10,7 @@ from typing import Literal
 from pydantic import Field
 
 from mpsfm_core import Options, WeightsFile
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 CONFIG, PROCESSOR, WEIGHTS = "config.json", "preprocessor_config.json", "model.safetensors"
 FILES = (CONFIG, PROCESSOR, WEIGHTS)

@@ -6,7 +6,7 @@ from pydantic import BaseModel
 
 from mpsfm_core import Options, ProviderSpec, hookimpl
 from mpsfm_core.providers import Capability, Kind
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from mpsfm_transformers import options as opt
 
 _OF_THE_MODEL = "of the chosen model"

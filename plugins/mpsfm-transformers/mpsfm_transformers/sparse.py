@@ -16,7 +16,7 @@ from transformers import LightGlueForKeypointMatching, SuperGlueForKeypointMatch
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
 from mpsfm_core.data import Float64
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.providers import required_features
+from mpsfm_core.providers import require_features
 from mpsfm_core.providers.torch_runtime import inference
 from mpsfm_transformers.hub import LoadedModel
 from mpsfm_transformers.options import LightGlueOptions, SparseOptions, SuperGlueOptions
@@ -58,7 +58,7 @@ class GivenKeypointsMatcher:
         Raises:
             ProviderError: the descriptors are not of the family this network was trained for.
         """
-        features = required_features(f"{self.name} matches features", features_a, features_b)
+        features = require_features(f"{self.name} matches features", features_a, features_b)
         for view, one in zip((view_a, view_b), features, strict=True):
             if one.descriptors.shape[1] != self._dimension:
                 raise ProviderError(

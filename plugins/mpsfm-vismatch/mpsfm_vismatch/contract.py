@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
-from mpsfm_core.testing import Setup
+from mpsfm_core.testing import ContractSetup
 
 _REAL = "sift-nn"
 _STAND_IN = "mpsfm_vismatch.stand_in"
@@ -13,34 +13,40 @@ _SMALL = {"network": f"{_STAND_IN}:Matching", "resize": 96}
 """So that comparing all pixels is quick."""
 
 
-def vismatch(folder: Path) -> Setup:
+def vismatch(folder: Path) -> ContractSetup:
     """The collection's own matcher without weights; a stand-in where it is not installed."""
-    return Setup(options={"network": _REAL} if find_spec("vismatch") else _SMALL, knows="seen")
+    return ContractSetup(
+        options={"network": _REAL} if find_spec("vismatch") else _SMALL, truth_source="image"
+    )
 
 
-def vismatch_sparse(folder: Path) -> Setup:
+def vismatch_sparse(folder: Path) -> ContractSetup:
     """The same, at keypoints of any detector."""
     options = {"network": _REAL} if find_spec("vismatch") else _SMALL
-    return Setup(options={**options, "snap_px": 3.0}, knows="seen")
+    return ContractSetup(options={**options, "snap_px": 3.0}, truth_source="image")
 
 
-def vismatch_roma(folder: Path) -> Setup:
+def vismatch_roma(folder: Path) -> ContractSetup:
     """Symmetric, with every position of a coarse grid."""
     options = {"network": f"{_STAND_IN}:Warping", "cell": 1, "min_certainty": 0.5}
-    return Setup(options=options, knows="seen")
+    return ContractSetup(options=options, truth_source="image")
 
 
-def vismatch_roma_sparse(folder: Path) -> Setup:
+def vismatch_roma_sparse(folder: Path) -> ContractSetup:
     """The coarse grid needs a wider reach than RoMa's sub-pixel warp."""
     options = {"network": f"{_STAND_IN}:Warping", "snap_px": 3.0, "min_certainty": 0.5}
-    return Setup(options=options, knows="seen")
+    return ContractSetup(options=options, truth_source="image")
 
 
-def vismatch_mast3r(folder: Path) -> Setup:
+def vismatch_mast3r(folder: Path) -> ContractSetup:
     """Small, so that comparing all pixels is quick."""
-    return Setup(options={"network": f"{_STAND_IN}:Pointing", "size": 128}, knows="seen")
+    return ContractSetup(
+        options={"network": f"{_STAND_IN}:Pointing", "size": 128}, truth_source="image"
+    )
 
 
-def vismatch_mast3r_sparse(folder: Path) -> Setup:
+def vismatch_mast3r_sparse(folder: Path) -> ContractSetup:
     """The same at the keypoints of any detector."""
-    return Setup(options={"network": f"{_STAND_IN}:Pointing", "size": 128}, knows="seen")
+    return ContractSetup(
+        options={"network": f"{_STAND_IN}:Pointing", "size": 128}, truth_source="image"
+    )

@@ -16,7 +16,7 @@ from mpsfm_core import (
 )
 from mpsfm_core.data import Float32, Float64
 from mpsfm_core.geometry import inside, resize_map, scale_pixels
-from mpsfm_core.providers import required_features
+from mpsfm_core.providers import require_features
 from mpsfm_core.providers.torch_runtime import inference
 from mpsfm_vismatch.collection import load
 from mpsfm_vismatch.options import CollectionOptions, SnapOptions
@@ -106,7 +106,7 @@ class SparseMatcher(DenseMatcher):
         features_b: Features | None = None,
     ) -> PairMatches:
         """The most certain ones first, each keypoint once."""
-        given = required_features("vismatch-sparse matches keypoints", features_a, features_b)
+        given = require_features("vismatch-sparse matches keypoints", features_a, features_b)
         found = self._matched(view_a, view_b)
         nearest = np.empty((len(found), 2), dtype=np.int64)
         near = np.ones(len(found), dtype=np.bool_)

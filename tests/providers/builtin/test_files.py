@@ -20,7 +20,7 @@ from mpsfm_core.providers.builtin.options import (
     NormalFileOptions,
 )
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 CAMERA = PinholeCamera(40, 30, 40.0, 40.0, 20.0, 15.0)
 VIEW = View("side/a.jpg", np.zeros((30, 40, 3), np.uint8), CAMERA)

@@ -11,7 +11,7 @@ import pytest
 
 import mpsfm_core
 from mpsfm_core import PinholeCamera, ProviderContext, View
-from mpsfm_core.providers.environments.store import FOLDER_VARIABLE, Environment
+from mpsfm_core.providers.environments.environment import FOLDER_VARIABLE, Environment
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.examples import outdoor_example
 

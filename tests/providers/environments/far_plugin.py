@@ -10,8 +10,8 @@ import numpy as np
 from mpsfm_core import DepthPrior, NormalPrior, Options, PairMatches, ProviderSpec, hookimpl
 from mpsfm_core.data import DenseMatches
 from mpsfm_core.data.errors import WeightsError
-from mpsfm_core.testing import Setup
-from mpsfm_core.testing.painting import decoder
+from mpsfm_core.testing import ContractSetup
+from mpsfm_core.testing.painted_views import decoder
 
 
 class FarOptions(Options):
@@ -65,7 +65,7 @@ class FarMatcher:
 
 
 def contract(folder):
-    return Setup(options={"mode": "painted"}, knows="painted")
+    return ContractSetup(options={"mode": "painted"}, truth_source="painted")
 
 
 @hookimpl

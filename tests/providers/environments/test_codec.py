@@ -9,15 +9,15 @@ import pytest
 
 from mpsfm_core import DepthPrior, Features, PinholeCamera, View
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.providers.environments.codec import Packed, unpack
-from mpsfm_core.providers.uncertainty.model import DepthCalibration
+from mpsfm_core.providers.environments.codec import EncodedMessage, decode_message
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 
 def there_and_back(value, copy=True):
-    packed = Packed(value)
+    packed = EncodedMessage(value)
     block = np.zeros(packed.size, dtype=np.uint8)
     packed.write(memoryview(block))
-    return unpack(packed.text, block, copy)
+    return decode_message(packed.text, block, copy)
 
 
 def test_values_come_back():
@@ -51,7 +51,7 @@ def test_what_is_not_copied_cannot_be_written_to():
 @pytest.mark.parametrize("value", [object(), np.array([object()]), {1: lambda: 0}])
 def test_no_objects(value):
     with pytest.raises(DataError, match="cannot be handed to another process"):
-        Packed(value)
+        EncodedMessage(value)
 
 
 @pytest.mark.parametrize(
@@ -60,4 +60,4 @@ def test_no_objects(value):
 )
 def test_nothing_but_the_protocol(text):
     with pytest.raises(DataError):
-        unpack(text, np.zeros(64, dtype=np.uint8), copy=True)
+        decode_message(text, np.zeros(64, dtype=np.uint8), copy=True)

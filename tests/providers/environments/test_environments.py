@@ -11,13 +11,22 @@ import pytest
 from mpsfm_core.config import load_config
 from mpsfm_core.data.errors import InputError, ProviderError, ProviderRunError, WeightsError
 from mpsfm_core.data.options import ProviderConfig, SettingsError
-from mpsfm_core.providers.environments import process, remote, store
+from mpsfm_core.providers.environments import environment as environment_module
+from mpsfm_core.providers.environments import remote_provider, worker_process
+from mpsfm_core.providers.environments.environment import (
+    FOLDER_VARIABLE,
+    Environment,
+    all_environments,
+    create_environment,
+    find_environment,
+)
+from mpsfm_core.providers.environments.worker_process import WorkerLost
 from mpsfm_core.providers.validation import run_depth
 from mpsfm_core.testing.contract import run_checks
 
 
 def test_what_is_there_is_listed_without_starting_it(registry, monkeypatch):
-    monkeypatch.setattr(store.Environment, "start", lambda self: pytest.fail("started"))
+    monkeypatch.setattr(Environment, "start", lambda self: pytest.fail("started"))
     line = next(line for line in registry.status() if line.name == "far@far")
     assert line.available
     assert (line.distribution, line.version) == ("far-plugin in environment 'far'", "0.3")
@@ -119,8 +128,8 @@ def test_a_worker_that_hangs(registry, context, named, monkeypatch):
     provider = registry.create("depth", "far@far", None, context)
     provider.predict(named("first.png"))
     with monkeypatch.context() as hurry:
-        hurry.setattr(remote, "_ANSWERING_S", 1.0)
-        with pytest.raises(process.WorkerLost, match="did not answer within 1 s"):
+        hurry.setattr(remote_provider, "_ANSWERING_S", 1.0)
+        with pytest.raises(WorkerLost, match="did not answer within 1 s"):
             provider.predict(named("hang"))
     assert provider.predict(named("next.png")).valid.any()
 
@@ -131,13 +140,13 @@ def test_what_cannot_be_constructed_there(registry, context):
 
 
 def test_another_version_of_the_protocols(far, monkeypatch):
-    monkeypatch.setattr(process, "PROTOCOL", 99)
+    monkeypatch.setattr(worker_process, "PROTOCOL", 99)
     with pytest.raises(ProviderError, match="protocols are of another version"):
         far.start()
 
 
 def test_an_environment_that_does_not_start(tmp_path):
-    broken = store.Environment(tmp_path / "broken")
+    broken = Environment(tmp_path / "broken")
     broken.python.parent.mkdir(parents=True)
     broken.python.write_text("#!/bin/sh\necho 'no numpy here' >&2\nexit 1\n")
     broken.python.chmod(0o755)
@@ -146,19 +155,19 @@ def test_an_environment_that_does_not_start(tmp_path):
 
 
 def test_names(monkeypatch, tmp_path):
-    monkeypatch.setenv(store.FOLDER_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     with pytest.raises(InputError, match="lower-case"):
-        store.create_environment("Not a name", ["x"])
+        create_environment("Not a name", ["x"])
     with pytest.raises(InputError, match="no environment 'x'"):
-        store.find_environment("x")
+        find_environment("x")
     (tmp_path / "there").mkdir()
     with pytest.raises(InputError, match="mpsfm env remove there"):
-        store.create_environment("there", ["x"])
+        create_environment("there", ["x"])
 
 
 def test_it_is_there_as_a_whole_or_not_at_all(monkeypatch, tmp_path):
     """It is made beside its place: others do not see one that is being made."""
-    monkeypatch.setenv(store.FOLDER_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     seen = []
 
     def made(command, label):
@@ -166,14 +175,16 @@ def test_it_is_there_as_a_whole_or_not_at_all(monkeypatch, tmp_path):
         python.parent.mkdir(parents=True, exist_ok=True)
         python.touch()
         python.with_name("pip").write_text(f"#!{python}\nimport pip\n")
-        seen.append([environment.name for environment in store.all_environments()])
+        seen.append([environment.name for environment in all_environments()])
 
-    monkeypatch.setattr(store, "_commands", lambda e, packages, python: [[str(e.python)]])
-    monkeypatch.setattr(store, "_run", made)
-    monkeypatch.setattr(store.Environment, "ask", lambda self, **request: [])
-    environment, found = store.create_environment("new", ["x"])
+    monkeypatch.setattr(
+        environment_module, "_commands", lambda e, packages, python: [[str(e.python)]]
+    )
+    monkeypatch.setattr(environment_module, "_run", made)
+    monkeypatch.setattr(Environment, "ask", lambda self, **request: [])
+    environment, found = create_environment("new", ["x"])
     assert (seen, found) == ([[]], [])
-    assert [e.name for e in store.all_environments()] == ["new"] and environment.python.exists()
+    assert [e.name for e in all_environments()] == ["new"] and environment.python.exists()
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
     script = environment.python.with_name("pip").read_text()
     assert script.splitlines()[0] == f"#!{environment.python}"
@@ -181,7 +192,7 @@ def test_it_is_there_as_a_whole_or_not_at_all(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 def test_what_cannot_be_installed_leaves_nothing_behind(monkeypatch, tmp_path):
-    monkeypatch.setenv(store.FOLDER_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     with pytest.raises(ProviderError, match="cannot be made"):
-        store.create_environment("new", [str(tmp_path / "nowhere")])
+        create_environment("new", [str(tmp_path / "nowhere")])
     assert not list(tmp_path.iterdir())

@@ -1,5 +1,5 @@
 from mpsfm_core import ProviderSpec, hookimpl
-from mpsfm_core.providers import file_named_by
+from mpsfm_core.providers import weights_from_option
 
 
 @hookimpl
@@ -11,7 +11,7 @@ def mpsfm_providers():
             factory="$module.model:$Class",
             options="$module.model:${Class}Options",
             capabilities=frozenset({"metric"}),
-            weights=file_named_by("weights"),
+            weights=weights_from_option("weights"),
             contract="$module.contract:contract",
             code_license="Apache-2.0",
         )

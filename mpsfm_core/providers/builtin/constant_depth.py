@@ -12,7 +12,7 @@ _GRID = (24, 32)
 """Of a constant any grid is as good; normals from depth want a few pixels."""
 
 
-class Flat:
+class ConstantDepth:
     """A plane parallel to the image, at a distance of 1 in no known unit.
 
     With the large std that it declares the mapper can lift keypoints to begin with, and photos

@@ -11,8 +11,8 @@ import pytest
 
 from mpsfm_core.data.errors import InputError, ProviderError, WeightsError
 from mpsfm_core.providers import ModelExport
-from mpsfm_core.providers.model_export import run
-from mpsfm_core.providers.model_export.run import export_model, relative_difference
+from mpsfm_core.providers.model_export import export
+from mpsfm_core.providers.model_export.export import export_model, measure_relative_difference
 from mpsfm_core.providers.weights import WeightStore, file_sha256
 
 torch = pytest.importorskip("torch")
@@ -35,9 +35,9 @@ class Net(torch.nn.Module):
 SCRIPT = """
 import torch
 from their_net import Net
-from mpsfm_core.model_export.authors import Job
+from mpsfm_core.providers.model_export.author_script import ExportJob
 
-job = Job.given()
+job = ExportJob.from_arguments()
 net = Net()
 if job.weights:
     net.load_state_dict(job.checkpoint())
@@ -117,7 +117,7 @@ class shifted(torch.nn.Module):
 """
     made = recipe(tmp_path, monkeypatch, helpers + change)
     with pytest.raises(ProviderError, match=message):
-        export_model("net", made, [code], run.RANDOM)
+        export_model("net", made, [code], export.RANDOM)
     assert not list((tmp_path / "exports").iterdir())
 
 
@@ -127,7 +127,7 @@ def test_weights_that_lie_beside_a_network_become_one_file_that_moves_with_it(
     onnx = pytest.importorskip("onnx")
     import onnxruntime
 
-    from mpsfm_core.providers.model_export.authors import gather_weights
+    from mpsfm_core.providers.model_export.author_script import gather_weights
 
     text = """<ir_version: 8, opset_import: ["" : 17]> net (float[1000] x) => (float[1000] y) {
         z = Add (x, one)
@@ -156,7 +156,7 @@ def test_what_onnx_has_no_word_for(
 ) -> None:
     net = code / "their_net.py"
     net.write_text(net.read_text().replace("image * self.gain", "torch.expm1(image * 1e-5)"))
-    found = export_model("net", recipe(tmp_path, monkeypatch), [code], run.RANDOM)
+    found = export_model("net", recipe(tmp_path, monkeypatch), [code], export.RANDOM)
     assert found["largest_differences"]["axes"] < 1e-6
 
 
@@ -172,7 +172,7 @@ def test_a_checkpoint_with_code_in_it_is_refused(
 def test_what_is_not_there(code: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = recipe(tmp_path, monkeypatch)
     with pytest.raises(InputError, match="git clone https://github"):
-        export_model("net", made, [tmp_path / "nowhere"], run.RANDOM)
+        export_model("net", made, [tmp_path / "nowhere"], export.RANDOM)
     with pytest.raises(WeightsError, match="does not exist"):
         export_model("net", made, [code], str(tmp_path / "none.pt"))
 
@@ -187,4 +187,4 @@ def test_what_is_not_there(code: Path, tmp_path: Path, monkeypatch: pytest.Monke
     ],
 )
 def test_relative_difference(found: np.ndarray, expected: np.ndarray, difference: float) -> None:
-    assert relative_difference(found, expected) == difference
+    assert measure_relative_difference(found, expected) == difference

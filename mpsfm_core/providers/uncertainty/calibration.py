@@ -40,7 +40,7 @@ class DepthCalibration(Options):
     use_network_variance: bool = True
     """False ignores what the network says of itself."""
     shift: float = 0.0
-    """Added to depth or inverse depth, in medians of it over the map; 0 for metric networks."""
+    """Added to depth or inverse depth, in depth_medians of it over the map; 0 for metric networks."""
     shift_space: Literal["depth", "disparity"] = "depth"
     """What ``shift`` is added to: disparity for networks that predict affine inverse depth."""
     edge_ratio: float | None = Field(None, gt=1)
@@ -69,14 +69,14 @@ class DepthCalibration(Options):
         if self.shift == 0 or not prior.valid.any():
             return prior
         depth = np.where(prior.valid, prior.depth, np.float32(1)).astype(np.float64)
-        moved, gain, possible = self.shift_depth(depth, medians(prior))
+        moved, gain, possible = self.shift_depth(depth, depth_medians(prior))
         variance = None if prior.variance is None else prior.variance * gain**2
         return DepthPrior.from_arrays(moved, variance, prior.valid & possible, metric=prior.metric)
 
     def shift_depth(
-        self, depth: Float64, medians: tuple[float, float]
+        self, depth: Float64, depth_medians: tuple[float, float]
     ) -> tuple[Float64, Float64, Bool]:
-        """Apply :attr:`shift` to depth values of a map with the given :func:`medians`.
+        """Apply :attr:`shift` to depth values of a map with the given :func:`depth_medians`.
 
         Returns:
             The new depth, the factor of its std, and where there is one; of the shape of
@@ -84,7 +84,7 @@ class DepthCalibration(Options):
         """
         in_depth = self.shift_space == "depth"
         quantity = depth if in_depth else 1 / depth
-        median = medians[0] if in_depth else medians[1]
+        median = depth_medians[0] if in_depth else depth_medians[1]
         moved = quantity + self.shift * median
         possible = moved > _SMALLEST_SHARE * median
         moved = np.where(possible, moved, median)
@@ -93,7 +93,7 @@ class DepthCalibration(Options):
         return 1 / moved, (quantity / moved) ** 2, possible
 
 
-def medians(prior: DepthPrior) -> tuple[float, float]:
+def depth_medians(prior: DepthPrior) -> tuple[float, float]:
     """Medians of depth and of inverse depth over a map with valid pixels."""
     depth = prior.depth[prior.valid].astype(np.float64)
     return float(np.median(depth)), float(np.median(1 / depth))

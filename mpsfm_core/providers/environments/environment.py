@@ -19,7 +19,7 @@ from typing import Any
 import platformdirs
 
 from mpsfm_core.data.errors import InputError, ProviderError, did_you_mean
-from mpsfm_core.providers.environments.process import Worker
+from mpsfm_core.providers.environments.worker_process import Worker
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.format_versions import VERSION, check_version
 

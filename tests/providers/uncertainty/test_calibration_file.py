@@ -8,8 +8,16 @@ import pytest
 
 from mpsfm_core.config import load_config
 from mpsfm_core.data.errors import ConfigError
-from mpsfm_core.providers.uncertainty.file import CalibrationFile, Provenance, load_calibration
-from mpsfm_core.providers.uncertainty.model import Calibration, DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import (
+    Calibration,
+    DepthCalibration,
+    NormalCalibration,
+)
+from mpsfm_core.providers.uncertainty.calibration_file import (
+    CalibrationFile,
+    Provenance,
+    load_calibration,
+)
 
 DEPTH = DepthCalibration(relative_std=0.07, shift=0.2, edge_ratio=1.1, edge_std_scale=2)
 NORMALS = NormalCalibration(std_scale=1.5, std_floor_deg=3.0)

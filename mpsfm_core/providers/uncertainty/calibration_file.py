@@ -16,7 +16,11 @@ from pydantic import Field, model_validator
 
 from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.data.options import Options, SettingsError, parse_settings
-from mpsfm_core.providers.uncertainty.model import Calibration, DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import (
+    Calibration,
+    DepthCalibration,
+    NormalCalibration,
+)
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.yaml_text import parse_yaml, write_yaml

@@ -22,9 +22,9 @@ from mpsfm_core.data import (
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.data.options import Options
 from mpsfm_core.providers import Kind, ProviderContext, ProviderSpec, WeightsFile, hookimpl
-from mpsfm_core.providers.environments.process import Worker, WorkerLost
-from mpsfm_core.providers.environments.store import Environment
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.environments.environment import Environment
+from mpsfm_core.providers.environments.worker_process import Worker, WorkerLost
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 _CREATING_S = 1800.0
 """Large weights from a slow disk, to a GPU; downloads are waited for without limit."""
@@ -33,7 +33,7 @@ _ANSWERING_S = 600.0
 
 
 @dataclass(frozen=True)
-class Home:
+class ProviderLocation:
     """Where a provider lives: environment, kind and name there."""
 
     environment: Environment
@@ -51,7 +51,7 @@ class RemoteOptions(Options):
     model_config = ConfigDict(
         frozen=True, extra="allow", protected_namespaces=(), ser_json_inf_nan="constants"
     )
-    home: ClassVar[Home]
+    home: ClassVar[ProviderLocation]
     defaults: ClassVar[Mapping[str, Any]]
 
     @classmethod
@@ -74,11 +74,13 @@ class RemoteOptions(Options):
         return _options, (self.home, dict(self.defaults), self.model_dump())
 
 
-def _options_class(home: Home, defaults: Mapping[str, Any]) -> type[RemoteOptions]:
+def _options_class(home: ProviderLocation, defaults: Mapping[str, Any]) -> type[RemoteOptions]:
     return type("RemoteOptions", (RemoteOptions,), {"home": home, "defaults": defaults})
 
 
-def _options(home: Home, defaults: Mapping[str, Any], values: Mapping[str, Any]) -> RemoteOptions:
+def _options(
+    home: ProviderLocation, defaults: Mapping[str, Any], values: Mapping[str, Any]
+) -> RemoteOptions:
     holding: RemoteOptions = _options_class(home, defaults)._holding(values)
     return holding
 
@@ -90,7 +92,9 @@ class RemoteProvider:
     A worker that crashed, hung or ran out of memory fails the call; the next one starts another.
     """
 
-    def __init__(self, home: Home, options: Mapping[str, Any], context: ProviderContext) -> None:
+    def __init__(
+        self, home: ProviderLocation, options: Mapping[str, Any], context: ProviderContext
+    ) -> None:
         self._home = home
         self._options = dict(options)
         self._context = context
@@ -173,7 +177,7 @@ class RemoteProvider:
 
 @dataclass(frozen=True)
 class _Factory:
-    home: Home
+    home: ProviderLocation
 
     def __call__(self, options: Options | None, context: ProviderContext) -> RemoteProvider:
         values = {} if options is None else options.model_dump()
@@ -182,7 +186,7 @@ class _Factory:
 
 @dataclass(frozen=True)
 class _Weights:
-    home: Home
+    home: ProviderLocation
 
     def __call__(self, options: Options | None) -> tuple[WeightsFile, ...]:
         values = {} if options is None else options.model_dump()
@@ -190,10 +194,10 @@ class _Weights:
 
 
 @dataclass(frozen=True)
-class Remote:
+class RemoteSpec:
     """A provider of an environment for the registry."""
 
-    home: Home
+    home: ProviderLocation
     spec: ProviderSpec
     distribution: str
     version: str
@@ -201,14 +205,14 @@ class Remote:
     hint: str = ""
 
 
-def remote_providers(environment: Environment) -> list[Remote]:
+def remote_providers(environment: Environment) -> list[RemoteSpec]:
     """What an environment brings, as it was described when it was made; starts nothing.
 
     Their names are ``NAME@ENVIRONMENT``.
     """
     found = []
     for entry in environment.describe():
-        home = Home(environment, entry["kind"], entry["name"])
+        home = ProviderLocation(environment, entry["kind"], entry["name"])
         defaults = entry["defaults"]
         spec = ProviderSpec(
             kind=home.kind,
@@ -225,7 +229,9 @@ def remote_providers(environment: Environment) -> list[Remote]:
             contract=_Contract(home),
         )
         origin = f"{entry['distribution']} in {environment.label}"
-        found.append(Remote(home, spec, origin, entry["version"], entry["fault"], entry["hint"]))
+        found.append(
+            RemoteSpec(home, spec, origin, entry["version"], entry["fault"], entry["hint"])
+        )
     return found
 
 
@@ -233,7 +239,7 @@ def remote_providers(environment: Environment) -> list[Remote]:
 class _Contract:
     """For the contract kit: the fields of the setup that the plugin gives there."""
 
-    home: Home
+    home: ProviderLocation
 
     def __call__(self, folder: Path) -> Mapping[str, Any]:
         setup: Mapping[str, Any] = self.home.ask("setup", folder=folder)
@@ -243,8 +249,8 @@ class _Contract:
 class EnvironmentHooks:
     """The hooks of a registry that answer for providers of environments."""
 
-    def __init__(self, remotes: Sequence[Remote]) -> None:
-        self._homes: dict[tuple[str, str], Home] = {
+    def __init__(self, remotes: Sequence[RemoteSpec]) -> None:
+        self._homes: dict[tuple[str, str], ProviderLocation] = {
             (r.spec.kind, r.spec.name): r.home for r in remotes
         }
 

@@ -76,7 +76,7 @@ def export_model(
             raise ProviderError(
                 f"the authors' code of {name} fails: {error} (it needs {needs})"
             ) from None
-        differences = compared(made)
+        differences = compare_with_original(made)
         worst = max(differences.values())
         if worst > TOLERANCE:
             told = ", ".join(f"{key} {value:.1e}" for key, value in differences.items())
@@ -107,7 +107,7 @@ def export_model(
     return manifest
 
 
-def compared(made: Path) -> dict[str, float]:
+def compare_with_original(made: Path) -> dict[str, float]:
     """Of each output the relative difference that 99.9 % of its values stay below, in the worst of
     the inputs that the script left beside the file."""
     runtime = importlib.import_module("onnxruntime")
@@ -120,12 +120,12 @@ def compared(made: Path) -> dict[str, float]:
     for number in sorted({name.split("/")[0] for name in arrays}):
         given = {n: arrays[f"{number}/in/{n}"] for n in wanted}
         for name, found in zip(names, session.run(names, given), strict=True):
-            difference = relative_difference(found, arrays[f"{number}/out/{name}"])
+            difference = measure_relative_difference(found, arrays[f"{number}/out/{name}"])
             worst[name] = max(worst[name], difference)
     return worst
 
 
-def relative_difference(found: Any, expected: Any) -> float:
+def measure_relative_difference(found: Any, expected: Any) -> float:
     """What 99.9 % of the values of an array are off by from another of its shape, in terms of their
     size, or of the typical one where they are smaller; infinite where the shapes differ or a value
     is no number."""
@@ -148,7 +148,7 @@ def run_script(
     python: Path | None = None,
 ) -> None:
     """Run a script that makes ``output`` with the checkouts on its search path, see
-    :class:`mpsfm_core.providers.model_export.authors.Job`.
+    :class:`mpsfm_core.providers.model_export.author_script.ExportJob`.
 
     Raises:
         ProviderError: it fails; the message is its last line.

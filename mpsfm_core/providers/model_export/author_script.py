@@ -2,10 +2,10 @@
 
 A script is run as a program with the checkouts on its search path::
 
-    from mpsfm_core.model_export.authors import Job
+    from mpsfm_core.providers.model_export.author_script import ExportJob
 
     if __name__ == "__main__":
-        job = Job.given()
+        job = ExportJob.from_arguments()
         model = TheirNetwork()
         if job.weights:
             job.load(model, job.checkpoint()["model"])
@@ -36,7 +36,7 @@ Given: TypeAlias = Mapping[str, torch.Tensor]
 
 
 @dataclass(frozen=True)
-class Job:
+class ExportJob:
     """What a script is asked for. ``weights``: the checkpoint, None for seeded random weights.
     ``output``: where the file goes. ``size``: of the network, where it comes in several."""
 
@@ -45,7 +45,7 @@ class Job:
     size: str = ""
 
     @classmethod
-    def given(cls) -> Job:
+    def from_arguments(cls) -> ExportJob:
         """From the program's argument; random weights are seeded from here on."""
         warnings.simplefilter("ignore")
         torch.manual_seed(0)
@@ -80,16 +80,16 @@ class Job:
         dynamic: Mapping[str, Mapping[int, str]] | None = None,
         said: Sequence[Sequence[torch.Tensor]] = (),
     ) -> None:
-        """Write the network, traced on the first of the ``given`` inputs, and its answers to all.
+        """Write the network, traced on the first of the ``given`` inputs, and its run_network to all.
 
         ``dynamic``: of each tensor the axes that may have other lengths, with a name; then the
-        given ones should have such. ``said``: the answers of the authors' own network, where
+        given ones should have such. ``said``: the run_network of the authors' own network, where
         ``model`` is another form of it.
         """
-        said = said or answers(model, given)
+        said = said or run_network(model, given)
         register_custom_op_symbolic("aten::expm1", _expm1, OPSET)
         before = set(self.output.parent.iterdir())
-        with MaskedWrites():
+        with MaskedWriteRewriter():
             torch.onnx.export(
                 model,
                 tuple(tensor.clone() for tensor in given[0].values()),
@@ -120,14 +120,14 @@ def gather_weights(output: Path, beside: Collection[Path]) -> None:
         path.unlink()
 
 
-def answers(model: torch.nn.Module, given: Sequence[Given]) -> list[tuple[torch.Tensor, ...]]:
+def run_network(model: torch.nn.Module, given: Sequence[Given]) -> list[tuple[torch.Tensor, ...]]:
     """What a network says of several inputs."""
     model = model.eval()
     with torch.inference_mode():
         return [_answer(model, tensors) for tensors in given]
 
 
-class MaskedWrites(TorchFunctionMode):
+class MaskedWriteRewriter(TorchFunctionMode):
     """Writes ``tensor[index][mask] = x`` as ``tensor[index] = where(mask, x, ...)``, which
     is the same.
 

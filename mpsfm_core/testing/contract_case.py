@@ -19,11 +19,11 @@ from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.providers import Capability, Kind, ProviderContext, ProviderSpec, validation
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
-from mpsfm_core.testing.examples import Example, Look, indoor_example, outdoor_example
-from mpsfm_core.testing.ground_truth_provider import ORACLE_SPECS, Oracle
+from mpsfm_core.testing.examples import Appearance, Example, indoor_example, outdoor_example
+from mpsfm_core.testing.ground_truth_provider import GROUND_TRUTH_SPECS, GroundTruth
 from mpsfm_core.testing.outcome import CheckSkipped
 
-Knowledge = Literal["painted", "told", "seen", "nothing"]
+TruthSource = Literal["painted", "prepared", "image", "none"]
 
 _RUN: Mapping[Kind, Callable[..., Any]] = MappingProxyType(
     {
@@ -39,21 +39,21 @@ GIVEN_RELATIVE_STD = 0.02
 
 
 @dataclass(frozen=True)
-class Setup:
+class ContractSetup:
     """How a provider is put under test, and from where it can know the right answer.
 
     ``options``: of the provider; without weights at hand, those of a stand-in network that the
     function in ``ProviderSpec.contract`` writes into the folder it is given:
-    ``def contract(folder: Path) -> Setup``.
+    ``def contract(folder: Path) -> ContractSetup``.
 
-    ``knows``, by default ``"seen"`` for features, matchers and retrieval, else ``"nothing"``:
+    ``knows``, by default ``"image"`` for features, matchers and retrieval, else ``"none"``:
 
     * ``"painted"``: a stand-in network reads depth and normals from the colours of the views
-      (:mod:`mpsfm_core.testing.painting`);
-    * ``"told"``: ``tell`` is called with every example before the provider is asked about it, for
+      (:mod:`mpsfm_core.testing.painted_views`);
+    * ``"prepared"``: ``tell`` is called with every example before the provider is asked about it, for
       instance to write files;
-    * ``"seen"``: the provider sees what is in a textured view, with real weights or without any;
-    * ``"nothing"``: answers cannot be compared with the truth, and checks that would are skipped;
+    * ``"image"``: the provider sees what is in a textured view, with real weights or without any;
+    * ``"none"``: answers cannot be compared with the truth, and checks that would are skipped;
       ``tell``, where it is given, writes what the provider reads beside the view.
 
     ``expected_failures``: ids of checks that are known to fail, each with the reason; a check that
@@ -61,19 +61,19 @@ class Setup:
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
-    knows: Knowledge | None = None
-    tell: Callable[[Example], None] | None = None
+    truth_source: TruthSource | None = None
+    prepare: Callable[[Example], None] | None = None
     expected_failures: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.knows == "told" and self.tell is None:
-            raise ValueError("knows='told' needs tell")
+        if self.truth_source == "prepared" and self.prepare is None:
+            raise ValueError("truth_source='prepared' needs prepare")
         for check, reason in self.expected_failures.items():
             if not reason.strip():
                 raise ValueError(f"expected failure of {check!r} needs a reason")
 
 
-class Case:
+class ContractCase:
     """One provider under test.
 
     ``kind`` is that of its answers: a wrapper is tested once for each kind it wraps, around an
@@ -85,7 +85,7 @@ class Case:
         self,
         registry: Registry,
         spec: ProviderSpec,
-        setup: Setup,
+        setup: ContractSetup,
         folder: Path,
         *,
         behaves_as: Kind | None = None,
@@ -97,51 +97,53 @@ class Case:
         self.setup = setup
         self._folder = folder
         self._device = device
-        self._oracle = Oracle() if spec.kind == "wrapper" else None
+        self._ground_truth = GroundTruth() if spec.kind == "wrapper" else None
         self._provider: Any = None
-        self._told: WeakSet[Example] = WeakSet()
+        self._prepared: WeakSet[Example] = WeakSet()
         self._detector: Any = None
         self._detected: WeakKeyDictionary[View, Features] = WeakKeyDictionary()
         self._main: Example | None = None
 
     @property
-    def knows(self) -> Knowledge:
+    def truth_source(self) -> TruthSource:
         """Where the provider can know the right answer from."""
-        if self._oracle is not None:
-            return "told"
+        if self._ground_truth is not None:
+            return "prepared"
         by_itself = self.kind in ("features", "matcher", "retrieval")
-        return self.setup.knows or ("seen" if by_itself else "nothing")
+        return self.setup.truth_source or ("image" if by_itself else "none")
 
-    def can(self, capability: Capability) -> bool:
+    def declares(self, capability: Capability) -> bool:
         """Whether the provider declares a capability."""
         return capability in self.spec.capabilities
 
-    def needs(self, *sources: Knowledge) -> None:
+    def require_truth(self, *sources: TruthSource) -> None:
         """Skip unless the provider knows the right answer from one of these sources."""
-        if self.knows == "nothing":
+        if self.truth_source == "none":
             raise CheckSkipped(
                 "no known answer: the provider has no stand-in that reads painted views, is not "
                 "told the truth and is not said to see it (docs/contract.md)"
             )
-        if self.knows not in sources:
-            raise CheckSkipped(f"says nothing about a provider whose truth is {self.knows}")
+        if self.truth_source not in sources:
+            raise CheckSkipped(f"says nothing about a provider whose truth is {self.truth_source}")
 
     @property
-    def main(self) -> Example:
+    def example(self) -> Example:
         """The example that most checks ask about."""
         if self._main is None:
-            look: Look = "painted" if self.knows == "painted" or self._oracle else "textured"
+            look: Appearance = (
+                "painted" if self.truth_source == "painted" or self._ground_truth else "textured"
+            )
             outdoor = self.kind in ("depth", "normals", "multiview", "mask")
             self._main = outdoor_example(look) if outdoor else indoor_example(look)
         return self._main
 
-    def make(self, **inner: Any) -> Any:
+    def create_provider(self, **inner: Any) -> Any:
         """A new instance of the provider; ``inner``: options of the oracle in a wrapper."""
-        if self._oracle is None:
+        if self._ground_truth is None:
             return self._create(self.registry, self.kind, self.spec.name, self.setup.options)
         registry = Registry()
-        oracle = ORACLE_SPECS[self.kind]
-        registry.add(self.spec, replace(oracle, factory=self._oracle.factory(self.kind)))
+        oracle = GROUND_TRUTH_SPECS[self.kind]
+        registry.add(self.spec, replace(oracle, factory=self._ground_truth.factory(self.kind)))
         wrapper = ProviderConfig(use=self.spec.name, options=dict(self.setup.options))
         return self._create(registry, self.kind, oracle.name, inner, (wrapper,))
 
@@ -149,16 +151,16 @@ class Case:
     def provider(self) -> Any:
         """The instance that most checks ask."""
         if self._provider is None:
-            self._provider = self.make()
+            self._provider = self.create_provider()
         return self._provider
 
-    def ask(self, example: Example, provider: Any = None) -> Any:
+    def run(self, example: Example, provider: Any = None) -> Any:
         """The provider's answer, validated; a matcher and a multi-view network are asked for the
         view and its partner."""
-        self.tell(example, *([example.partner] if self.kind in ("matcher", "multiview") else []))
-        return self.ask_about(example.view, example, provider)
+        self.prepare(example, *([example.partner] if self.kind in ("matcher", "multiview") else []))
+        return self.run_on_view(example.view, example, provider)
 
-    def ask_about(
+    def run_on_view(
         self, view: View, example: Example, provider: Any = None, extra: Any = None
     ) -> Any:
         """The answer about a changed view of an example; everything else is the example's.
@@ -166,7 +168,7 @@ class Case:
         ``extra``: what is handed in besides the view, by default what :meth:`extra` makes.
         """
         provider = self.provider if provider is None else provider
-        extra = self.extra(view, example) if extra is None else extra
+        extra = self.make_auxiliary_input(view, example) if extra is None else extra
         if self.kind == "matcher":
             views = (view, example.partner.view)
             return validation.run_matcher(self._rules, provider, views, extra)
@@ -178,68 +180,68 @@ class Case:
         run: Callable[[ProviderSpec, Any, View], Any] = _RUN[self.kind]
         return run(self._rules, provider, view)
 
-    def extra(self, view: View, example: Example) -> Any:
+    def make_auxiliary_input(self, view: View, example: Example) -> Any:
         """Depth for normals providers that need it, features for sparse matchers, else None."""
         if self.kind == "matcher":
             return self.features_of(view, example.partner.view)
-        if self.kind != "normals" or not (self.can("needs-depth") or self._oracle):
+        if self.kind != "normals" or not (self.declares("needs-depth") or self._ground_truth):
             return None
         truth = example.truth()
         variance = (GIVEN_RELATIVE_STD * truth.depth) ** 2
         return DepthPrior.from_arrays(truth.depth, variance, truth.valid)
 
-    def ask_pair(self, a: Example, b: Example) -> Any:
+    def run_on_pair(self, a: Example, b: Example) -> Any:
         """A matcher's answer about two examples."""
-        self.tell(a, b)
+        self.prepare(a, b)
         views = (a.view, b.view)
         features = self.features_of(*views)
         return validation.run_matcher(self._rules, self.provider, views, features)
 
-    def ask_group(self, *examples: Example) -> GroupPrior:
+    def run_on_group(self, *examples: Example) -> GroupPrior:
         """A multi-view network's answer about several examples."""
-        self.tell(*examples)
+        self.prepare(*examples)
         views = [example.view for example in examples]
         return validation.run_multiview(self._rules, self.provider, views)
 
-    def tell(self, *examples: Example) -> None:
+    def prepare(self, *examples: Example) -> None:
         """Let the provider know the truth, if that is where it knows it from."""
         for example in examples:
-            if example in self._told:
+            if example in self._prepared:
                 continue
-            self._told.add(example)
-            if self._oracle is not None:
-                self._oracle.tell(example)
-            if self.setup.tell is not None:
-                self.setup.tell(example)
+            self._prepared.add(example)
+            if self._ground_truth is not None:
+                self._ground_truth.add_example(example)
+            if self.setup.prepare is not None:
+                self.setup.prepare(example)
 
     def features_of(self, *views: View) -> Any:
         """Features for a sparse matcher, from the first detector of its family; else None."""
-        if not self.can("sparse"):
+        if not self.declares("sparse"):
             return None
         return tuple(self._detect(view) for view in views)
 
-    def given_depth(self) -> list[DepthPrior | None]:
+    def received_depth(self) -> list[DepthPrior | None]:
         """The depth that a wrapper handed to the normals provider inside, at each question."""
-        return [] if self._oracle is None else self._oracle.given_depth
+        return [] if self._ground_truth is None else self._ground_truth.given_depth
 
     def calibration(self) -> Any:
         """The uncertainty model that a run would apply to the provider's answers."""
         options = dict(self.setup.options)
-        if self._oracle is None:
+        if self._ground_truth is None:
             return self.registry.calibration(
                 self.kind, ProviderConfig(use=self.spec.name, options=options)
             )
         wrapper = ProviderConfig(use=self.spec.name, options=options)
         registry = Registry()
-        registry.add(self.spec, ORACLE_SPECS[self.kind])
-        inner = ProviderConfig(use=ORACLE_SPECS[self.kind].name, wrap=(wrapper,))
+        registry.add(self.spec, GROUND_TRUTH_SPECS[self.kind])
+        inner = ProviderConfig(use=GROUND_TRUTH_SPECS[self.kind].name, wrap=(wrapper,))
         return registry.calibration(self.kind, inner)
 
     @property
     def _rules(self) -> ProviderSpec:
         """The specification that answers are validated against. A wrapper promises nothing of
         its own (what it has to keep is checked by name), and is given depth to hand on."""
-        if self._oracle is None:
+        if self._ground_truth is None:
             return self.spec
         return replace(self.spec, capabilities=frozenset({"needs-depth"}))
 
@@ -247,7 +249,7 @@ class Case:
         if view not in self._detected:
             spec = self._detector_spec()
             if self._detector is None:
-                options = setup_of(spec, self._folder).options
+                options = load_setup(spec, self._folder).options
                 self._detector = self._create(self.registry, "features", spec.name, options)
             self._detected[view] = validation.run_features(spec, self._detector, view)
         return self._detected[view]
@@ -279,13 +281,13 @@ class Case:
         return registry.create(kind, name, options, context, wrap)
 
 
-def setup_of(spec: ProviderSpec, folder: Path) -> Setup:
+def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:
     """The setup that the plugin gives for the contract kit, or one of defaults.
 
     Raises :class:`~mpsfm_core.data.errors.ProviderError` when there is one and it cannot be made.
     """
     if spec.contract is None:
-        return Setup()
+        return ContractSetup()
     try:
         if isinstance(spec.contract, str):
             module, _, name = spec.contract.partition(":")
@@ -295,11 +297,15 @@ def setup_of(spec: ProviderSpec, folder: Path) -> Setup:
     except Exception as error:
         text = f"{spec.kind} provider {spec.name!r}: its contract {spec.contract!r} fails"
         raise ProviderError(f"{text}: {type(error).__name__}: {error}") from error
-    if isinstance(setup, Mapping) and {part.name for part in fields(Setup)}.issuperset(setup):
+    if isinstance(setup, Mapping) and {part.name for part in fields(ContractSetup)}.issuperset(
+        setup
+    ):
         # from another environment
-        setup = Setup(**setup)
-    if not isinstance(setup, Setup):
-        raise ProviderError(f"{spec.contract!r} returns a {type(setup).__name__}, not a Setup")
+        setup = ContractSetup(**setup)
+    if not isinstance(setup, ContractSetup):
+        raise ProviderError(
+            f"{spec.contract!r} returns a {type(setup).__name__}, not a ContractSetup"
+        )
     return setup
 
 
@@ -309,23 +315,25 @@ def depth_in(answer: Any) -> DepthPrior:
     return prior
 
 
-def arrays_of(answer: object, name: str = "answer") -> dict[str, NDArray[Any]]:
+def collect_arrays(answer: object, name: str = "answer") -> dict[str, NDArray[Any]]:
     """All arrays and numbers in an answer by their path, to compare answers."""
     if isinstance(answer, np.ndarray):
         return {name: answer}
     if is_dataclass(answer) and not isinstance(answer, type):
         found: dict[str, NDArray[Any]] = {}
         for part in fields(answer):
-            found |= arrays_of(getattr(answer, part.name), f"{name}.{part.name}")
+            found |= collect_arrays(getattr(answer, part.name), f"{name}.{part.name}")
         return found
     if isinstance(answer, tuple):
-        return {k: v for i, a in enumerate(answer) for k, v in arrays_of(a, f"{name}[{i}]").items()}
+        return {
+            k: v for i, a in enumerate(answer) for k, v in collect_arrays(a, f"{name}[{i}]").items()
+        }
     return {} if answer is None else {name: np.asarray(answer)}
 
 
-def difference(first: object, second: object) -> str:
+def describe_difference(first: object, second: object) -> str:
     """Where two answers differ, or an empty text."""
-    a, b = arrays_of(first), arrays_of(second)
+    a, b = collect_arrays(first), collect_arrays(second)
     if a.keys() != b.keys():
         return f"one has {sorted(a)}, the other {sorted(b)}"
     for name, value in a.items():

@@ -17,9 +17,9 @@ from mpsfm_core.data import errors
 from mpsfm_core.data.errors import DataError, MpsfmError, ProviderError
 from mpsfm_core.data.options import SettingProblem, SettingsError
 from mpsfm_core.providers import API_VERSION
-from mpsfm_core.providers.environments.channel import Channel, Closed, memory_folder
+from mpsfm_core.providers.environments.channel import Channel, ChannelClosed, create_shared_folder
 
-PROTOCOL = 2
+PROTOCOL = 3
 """Of the messages; both sides must have the same."""
 
 _MODULE = "mpsfm_core.providers.environments.worker"
@@ -48,11 +48,11 @@ class Worker:
 
     ``python``: the interpreter. ``label``: of the environment, for messages. Raises
     :class:`~mpsfm_core.data.errors.ProviderError` when it does not start, or has another version of
-    the protocols. """
+    the protocols."""
 
     def __init__(self, python: Path, label: str) -> None:
         self._label = label
-        self._folder = memory_folder(_NEEDED_BYTES)
+        self._folder = create_shared_folder(_NEEDED_BYTES)
         folder = Path(self._folder.name)
         self._log = folder / "stderr"
         with self._log.open("wb") as log:
@@ -107,7 +107,7 @@ class Worker:
                 if "resolve" in answer:
                     self._send(_resolved(resolve_weights, *answer["resolve"]))
                 elif "error" in answer:
-                    raise error_of(answer["error"])
+                    raise decode_error(answer["error"])
                 else:
                     return answer["value"]
 
@@ -119,7 +119,7 @@ class Worker:
     def _send(self, message: Any) -> None:
         try:
             self._channel.send(message)
-        except Closed as error:
+        except ChannelClosed as error:
             raise self._lost("") from error
 
     def _receive(self, timeout_s: float, late: str) -> Any:
@@ -135,7 +135,7 @@ class Worker:
         timer.start()
         try:
             return self._channel.receive()
-        except Closed as error:
+        except ChannelClosed as error:
             raise self._lost(late if overdue else "") from error
         finally:
             timer.cancel()
@@ -169,11 +169,11 @@ def _resolved(
             raise ProviderError(f"nobody here can fetch {uri}")
         return {"value": resolve(uri, sha256)}
     except MpsfmError as error:
-        return {"error": described(error)}
+        return {"error": encode_error(error)}
 
 
-def described(error: BaseException) -> dict[str, Any]:
-    """An error as a message of the protocol; :func:`error_of` makes one of it again."""
+def encode_error(error: BaseException) -> dict[str, Any]:
+    """An error as a message of the protocol; :func:`decode_error` makes one of it again."""
     kind = next((k.__name__ for k in type(error).__mro__ if k.__name__ in _OURS), "")
     if isinstance(error, SettingsError):
         problems = [[list(p.path), p.text, p.missing] for p in error.problems]
@@ -184,7 +184,7 @@ def described(error: BaseException) -> dict[str, Any]:
     return {"kind": kind, "text": text}
 
 
-def error_of(message: Mapping[str, Any]) -> Exception:
+def decode_error(message: Mapping[str, Any]) -> Exception:
     """The error that a message describes."""
     if "settings" in message:
         problems = (

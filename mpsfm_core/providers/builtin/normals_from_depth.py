@@ -11,7 +11,7 @@ from mpsfm_core.data import Bool, DepthPrior, Float64, NormalPrior, PinholeCamer
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.geometry import pixel_centers, rays
 from mpsfm_core.providers import ProviderContext
-from mpsfm_core.providers.builtin.options import FromDepthOptions
+from mpsfm_core.providers.builtin.options import NormalsFromDepthOptions
 
 _MIN_SUPPORT = 0.5
 """Share of a window's pixels that must be valid."""
@@ -26,7 +26,7 @@ _BEND_NOISE = np.sqrt(1.5)
 """Std of ``w1 - (w0 + w2) / 2`` for independent errors of std 1."""
 
 
-class FromDepth:
+class NormalsFromDepth:
     """Least-squares planes in a window around each pixel, on the grid of the depth map.
 
     The plane ``g . X = 1`` has the inverse depth ``1 / z = g . (x, y, 1)`` along the ray
@@ -40,7 +40,7 @@ class FromDepth:
     fit add what is rough, with one independent error a pixel.
     """
 
-    def __init__(self, options: FromDepthOptions, context: ProviderContext) -> None:
+    def __init__(self, options: NormalsFromDepthOptions, context: ProviderContext) -> None:
         self._options = options
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
@@ -50,8 +50,10 @@ class FromDepth:
         return fit_normals(view.camera, depth, self._options)
 
 
-def fit_normals(camera: PinholeCamera, depth: DepthPrior, options: FromDepthOptions) -> NormalPrior:
-    """What :class:`FromDepth` predicts for a depth map that covers the view of a camera.
+def fit_normals(
+    camera: PinholeCamera, depth: DepthPrior, options: NormalsFromDepthOptions
+) -> NormalPrior:
+    """What :class:`NormalsFromDepth` predicts for a depth map that covers the view of a camera.
 
     Raises :class:`ProviderError` when the map has no variance.
     """

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import DepthPrior, NormalPrior
-from mpsfm_core.providers.uncertainty.model import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 DEPTH = np.array([[1.0, 2.0], [4.0, 8.0]])
 

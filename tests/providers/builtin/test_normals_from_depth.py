@@ -12,8 +12,8 @@ from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera, View
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.geometry import pixel_centers, rays
 from mpsfm_core.providers import ProviderContext
-from mpsfm_core.providers.builtin.from_depth import FromDepth
-from mpsfm_core.providers.builtin.options import FromDepthOptions
+from mpsfm_core.providers.builtin.normals_from_depth import NormalsFromDepth
+from mpsfm_core.providers.builtin.options import NormalsFromDepthOptions
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 280.0, 270.0, 165.0, 118.0)
@@ -32,7 +32,7 @@ def prior(depth: np.ndarray, relative_std: float = 0.01, valid: np.ndarray | Non
 
 
 def predict(depth: DepthPrior, context: ProviderContext, view: View = VIEW, **options: float):
-    return FromDepth(FromDepthOptions(**options), context).predict(view, depth)
+    return NormalsFromDepth(NormalsFromDepthOptions(**options), context).predict(view, depth)
 
 
 def errors_deg(found: NormalPrior, truth: np.ndarray) -> np.ndarray:
@@ -92,7 +92,7 @@ def test_variance_follows_the_depth(context: ProviderContext) -> None:
     assert np.allclose(two.variance[two.valid], 4 * one.variance[one.valid], rtol=1e-3)
     # Head-on, the angle is the slope of the relative error.
     middle = np.sqrt(one.variance[118, 165])
-    assert middle == pytest.approx(FromDepthOptions().slope_std * 0.01, rel=1e-3)
+    assert middle == pytest.approx(NormalsFromDepthOptions().slope_std * 0.01, rel=1e-3)
 
 
 def test_independent_noise_is_propagated(context: ProviderContext) -> None:
@@ -129,7 +129,7 @@ def test_needs_a_depth_with_variance(context: ProviderContext) -> None:
     bare = DepthPrior.from_arrays(np.full((24, 32), 2.0))
     for depth in (None, bare):
         with pytest.raises(ProviderError, match="needs a depth prior"):
-            FromDepth(FromDepthOptions(), context).predict(VIEW, depth)
+            NormalsFromDepth(NormalsFromDepthOptions(), context).predict(VIEW, depth)
 
 
 def test_rendered_kitchen(shared_data: Path, context: ProviderContext) -> None:
