@@ -26,7 +26,7 @@ from mpsfm_core.evaluation.records import read_records
 from mpsfm_core.evaluation.scene_folder import _read_sets
 from mpsfm_core.extraction.cache import Cache, digest
 from mpsfm_core.extraction.empty_results import JointPrior
-from mpsfm_core.extraction.matching.verification import TwoView
+from mpsfm_core.extraction.matching.verification import TwoViewGeometry
 from mpsfm_core.inputs import video
 from mpsfm_core.mapping.state import thaw
 from mpsfm_core.pipeline.checkpoints import read_checkpoint
@@ -215,7 +215,7 @@ def test_the_configuration_comes_back_as_it_was_written(golden: Path) -> None:
 
 CLASSES = {
     **{"features": Features, "matcher": PairMatches, "depth": DepthPrior, "normals": NormalPrior},
-    **{"joint": JointPrior, "two-view": TwoView, "mask": np.ndarray},
+    **{"joint": JointPrior, "two-view": TwoViewGeometry, "mask": np.ndarray},
 }
 
 

@@ -23,17 +23,21 @@ from mpsfm_core.calibration.samples import DepthTruth
 from mpsfm_core.calibration.study import Data, Study, StudyOptions, study
 from mpsfm_core.config import Config
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.active_provider import ActiveProvider, thread_count
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.models import read_model
-from mpsfm_core.pipeline.provider_resolution import provide
+from mpsfm_core.pipeline.provider_resolution import resolve_providers
 from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.pipeline.stages import Stages
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry, core_version
-from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind, CalibrationFile, Provenance
 from mpsfm_core.providers.uncertainty.calibration import Calibration
+from mpsfm_core.providers.uncertainty.calibration_file import (
+    CalibratedKind,
+    CalibrationFile,
+    Provenance,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -140,7 +144,7 @@ class _Run:
     ) -> None:
         stages = Stages(registry)
         needed = ("depth", "normals", "masks")  # a reconstruction sees to the others itself
-        config = provide(config, registry, stages, needed).config
+        config = resolve_providers(config, registry, stages, needed).config
         self._photos, self._config, self._kind = photos, config, kind
         self._registry, self._options = registry, options
         self._backend: ProviderConfig = getattr(config, kind)

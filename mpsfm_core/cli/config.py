@@ -32,7 +32,7 @@ def show(
     """
     from mpsfm_core.config import load_config
     from mpsfm_core.data.errors import InputError
-    from mpsfm_core.pipeline.provider_resolution import look_up
+    from mpsfm_core.pipeline.provider_resolution import preview_providers
     from mpsfm_core.providers.registry import Registry
 
     registry = Registry.discover()
@@ -40,7 +40,7 @@ def show(
     typer.echo(config.to_yaml(), nl=False)
     typer.echo("\n# here and now:")
     try:
-        for choice in look_up(config, registry).choices:
+        for choice in preview_providers(config, registry).choices:
             typer.echo(f"# {choice}")
     except InputError as error:
         typer.echo(f"# it does not run: {error}")

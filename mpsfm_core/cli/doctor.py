@@ -34,7 +34,7 @@ def doctor(
     from mpsfm_core.config import load_config
     from mpsfm_core.data.errors import InputError
     from mpsfm_core.extraction.cache import cache_folder
-    from mpsfm_core.pipeline.provider_resolution import look_up
+    from mpsfm_core.pipeline.provider_resolution import preview_providers
     from mpsfm_core.providers.registry import Registry, core_version
     from mpsfm_core.support.threads import cores
 
@@ -51,7 +51,7 @@ def doctor(
     advice = list(_missing_plugins(registry))
     try:
         overrides = [*settings(None, offline), *([f"runtime.cache_dir={cache}"] if cache else [])]
-        provision = look_up(load_config(config, overrides, registry), registry)
+        provision = preview_providers(load_config(config, overrides, registry), registry)
     except InputError as error:
         _line("nothing", str(error))
         advice.insert(0, str(error))

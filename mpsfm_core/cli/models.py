@@ -231,7 +231,7 @@ def _wanted(targets: list[str], overrides: list[str]) -> list[tuple[str, Weights
     """The files that configurations, providers and URIs stand for, each once, with the name of a
     provider that loads it."""
     from mpsfm_core.config import load_config, shipped_configs
-    from mpsfm_core.pipeline.provider_resolution import look_up
+    from mpsfm_core.pipeline.provider_resolution import preview_providers
     from mpsfm_core.providers.registry import Registry
 
     chosen: dict[str, tuple[str, WeightsFile]] = {}
@@ -240,7 +240,7 @@ def _wanted(targets: list[str], overrides: list[str]) -> list[tuple[str, Weights
             found = [(target, file) for file in _select([target])]
         else:
             registry = Registry.discover()
-            provision = look_up(load_config(target, overrides, registry), registry)
+            provision = preview_providers(load_config(target, overrides, registry), registry)
             found = [
                 (spec.name, file)
                 for path, kind, backend in provision.config.provider_configs()

@@ -33,9 +33,9 @@ from mpsfm_core.evaluation.prior_quality import QUALITIES, error_seed, prior_set
 from mpsfm_core.evaluation.records import Record, read_record, record_file, write_record
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
 from mpsfm_core.extraction.cache import content_key, digest
-from mpsfm_core.extraction.runner import adjust, extract
+from mpsfm_core.extraction.runner import adjust_problem, extract
 from mpsfm_core.inputs.images import ImageSet, load_images
-from mpsfm_core.pipeline.provider_resolution import provide
+from mpsfm_core.pipeline.provider_resolution import resolve_providers
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers import hookimpl
 from mpsfm_core.providers.registry import Registry, core_version
@@ -140,7 +140,9 @@ class PreparedSets(NamedTuple):
             if {images[pair.image_a].name, images[pair.image_b].name} <= names
         ]
         alone = replace(self.problem, pairs=tuple(inside))
-        return adjust(self.images, self.config, self.registry, alone).subset(list(item.images))
+        return adjust_problem(self.images, self.config, self.registry, alone).subset(
+            list(item.images)
+        )
 
 
 def problem_of_sets(
@@ -161,7 +163,7 @@ def problem_of_sets(
     settings = prior_settings(prior, scene, names, work / f"{prior}-depth")
     stages = Stages(registry)
     loaded = load_config(config, (*settings, *overrides), registry=registry)
-    loaded = provide(loaded, registry, stages).config
+    loaded = resolve_providers(loaded, registry, stages).config
     listed = work / "images.txt"
     write_file(listed, "\n".join(names) + "\n")
     inputs = loaded.inputs.model_copy(update={"strict": True})  # a set is compared as a whole

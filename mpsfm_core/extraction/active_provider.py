@@ -13,8 +13,8 @@ from typing import Any, TypeVar, cast
 
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data.errors import ProviderRunError
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.providers import API_VERSION, Capability, Kind, ProviderContext, ProviderSpec
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore, file_sha256, is_remote
 from mpsfm_core.support.threads import cores
@@ -91,11 +91,11 @@ class ActiveProvider:
         provider = self.instance
         started = time.perf_counter()
         try:
-            result = within(timeout_s, lambda: compute(provider))
+            result = run_with_timeout(timeout_s, lambda: compute(provider))
         except TimeoutError as error:
             del self._local.provider
             raise ProviderRunError(
-                f"provider {self.spec.name!r}: no answer within {timeout_s:g} s; raise "
+                f"provider {self.spec.name!r}: no answer run_with_timeout {timeout_s:g} s; raise "
                 f"runtime.timeout_s if it is that slow"
             ) from error
         seconds = time.perf_counter() - started
@@ -152,7 +152,7 @@ class ActiveProvider:
         return {uri: file_sha256(path) for uri, path in found.items() if path is not None}
 
 
-def within(seconds: float | None, compute: Callable[[], T]) -> T:
+def run_with_timeout(seconds: float | None, compute: Callable[[], T]) -> T:
     """The result of a computation; :class:`TimeoutError` when it is not there in time."""
     if seconds is None:
         return compute()

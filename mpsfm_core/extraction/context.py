@@ -12,14 +12,14 @@ import numpy as np
 from mpsfm_core.config import Config
 from mpsfm_core.data import Bool, UInt8, View
 from mpsfm_core.data.errors import MpsfmError, ProviderOutputError, ProviderRunError
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.active_provider import ActiveProvider, worker_count
 from mpsfm_core.extraction.cache import Cache, content_key, digest
-from mpsfm_core.extraction.empty_results import NOTHING
+from mpsfm_core.extraction.empty_results import EMPTY_RESULTS
 from mpsfm_core.extraction.events import ExtractionEvents
 from mpsfm_core.extraction.parallel import run_stage
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.providers import Kind, validation
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 
 _log = logging.getLogger(__name__)
@@ -97,7 +97,7 @@ class ExtractionContext:
         if found is not None:
             provider.count_cached(key)
             return found
-        may_skip = self.config.runtime.on_error == "skip" and cls in NOTHING and bool(images)
+        may_skip = self.config.runtime.on_error == "skip" and cls in EMPTY_RESULTS and bool(images)
         try:
             if may_skip:
                 self._check_known_failure(key)
@@ -108,7 +108,7 @@ class ExtractionContext:
             if self.shared_run:
                 self.cache.store(RUNS, content_key(self.shared_run, key), np.array(str(error)))
             self._note_failure(images, error)
-            return cast(Result, NOTHING[cls]())
+            return cast(Result, EMPTY_RESULTS[cls]())
         if not uncached:
             self.cache.store(provider.kind, key, value)
         return value

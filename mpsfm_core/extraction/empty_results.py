@@ -41,7 +41,7 @@ def _matches() -> PairMatches:
     return PairMatches(SparseMatches(np.zeros((0, 2), dtype=np.int64), none))
 
 
-NOTHING: Mapping[type, Callable[[], object]] = MappingProxyType(
+EMPTY_RESULTS: Mapping[type, Callable[[], object]] = MappingProxyType(
     {
         Features: lambda: Features(np.zeros((0, 2)), np.zeros((0, 0), dtype=np.float32)),
         DepthPrior: _depth,

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import Bool, Features
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.providers import validation
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.support.lru_cache import LruCache
 
 CACHED_BYTES = 512 << 20
@@ -21,17 +21,17 @@ CACHED_BYTES = 512 << 20
 class FeatureTable:
     """Features of each image without those in masked areas; loaded again when needed."""
 
-    def __init__(self, bench: ExtractionContext, backend: ProviderConfig) -> None:
-        self._bench = bench
-        self._provider = bench.provider("features", backend)
+    def __init__(self, context: ExtractionContext, backend: ProviderConfig) -> None:
+        self._context = context
+        self._provider = context.provider("features", backend)
         self._recent: LruCache[int, Features] = LruCache(
             CACHED_BYTES, lambda f: f.descriptors.nbytes
         )
 
     def extract(self) -> list[Features]:
         """Run the stage; returns features without descriptors, to keep memory small."""
-        images = range(len(self._bench.images))
-        return self._bench.each("features", images, self._located, self._provider)
+        images = range(len(self._context.images))
+        return self._context.each("features", images, self._located, self._provider)
 
     def __getitem__(self, index: int) -> Features:
         return self._recent.get(index, lambda: self._load(index))
@@ -40,7 +40,7 @@ class FeatureTable:
         """Names the features of an image."""
         if self._provider.can("uncached"):
             return digest(self[index])
-        return self._bench.key(self._provider, self._bench.view_inputs(index, self._provider))
+        return self._context.key(self._provider, self._context.view_inputs(index, self._provider))
 
     def _located(self, index: int) -> Features:
         features = self[index]
@@ -52,11 +52,11 @@ class FeatureTable:
 
     def _load(self, index: int) -> Features:
         def compute(instance: Any) -> Features:
-            return validation.run_features(self._provider.spec, instance, self._bench.view(index))
+            return validation.run_features(self._provider.spec, instance, self._context.view(index))
 
-        inputs = self._bench.view_inputs(index, self._provider)
-        features = self._bench.result(self._provider, Features, inputs, compute, [index])
-        mask = self._bench.mask(index)
+        inputs = self._context.view_inputs(index, self._provider)
+        features = self._context.result(self._provider, Features, inputs, compute, [index])
+        mask = self._context.mask(index)
         if mask is None:
             return features
         return _select(features, sample_nearest(mask, features.keypoints))

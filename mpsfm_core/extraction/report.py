@@ -10,24 +10,24 @@ import numpy as np
 from mpsfm_core.data import DepthPrior, MappingImage, MappingProblem
 from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.context import ExtractionContext
-from mpsfm_core.extraction.matching.matching import Candidates
-from mpsfm_core.extraction.matching.verification import TwoView
+from mpsfm_core.extraction.matching.pair_matching import CandidateMatches
+from mpsfm_core.extraction.matching.verification import TwoViewGeometry
 
 
 def describe(
-    bench: ExtractionContext,
+    context: ExtractionContext,
     problem: MappingProblem,
     proposed: int,
-    candidates: list[Candidates],
-    outcomes: list[TwoView],
+    candidates: list[CandidateMatches],
+    outcomes: list[TwoViewGeometry],
 ) -> dict[str, Any]:
     """Pairs, images and providers.
 
     ``proposed``: number of pairs before the filters of plugins.
     """
-    names = bench.images.names
+    names = context.images.names
     pairs = [
-        _pair(names, matches, outcome, bench.config.verification.min_inliers)
+        _pair(names, matches, outcome, context.config.verification.min_inliers)
         for matches, outcome in zip(candidates, outcomes, strict=True)
     ]
     return {
@@ -35,9 +35,9 @@ def describe(
         "pairs_matched": len(candidates),
         "pairs_verified": len(problem.pairs),
         "pairs": pairs,
-        "failed": {names[index]: reason for index, reason in sorted(bench.failures.items())},
+        "failed": {names[index]: reason for index, reason in sorted(context.failures.items())},
         "images": {image.name: _image(image) for image in problem.images},
-        "providers": [_provider(provider) for provider in bench.providers],
+        "providers": [_provider(provider) for provider in context.providers],
     }
 
 
@@ -74,7 +74,7 @@ def _pair_of_both(first: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]
 
 
 def _pair(
-    names: list[str], matches: Candidates, outcome: TwoView, min_matches: int
+    names: list[str], matches: CandidateMatches, outcome: TwoViewGeometry, min_matches: int
 ) -> dict[str, Any]:
     a, b = matches.pair
     described: dict[str, Any] = {"images": [names[a], names[b]], "matches": len(matches)}

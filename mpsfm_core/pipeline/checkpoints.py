@@ -57,7 +57,7 @@ _NUMERICS = (
 )
 
 
-class DiskCheckpoints:
+class MappingCheckpoints:
     """The checkpoints of one problem.
 
     ``every_s``: seconds between two of them at least; more where writing takes long.

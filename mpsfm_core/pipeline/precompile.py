@@ -2,7 +2,7 @@
 
 A run that finds them not compiled starts this beside its extraction and waits for it before it
 maps; ``python -m mpsfm_core.pipeline.precompile`` does it at installation. Two processes map a tiny
-scene, of which one begins with what the other compiles last, and share what they have on disk. """
+scene, of which one begins with what the other compiles last, and share what they have on disk."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ import numba
 import numpy as np
 
 from mpsfm_core.data import PinholeCamera, View
+from mpsfm_core.dense.densify import densify
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.densify import densify
 from mpsfm_core.geometry.patch_alignment import align_patches
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import InitializationOptions, MapperOptions
@@ -48,7 +48,7 @@ class Compilation(NamedTuple):
             self.stamp.touch()
 
 
-def begin() -> Compilation | None:
+def start_compilation() -> Compilation | None:
     """Start compiling in the background; None if it was done before, or cannot be kept."""
     stamp = _stamp()
     if stamp is None or stamp.exists():
@@ -98,5 +98,5 @@ def _stamp() -> Path | None:
 if __name__ == "__main__":
     if len(sys.argv) > 1:
         compile_kernels(sys.argv[1])
-    elif (compilation := begin()) is not None:
+    elif (compilation := start_compilation()) is not None:
         compilation.wait()

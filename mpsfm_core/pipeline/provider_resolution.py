@@ -16,16 +16,10 @@ from pathlib import Path
 from mpsfm_core.config import BLOCKS, Config, check_provider_config, combination_problems
 from mpsfm_core.data.decisions import ChoiceReason, ProviderReason, Reason
 from mpsfm_core.data.errors import ConfigError, InputError, WeightsError
-from mpsfm_core.data.options import (
-    SAME_NETWORK,
-    Options,
-    ProviderConfig,
-    SettingPath,
-    SettingsError,
-    dotted,
-)
+from mpsfm_core.data.options import Options, SettingPath, SettingsError, dotted
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers import Kind, ProviderSpec, WeightsFile
+from mpsfm_core.providers.provider_config import SAME_NETWORK, ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore, is_remote
 from mpsfm_core.report.reasons import explain
@@ -34,7 +28,7 @@ _MEGABYTE = 1_000_000
 
 
 @dataclass(frozen=True)
-class Choice:
+class ProviderChoice:
     """Which provider a block of the configuration has got, and why.
 
     ``block``: as ``depth`` or ``masks.0``. ``provider``: its specification; ``origin``: its
@@ -71,10 +65,10 @@ class ProviderResolution:
     """A configuration that leaves no choice open, and how each of its providers was chosen."""
 
     config: Config
-    choices: tuple[Choice, ...]
+    choices: tuple[ProviderChoice, ...]
 
 
-def provide(
+def resolve_providers(
     config: Config,
     registry: Registry,
     stages: Stages | None = None,
@@ -91,7 +85,7 @@ def provide(
         WeightsError: weights are missing, and no other provider may be taken instead.
     """
     stages = stages or Stages(registry)
-    look_up(config, registry, blocks)
+    preview_providers(config, registry, blocks)
     downloads = _Downloads(stages)
     runtime = config.runtime
     store = WeightStore(runtime.cache_dir, True if runtime.offline else None, downloads.progress)
@@ -100,18 +94,18 @@ def provide(
         with downloads.announced(file, store):
             store.resolve(file.uri, file.sha256)
 
-    provision = _Search(registry, fetch)(config, blocks)
+    provision = _ProviderSearch(registry, fetch)(config, blocks)
     for choice in provision.choices:
         stages.notice(str(choice))
     return provision
 
 
-def look_up(
+def preview_providers(
     config: Config, registry: Registry, blocks: Collection[str] = BLOCKS
 ) -> ProviderResolution:
-    """What :func:`provide` would give if every download succeeded; downloads nothing.
+    """What :func:`resolve_providers` would give if every download succeeded; downloads nothing.
 
-    Raises as :func:`provide`.
+    Raises as :func:`resolve_providers`.
     """
     runtime = config.runtime
     store = WeightStore(runtime.cache_dir, True if runtime.offline else None)
@@ -123,7 +117,7 @@ def look_up(
                 store.resolve(file.uri, file.sha256)  # says what is missing, and what to do
             absent.append(file)
 
-    return _Search(registry, look, absent)(config, blocks)
+    return _ProviderSearch(registry, look, absent)(config, blocks)
 
 
 def describe_file(file: WeightsFile) -> str:
@@ -131,7 +125,7 @@ def describe_file(file: WeightsFile) -> str:
     return file.uri if file.size is None else f"{file.uri} ({_megabytes(file.size)} MB)"
 
 
-class _Search:
+class _ProviderSearch:
     """Goes through the blocks of a configuration, and through the candidates of each.
 
     ``have``: sees to a weights file, raises where it cannot be had, and may note in ``absent`` that
@@ -160,7 +154,7 @@ class _Search:
 
     def _choose(
         self, config: Config, path: SettingPath, kind: Kind, backend: ProviderConfig
-    ) -> tuple[ProviderConfig, Choice]:
+    ) -> tuple[ProviderConfig, ProviderChoice]:
         names = (backend.use, *backend.fallback)
         passed_over: dict[str, Reason] = {}
         for name in names:
@@ -178,7 +172,7 @@ class _Search:
             spec = self._registry.spec(kind, found.use)
             origin = self._registry.version(kind, found.use)
             absent = tuple(self._absent)
-            return found, Choice(dotted(path), spec, origin, reason, passed_over, absent)
+            return found, ProviderChoice(dotted(path), spec, origin, reason, passed_over, absent)
         reasons = "; ".join(f"{name}: {explain(why).text}" for name, why in passed_over.items())
         raise ConfigError(f"{dotted(path)}: no provider can be had: {reasons}")
 

@@ -93,7 +93,7 @@ _GROUPS = Path("/sys/fs/cgroup")
 
 
 @dataclass(frozen=True)
-class Needs:
+class ResourceEstimate:
     """Megabytes: peak of memory of the process and those it starts, cache and output folder."""
 
     memory_mb: float
@@ -108,12 +108,12 @@ class Needs:
         )
 
 
-def predict(
+def estimate_resources(
     sizes: Sequence[tuple[int, int]],
     config: Config,
     providers: Sequence[ProviderSpec],
     networks: Sequence[int],
-) -> Needs:
+) -> ResourceEstimate:
     """What a run will take.
 
     ``sizes``: (width, height) of the undistorted views. ``providers``: those that were chosen;
@@ -145,7 +145,7 @@ def predict(
     memory += _RESULT_BYTES * final + _POINT_BYTES * points
     output = _WRITTEN_POINT_BYTES * points + results.depth_maps * _WRITTEN_BYTES * final
     output += results.report * ((_PAGE_MB + _PAGE_PHOTO_MB * count) * _MB + _VIEW_BYTES * prior)
-    return Needs(round(memory / _MB), round(cache / _MB), round(output / _MB))
+    return ResourceEstimate(round(memory / _MB), round(cache / _MB), round(output / _MB))
 
 
 def network_bytes(file: WeightsFile, store: WeightStore) -> int:
@@ -157,7 +157,7 @@ def network_bytes(file: WeightsFile, store: WeightStore) -> int:
     return sum(part.stat().st_size for part in path.parent.glob(f"{escape(path.name)}*"))
 
 
-def shortages(needs: Needs, cache: Path, output: Path | None) -> list[str]:
+def shortages(needs: ResourceEstimate, cache: Path, output: Path | None) -> list[str]:
     """What is short, in words; empty where the run fits.
 
     Raises:
@@ -203,7 +203,7 @@ def memory_mb() -> tuple[float, float]:
     return min(limits) / _MB, min(free) / _MB
 
 
-class Watch:
+class ChildMemoryMonitor:
     """Memory of the processes that this one starts; its own is in the stages' records."""
 
     def __init__(self) -> None:

@@ -17,7 +17,6 @@ import pycolmap
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import DepthPrior, Float64, MappingProblem, Pose, View
 from mpsfm_core.data.errors import ConfigError, InputError, ReconstructionError
-from mpsfm_core.data.options import FROM_MATCHER
 from mpsfm_core.data.result_layout import DENSE, DEPTH, MESH, SPARSE, SUMMARY
 from mpsfm_core.dense.densify import DenseReport, densify
 from mpsfm_core.dense.depth_range import depth_prior_from_points
@@ -25,8 +24,8 @@ from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
 from mpsfm_core.dense.options import DenseOptions, MeshOptions
 from mpsfm_core.extraction.cache import cache_folder
-from mpsfm_core.extraction.priors.focal_length import estimate_focals
-from mpsfm_core.extraction.runner import Extraction, extract, extract_more
+from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
+from mpsfm_core.extraction.runner import Extraction, extend_matches, extract
 from mpsfm_core.geometry import transform
 from mpsfm_core.inputs.images import ImageSet, check_output_folder, find_images, load_images
 from mpsfm_core.inputs.matches import (
@@ -37,13 +36,14 @@ from mpsfm_core.inputs.matches import (
 from mpsfm_core.inputs.models import match_names, read_model, read_poses, reconstruction_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
-from mpsfm_core.mapping.initialization.seed_poses import select_seed_images, with_seed_poses
+from mpsfm_core.mapping.initialization.seed_poses import select_seed_images, apply_seed_poses
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
 from mpsfm_core.pipeline import precompile, resources
-from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, DiskCheckpoints
-from mpsfm_core.pipeline.provider_resolution import ProviderResolution, provide
+from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, MappingCheckpoints
+from mpsfm_core.pipeline.provider_resolution import ProviderResolution, resolve_providers
 from mpsfm_core.pipeline.stages import Stages
+from mpsfm_core.providers.provider_config import FROM_MATCHER
 from mpsfm_core.providers.registry import Registry, core_version
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.report.page import write_report
@@ -170,9 +170,9 @@ class _Run:
         self._dense: list[dict[str, Any]] | None = None
         self._imported: ImportedMatches | None = None
         self._place: dict[str, object] | None = None
-        self._needs = resources.Needs(0, 0, 0)
-        self._started = resources.Watch()
-        self._checkpoints: list[DiskCheckpoints | DenseCheckpoints] = []
+        self._needs = resources.ResourceEstimate(0, 0, 0)
+        self._started = resources.ChildMemoryMonitor()
+        self._checkpoints: list[MappingCheckpoints | DenseCheckpoints] = []
 
     def watching_processes(self) -> AbstractContextManager[None]:
         """Measure the memory of processes that this one starts."""
@@ -190,13 +190,13 @@ class _Run:
         if not is_video(folder):
             find_images(folder)  # no folder, no downloads
         with stage("providers"):
-            self._provision = provide(self._config, self._registry, self._stages)
+            self._provision = resolve_providers(self._config, self._registry, self._stages)
         config = self._provision.config
         if is_video(folder):
             with stage("video"):
                 folder = self._frames(folder)
         self._folder = folder
-        compilation = precompile.begin() if allowed() > 1 else None
+        compilation = precompile.start_compilation() if allowed() > 1 else None
         with stage("inputs"):
             images = load_images(
                 folder,
@@ -210,7 +210,7 @@ class _Run:
             known = {} if poses is None else _known_poses(poses, images)
             self._imported = _import_matches(matches, images)
         with stage("extraction"):
-            images = estimate_focals(images, config, self._registry, self._stages)
+            images = estimate_focal_lengths(images, config, self._registry, self._stages)
             first = config.fast_pass_config() or config
             extraction = extract(images, first, self._registry, self._stages, self._imported)
         if compilation is not None:
@@ -221,7 +221,7 @@ class _Run:
         if config.has_second_pass and (held := self._held(mapping, images)) is not None:
             with stage("extraction"):
                 loose = frozenset(range(len(images))) - {image.index for image in held}
-                extraction = extract_more(
+                extraction = extend_matches(
                     images, config, self._registry, extraction, loose, self._stages
                 )
             mapping = self._map_again(extraction, known, held)
@@ -269,7 +269,7 @@ class _Run:
         if not known:
             options = options.model_copy(update={"known_poses": "guess"})
         if options.known_poses != "fixed":
-            problem = with_seed_poses(problem, held)
+            problem = apply_seed_poses(problem, held)
         return self._map(problem, options)
 
     def _held(self, mapping: MappingResult, images: ImageSet) -> list[RegisteredImage] | None:
@@ -294,7 +294,7 @@ class _Run:
             for _, kind, backend in config.provider_configs()
             for file in registry.weights(kind, backend.use, backend.options)
         }
-        self._needs = resources.predict(
+        self._needs = resources.estimate_resources(
             [image.pinhole.size for image in images],
             config,
             [choice.provider for choice in self._provision.choices],
@@ -317,11 +317,11 @@ class _Run:
 
     def _mapper_checkpoints(
         self, problem: MappingProblem, options: MapperOptions
-    ) -> DiskCheckpoints | None:
+    ) -> MappingCheckpoints | None:
         config = self._provision.config
         if config.runtime.checkpoint_s is None:
             return None
-        checkpoints = DiskCheckpoints(
+        checkpoints = MappingCheckpoints(
             config.runtime.cache_dir,
             problem,
             options,
@@ -488,7 +488,9 @@ class _Run:
                     **used.get((kind, spec.name), {"kind": kind, "name": spec.name, **unused}),
                     "from": choice.origin,
                     "chosen": choice.reason.value,
-                    "passed_over": {name: why.to_json() for name, why in choice.passed_over.items()},
+                    "passed_over": {
+                        name: why.to_json() for name, why in choice.passed_over.items()
+                    },
                     "code_license": spec.code_license,
                     "weights_license": spec.weights_license,
                     "accuracy": spec.accuracy,

@@ -15,7 +15,7 @@ from mpsfm_core.config import Config, load_config
 from mpsfm_core.evaluation.peers import PEERS, write_database
 from mpsfm_core.extraction.runner import extract
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.pipeline.provider_resolution import provide
+from mpsfm_core.pipeline.provider_resolution import resolve_providers
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
@@ -98,7 +98,7 @@ def test_so_do_the_points_of_a_model_by_colmap(
     room: Room, by_sensor: Calibrated, tmp_path: Path
 ) -> None:
     photos, registry = room.frames, Registry.discover()
-    config = provide(room.config, registry).config
+    config = resolve_providers(room.config, registry).config
     images = load_images(photos.folder, photos.intrinsics, photos.image_list, config.inputs)
     problem = extract(images, config, registry, Stages(registry)).problem
     write_database(problem, tmp_path / "database.db")

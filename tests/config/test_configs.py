@@ -10,9 +10,10 @@ import yaml
 
 from mpsfm_core.config import Config, describe_shipped, load_config, shipped_configs
 from mpsfm_core.data.errors import ConfigError
-from mpsfm_core.data.options import SAME_NETWORK, SettingsError, dotted
-from mpsfm_core.pipeline.provider_resolution import look_up, provide
+from mpsfm_core.data.options import SettingsError, dotted
+from mpsfm_core.pipeline.provider_resolution import preview_providers, resolve_providers
 from mpsfm_core.providers.first_party import PLUGIN_PROVIDERS, requirement_for
+from mpsfm_core.providers.provider_config import SAME_NETWORK
 from mpsfm_core.providers.registry import CORE, Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from mpsfm_core.providers.weights import is_remote
@@ -103,7 +104,7 @@ def test_needs_nothing_but_what_can_be_fetched_or_exported(
         "paper-dense": [f"{m}.options.model={file}" for m in ("matcher", "dense_matcher")],
     }.get(name, [])
     config = load_config(name, [*named, f"runtime.cache_dir={tmp_path}"], registry)
-    files = [f for choice in look_up(config, registry).choices for f in choice.to_fetch]
+    files = [f for choice in preview_providers(config, registry).choices for f in choice.to_fetch]
     assert all(is_remote(file.uri) and file.license != "unknown" for file in files)
 
 
@@ -155,5 +156,5 @@ def test_runs_with_nothing_named_and_without_a_network_connection(
     name: str, registry: Registry, tmp_path: Path
 ) -> None:
     offline = ("runtime.offline=true", f"runtime.cache_dir={tmp_path}")
-    provision = provide(load_config(name, offline, registry), registry)
+    provision = resolve_providers(load_config(name, offline, registry), registry)
     assert provision.config.depth.use == provision.config.normals.use == "compact"

@@ -23,11 +23,12 @@ from mpsfm_core.data import (
     PinholeCamera,
     View,
 )
-from mpsfm_core.data.options import Options, ProviderConfig
+from mpsfm_core.data.options import Options
 from mpsfm_core.extraction.options import AdjustmentOptions
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.providers import ProviderContext, ProviderSpec
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 

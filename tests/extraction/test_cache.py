@@ -25,7 +25,7 @@ from mpsfm_core.data import (
 from mpsfm_core.data.errors import OutputError
 from mpsfm_core.extraction import cache as module
 from mpsfm_core.extraction.cache import Cache, content_key, digest, pack
-from mpsfm_core.extraction.matching.verification import TwoView
+from mpsfm_core.extraction.matching.verification import TwoViewGeometry
 from mpsfm_core.extraction.priors.raw_priors import JointPrior
 
 RNG = np.random.default_rng(0)
@@ -51,7 +51,7 @@ def examples() -> dict[str, object]:
         "everything": PairMatches(sparse, dense, PairDepth(depth(), depth(metric=False))),
         "depth": DepthPrior.from_arrays(np.ones((3, 4))),
         "joint": JointPrior(depth(), normals),
-        "two-view": TwoView("", "planar", np.arange(3), np.eye(3), np.zeros(3)),
+        "two-view": TwoViewGeometry("", "planar", np.arange(3), np.eye(3), np.zeros(3)),
         "vector": RNG.normal(size=7).astype(np.float32),
         "mask": RNG.uniform(size=(4, 4)) > 0.5,
     }

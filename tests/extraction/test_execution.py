@@ -17,10 +17,10 @@ from mpsfm_core import hookimpl
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import DataError, PinholeCamera
 from mpsfm_core.data.errors import ConfigError, InputError, ProviderOutputError, ReconstructionError
-from mpsfm_core.data.options import ProviderConfig
-from mpsfm_core.extraction.remote_execution import Step
+from mpsfm_core.extraction.remote_execution import RemoteStep
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.contract_case import describe_difference
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
@@ -38,12 +38,12 @@ class Pickled:
 
     def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
         arrived = pickle.loads(pickle.dumps(step))
-        assert isinstance(arrived, Step)
+        assert isinstance(arrived, RemoteStep)
         self.stages[arrived.stage] = len(items)
         if self.another_cache is not None:
             runtime = arrived.config.runtime.model_copy(update={"cache_dir": self.another_cache})
             config = arrived.config.model_copy(update={"runtime": runtime})
-            arrived = Step(arrived.run, arrived.stage, arrived.images, config)
+            arrived = RemoteStep(arrived.run, arrived.stage, arrived.images, config)
         for item in items:
             arrived(item)
             yield

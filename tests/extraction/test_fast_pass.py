@@ -7,12 +7,12 @@ import pytest
 
 from mpsfm_core.config import FastPass
 from mpsfm_core.data import Float64
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.options import PairOptions
-from mpsfm_core.extraction.runner import Extraction, extract_more
+from mpsfm_core.extraction.runner import Extraction, extend_matches
 from mpsfm_core.geometry import transform
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.pipeline.run import reconstruct
+from mpsfm_core.providers.provider_config import ProviderConfig
 
 TRUTH = FastPass(features=ProviderConfig(use="truth"), matcher=ProviderConfig(use="mutual-nearest"))
 DENSE = {"features": None, "matcher": None, "dense_matcher": ProviderConfig(use="dense")}
@@ -38,7 +38,7 @@ def test_more_matches_of_one_photo(world) -> None:
     assert world.asked() == {"features": 4, "depth": 4, "normals": 4}
     config = world.config(**DENSE)
     images = load_images(world.root / "images", world.root / "intrinsics.yaml")
-    both = extract_more(images, config, world.registry, first, {3})
+    both = extend_matches(images, config, world.registry, first, {3})
     assert world.asked() == {"dense": 3}  # its pairs alone, and no prior again
     assert [len(image.keypoints) for image in both.problem.images[:3]] > [
         len(image.keypoints) for image in first.problem.images[:3]
@@ -63,7 +63,7 @@ def test_a_pair_that_quick_matching_dropped(world) -> None:
     first = world.extract(matcher=ProviderConfig(use="mutual-nearest", options={"ratio": 0.001}))
     assert not first.problem.pairs
     images = load_images(world.root / "images", world.root / "intrinsics.yaml")
-    both = extract_more(images, world.config(), world.registry, first, {0})
+    both = extend_matches(images, world.config(), world.registry, first, {0})
     assert [(pair.image_a, pair.image_b) for pair in both.problem.pairs] == [(0, 1), (0, 2), (0, 3)]
     kept = [pair["images"] for pair in both.report["pairs"] if "dropped" not in pair]
     assert kept == [[world.names[0], name] for name in world.names[1:]]
@@ -78,7 +78,7 @@ def test_photos_that_are_held_ask_for_no_partners(world) -> None:
 
     def asked(image: int, **changes: object) -> int:
         config = world.config(pairs=pairs, **changes)
-        both = extract_more(images, config, world.registry, first, {image})
+        both = extend_matches(images, config, world.registry, first, {image})
         return both.report["pairs_proposed"] - first.report["pairs_proposed"]
 
     assert asked(3) == 2
@@ -100,7 +100,13 @@ def test_photos_that_are_held_are_not_matched_again(world, fast_pass, asked: int
     assert len(result.summary["images"]["registered"]) == 4
     assert world.asked()["dense"] == asked
     blocks = [provider["block"] for provider in result.summary["providers"]]
-    assert blocks == ["fast_pass.features", "fast_pass.matcher", "dense_matcher", "depth", "normals"]
+    assert blocks == [
+        "fast_pass.features",
+        "fast_pass.matcher",
+        "dense_matcher",
+        "depth",
+        "normals",
+    ]
 
 
 def test_the_same_features_are_not_found_twice(world) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from mpsfm_core.data.options import ProviderConfig
-from mpsfm_core.extraction.priors.focal_length import estimate_focals
+from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.providers import ProviderSpec
+from mpsfm_core.providers.provider_config import ProviderConfig
 
 ESTIMATES = {"view0.png": 150.0, "view1.png": 130.0, "view2.png": 100.0, "view3.png": None}
 
@@ -32,7 +32,7 @@ def estimated(world):
     def run(provider="sees", intrinsics=None):
         images = load_images(world.root / "images", intrinsics)
         config = world.config(depth=ProviderConfig(use=provider))
-        return estimate_focals(images, config, world.registry), asked
+        return estimate_focal_lengths(images, config, world.registry), asked
 
     return run
 

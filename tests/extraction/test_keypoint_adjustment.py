@@ -15,23 +15,23 @@ from mpsfm_core.data import (
     VerifiedPair,
     View,
 )
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.matching.keypoint_adjustment import (
     AlignedPair,
-    Side,
+    PairSide,
     adjust_keypoints,
     align_pair,
-    facing_plane_warp,
-    grey,
+    fronto_parallel_warp,
+    select_best_matches,
+    smooth_gray_image,
     solve_shifts,
-    with_best_matches,
 )
 from mpsfm_core.extraction.options import AdjustmentOptions
-from mpsfm_core.extraction.runner import adjust, extract, extract_more
+from mpsfm_core.extraction.runner import adjust_problem, extend_matches, extract
 from mpsfm_core.geometry import compose, invert, project, transform, unproject
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.matches import ImportedMatches
 from mpsfm_core.providers import ProviderSpec
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
@@ -42,8 +42,8 @@ def relative(pose_a: np.ndarray, pose_b: np.ndarray) -> tuple[np.ndarray, np.nda
     return compose((pose_b[:, :3], pose_b[:, 3]), invert(pose_a[:, :3], pose_a[:, 3]))
 
 
-def side(xy: np.ndarray, camera: PinholeCamera = CAMERA, std_px: float = 1.0) -> Side:
-    return Side(camera, np.zeros((camera.height, camera.width), np.float32), xy, std_px)
+def side(xy: np.ndarray, camera: PinholeCamera = CAMERA, std_px: float = 1.0) -> PairSide:
+    return PairSide(camera, np.zeros((camera.height, camera.width), np.float32), xy, std_px)
 
 
 def pair_of(matches: list[tuple[int, int]], images: tuple[int, int] = (0, 1)) -> VerifiedPair:
@@ -73,7 +73,7 @@ def test_the_warp_is_that_of_a_facing_plane() -> None:
 
     step = 1e-4
     numeric = [(seen(xy + step * e) - seen(xy - step * e)) / (2 * step) for e in np.eye(2)]
-    warp = facing_plane_warp(side(xy), side(seen(xy), OTHER), rotation, 7 * translation)
+    warp = fronto_parallel_warp(side(xy), side(seen(xy), OTHER), rotation, 7 * translation)
     assert np.abs(warp - np.stack(numeric, axis=2)).max() < 1e-6
 
 
@@ -86,7 +86,7 @@ def test_the_warp_without_parallax_is_the_rotation_s() -> None:
 
     numeric = [(seen(xy + 1e-4 * e, 1.0) - seen(xy - 1e-4 * e, 1.0)) / 2e-4 for e in np.eye(2)]
     for translation in (np.zeros(3), np.array([0.0, 0.0, -1.0])):  # behind the cameras: far away
-        warp = facing_plane_warp(side(xy), side(seen(xy, 1.0)), rotation, translation)
+        warp = fronto_parallel_warp(side(xy), side(seen(xy, 1.0)), rotation, translation)
         if not translation.any():
             assert np.abs(warp - np.stack(numeric, axis=2)).max() < 1e-6
         assert np.isfinite(warp).all()
@@ -96,13 +96,13 @@ def test_both_orders_of_a_pair_say_the_same() -> None:
     """The template is the finer image's, whichever it is."""
     scene, poses = room_scene(), arc_poses(2, 10.0)
     views = [
-        grey(scene.render(camera, pose).rgb, 1.0)
+        smooth_gray_image(scene.render(camera, pose).rgb, 1.0)
         for camera, pose in zip((CAMERA, OTHER), poses, strict=True)
     ]
     seeds = np.random.default_rng(0).uniform(40, 180, (100, 2))
     found = scene.correspondences(CAMERA, poses[0], OTHER, poses[1], seeds)
     xy = seeds[found.visible], found.xy_b[found.visible]
-    a, b = Side(CAMERA, views[0], xy[0], 1.0), Side(OTHER, views[1], xy[1], 1.0)
+    a, b = PairSide(CAMERA, views[0], xy[0], 1.0), PairSide(OTHER, views[1], xy[1], 1.0)
     forth = align_pair(a, b, *relative(*poses), AdjustmentOptions())
     back = align_pair(b, a, *relative(*poses[::-1]), AdjustmentOptions())
     assert len(forth.rows) > 20 and np.array_equal(forth.rows, back.rows)
@@ -184,9 +184,9 @@ def test_without_pairs_nothing_moves() -> None:
 
 def test_images_of_coarse_keypoints_are_made_smaller() -> None:
     rgb = np.random.default_rng(0).integers(0, 255, (100, 200, 3), dtype=np.uint8)
-    assert grey(rgb, 0.5).shape == (100, 200)
-    assert grey(rgb, 4.0).shape == (25, 50)
-    assert grey(rgb, 1e6).shape == (1, 1)
+    assert smooth_gray_image(rgb, 0.5).shape == (100, 200)
+    assert smooth_gray_image(rgb, 4.0).shape == (25, 50)
+    assert smooth_gray_image(rgb, 1e6).shape == (1, 1)
 
 
 OFF = AdjustmentOptions(enabled=False)
@@ -242,7 +242,7 @@ def test_rounded_keypoints_become_exact(rounded) -> None:
     ]
     assert max(moved) <= AdjustmentOptions().max_shift
     images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml")
-    later = adjust(images, rounded.config(**ROUNDED), rounded.registry, off)
+    later = adjust_problem(images, rounded.config(**ROUNDED), rounded.registry, off)
     for a, b in zip(later.images, on.images, strict=True):
         assert np.array_equal(a.keypoints, b.keypoints)
 
@@ -251,8 +251,8 @@ def test_the_order_of_pairs_does_not_matter(rounded) -> None:
     off = rounded.extract(**{**ROUNDED, "adjustment": OFF}).problem
     images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml")
     config = rounded.config(**ROUNDED)
-    forth = adjust(images, config, rounded.registry, off)
-    back = adjust(images, config, rounded.registry, replace(off, pairs=off.pairs[::-1]))
+    forth = adjust_problem(images, config, rounded.registry, off)
+    back = adjust_problem(images, config, rounded.registry, replace(off, pairs=off.pairs[::-1]))
     for a, b in zip(forth.images, back.images, strict=True):
         assert np.abs(a.keypoints - b.keypoints).max() < 1e-6
 
@@ -278,7 +278,7 @@ def test_more_matches_leave_keypoints_that_are_adjusted(rounded) -> None:
     images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml")
     config = rounded.config(**ROUNDED)
     first = extract(images, config, rounded.registry)
-    both = extract_more(images, config, rounded.registry, first, {3}).problem
+    both = extend_matches(images, config, rounded.registry, first, {3}).problem
     for before, after in zip(first.problem.images, both.images, strict=True):
         count = len(before.keypoints)
         assert np.array_equal(after.keypoints[:count], before.keypoints)
@@ -293,7 +293,7 @@ def test_a_match_that_no_keypoint_needs_is_not_aligned() -> None:
         for other, score in ((1, 0.9), (2, 0.5), (3, 0.7))
     ]
     pairs.append(replace(pair_of([(0, 0)], (2, 3)), scores=np.array([0.6], np.float32)))
-    kept = with_best_matches(pairs, [1] * 4, 1)
+    kept = select_best_matches(pairs, [1] * 4, 1)
     assert [(p.image_a, p.image_b) for p in kept] == [(0, 1), (0, 3), (2, 3)]
-    assert len(with_best_matches(pairs, [1] * 4, 3)) == len(pairs)
-    assert with_best_matches([], [], 1) == []
+    assert len(select_best_matches(pairs, [1] * 4, 3)) == len(pairs)
+    assert select_best_matches([], [], 1) == []

@@ -11,11 +11,11 @@ import pytest
 from mpsfm_core import DepthPrior, GroupPrior, View
 from mpsfm_core.data import DataError
 from mpsfm_core.data.errors import ConfigError
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.cache import Cache, pack, unpack
-from mpsfm_core.extraction.priors.multiview import choose_groups, in_turn
+from mpsfm_core.extraction.priors.multiview import choose_groups, consecutive_groups
 from mpsfm_core.geometry import compose, invert
 from mpsfm_core.providers import ProviderSpec
+from mpsfm_core.providers.provider_config import ProviderConfig
 
 from .conftest import World
 
@@ -41,7 +41,7 @@ def test_every_image_is_in_one_group_and_small_groups_are_filled() -> None:
 
 
 def test_groups_in_turn() -> None:
-    assert in_turn([3, 5, 7, 9, 11], 2) == [(3, 5), (7, 9), (11,)]
+    assert consecutive_groups([3, 5, 7, 9, 11], 2) == [(3, 5), (7, 9), (11,)]
 
 
 def test_the_cache_keeps_a_group(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Which photos are likely to show the same: the evidence, and what follows from all of it."""
+"""Which photos are likely to show the same: the match_score, and what follows from all of it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import Features
-from mpsfm_core.extraction.pairs.similarity import STRONGEST, evidence, likeness, strongest
+from mpsfm_core.extraction.pairs.similarity import (
+    NUM_DESCRIPTORS,
+    diffuse_similarity,
+    match_score,
+    strongest_descriptors,
+)
 
 
 def unit(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -15,38 +20,40 @@ def unit(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def test_strongest_by_score() -> None:
-    count = STRONGEST + 7
+    count = NUM_DESCRIPTORS + 7
     scores = np.random.default_rng(0).permutation(count).astype(np.float32) / count
     descriptors = np.arange(count, dtype=np.float32)[:, None]
     features = Features(np.zeros((count, 2)), descriptors, scores)
-    np.testing.assert_array_equal(strongest(features)[:, 0], np.argsort(-scores)[:STRONGEST])
+    np.testing.assert_array_equal(
+        strongest_descriptors(features)[:, 0], np.argsort(-scores)[:NUM_DESCRIPTORS]
+    )
     unscored = Features(np.zeros((count, 2)), descriptors)
-    np.testing.assert_array_equal(strongest(unscored), descriptors[:STRONGEST])
+    np.testing.assert_array_equal(strongest_descriptors(unscored), descriptors[:NUM_DESCRIPTORS])
 
 
 def test_evidence_counts_what_two_photos_share() -> None:
     rng = np.random.default_rng(0)
     shared, a, b = (unit(rng, n) for n in (40, 100, 80))
-    found = evidence(np.concatenate([a, shared]), np.concatenate([shared, b]))
-    assert 40 <= found < 40 + 0.2 * evidence(a, b) + 5
-    assert evidence(a, b) < 10
+    found = match_score(np.concatenate([a, shared]), np.concatenate([shared, b]))
+    assert 40 <= found < 40 + 0.2 * match_score(a, b) + 5
+    assert match_score(a, b) < 10
 
 
 def test_evidence_by_hand() -> None:
     """One mutual pair at distance 1; the second nearest of either side are at 5 and at 2."""
     a, b = np.array([[0.0, 0.0], [2.0, 1.0]]), np.array([[0.0, 1.0], [3.0, 4.0]])
-    assert evidence(a.astype(np.float32), b.astype(np.float32)) == pytest.approx(1 - 1 / 2)
+    assert match_score(a.astype(np.float32), b.astype(np.float32)) == pytest.approx(1 - 1 / 2)
 
 
 @pytest.mark.parametrize("counts", [(0, 5), (5, 0), (0, 0)])
 def test_no_descriptors_no_evidence(counts) -> None:
     a, b = (np.zeros((count, 8), dtype=np.float32) for count in counts)
-    assert evidence(a, b) == 0
+    assert match_score(a, b) == 0
 
 
 def test_the_same_descriptor_everywhere_is_no_evidence() -> None:
     same = np.ones((5, 8), dtype=np.float32)
-    assert np.isfinite(evidence(same, same))
+    assert np.isfinite(match_score(same, same))
 
 
 def chain(count: int, reach: int = 2) -> np.ndarray:
@@ -59,7 +66,7 @@ def chain(count: int, reach: int = 2) -> np.ndarray:
 
 def test_likeness_is_handed_on() -> None:
     """Photos 3 apart share nothing themselves, but partners."""
-    like = likeness(chain(20))
+    like = diffuse_similarity(chain(20))
     assert like[10, 11] > like[10, 12] > like[10, 13] > like[10, 16] > 0
     np.testing.assert_allclose(like, like.T)
     assert (np.diag(like) == 0).all()
@@ -69,13 +76,13 @@ def test_a_photo_that_is_a_little_like_all_is_like_none() -> None:
     found = chain(20)
     found[7] = found[:, 7] = 20.0
     found[7, 7] = 0
-    like = likeness(found)
+    like = diffuse_similarity(found)
     assert like[6, 8] > like[6, 7]
 
 
 def test_photos_without_features() -> None:
-    assert (likeness(np.zeros((4, 4))) == 0).all()
+    assert (diffuse_similarity(np.zeros((4, 4))) == 0).all()
     found = chain(12)
     found[5] = found[:, 5] = 0
-    like = likeness(found)
+    like = diffuse_similarity(found)
     assert (like[5] == 0).all() and np.isfinite(like).all()

@@ -6,29 +6,29 @@ import numpy as np
 import pytest
 
 from mpsfm_core.extraction.options import PairOptions
-from mpsfm_core.extraction.pairs.candidates import (
-    apply_filters,
-    exhaustive,
-    most_alike,
-    neighbours,
-    retrieval,
-    sequential,
+from mpsfm_core.extraction.pairs.pairing import (
+    exhaustive_pairs,
+    filter_pairs,
+    most_similar_pairs,
+    numbered_neighbor_pairs,
+    retrieval_pairs,
+    sequential_pairs,
 )
 
 
 def test_exhaustive() -> None:
-    assert exhaustive(3) == [(0, 1), (0, 2), (1, 2)]
-    assert exhaustive(1) == []
-    assert len(exhaustive(20)) == 190
+    assert exhaustive_pairs(3) == [(0, 1), (0, 2), (1, 2)]
+    assert exhaustive_pairs(1) == []
+    assert len(exhaustive_pairs(20)) == 190
 
 
 def test_sequential() -> None:
-    assert sequential(4, PairOptions(overlap=2)) == [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)]
-    assert sequential(2, PairOptions(overlap=5)) == [(0, 1)]
+    assert sequential_pairs(4, PairOptions(overlap=2)) == [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)]
+    assert sequential_pairs(2, PairOptions(overlap=5)) == [(0, 1)]
 
 
 def test_quadratic() -> None:
-    pairs = sequential(10, PairOptions(overlap=4, quadratic=True))
+    pairs = sequential_pairs(10, PairOptions(overlap=4, quadratic=True))
     assert [b for a, b in pairs if a == 0] == [1, 2, 4, 8]
 
 
@@ -38,50 +38,55 @@ def unit(*angles_deg: float) -> list[np.ndarray]:
 
 
 def test_retrieval_takes_the_most_similar() -> None:
-    pairs = retrieval(unit(0, 10, 40, 45), PairOptions(top_k=1))
+    pairs = retrieval_pairs(unit(0, 10, 40, 45), PairOptions(top_k=1))
     assert pairs == [(0, 1), (2, 3)]
 
 
 def test_retrieval_is_a_union_over_images() -> None:
     """Image 2 asks for 1 although 1 prefers 0."""
-    assert retrieval(unit(0, 10, 40), PairOptions(top_k=1)) == [(0, 1), (1, 2)]
+    assert retrieval_pairs(unit(0, 10, 40), PairOptions(top_k=1)) == [(0, 1), (1, 2)]
 
 
 @pytest.mark.parametrize(("least", "expected"), [(0.0, [(0, 1)]), (-1.0, [(0, 1), (0, 2), (1, 2)])])
 def test_retrieval_has_a_least_similarity(least, expected) -> None:
     descriptors = unit(0, 10, 150)
-    assert retrieval(descriptors, PairOptions(min_similarity=least)) == expected
+    assert retrieval_pairs(descriptors, PairOptions(min_similarity=least)) == expected
 
 
 def test_retrieval_never_pairs_an_image_with_itself() -> None:
     options = PairOptions(top_k=5, min_similarity=-np.inf)
-    assert retrieval(unit(0, 0, 0), options) == [(0, 1), (0, 2), (1, 2)]
+    assert retrieval_pairs(unit(0, 0, 0), options) == [(0, 1), (0, 2), (1, 2)]
 
 
 def test_filters_intersect_and_ignore_order() -> None:
     names = ["a", "b", "c"]
     pairs = [(0, 1), (0, 2), (1, 2)]
-    assert apply_filters(pairs, names, []) == pairs
+    assert filter_pairs(pairs, names, []) == pairs
     answers = [[("b", "a"), ("a", "c")], [("a", "b"), ("b", "c"), ("x", "y")]]
-    assert apply_filters(pairs, names, answers) == [(0, 1)]
-    assert apply_filters(pairs, names, [[]]) == []
+    assert filter_pairs(pairs, names, answers) == [(0, 1)]
+    assert filter_pairs(pairs, names, [[]]) == []
 
 
 def test_most_alike_leaves_out_what_is_not_alike_at_all() -> None:
     likeness = np.array([[9, 3, 0, 0], [3, 9, 1, 0], [0, 1, 9, 0], [0, 0, 0, 9]], dtype=np.float64)
-    assert most_alike(likeness, 1) == [(0, 1), (1, 2)]
-    assert most_alike(likeness, 3) == [(0, 1), (1, 2)]
+    assert most_similar_pairs(likeness, 1) == [(0, 1), (1, 2)]
+    assert most_similar_pairs(likeness, 3) == [(0, 1), (1, 2)]
 
 
 def test_most_alike_of_some_images() -> None:
     """Those that another one would choose are not asked for."""
     likeness = np.array([[0, 3, 1, 0], [3, 0, 2, 0], [1, 2, 0, 5], [0, 0, 5, 0]], dtype=np.float64)
-    assert most_alike(likeness, 1, images=[0]) == [(0, 1)]
-    assert most_alike(likeness, 2, images=[3, 0]) == [(0, 1), (0, 2), (2, 3)]
+    assert most_similar_pairs(likeness, 1, images=[0]) == [(0, 1)]
+    assert most_similar_pairs(likeness, 2, images=[3, 0]) == [(0, 1), (0, 2), (2, 3)]
 
 
 def test_neighbours_by_number() -> None:
     """Two sequences, one with a gap and not in the order of its numbers, and a name by itself."""
     names = ["a_9.png", "a_10.png", "a_3.png", "b1/7.jpg", "cover.png", "b1/8.jpg", "b2/9.jpg"]
-    assert neighbours(names, PairOptions(overlap=1)) == [(0, 1), (0, 2), (3, 5)]
-    assert neighbours(names, PairOptions(overlap=2)) == [(0, 1), (0, 2), (1, 2), (3, 5)]
+    assert numbered_neighbor_pairs(names, PairOptions(overlap=1)) == [(0, 1), (0, 2), (3, 5)]
+    assert numbered_neighbor_pairs(names, PairOptions(overlap=2)) == [
+        (0, 1),
+        (0, 2),
+        (1, 2),
+        (3, 5),
+    ]

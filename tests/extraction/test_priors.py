@@ -101,18 +101,18 @@ def test_normals_are_averaged_and_unit() -> None:
 def test_masks_take_the_nearest_pixel() -> None:
     mask = np.zeros((64, 96), dtype=np.bool_)
     mask[:, 48:] = True
-    allowed = priors.allow_only(mask, GRID)
+    allowed = priors.resize_mask(mask, GRID)
     assert not allowed[:, :24].any() and allowed[:, 24:].all()
-    restricted = priors.restrict_depth(depth_prior(plane_depth(GRID)), allowed)
+    restricted = priors.mask_depth(depth_prior(plane_depth(GRID)), allowed)
     assert np.array_equal(restricted.valid, allowed)
-    assert np.array_equal(priors.restrict_normals(normal_prior((32, 48)), allowed).valid, allowed)
+    assert np.array_equal(priors.mask_normals(normal_prior((32, 48)), allowed).valid, allowed)
 
 
 def test_edges_are_distrusted_on_both_sides() -> None:
     depth = np.full((32, 48), 2.0)
     depth[:, 20:] = 2.1
     depth[:, 30:] = 2.1 * 1.01
-    found = priors.distrust_edges(normal_prior((32, 48)), depth_prior(depth), 1.015)
+    found = priors.inflate_edge_variance(normal_prior((32, 48)), depth_prior(depth), 1.015)
     distrusted = found.variance == priors.EDGE_VARIANCE
     assert np.argwhere(distrusted.all(axis=0)).ravel().tolist() == [19, 20]
     assert distrusted.sum() == 2 * 32
@@ -122,5 +122,5 @@ def test_steps_to_invalid_pixels_are_no_edges() -> None:
     valid = np.ones((32, 48), dtype=np.bool_)
     valid[:, 20] = False
     prior = depth_prior(np.full((32, 48), 2.0), valid)
-    found = priors.distrust_edges(normal_prior((32, 48)), prior, 1.015)
+    found = priors.inflate_edge_variance(normal_prior((32, 48)), prior, 1.015)
     assert np.allclose(found.variance, 0.01)

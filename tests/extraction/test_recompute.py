@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from mpsfm_core.config import RuntimeOptions
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.options import ExtractionOptions, VerificationOptions
+from mpsfm_core.providers.provider_config import ProviderConfig
 
 FULL = {"features": 4, "depth": 4, "normals": 4}
 
@@ -178,7 +178,7 @@ from pathlib import Path
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.extraction.runner import extract
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.options import ProviderConfig
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.registry import Registry
 
 root = Path(sys.argv[1])

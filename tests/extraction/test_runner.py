@@ -11,15 +11,15 @@ import pytest
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import ConfigError, ProviderOutputError, ProviderRunError
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.options import AdjustmentOptions, ExtractionOptions, PairOptions
-from mpsfm_core.extraction.pairs import candidates as pairs
+from mpsfm_core.extraction.pairs import pairing as pairs
 from mpsfm_core.extraction.pairs import similarity as first_look
 from mpsfm_core.extraction.priors.prior_maps import EDGE_VARIANCE
 from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_angle_deg
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.providers import ProviderSpec, hookimpl
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 ALL_PAIRS = {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)}
@@ -243,7 +243,7 @@ def test_auto_without_features_matches_all(world) -> None:
 def test_what_stays_apart_is_tried_again(world, monkeypatch) -> None:
     """A first look that sees two halves only, and names that are not numbered."""
     likeness = np.eye(4)[[1, 0, 3, 2]] + 1e-3 * np.eye(4)[[2, 3, 0, 1]]
-    monkeypatch.setattr(first_look, "likeness", lambda found: likeness)
+    monkeypatch.setattr(first_look, "diffuse_similarity", lambda found: likeness)
     monkeypatch.setattr(pairs, "neighbours", lambda names, options: [])
     extraction = world.extract(pairs=PairOptions(mode="auto", partners=1))
     assert extraction.report["pairs_matched"] == 3

@@ -6,9 +6,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mpsfm_core.data.decisions import PairReason
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.extraction.matching.verification import verify
+from mpsfm_core.data.decisions import PairReason
+from mpsfm_core.extraction.matching.verification import verify_matches
 from mpsfm_core.extraction.options import VerificationOptions
 from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_angle_deg
 from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Plane, arc_poses, room_scene
@@ -46,7 +46,7 @@ def add_outliers(xy_a: np.ndarray, xy_b: np.ndarray, count: int, camera=CAMERA):
 def test_pose_and_inliers(camera_b) -> None:
     points = correspondences(room_scene(), 300, 0.5, camera_b)
     xy_a, xy_b, good = add_outliers(*points, 100, camera_b)
-    found = verify(CAMERA, camera_b, xy_a, xy_b, VerificationOptions())
+    found = verify_matches(CAMERA, camera_b, xy_a, xy_b, VerificationOptions())
     rotation, translation = relative_pose()
     assert (found.dropped, found.configuration) == ("", "calibrated")
     assert rotation_angle_deg(found.rotation @ rotation.T) < 0.3
@@ -70,7 +70,7 @@ def test_same_as_colmap() -> None:
     expected = pycolmap.estimate_calibrated_two_view_geometry(
         camera, xy_a, camera, xy_b, matches, options
     )
-    found = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(), seed=3)
+    found = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(), seed=3)
     configuration = pycolmap.TwoViewGeometryConfiguration(expected.config)
     assert found.configuration == configuration.name.lower() == "calibrated"
     assert found.inliers.tolist() == expected.inlier_matches[:, 0].tolist()
@@ -81,7 +81,7 @@ def test_same_as_colmap() -> None:
 def test_deterministic() -> None:
     xy_a, xy_b, _ = add_outliers(*correspondences(room_scene(), 150, 1.0), 90)
     first, second = (
-        verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(), seed=1) for _ in range(2)
+        verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(), seed=1) for _ in range(2)
     )
     assert first.inliers.tolist() == second.inliers.tolist()
     assert np.array_equal(first.rotation, second.rotation)
@@ -90,7 +90,7 @@ def test_deterministic() -> None:
 def test_planar_scene() -> None:
     wall = AnalyticScene((Plane((4.0, 0.0, 0.0), (1.0, 0.2, 0.0)),))
     xy_a, xy_b = correspondences(wall, 100, 0.3)
-    found = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
+    found = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
     assert found.configuration in ("planar", "planar or panoramic")
     assert len(found.inliers) > 90
     assert rotation_angle_deg(found.rotation @ relative_pose()[0].T) < 5
@@ -106,7 +106,7 @@ def test_pure_rotation() -> None:
     xy_a, xy_b = (
         (p[:, :2] / p[:, 2:]) * [500, 510] + [318, 243] for p in (points, points @ turn.T)
     )
-    found = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
+    found = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
     assert found.configuration == "panoramic"
     assert rotation_angle_deg(found.rotation @ turn.T) < 0.1
     assert np.linalg.norm(found.translation) < 1e-6
@@ -114,12 +114,12 @@ def test_pure_rotation() -> None:
 
 def test_too_few_matches() -> None:
     xy = np.zeros((14, 2))
-    found = verify(CAMERA, CAMERA, xy, xy, VerificationOptions())
+    found = verify_matches(CAMERA, CAMERA, xy, xy, VerificationOptions())
     assert found.drop_reason(14, 15) == PairReason.TOO_FEW_MATCHES.because(
         num_matches=14, min_matches=15
     )
     assert not len(found.inliers)
-    assert verify(CAMERA, CAMERA, xy[:0], xy[:0], VerificationOptions()).dropped
+    assert verify_matches(CAMERA, CAMERA, xy[:0], xy[:0], VerificationOptions()).dropped
 
 
 @pytest.mark.parametrize("count", [20, 40, 250])
@@ -127,16 +127,16 @@ def test_random_matches_are_dropped(count: int) -> None:
     """Also the many that fit some epipolar geometry because there are many."""
     rng = np.random.default_rng(count)
     xy_a, xy_b = rng.uniform(0, 1, (2, count, 2)) * CAMERA.size
-    dropped = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
+    dropped = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
     assert dropped.dropped and not len(dropped.inliers)
     if count > 100:
-        lenient = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(max_chance=1.0))
+        lenient = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(max_chance=1.0))
         assert not lenient.dropped  # what the number of inliers alone would say
         assert dropped.dropped == PairReason.EXPLAINED_BY_CHANCE.value
 
 
 def test_noisier_keypoints_have_a_larger_threshold() -> None:
     xy_a, xy_b = correspondences(room_scene(), 200, 6.0)
-    sharp = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
-    wide = verify(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(), std_px=4.0)
+    sharp = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
+    wide = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(), std_px=4.0)
     assert len(wide.inliers) > 180 > len(sharp.inliers)

@@ -36,7 +36,7 @@ from mpsfm_core.evaluation.records import Record, write_record
 from mpsfm_core.evaluation.scene_folder import write_sets
 from mpsfm_core.extraction.cache import Cache, digest
 from mpsfm_core.extraction.empty_results import JointPrior
-from mpsfm_core.extraction.matching.verification import TwoView
+from mpsfm_core.extraction.matching.verification import TwoViewGeometry
 from mpsfm_core.inputs import video
 from mpsfm_core.inputs.options import VideoOptions
 from mpsfm_core.mapping.state import freeze
@@ -44,8 +44,8 @@ from mpsfm_core.pipeline import checkpoints
 from mpsfm_core.providers.environments.environment import Environment
 from mpsfm_core.providers.environments.worker import _description
 from mpsfm_core.providers.registry import Registry, core_version
-from mpsfm_core.providers.uncertainty.calibration_file import CalibrationFile, Provenance
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration_file import CalibrationFile, Provenance
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.support.files import replacing
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
@@ -93,7 +93,9 @@ def entries() -> dict[str, Any]:
         "depth": depth,
         "normals": faces,
         "joint": JointPrior(depth, faces),
-        "two-view": TwoView("", "calibrated", np.arange(4), np.eye(3), np.array([0.6, 0, 0.8])),
+        "two-view": TwoViewGeometry(
+            "", "calibrated", np.arange(4), np.eye(3), np.array([0.6, 0, 0.8])
+        ),
         "mask": np.array([[0, 255]], np.uint8),
     }
 

@@ -12,7 +12,7 @@ from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.state import freeze, thaw
 from mpsfm_core.pipeline import checkpoints as module
-from mpsfm_core.pipeline.checkpoints import DiskCheckpoints
+from mpsfm_core.pipeline.checkpoints import MappingCheckpoints
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
@@ -40,7 +40,7 @@ def problem() -> MappingProblem:
 
 
 def opened(folder: Path, problem: MappingProblem, every_s: float = 0.0, **options: Any) -> Any:
-    checkpoints = DiskCheckpoints(
+    checkpoints = MappingCheckpoints(
         folder, problem, MapperOptions(**options), notices := Notices(), every_s
     )
     return checkpoints, notices.texts

@@ -18,9 +18,13 @@ from mpsfm_core.cli import build_app
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera, View
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.pipeline.provider_resolution import ProviderResolution, look_up, provide
+from mpsfm_core.pipeline.provider_resolution import (
+    ProviderResolution,
+    preview_providers,
+    resolve_providers,
+)
 from mpsfm_core.pipeline.run import reconstruct
-from mpsfm_core.providers import ProviderContext, weights_from_option, weights
+from mpsfm_core.providers import ProviderContext, weights, weights_from_option
 from mpsfm_core.providers.builtin import plugin as builtin
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
@@ -146,19 +150,19 @@ def test_first_and_second_use(room: Room, server: Server, configured: Configured
     registry, listener = networks(room, server.url), Listener()
     registry.register(listener)
     config = configured(registry)
-    (choice,) = [c for c in look_up(config, registry).choices if c.block == "depth"]
+    (choice,) = [c for c in preview_providers(config, registry).choices if c.block == "depth"]
     assert server.requests == [] and [file.size for file in choice.to_fetch] == [len(CONTENT)]
-    first = provide(config, registry)
+    first = resolve_providers(config, registry)
     assert names(first) == ["sift", "mutual-nearest", "strong", "strong"]
-    assert not any(b.is_open for _, _, b in first.config.provider_configs())
+    assert not any(b.is_unresolved for _, _, b in first.config.provider_configs())
     assert len(server.requests) == 1
     assert listener.progress[-1][0] == "fetch strong.onnx"
     assert listener.notices[0] == f"fetching {server.url}/strong.onnx (0 MB), licence MIT"
     assert listener.notices[-2].startswith("depth: strong")
     assert listener.notices[-2].endswith("to expect: published")
-    again = provide(config, registry)
+    again = resolve_providers(config, registry)
     assert again.config == first.config and len(server.requests) == 1
-    assert look_up(config, registry).choices[-2].to_fetch == ()
+    assert preview_providers(config, registry).choices[-2].to_fetch == ()
 
 
 def cut(server: Server) -> None:
@@ -210,7 +214,7 @@ def test_the_run_goes_on_with_our_own_network(
 
 def test_no_server(room: Room, configured: Configured) -> None:
     registry = networks(room, "http://127.0.0.1:9")
-    assert names(provide(configured(registry), registry))[2:] == ["compact", "compact"]
+    assert names(resolve_providers(configured(registry), registry))[2:] == ["compact", "compact"]
 
 
 def test_a_network_that_the_user_names_is_taken_or_missed(
@@ -219,7 +223,7 @@ def test_a_network_that_the_user_names_is_taken_or_missed(
     cut(server)
     registry = networks(room, server.url)
     with pytest.raises(InputError, match=r"strong\.onnx cannot be downloaded"):
-        provide(configured(registry, "depth.use=strong"), registry)
+        resolve_providers(configured(registry, "depth.use=strong"), registry)
 
 
 def test_the_core_alone_reconstructs(room: Room, tmp_path: Path) -> None:
@@ -254,7 +258,7 @@ def test_options_say_whose_they_are(
     for name, place in places.items():
         settings = tuple(text.replace(name, place) for text in settings)
     config = load_config("default", [*settings, f"runtime.cache_dir={tmp_path}"], registry)
-    assert names(provide(config, registry))[2:] == expected
+    assert names(resolve_providers(config, registry))[2:] == expected
 
 
 @pytest.fixture
@@ -279,7 +283,10 @@ def unreadable(tmp_path: Path, room: Room) -> Path:
         (["depth.use=torchless"], "needs no_such_package, not installed; pip install it"),
         (["depth.calibration=nowhere.yaml"], "nowhere.yaml' cannot be read"),
         (["pairs.mode=retrieval"], "retrieval: is needed by pairs.mode"),
-        (["normals={use: same-network, fallback: []}", "depth.use=flat"], "'flat' gives no normals"),
+        (
+            ["normals={use: same-network, fallback: []}", "depth.use=flat"],
+            "'flat' gives no normals",
+        ),
         (["inputs.masks=nowhere"], "masks folder nowhere does not exist"),
     ],
 )
@@ -305,7 +312,7 @@ def test_a_cheap_fault_is_found_before_a_download(
     registry = networks(room, server.url)
     config = configured(registry, "masks=[{use: files, options: {directory: nowhere}}]")
     with pytest.raises(InputError, match="nowhere does not exist"):
-        provide(config, registry)
+        resolve_providers(config, registry)
     assert not server.requests
 
 

@@ -10,12 +10,12 @@ import pytest
 
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.pipeline import resources
 from mpsfm_core.pipeline import run as pipeline
-from mpsfm_core.pipeline.resources import Needs, predict, shortages
+from mpsfm_core.pipeline.resources import ResourceEstimate, estimate_resources, shortages
 from mpsfm_core.providers import WeightsFile
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.weights import WeightStore
 
 SIZE = (640, 480)
@@ -33,18 +33,18 @@ def config(**changes: object) -> Config:
 
 
 def test_what_a_run_takes_grows_with_what_it_is_given() -> None:
-    few, many = (predict([SIZE] * count, config(), (), ()) for count in (10, 100))
+    few, many = (estimate_resources([SIZE] * count, config(), (), ()) for count in (10, 100))
     assert many.memory_mb > few.memory_mb + 90 * 15 and many.cache_mb > 9 * few.cache_mb
-    large = predict([(1280, 960)] * 10, config(), (), ())
+    large = estimate_resources([(1280, 960)] * 10, config(), (), ())
     assert large.memory_mb > few.memory_mb
-    sparse = predict([SIZE] * 100, config(dense={"enabled": False}), (), ())
+    sparse = estimate_resources([SIZE] * 100, config(dense={"enabled": False}), (), ())
     assert sparse.memory_mb < many.memory_mb and sparse.output_mb < many.output_mb
-    maps = predict([SIZE] * 100, config(results={"dense_cloud": False}), (), ())
+    maps = estimate_resources([SIZE] * 100, config(results={"dense_cloud": False}), (), ())
     assert maps.memory_mb < many.memory_mb and maps.output_mb < many.output_mb
-    pairs = predict([SIZE] * 100, config(pairs={"mode": "sequential"}), (), ())
+    pairs = estimate_resources([SIZE] * 100, config(pairs={"mode": "sequential"}), (), ())
     assert pairs.cache_mb < many.cache_mb
-    workers = predict([SIZE] * 10, config(runtime=RuntimeOptions(workers=4)), (), ())
-    network = predict([SIZE] * 10, config(), (), [200 << 20])
+    workers = estimate_resources([SIZE] * 10, config(runtime=RuntimeOptions(workers=4)), (), ())
+    network = estimate_resources([SIZE] * 10, config(), (), [200 << 20])
     assert workers.memory_mb > few.memory_mb and network.memory_mb == few.memory_mb + 720
 
 
@@ -68,16 +68,16 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("machine")
 def test_a_run_that_fits_is_silent_and_one_that_may_not_is_told(tmp_path: Path) -> None:
-    assert shortages(Needs(1900, 400, 400), tmp_path, tmp_path / "out") == []
-    (memory,) = shortages(Needs(9000, 0, 0), tmp_path, tmp_path / "out")
+    assert shortages(ResourceEstimate(1900, 400, 400), tmp_path, tmp_path / "out") == []
+    (memory,) = shortages(ResourceEstimate(9000, 0, 0), tmp_path, tmp_path / "out")
     assert "takes about 9000 MB of memory and 2000 MB are free" in memory
-    together = shortages(Needs(100, 600, 600), tmp_path, tmp_path / "out")
+    together = shortages(ResourceEstimate(100, 600, 600), tmp_path, tmp_path / "out")
     assert len(together) == 2 and "the cache" in together[0] and "the results" in together[1]
 
 
 @pytest.mark.usefixtures("machine")
-@pytest.mark.parametrize("needs", [Needs(10_500, 0, 0), Needs(100, 0, 1400)])
-def test_a_run_that_cannot_fit_is_refused(needs: Needs, tmp_path: Path) -> None:
+@pytest.mark.parametrize("needs", [ResourceEstimate(10_500, 0, 0), ResourceEstimate(100, 0, 1400)])
+def test_a_run_that_cannot_fit_is_refused(needs: ResourceEstimate, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"MB are .*runtime\.check_resources=false"):
         shortages(needs, tmp_path, tmp_path / "out")
 

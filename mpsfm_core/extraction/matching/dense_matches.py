@@ -23,7 +23,7 @@ class PointMatches:
 NO_POINTS = PointMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, dtype=np.float32))
 
 
-def snap(
+def snap_to_keypoints(
     dense: DenseMatches, keypoints_a: Float64, keypoints_b: Float64, radius_px: float
 ) -> SparseMatches:
     """Dense matches that lie on keypoints in both images, as matches of those.
@@ -37,7 +37,7 @@ def snap(
     return SparseMatches.best_first(rows, dense.scores[near])
 
 
-def sample(
+def sample_dense_matches(
     dense: DenseMatches, keypoints_a: Float64, keypoints_b: Float64, options: ExtractionOptions
 ) -> PointMatches:
     """Dense matches that are certain, apart from the keypoints of both images, and apart from

@@ -26,7 +26,7 @@ from mpsfm_core.geometry.patch_alignment import align_patches
 from mpsfm_core.support.lru_cache import LruCache
 
 CACHED_BYTES = 256 << 20
-"""Of grey images that are kept."""
+"""Of smooth_gray_image images that are kept."""
 BLUR_PX = 0.8
 """Std of the Gaussian that images are smoothed by, so that they can be interpolated (ours)."""
 _NOISE_PX = float(2 * np.sqrt(np.pi) * BLUR_PX)
@@ -61,15 +61,15 @@ class AlignedPair:
 _EQUATION = ("warp", "offset", "information")
 
 
-class Adjusted(NamedTuple):
+class AdjustedKeypoints(NamedTuple):
     """Of one image: keypoints (n, 2), and which of them were measured (n,)."""
 
     keypoints: Float64
     measured: Bool
 
 
-class Side(NamedTuple):
-    """One side of a pair: its ``camera``, the grey ``image`` (see :func:`grey`), and the keypoints
+class PairSide(NamedTuple):
+    """One side of a pair: its ``camera``, the smooth_gray_image ``image`` (see :func:`smooth_gray_image`), and the keypoints
     of the matches ``xy`` (m, 2), pixels of the camera, of noise ``std_px``."""
 
     camera: PinholeCamera
@@ -79,7 +79,7 @@ class Side(NamedTuple):
 
     @property
     def step(self) -> Float64:
-        """(2,) pixels of the grey image in one of the view."""
+        """(2,) pixels of the smooth_gray_image image in one of the view."""
         return np.array(self.image.shape[::-1]) / (self.camera.width, self.camera.height)
 
 
@@ -90,40 +90,42 @@ class KeypointAdjuster:
     """
 
     def __init__(
-        self, bench: ExtractionContext, keypoints: Sequence[Float64], std_px: Sequence[float]
+        self, context: ExtractionContext, keypoints: Sequence[Float64], std_px: Sequence[float]
     ) -> None:
-        self._bench = bench
+        self._context = context
         self._keypoints = keypoints
         self._std_px = std_px
         self._grey: LruCache[int, Float32] = LruCache(CACHED_BYTES, lambda image: image.nbytes)
 
-    def run(self, pairs: Sequence[VerifiedPair]) -> list[Adjusted]:
+    def run(self, pairs: Sequence[VerifiedPair]) -> list[AdjustedKeypoints]:
         """The stage."""
-        options = self._bench.config.adjustment
+        options = self._context.config.adjustment
         counts = [len(xy) for xy in self._keypoints]
-        pairs = with_best_matches(pairs, counts, options.max_alignments)
-        aligned = self._bench.each("adjustment", pairs, self._aligned)
+        pairs = select_best_matches(pairs, counts, options.max_alignments)
+        aligned = self._context.each("adjustment", pairs, self._aligned)
         return adjust_keypoints(self._keypoints, self._std_px, pairs, aligned, options.max_shift)
 
     def _aligned(self, pair: VerifiedPair) -> AlignedPair:
         a, b = (
-            Side(
-                self._bench.images[index].pinhole,
+            PairSide(
+                self._context.images[index].pinhole,
                 self._image(index),
                 self._keypoints[index][pair.matches[:, column]],
                 self._std_px[index],
             )
             for column, index in enumerate((pair.image_a, pair.image_b))
         )
-        options = self._bench.config.adjustment
+        options = self._context.config.adjustment
         return align_pair(a, b, pair.rotation, pair.translation, options)
 
     def _image(self, index: int) -> Float32:
         std_px = self._std_px[index]
-        return self._grey.get(index, lambda: grey(self._bench.view(index).image, std_px))
+        return self._grey.get(
+            index, lambda: smooth_gray_image(self._context.view(index).image, std_px)
+        )
 
 
-def with_best_matches(
+def select_best_matches(
     pairs: Sequence[VerifiedPair], counts: Sequence[int], most: int
 ) -> list[VerifiedPair]:
     """The pairs with those matches alone that are among the ``most`` best of one of their
@@ -154,8 +156,8 @@ def _numbered(pairs: Sequence[VerifiedPair], counts: Sequence[int]) -> tuple[Int
     return np.concatenate(a), np.concatenate(b)
 
 
-def grey(rgb: UInt8, std_px: float) -> Float32:
-    """A view (h, w, 3) as patches of it are aligned: grey, smooth, and no larger than that its
+def smooth_gray_image(rgb: UInt8, std_px: float) -> Float32:
+    """A view (h, w, 3) as patches of it are aligned: smooth_gray_image, smooth, and no larger than that its
     keypoints err by a pixel."""
     image: Any = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     if std_px > 1:
@@ -166,13 +168,13 @@ def grey(rgb: UInt8, std_px: float) -> Float32:
 
 
 def align_pair(
-    a: Side, b: Side, rotation: Float64, translation: Float64, options: AdjustmentOptions
+    a: PairSide, b: PairSide, rotation: Float64, translation: Float64, options: AdjustmentOptions
 ) -> AlignedPair:
     """Align the patches of a pair's matches; the template is of the image that shows more detail.
 
     ``rotation`` (3, 3), ``translation`` (3,): ``cam_b_from_cam_a``.
     """
-    warp = facing_plane_warp(a, b, rotation, translation) * (b.step[:, None] / a.step)
+    warp = fronto_parallel_warp(a, b, rotation, translation) * (b.step[:, None] / a.step)
     swapped = bool(np.median(np.linalg.det(warp)) > 1)
     if swapped:
         a, b, warp = b, a, _inverse(warp)
@@ -196,7 +198,9 @@ def align_pair(
     return AlignedPair(rows, warp, offset, information)
 
 
-def facing_plane_warp(a: Side, b: Side, rotation: Float64, translation: Float64) -> Float64:
+def fronto_parallel_warp(
+    a: PairSide, b: PairSide, rotation: Float64, translation: Float64
+) -> Float64:
     """(m, 2, 2) offsets in view a to offsets in view b, of planes through the points that matches
     show, parallel to image a.
 
@@ -224,7 +228,7 @@ def adjust_keypoints(
     pairs: Sequence[VerifiedPair],
     aligned: Sequence[AlignedPair],
     max_shift: float,
-) -> list[Adjusted]:
+) -> list[AdjustedKeypoints]:
     """Move the keypoints of all images so that they fit the alignments of all pairs.
 
     A keypoint is expected where it was found, within its ``std_px``; alignments that others
@@ -246,7 +250,7 @@ def adjust_keypoints(
     measured &= np.linalg.norm(shifts, axis=1) <= max_shift * std
     moved = np.concatenate(keypoints) + np.where(measured[:, None], shifts, 0.0)
     ends = np.cumsum(counts)[:-1]
-    return list(map(Adjusted, np.split(moved, ends), np.split(measured, ends)))
+    return list(map(AdjustedKeypoints, np.split(moved, ends), np.split(measured, ends)))
 
 
 def solve_shifts(

@@ -26,7 +26,7 @@ _USABLE = {
 
 
 @dataclass(frozen=True, eq=False)
-class TwoView:
+class TwoViewGeometry:
     """Two-view geometry of an image pair, or the code of the reason why the pair is dropped."""
 
     dropped: str
@@ -54,7 +54,7 @@ class TwoView:
         return code.because(**{name: values[name] for name in code.fields})
 
 
-def verify(
+def verify_matches(
     camera_a: PinholeCamera,
     camera_b: PinholeCamera,
     xy_a: Float64,
@@ -63,7 +63,7 @@ def verify(
     *,
     std_px: float = 1.0,
     seed: int = 0,
-) -> TwoView:
+) -> TwoViewGeometry:
     """Verify matches, row by row of ``xy_a``, ``xy_b`` (m, 2), by COLMAP's calibrated estimation.
 
     The same input and seed give the same outcome. ``std_px``: localisation noise of the matches.
@@ -94,7 +94,7 @@ def verify(
         return _dropped(PairReason.NO_RELATIVE_POSE, configuration, len(inliers))
     rotation = np.asarray(pose.rotation.matrix(), dtype=np.float64)
     translation = np.asarray(pose.translation, dtype=np.float64)
-    return TwoView("", configuration, len(inliers), inliers, rotation, translation)
+    return TwoViewGeometry("", configuration, len(inliers), inliers, rotation, translation)
 
 
 def _chance(inliers: int, matches: int, camera: PinholeCamera, error_px: float) -> float:
@@ -110,10 +110,10 @@ def _chance(inliers: int, matches: int, camera: PinholeCamera, error_px: float) 
     return float(bdtrc(inliers - sample - 1, matches - sample, min(band, 1.0)))
 
 
-def _dropped(reason: PairReason, configuration: str = "", num_inliers: int = 0) -> TwoView:
+def _dropped(reason: PairReason, configuration: str = "", num_inliers: int = 0) -> TwoViewGeometry:
     """Return the result for a dropped pair."""
     none = np.empty(0, np.int64)
-    return TwoView(reason.value, configuration, num_inliers, none, np.eye(3), np.zeros(3))
+    return TwoViewGeometry(reason.value, configuration, num_inliers, none, np.eye(3), np.zeros(3))
 
 
 def _colmap_options(

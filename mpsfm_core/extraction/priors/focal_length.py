@@ -21,7 +21,7 @@ from mpsfm_core.providers.registry import Registry
 _log = logging.getLogger(__name__)
 
 
-def estimate_focals(
+def estimate_focal_lengths(
     images: ImageSet, config: Config, registry: Registry, events: ExtractionEvents | None = None
 ) -> ImageSet:
     """The images with the depth provider's focal lengths, where they were the default.
@@ -37,8 +37,8 @@ def estimate_focals(
     guessed = [index for index, image in enumerate(images) if image.focal_source == "default"]
     if not guessed:
         return images
-    bench = ExtractionContext(images, config, registry, events or NullExtractionEvents())
-    provider = bench.provider("depth", config.depth.model_copy(update={"wrap": ()}))
+    context = ExtractionContext(images, config, registry, events or NullExtractionEvents())
+    provider = context.provider("depth", config.depth.model_copy(update={"wrap": ()}))
     if not provider.can("estimates-focal"):
         return images
 
@@ -49,11 +49,11 @@ def estimate_focals(
             found = validation.run_focal(provider.spec, instance, view)
             return np.array(np.nan if found is None else found)
 
-        focal = bench.result(provider, np.ndarray, ["focal", images.pixel_key(index)], compute)
+        focal = context.result(provider, np.ndarray, ["focal", images.pixel_key(index)], compute)
         return float(focal * images[index].camera.width / view.camera.width)
 
     with threadpool_limits(thread_count(config.runtime), user_api="blas"):
-        estimates = bench.each("focal", guessed, estimate, provider, here=True)
+        estimates = context.each("focal", guessed, estimate, provider, here=True)
     by_camera: dict[int, list[float]] = defaultdict(list)
     for index, focal in zip(guessed, estimates, strict=True):
         if np.isfinite(focal):

@@ -9,8 +9,8 @@ import numpy as np
 
 from mpsfm_core.data import DepthPrior, Float64, GroupPrior, Int64, Pose
 from mpsfm_core.extraction.context import ExtractionContext
-from mpsfm_core.extraction.empty_results import NOTHING
-from mpsfm_core.extraction.pairs.candidates import Pair
+from mpsfm_core.extraction.empty_results import EMPTY_RESULTS
+from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.providers import validation
 
 Group = tuple[int, ...]
@@ -54,40 +54,40 @@ def _grown(group: list[int], shared: Int64, allowed: Any, size: int) -> list[int
 class GroupPriors:
     """Runs the multi-view provider of a configuration on groups of images; cached."""
 
-    def __init__(self, bench: ExtractionContext) -> None:
-        assert bench.config.multiview is not None
-        self.provider = bench.provider("multiview", bench.config.multiview)
+    def __init__(self, context: ExtractionContext) -> None:
+        assert context.config.multiview is not None
+        self.provider = context.provider("multiview", context.config.multiview)
         self.groups: list[tuple[Group, int]] = []
-        self._bench = bench
+        self._context = context
         self._place: dict[int, tuple[int, int]] = {}
         self._poses: list[Float64 | None] = []
 
     def run(self, matches: dict[Pair, int]) -> None:
         """Choose the groups by verified matches, and ask about all of them."""
-        size = self._bench.config.extraction.group_size
-        self.groups = choose_groups(len(self._bench.images), matches, size)
+        size = self._context.config.extraction.group_size
+        self.groups = choose_groups(len(self._context.images), matches, size)
         for number, (group, own) in enumerate(self.groups):
             self._place |= {image: (number, row) for row, image in enumerate(group[:own])}
         shown = [group for group, _ in self.groups]
-        self._poses = self._bench.each("multiview", shown, self._see, self.provider)
+        self._poses = self._context.each("multiview", shown, self._see, self.provider)
 
     def predict(self, group: Group) -> GroupPrior:
         """What the network says of a group."""
-        bench, provider = self._bench, self.provider
+        context, provider = self._context, self.provider
 
         def compute(instance: Any) -> GroupPrior:
-            views = [bench.view(index) for index in group]
+            views = [context.view(index) for index in group]
             return validation.run_multiview(provider.spec, instance, views)
 
-        inputs = [bench.view_inputs(index, provider) for index in group]
-        return bench.result(provider, GroupPrior, inputs, compute, group)
+        inputs = [context.view_inputs(index, provider) for index in group]
+        return context.result(provider, GroupPrior, inputs, compute, group)
 
     def depth(self, image: int) -> DepthPrior:
         """Depth of an image, of the group that it belongs to."""
         number, row = self._place[image]
         prior = self.predict(self.groups[number][0])
         if not prior.depth:  # the provider failed, and the run goes on
-            nothing: DepthPrior = NOTHING[DepthPrior]()  # type: ignore[assignment]
+            nothing: DepthPrior = EMPTY_RESULTS[DepthPrior]()  # type: ignore[assignment]
             return nothing
         return prior.depth[row]
 
@@ -101,7 +101,7 @@ class GroupPriors:
 
     def described(self) -> list[list[str]]:
         """Names of the images of each group, for the report."""
-        names = self._bench.images.names
+        names = self._context.images.names
         return [[names[image] for image in group] for group, _ in self.groups]
 
     def _see(self, group: Group) -> Float64 | None:
@@ -109,6 +109,6 @@ class GroupPriors:
         return self.predict(group).poses
 
 
-def in_turn(images: Sequence[int], size: int) -> list[Group]:
+def consecutive_groups(images: Sequence[int], size: int) -> list[Group]:
     """Groups of images that follow each other, for before anything is known of them."""
     return [tuple(images[start : start + size]) for start in range(0, len(images), size)]

@@ -52,23 +52,23 @@ def resize_normals(prior: NormalPrior, grid: tuple[int, int]) -> NormalPrior:
     return NormalPrior.from_arrays(normals, variance, valid)
 
 
-def allow_only(mask: Bool, grid: tuple[int, int]) -> Bool:
+def resize_mask(mask: Bool, grid: tuple[int, int]) -> Bool:
     """A mask (H, W) of the view on the grid of the maps, by the nearest pixel."""
     resized = cv2.resize(mask.astype(np.uint8), grid, interpolation=cv2.INTER_NEAREST_EXACT)
     return np.asarray(resized > 0)
 
 
-def restrict_depth(prior: DepthPrior, allowed: Bool) -> DepthPrior:
+def mask_depth(prior: DepthPrior, allowed: Bool) -> DepthPrior:
     """The prior, valid only where allowed."""
     return DepthPrior(prior.depth, prior.variance, prior.valid & allowed, prior.metric)
 
 
-def restrict_normals(prior: NormalPrior, allowed: Bool) -> NormalPrior:
+def mask_normals(prior: NormalPrior, allowed: Bool) -> NormalPrior:
     """The prior, valid only where allowed."""
     return NormalPrior(prior.normals, prior.variance, prior.valid & allowed)
 
 
-def distrust_edges(normals: NormalPrior, depth: DepthPrior, ratio: float) -> NormalPrior:
+def inflate_edge_variance(normals: NormalPrior, depth: DepthPrior, ratio: float) -> NormalPrior:
     """Normals with :data:`EDGE_VARIANCE` on both sides of a depth step of more than ``ratio``.
 
     The variance must be there, and the grids the same. Steps to invalid pixels do not count.

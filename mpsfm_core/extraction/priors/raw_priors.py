@@ -19,46 +19,46 @@ class RawPriors:
     provider gives both.
     """
 
-    def __init__(self, bench: ExtractionContext) -> None:
-        self._bench = bench
-        self.depth = bench.provider("depth", bench.config.depth)
-        joint = _is_joint(bench, self.depth)
-        self.normals = None if joint else bench.provider("normals", bench.config.normals)
+    def __init__(self, context: ExtractionContext) -> None:
+        self._context = context
+        self.depth = context.provider("depth", context.config.depth)
+        joint = _is_joint(context, self.depth)
+        self.normals = None if joint else context.provider("normals", context.config.normals)
 
     def predict(self, index: int) -> tuple[DepthPrior, NormalPrior | None]:
         """Depth of an image, and its normals if they come along."""
-        provider, bench = self.depth, self._bench
-        inputs = bench.view_inputs(index, provider)
+        provider, context = self.depth, self._context
+        inputs = context.view_inputs(index, provider)
         if self.normals is None:
 
             def compute_both(instance: Any) -> JointPrior:
-                return JointPrior(*validation.run_joint(provider.spec, instance, bench.view(index)))
+                return JointPrior(*validation.run_joint(provider.spec, instance, context.view(index)))
 
-            both = bench.result(provider, JointPrior, ["joint", *inputs], compute_both, [index])
+            both = context.result(provider, JointPrior, ["joint", *inputs], compute_both, [index])
             return both.depth, both.normals
 
         def compute(instance: Any) -> DepthPrior:
-            return validation.run_depth(provider.spec, instance, bench.view(index))
+            return validation.run_depth(provider.spec, instance, context.view(index))
 
-        return bench.result(provider, DepthPrior, inputs, compute, [index]), None
+        return context.result(provider, DepthPrior, inputs, compute, [index]), None
 
     def predict_normals(self, index: int, depth: DepthPrior | None) -> NormalPrior:
         """Normals of an image by the normals provider; ``depth``: its calibrated depth, which a
         provider that does not say ``needs-depth`` does without."""
-        provider, bench = self.normals, self._bench
+        provider, context = self.normals, self._context
         assert provider is not None
-        inputs = bench.view_inputs(index, provider)
+        inputs = context.view_inputs(index, provider)
         if provider.can("needs-depth"):
             inputs.append(digest(depth))
 
         def compute(instance: Any) -> NormalPrior:
-            return validation.run_normals(provider.spec, instance, bench.view(index), depth)
+            return validation.run_normals(provider.spec, instance, context.view(index), depth)
 
-        return bench.result(provider, NormalPrior, inputs, compute, [index])
+        return context.result(provider, NormalPrior, inputs, compute, [index])
 
 
-def _is_joint(bench: ExtractionContext, depth: ActiveProvider) -> bool:
+def _is_joint(context: ExtractionContext, depth: ActiveProvider) -> bool:
     """Whether one pass of the depth provider gives the normals too."""
-    wanted, normals = bench.config.depth, bench.config.normals
+    wanted, normals = context.config.depth, context.config.normals
     same = (wanted.use, wanted.options) == (normals.use, normals.options)
     return depth.can("joint-normals") and same and not wanted.wrap and not normals.wrap

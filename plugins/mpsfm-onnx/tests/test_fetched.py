@@ -14,7 +14,7 @@ from mpsfm_core.config import load_config
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.extraction.runner import extract
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.pipeline.provider_resolution import provide
+from mpsfm_core.pipeline.provider_resolution import resolve_providers
 from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.providers import weights
 from mpsfm_core.providers.registry import Registry
@@ -90,14 +90,14 @@ def photos(tmp_path_factory):
 
 
 def test_first_use_fetches_and_the_next_one_does_not(server, registry, config, photos):
-    provision = provide(config, registry)
+    provision = resolve_providers(config, registry)
     assert provision.config.depth.use == provision.config.normals.use == "moge-2-small"
     assert [path for path, _ in server.requests] == [PATH]
     report = extract(load_images(*photos), provision.config, registry).report["providers"]
     (depth,) = [line for line in report if line["kind"] == "depth"]
     assert (depth["name"], depth["computed"]) == ("moge-2-small", 3)
     assert not [line for line in report if line["kind"] == "normals"]  # of the same pass
-    assert provide(config, registry).config == provision.config
+    assert resolve_providers(config, registry).config == provision.config
     assert len(server.requests) == 1
 
 

@@ -24,10 +24,10 @@ from mpsfm_core.extraction.cache import content_key
 from mpsfm_core.extraction.context import RUNS, ExtractionContext
 from mpsfm_core.extraction.events import NullExtractionEvents
 from mpsfm_core.extraction.features import FeatureTable
-from mpsfm_core.extraction.matching.matching import PairMatcher
+from mpsfm_core.extraction.matching.pair_matching import PairMatcher
 from mpsfm_core.extraction.pairs.selection import PairSelection
 from mpsfm_core.extraction.priors.multiview import GroupPriors
-from mpsfm_core.extraction.priors.predictions import Predictions
+from mpsfm_core.extraction.priors.prior_predictor import PriorPredictor
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.providers import Executor
 from mpsfm_core.providers.first_party import EXECUTORS
@@ -38,28 +38,28 @@ THREADS = "threads"
 
 
 @contextmanager
-def workers_elsewhere(bench: ExtractionContext) -> Iterator[None]:
+def use_executor(context: ExtractionContext) -> Iterator[None]:
     """While this lasts, the stages that the executor's workers can do are done there first.
 
     Raises :class:`ConfigError` when no plugin brings the executor, or its workers cannot be had.
     """
-    executor = _executor(bench)
+    executor = _executor(context)
     if executor is None:
         yield
         return
-    bench.elsewhere = _Elsewhere(bench, executor)
+    context.elsewhere = _RemoteStages(context, executor)
     try:
         yield
     finally:
         executor.close()
 
 
-def _executor(bench: ExtractionContext) -> Executor | None:
-    runtime = bench.config.runtime
+def _executor(context: ExtractionContext) -> Executor | None:
+    runtime = context.config.runtime
     name, options = runtime.executor, runtime.executor_options
     if name == THREADS:
         return None
-    found: Executor | None = bench.registry.hook.mpsfm_executor(name=name, options=options)
+    found: Executor | None = context.registry.hook.mpsfm_executor(name=name, options=options)
     if found is None:
         known = (THREADS, *EXECUTORS)
         hint = (
@@ -69,16 +69,16 @@ def _executor(bench: ExtractionContext) -> Executor | None:
     return found
 
 
-class _Elsewhere:
+class _RemoteStages:
     """The stages of a run that its executor's workers do."""
 
-    def __init__(self, bench: ExtractionContext, executor: Executor) -> None:
-        runtime = bench.config.runtime.model_copy(update={"executor": THREADS})
-        config = bench.config.model_copy(update={"runtime": runtime})
-        self._step = Step(uuid.uuid4().hex, "", bench.images, config)
+    def __init__(self, context: ExtractionContext, executor: Executor) -> None:
+        runtime = context.config.runtime.model_copy(update={"executor": THREADS})
+        config = context.config.model_copy(update={"runtime": runtime})
+        self._step = RemoteStep(uuid.uuid4().hex, "", context.images, config)
         self._executor = executor
-        bench.shared_run = self._step.run
-        bench.cache.store(RUNS, content_key(self._step.run), np.array(True))
+        context.shared_run = self._step.run
+        context.cache.store(RUNS, content_key(self._step.run), np.array(True))
 
     def __call__(self, stage: str, items: Sequence[Any]) -> Generator[None, None, None]:
         """Run a stage; yields after each item."""
@@ -86,7 +86,7 @@ class _Elsewhere:
 
 
 @dataclass(frozen=True)
-class Step:
+class RemoteStep:
     """A stage, to be called with an item on any machine.
 
     ``run``: names the run; a worker keeps its providers from step to step.
@@ -99,46 +99,46 @@ class Step:
 
     def __call__(self, item: Any) -> None:
         with limited(thread_count(self.config.runtime)):
-            _station(self).work[self.stage](item)
+            _worker_state(self).work[self.stage](item)
 
 
-class _Station:
+class _WorkerState:
     """What a worker has of a run: how each stage works on an item."""
 
-    def __init__(self, step: Step) -> None:
+    def __init__(self, step: RemoteStep) -> None:
         config = step.config
-        bench = ExtractionContext(step.images, config, Registry.discover(), NullExtractionEvents())
-        bench.shared_run = step.run
-        if bench.cache.load(RUNS, content_key(step.run), np.ndarray) is None:
+        context = ExtractionContext(step.images, config, Registry.discover(), NullExtractionEvents())
+        context.shared_run = step.run
+        if context.cache.load(RUNS, content_key(step.run), np.ndarray) is None:
             raise InputError(
-                f"the worker on {socket.gethostname()} does not see the cache {bench.cache.folder} "
+                f"the worker on {socket.gethostname()} does not see the cache {context.cache.folder} "
                 f"of this run: set runtime.cache_dir to a folder that all machines share"
             )
-        bench.take_masks()
-        table = None if config.features is None else FeatureTable(bench, config.features)
-        matcher = PairMatcher(bench, table)
-        priors = Predictions(bench, matcher, [])
+        context.take_masks()
+        table = None if config.features is None else FeatureTable(context, config.features)
+        matcher = PairMatcher(context, table)
+        priors = PriorPredictor(context, matcher, [])
         self.work: dict[str, Callable[[Any], object]] = {
-            "masks": bench.mask,
-            "retrieval": PairSelection(bench, table).describe,
+            "masks": context.mask,
+            "retrieval": PairSelection(context, table).describe,
             "matching": matcher.results,
             "depth": priors.predicted,
             "normals": priors.full_size,
         }
         if config.multiview is not None:
-            self.work["multiview"] = GroupPriors(bench).predict
+            self.work["multiview"] = GroupPriors(context).predict
         if table is not None:
             self.work["features"] = table.__getitem__
 
 
 _LOCK = threading.Lock()
-_STATIONS: dict[str, _Station] = {}
+_WORKER_STATES: dict[str, _WorkerState] = {}
 
 
-def _station(step: Step) -> _Station:
+def _worker_state(step: RemoteStep) -> _WorkerState:
     """This process's own, of the latest run alone."""
     with _LOCK:
-        if step.run not in _STATIONS:
-            _STATIONS.clear()
-            _STATIONS[step.run] = _Station(step)
-        return _STATIONS[step.run]
+        if step.run not in _WORKER_STATES:
+            _WORKER_STATES.clear()
+            _WORKER_STATES[step.run] = _WorkerState(step)
+        return _WORKER_STATES[step.run]

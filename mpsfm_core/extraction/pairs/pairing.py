@@ -17,26 +17,26 @@ _NUMBERED = re.compile(r"(.*?)(\d+)(\D*)")
 _ABOVE_NOTHING = float(np.finfo(np.float64).tiny)
 
 
-def exhaustive(count: int) -> list[Pair]:
+def exhaustive_pairs(count: int) -> list[Pair]:
     """All pairs of ``count`` images."""
     return [(a, b) for a in range(count) for b in range(a + 1, count)]
 
 
-def sequential(count: int, options: PairOptions) -> list[Pair]:
+def sequential_pairs(count: int, options: PairOptions) -> list[Pair]:
     """Each image with the next ones, or with those 1, 2, 4, 8, ... further on."""
     steps = range(options.overlap)
     offsets = [2**step if options.quadratic else step + 1 for step in steps]
     return _unordered((a, a + d) for a in range(count) for d in offsets if a + d < count)
 
 
-def retrieval(descriptors: Sequence[Float32], options: PairOptions) -> list[Pair]:
+def retrieval_pairs(descriptors: Sequence[Float32], options: PairOptions) -> list[Pair]:
     """Each image with its most similar ones; descriptors (d,) are compared by dot product."""
     matrix = np.stack(descriptors).astype(np.float64)
     least = max(options.min_similarity, -np.finfo(np.float64).max)
-    return most_alike(matrix @ matrix.T, options.top_k, least)
+    return most_similar_pairs(matrix @ matrix.T, options.top_k, least)
 
 
-def most_alike(
+def most_similar_pairs(
     likeness: Float64,
     count: int,
     least: float = _ABOVE_NOTHING,
@@ -51,7 +51,7 @@ def most_alike(
     return _unordered((a, int(b)) for a in chosen for b in best[a] if others[a, b] >= least)
 
 
-def neighbours(names: Sequence[str], options: PairOptions) -> list[Pair]:
+def numbered_neighbor_pairs(names: Sequence[str], options: PairOptions) -> list[Pair]:
     """Each image with the next ones in its sequence; images belong to one when their names differ
     by the last number in them only, and follow each other by that number."""
     sequences: dict[tuple[str, str], list[tuple[int, int]]] = {}
@@ -63,11 +63,11 @@ def neighbours(names: Sequence[str], options: PairOptions) -> list[Pair]:
     return _unordered(
         (sequence[a][1], sequence[b][1])
         for sequence in map(sorted, sequences.values())
-        for a, b in sequential(len(sequence), options)
+        for a, b in sequential_pairs(len(sequence), options)
     )
 
 
-def apply_filters(
+def filter_pairs(
     pairs: Sequence[Pair], names: Sequence[str], answers: Iterable[Iterable[tuple[str, str]]]
 ) -> list[Pair]:
     """The pairs that every filter's answer (pairs of image names, in any order) contains."""

@@ -22,18 +22,23 @@ from mpsfm_core.data import (
 from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.context import ExtractionContext
-from mpsfm_core.extraction.empty_results import NOTHING
+from mpsfm_core.extraction.empty_results import EMPTY_RESULTS
 from mpsfm_core.extraction.features import FeatureTable
-from mpsfm_core.extraction.matching.dense_matches import NO_POINTS, PointMatches, sample, snap
+from mpsfm_core.extraction.matching.dense_matches import (
+    NO_POINTS,
+    PointMatches,
+    sample_dense_matches,
+    snap_to_keypoints,
+)
 from mpsfm_core.extraction.matching.keypoint_adjustment import KeypointAdjuster
-from mpsfm_core.extraction.matching.verification import CALIBRATED, TwoView, verify
-from mpsfm_core.extraction.pairs.candidates import Pair
+from mpsfm_core.extraction.matching.verification import CALIBRATED, TwoViewGeometry, verify_matches
+from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.providers import validation
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class CandidateMatches:
     """Matches of a pair before verification: rows of the features, then free points.
 
     ``std_px``: localisation noise of the free points. ``precision``: mean inverse variance of the
@@ -53,21 +58,21 @@ class Candidates:
 class PairMatcher:
     """The chosen matchers on pairs of images."""
 
-    def __init__(self, bench: ExtractionContext, table: FeatureTable | None) -> None:
-        self._bench = bench
+    def __init__(self, context: ExtractionContext, table: FeatureTable | None) -> None:
+        self._context = context
         self._table = table
-        config = bench.config
+        config = context.config
         chosen = (config.matcher, config.dense_matcher)
-        self._providers = [bench.provider("matcher", b) for b in chosen if b is not None]
+        self._providers = [context.provider("matcher", b) for b in chosen if b is not None]
         self._snaps = config.matcher is None and table is not None
 
-    def match(self, pairs: list[Pair], located: list[Features]) -> list[Candidates]:
+    def match(self, pairs: list[Pair], located: list[Features]) -> list[CandidateMatches]:
         """Run the stage. ``located``: features of all images, descriptors not needed."""
 
-        def work(pair: Pair) -> Candidates:
+        def work(pair: Pair) -> CandidateMatches:
             return self._candidates(pair, located[pair[0]], located[pair[1]])
 
-        return self._bench.each("matching", pairs, work, *self._providers)
+        return self._context.each("matching", pairs, work, *self._providers)
 
     def results(self, pair: Pair) -> list[PairMatches]:
         """What each matcher returns for a pair, cached."""
@@ -81,8 +86,8 @@ class PairMatcher:
                 return (depth.depth_a, depth.depth_b)[side]
         raise LookupError(f"no matcher gave depth for pair {pair}")
 
-    def _candidates(self, pair: Pair, a: Features, b: Features) -> Candidates:
-        options = self._bench.config.extraction
+    def _candidates(self, pair: Pair, a: Features, b: Features) -> CandidateMatches:
+        options = self._context.config.extraction
         results = self.results(pair)
         no_scores = np.empty(0, dtype=np.float32)
         sparse = SparseMatches(np.empty((0, 2), dtype=np.int64), no_scores)
@@ -94,31 +99,31 @@ class PairMatcher:
                 continue
             dense = self._allowed(pair, result.dense)
             if self._snaps:
-                sparse = snap(dense, a.keypoints, b.keypoints, options.dense_snap_px)
-            points = sample(dense, a.keypoints, b.keypoints, options)
+                sparse = snap_to_keypoints(dense, a.keypoints, b.keypoints, options.dense_snap_px)
+            points = sample_dense_matches(dense, a.keypoints, b.keypoints, options)
             std_px = dense.std_px
-        return Candidates(pair, sparse, points, std_px, _precision(results))
+        return CandidateMatches(pair, sparse, points, std_px, _precision(results))
 
     def _run(self, provider: ActiveProvider, pair: Pair) -> PairMatches:
-        bench, table = self._bench, self._table
-        if bench.failed(pair):
-            return cast(PairMatches, NOTHING[PairMatches]())
+        context, table = self._context, self._table
+        if context.failed(pair):
+            return cast(PairMatches, EMPTY_RESULTS[PairMatches]())
 
         def compute(instance: Any) -> PairMatches:
-            views = bench.view(pair[0]), bench.view(pair[1])
+            views = context.view(pair[0]), context.view(pair[1])
             features = None if table is None else (table[pair[0]], table[pair[1]])
             return validation.run_matcher(provider.spec, instance, views, features)
 
-        inputs: list[object] = [bench.view_inputs(index, provider) for index in pair]
+        inputs: list[object] = [context.view_inputs(index, provider) for index in pair]
         if table is not None and provider.can("sparse"):
             inputs += [table.key(index) for index in pair]
-        return bench.result(provider, PairMatches, inputs, compute, pair)
+        return context.result(provider, PairMatches, inputs, compute, pair)
 
     def _allowed(self, pair: Pair, dense: DenseMatches) -> DenseMatches:
         """The matches that no mask forbids."""
         keep = np.ones(len(dense), dtype=np.bool_)
         for index, points in zip(pair, (dense.points_a, dense.points_b), strict=True):
-            mask = self._bench.mask(index)
+            mask = self._context.mask(index)
             if mask is not None:
                 keep &= sample_nearest(mask, points)
         return DenseMatches(
@@ -129,16 +134,16 @@ class PairMatcher:
 class PairVerifier:
     """Two-view geometry of candidate matches."""
 
-    def __init__(self, bench: ExtractionContext, located: list[Features]) -> None:
-        self._bench = bench
+    def __init__(self, context: ExtractionContext, located: list[Features]) -> None:
+        self._context = context
         self._located = located
 
-    def verify(self, candidates: list[Candidates]) -> list[TwoView]:
+    def verify_matches(self, candidates: list[CandidateMatches]) -> list[TwoViewGeometry]:
         """Run the stage."""
-        return self._bench.each("verification", candidates, self._verify)
+        return self._context.each("verification", candidates, self._verify)
 
-    def _verify(self, matches: Candidates) -> TwoView:
-        options, seed = self._bench.config.verification, self._bench.config.runtime.seed
+    def _verify(self, matches: CandidateMatches) -> TwoViewGeometry:
+        options, seed = self._context.config.verification, self._context.config.runtime.seed
         a, b = matches.pair
         rows = matches.sparse.indices
         xy_a = np.concatenate([self._located[a].keypoints[rows[:, 0]], matches.points.xy_a])
@@ -147,7 +152,7 @@ class PairVerifier:
             max(self._located[a].std_px, self._located[b].std_px) if len(rows) else 0.0,
             matches.std_px if len(matches.points.scores) else 0.0,
         )
-        cameras = self._bench.images[a].pinhole, self._bench.images[b].pinhole
+        cameras = self._context.images[a].pinhole, self._context.images[b].pinhole
         parts = [
             options.model_dump(mode="json"),
             *map(asdict, cameras),
@@ -156,15 +161,15 @@ class PairVerifier:
             pycolmap.__version__,
         ]
         key = content_key(parts, digest(xy_a), digest(xy_b))
-        found = self._bench.cache.load("two-view", key, TwoView)
+        found = self._context.cache.load("two-view", key, TwoViewGeometry)
         if found is None:
-            found = verify(*cameras, xy_a, xy_b, options, std_px=std_px, seed=seed)
-            self._bench.cache.store("two-view", key, found)
+            found = verify_matches(*cameras, xy_a, xy_b, options, std_px=std_px, seed=seed)
+            self._context.cache.store("two-view", key, found)
         return found
 
 
 @dataclass(frozen=True, eq=False)
-class Assembled:
+class AssembledMatches:
     """Verified pairs, and the keypoints (n, 2) of each image they refer to, and their noise as they
     were found.
 
@@ -177,16 +182,16 @@ class Assembled:
     std_factor: list[Float64]
 
 
-def assemble(
-    candidates: list[Candidates], outcomes: list[TwoView], located: list[Features]
-) -> Assembled:
+def assemble_matches(
+    candidates: list[CandidateMatches], outcomes: list[TwoViewGeometry], located: list[Features]
+) -> AssembledMatches:
     """Number the keypoints: each image's features, then the free points of its verified pairs."""
     keypoints = [[features.keypoints] for features in located]
     counts = [len(features) for features in located]
     noise = [[(len(features), features.std_px)] for features in located]
     verified = []
     for matches, outcome in zip(candidates, outcomes, strict=True):
-        if outcome.reason:
+        if outcome.dropped:
             continue
         sparse = outcome.inliers[outcome.inliers < len(matches.sparse)]
         free = outcome.inliers[outcome.inliers >= len(matches.sparse)] - len(matches.sparse)
@@ -208,20 +213,20 @@ def assemble(
                 outcome.configuration == CALIBRATED,
             )
         )
-    return Assembled(
+    return AssembledMatches(
         tuple(verified),
         [np.concatenate(parts) for parts in keypoints],
-        [_typical(parts) for parts in noise],
+        [_median_std(parts) for parts in noise],
         [np.ones(count) for count in counts],
     )
 
 
-def adjusted(bench: ExtractionContext, assembled: Assembled) -> Assembled:
+def adjust_assembled(context: ExtractionContext, assembled: AssembledMatches) -> AssembledMatches:
     """With keypoints moved to where the patches of their matches are alike."""
-    options = bench.config.adjustment
+    options = context.config.adjustment
     if not (options.enabled and assembled.pairs):
         return assembled
-    adjuster = KeypointAdjuster(bench, assembled.keypoints, assembled.std_px)
+    adjuster = KeypointAdjuster(context, assembled.keypoints, assembled.std_px)
     found = adjuster.run(assembled.pairs)
     return replace(
         assembled,
@@ -230,12 +235,12 @@ def adjusted(bench: ExtractionContext, assembled: Assembled) -> Assembled:
     )
 
 
-def adjusted_problem(bench: ExtractionContext, problem: MappingProblem) -> MappingProblem:
-    """A problem that was assembled without adjustment, with keypoints that are adjusted."""
+def adjust_problem_keypoints(context: ExtractionContext, problem: MappingProblem) -> MappingProblem:
+    """A problem that was assembled without adjustment, with keypoints that are adjust_assembled."""
     images = problem.images
-    found = adjusted(
-        bench,
-        Assembled(
+    found = adjust_assembled(
+        context,
+        AssembledMatches(
             problem.pairs,
             [image.keypoints for image in images],
             [image.keypoint_std_px for image in images],
@@ -249,14 +254,14 @@ def adjusted_problem(bench: ExtractionContext, problem: MappingProblem) -> Mappi
     return replace(problem, images=tuple(moved))
 
 
-def joined(problem: MappingProblem, more: Assembled) -> MappingProblem:
+def merge_matches(problem: MappingProblem, more: AssembledMatches) -> MappingProblem:
     """The problem with more matches between its images, on keypoints that come after its own."""
     offsets = [len(image.keypoints) for image in problem.images]
     images = tuple(
         replace(
             image,
             keypoints=np.concatenate([image.keypoints, xy]),
-            keypoint_std_px=_typical(
+            keypoint_std_px=_median_std(
                 [(len(image.keypoints), image.keypoint_std_px), (len(xy), std)]
             ),
             keypoint_std_factor=np.concatenate([_std_factor(image), factor]),
@@ -269,7 +274,7 @@ def joined(problem: MappingProblem, more: Assembled) -> MappingProblem:
     for pair in more.pairs:
         key = pair.image_a, pair.image_b
         rows = pair.matches + np.array([offsets[index] for index in key])
-        pairs[key] = _both(pairs.get(key), replace(pair, matches=rows))
+        pairs[key] = _merge_pair(pairs.get(key), replace(pair, matches=rows))
     return MappingProblem(images, tuple(pairs[key] for key in sorted(pairs)))
 
 
@@ -278,7 +283,7 @@ def _std_factor(image: MappingImage) -> Float64:
     return np.ones(len(image.keypoints)) if factor is None else factor
 
 
-def _both(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:
+def _merge_pair(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:
     """All matches of a pair, with the geometry that more of them fit."""
     if a is None:
         return b
@@ -289,7 +294,7 @@ def _both(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:
     )
 
 
-def _typical(parts: list[tuple[int, float]]) -> float:
+def _median_std(parts: list[tuple[int, float]]) -> float:
     """Median noise of keypoints that come in groups of (number, std)."""
     values = np.repeat([std for _, std in parts], [count for count, _ in parts])
     return float(np.median(values)) if len(values) else 1.0

@@ -1,0 +1,134 @@
+"""Depth and normals of the images, from their providers to the maps of the mapper."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mpsfm_core.config import Config
+from mpsfm_core.data import DepthPrior, NormalPrior
+from mpsfm_core.data.errors import ConfigError
+from mpsfm_core.extraction.context import ExtractionContext
+from mpsfm_core.extraction.matching.pair_matching import CandidateMatches, PairMatcher
+from mpsfm_core.extraction.priors import prior_maps as priors
+from mpsfm_core.extraction.priors.multiview import GroupPriors
+from mpsfm_core.extraction.priors.raw_priors import RawPriors
+from mpsfm_core.providers import Kind
+from mpsfm_core.providers.provider_config import FROM_MATCHER, FROM_MULTIVIEW
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
+
+
+class PriorPredictor:
+    """Runs the depth and normals providers; calibrates, resizes and masks what they say.
+
+    ``groups``: what the multi-view network said, where there is one.
+    """
+
+    def __init__(
+        self,
+        context: ExtractionContext,
+        matcher: PairMatcher | None,
+        candidates: list[CandidateMatches],
+        groups: GroupPriors | None = None,
+    ) -> None:
+        self._context = context
+        self._matcher = matcher
+        self._groups = groups if context.config.depth.use == FROM_MULTIVIEW else None
+        config, registry = context.config, context.registry
+        self._raw = RawPriors(context)
+        depth_calibration = _depth_calibration(config, registry)
+        normal_calibration = registry.calibration("normals", config.normals)
+        assert isinstance(normal_calibration, NormalCalibration)
+        self._depth_calibration = depth_calibration
+        self._normal_calibration = normal_calibration
+        self._best = _best_pairs(candidates) if config.depth.use == FROM_MATCHER else None
+
+    def run(self) -> list[tuple[DepthPrior, NormalPrior]]:
+        """Run the stages; returns both priors of each image on its grid, with variances."""
+        images = range(len(self._context.images))
+        depth = self._raw.depth
+        if not depth.can("uncached"):
+            self._context.each("depth", images, self._predict_only, depth)
+        slowest = self._raw.normals or depth
+        here = self._best is not None or self._groups is not None
+        return self._context.each("normals", images, self._both, slowest, here=here)
+
+    def _predict_only(self, index: int) -> None:
+        """Leaves the result in the cache: full-size maps of all images need not fit in memory."""
+        self.predicted(index)
+
+    def _both(self, index: int) -> tuple[DepthPrior, NormalPrior]:
+        depth, normals = self.full_size(index)
+        return self._on_grid(index, depth, self._normal_calibration.apply(normals))
+
+    def full_size(self, index: int) -> tuple[DepthPrior, NormalPrior]:
+        """Calibrated depth of an image, and its normals as they are predicted; cached."""
+        raw_depth, normals = self.predicted(index)
+        depth = self._depth_calibration.apply(raw_depth)
+        return depth, self._raw.predict_normals(index, depth) if normals is None else normals
+
+    def predicted(self, index: int) -> tuple[DepthPrior, NormalPrior | None]:
+        """Depth of an image as it is predicted, and its normals if they come along; cached."""
+        if self._groups is not None:
+            return self._groups.depth(index), None
+        if self._best is not None:
+            return self._from_matcher(index), None
+        return self._raw.predict(index)
+
+    def _from_matcher(self, index: int) -> DepthPrior:
+        """Depth of the pair whose prediction is most certain; none at all without a pair."""
+        assert self._best is not None and self._matcher is not None
+        if index not in self._best:
+            empty = np.zeros((1, 1), dtype=np.float32)
+            return DepthPrior(empty, empty, np.zeros((1, 1), dtype=np.bool_))
+        candidates, side = self._best[index]
+        return self._matcher.pair_depth(candidates.pair, side)
+
+    def _on_grid(
+        self, index: int, depth: DepthPrior, normals: NormalPrior
+    ) -> tuple[DepthPrior, NormalPrior]:
+        options = self._context.config.extraction
+        grid = priors.integration_grid(
+            self._context.images[index].pinhole.size, options.integration_size
+        )
+        depth, normals = priors.resize_depth(depth, grid), priors.resize_normals(normals, grid)
+        mask = self._context.mask(index)
+        if mask is not None:
+            allowed = priors.resize_mask(mask, grid)
+            depth = priors.mask_depth(depth, allowed)
+            normals = priors.mask_normals(normals, allowed)
+        if options.edge_ratio is not None:
+            normals = priors.inflate_edge_variance(normals, depth, options.edge_ratio)
+        return depth, normals
+
+
+def _depth_calibration(config: Config, registry: Registry) -> DepthCalibration:
+    """Of the network that gives the depth, unless the configuration says something of it."""
+    kind: Kind = "depth"
+    backend = config.depth
+    if backend.use == FROM_MULTIVIEW and config.multiview and backend.calibration is None:
+        kind, backend = "multiview", config.multiview
+    calibration = registry.calibration(kind, backend)
+    assert isinstance(calibration, DepthCalibration)
+    return calibration
+
+
+def check_depth_source(config: Config, registry: Registry) -> None:
+    """Raise :class:`ConfigError` if depth is to come from a matcher that predicts none."""
+    chosen = [b for b in (config.matcher, config.dense_matcher) if b is not None]
+    specs = [registry.spec("matcher", backend.use) for backend in chosen]
+    able = any("pair-depth" in spec.capabilities for spec in specs)
+    if config.depth.use == FROM_MATCHER and not able:
+        names = ", ".join(repr(spec.name) for spec in specs)
+        raise ConfigError(f"depth.use: 'matcher': {names} predicts no depth (pair-depth)")
+
+
+def _best_pairs(candidates: list[CandidateMatches]) -> dict[int, tuple[CandidateMatches, int]]:
+    """For each image the pair, and its place in it, with the highest mean precision."""
+    best: dict[int, tuple[float, CandidateMatches, int]] = {}
+    for matches in candidates:
+        for side, image in enumerate(matches.pair):
+            precision = matches.precision[side]
+            if precision > 0 and (image not in best or precision > best[image][0]):
+                best[image] = (precision, matches, side)
+    return {image: (matches, side) for image, (_, matches, side) in best.items()}
