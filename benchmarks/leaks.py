@@ -20,8 +20,8 @@ import numpy as np
 from benchmarks._scenes import RESULTS
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import PinholeCamera
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.pipeline.run import reconstruct
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.leak_probe import ProcessUsage, measure_usage
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene

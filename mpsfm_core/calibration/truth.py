@@ -10,12 +10,13 @@ import numpy as np
 from mpsfm_core.calibration.samples import DepthTruth, NormalTruth
 from mpsfm_core.data import Bool, Float64, Int64, View
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.data.options import ProviderConfig, parse_settings
+from mpsfm_core.data.options import parse_settings
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.geometry import pixel_centers, sample_nearest, scale_pixels
 from mpsfm_core.providers import validation
 from mpsfm_core.providers.builtin.map_files import find_file
 from mpsfm_core.providers.builtin.options import DepthFileOptions, FileOptions, NormalFileOptions
+from mpsfm_core.providers.provider_config import ProviderConfig
 
 EXACT = 1e-4
 """Relative std of depth files for which none is given: exact for every prior, and positive."""

@@ -19,17 +19,14 @@ from typing import Any
 
 from mpsfm_core.config.model import FORMAT, Config
 from mpsfm_core.data.errors import ConfigError, ProviderError, did_you_mean
-from mpsfm_core.data.options import (
-    SAME_NETWORK,
+from mpsfm_core.data.options import SettingPath, SettingProblem, SettingsError, parse_settings
+from mpsfm_core.providers import Kind
+from mpsfm_core.providers.provider_config import (
     FROM_MATCHER,
     FROM_MULTIVIEW,
+    SAME_NETWORK,
     ProviderConfig,
-    SettingPath,
-    SettingProblem,
-    SettingsError,
-    parse_settings,
 )
-from mpsfm_core.providers import Kind
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.calibration_file import CALIBRATIONS, read_values
 from mpsfm_core.support.format_versions import VERSION, check_version
@@ -203,7 +200,7 @@ def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complet
             known = backend.model_copy(
                 update={"calibration": _calibration(path, kind, backend, layers)}
             )
-            if known.is_open:
+            if known.is_unresolved:
                 _check_open(path, kind, known, registry, complete)
             else:
                 known = check_provider_config(path, kind, known, registry, complete)
@@ -328,7 +325,7 @@ def combination_problems(config: Config, registry: Registry) -> list[SettingProb
     settled = {
         path[0]: registry.spec(kind, backend.use)
         for path, kind, backend in config.provider_configs()
-        if not backend.is_open
+        if not backend.is_unresolved
     }
     for name, capability in (("matcher", "sparse"), ("dense_matcher", "dense")):
         if name in settled and capability not in settled[name].capabilities:

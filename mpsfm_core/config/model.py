@@ -8,11 +8,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from mpsfm_core.data.options import (
-    Options,
-    ProviderConfig,
-    SettingPath,
-)
+from mpsfm_core.data.options import Options, SettingPath
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.extraction.options import (
     AdjustmentOptions,
@@ -23,6 +19,7 @@ from mpsfm_core.extraction.options import (
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.options import MapperOptions, MappingOptions
 from mpsfm_core.providers import Kind
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.support.format_versions import VERSION
 from mpsfm_core.support.yaml_text import write_yaml

@@ -1,7 +1,6 @@
-"""The base of everything a user can set, and how a wrong setting is told.
+"""Base class of all options, and error messages for wrong settings.
 
-:class:`Options` is the base of a provider's options and of the options of each room;
-:class:`ProviderConfig` is the choice of one provider in a configuration.
+:class:`Options` is the base of a provider's options and of the options of each package.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from mpsfm_core.data.errors import ConfigError, did_you_mean
@@ -32,53 +31,6 @@ def expert(default: Any, **constraints: Any) -> Any:
         constraints: Keyword arguments of :func:`pydantic.Field`, such as ``ge`` and ``gt``.
     """
     return Field(default, json_schema_extra={"expert": True}, **constraints)
-
-
-SAME_NETWORK = "same-network"
-"""As the normals provider: the depth network's own normals, of the same pass."""
-
-
-FROM_MATCHER = "matcher"
-"""As the depth provider: the depth that the matcher predicts."""
-
-FROM_MULTIVIEW = "multiview"
-"""As the depth provider: the depth of the multi-view network, which sees several photos at once."""
-
-
-class ProviderConfig(Options):
-    """The choice of one provider, or of several in the order of preference."""
-
-    use: str
-    """Name of the provider (see ``mpsfm plugins list``)."""
-    fallback: tuple[str, ...] = ()
-    """Providers to take instead, in this order, where ``use`` cannot be had: its plugin or weights
-    are missing, or it does not know the given options."""
-    environment: str | None = None
-    """The environment that ``use`` lives in (``mpsfm env create``); ``use: NAME@ENVIRONMENT``,
-    as it is written from then on, says the same."""
-    options: dict[str, Any] = Field(default_factory=dict)
-    """The provider's own options."""
-    wrap: tuple[ProviderConfig, ...] = ()
-    """Wrappers around the provider, the innermost first."""
-    calibration: dict[str, Any] | str | None = None
-    """Uncertainty of a depth or normals provider: the values, a YAML or JSON file with them, or
-    null for what the plugin declares."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _with_environment(cls, values: Any) -> Any:
-        if isinstance(values, Mapping) and values.get("environment") and "use" in values:
-            if values["use"] == SAME_NETWORK or "@" in str(values["use"]):
-                raise ValueError(f"environment: {values['use']!r} says where it is")
-            values = {**values, "use": f"{values['use']}@{values['environment']}"}
-            del values["environment"]
-        return values
-
-    @property
-    def is_open(self) -> bool:
-        """Whether it is yet to be found out which provider it is
-        (:mod:`mpsfm_core.pipeline.provider_resolution`)."""
-        return bool(self.fallback) or self.use == SAME_NETWORK
 
 
 SettingPath = tuple[str | int, ...]

@@ -166,7 +166,7 @@ class _ProviderSearch:
                     raise
                 passed_over[name] = _reason_of(error)
                 continue
-            reason = ChoiceReason.FIRST_CHOICE if backend.is_open else ChoiceReason.CONFIGURED
+            reason = ChoiceReason.FIRST_CHOICE if backend.is_unresolved else ChoiceReason.CONFIGURED
             if passed_over:
                 reason = ChoiceReason.FALLBACK
             spec = self._registry.spec(kind, found.use)

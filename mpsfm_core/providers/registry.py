@@ -18,7 +18,7 @@ from typing import Any, Literal
 import pluggy
 
 from mpsfm_core.data.errors import InputError, MpsfmError, ProviderError, did_you_mean
-from mpsfm_core.data.options import Options, ProviderConfig, SettingPath, parse_settings
+from mpsfm_core.data.options import Options, SettingPath, parse_settings
 from mpsfm_core.providers import (
     CAPABILITY_METHODS,
     KINDS,
@@ -40,6 +40,7 @@ from mpsfm_core.providers.discovery import (
 from mpsfm_core.providers.environments.environment import all_environments
 from mpsfm_core.providers.environments.remote_provider import EnvironmentHooks, remote_providers
 from mpsfm_core.providers.first_party import requirement_for
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 _log = logging.getLogger(__name__)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import DepthPrior, Features, GroupPrior, View
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.providers import Capability, Kind, ProviderContext, ProviderSpec, validation
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.testing.examples import Appearance, Example, indoor_example, outdoor_example

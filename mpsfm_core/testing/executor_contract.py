@@ -17,11 +17,11 @@ import cv2
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.errors import ConfigError, DataError, ProviderRunError
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.extraction.events import NullExtractionEvents
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.providers import Executor
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.contract_case import describe_difference
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene

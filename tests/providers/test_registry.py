@@ -23,7 +23,8 @@ from mpsfm_core import (
     hookimpl,
 )
 from mpsfm_core.data.errors import InputError, ProviderError, WeightsError
-from mpsfm_core.data.options import ProviderConfig, SettingsError
+from mpsfm_core.data.options import SettingsError
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import CORE, ProviderStatus, Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 

@@ -16,9 +16,9 @@ from threadpoolctl import threadpool_info
 from mpsfm_core import ProviderSpec
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import DepthPrior, PinholeCamera, View
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.providers import ProviderContext
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.support.threads import allowed, cores, each, limited
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.providers import API_VERSION, ProviderContext
 from mpsfm_core.providers.environments.channel import Channel, ChannelClosed
 from mpsfm_core.providers.environments.worker_process import PROTOCOL, decode_error, encode_error
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import CORE, Registry, core_version
 from mpsfm_core.support.threads import limited
 

@@ -10,8 +10,8 @@ from mpsfm_flip_consistency.wrapper import FlipConsistency
 
 from mpsfm_core import DepthPrior, NormalPrior, PinholeCamera, View
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.geometry import pixel_centers, rays
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 
 CAMERA = PinholeCamera(40, 30, 50.0, 52.0, 17.3, 15.8)

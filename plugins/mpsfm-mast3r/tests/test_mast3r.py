@@ -10,7 +10,7 @@ from mpsfm_mast3r.options import DenseOptions, SparseOptions
 
 from mpsfm_core import Features, PinholeCamera, View
 from mpsfm_core.data.errors import ConfigError, ProviderError
-from mpsfm_core.data.options import ProviderConfig
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 

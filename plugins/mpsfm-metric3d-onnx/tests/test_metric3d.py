@@ -10,7 +10,7 @@ from mpsfm_onnx.decode import expected_angle
 
 from mpsfm_core import PinholeCamera, View
 from mpsfm_core.data.errors import ConfigError, WeightsError
-from mpsfm_core.data.options import ProviderConfig
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 
 # Depth is the red channel as it is fed, confidence a 200th of the blue one.

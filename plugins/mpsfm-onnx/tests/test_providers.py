@@ -14,8 +14,8 @@ from mpsfm_onnx.options import OnnxOptions
 from mpsfm_onnx.providers import OnnxDepth, OnnxJoint, OnnxNormals
 
 from mpsfm_core.data.errors import ConfigError, WeightsError
-from mpsfm_core.data.options import ProviderConfig
 from mpsfm_core.geometry import pixel_centers, rays, resize_map, unproject
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 

@@ -10,7 +10,7 @@ import pytest
 
 from mpsfm_core.config import load_config
 from mpsfm_core.data.errors import InputError, ProviderError, ProviderRunError, WeightsError
-from mpsfm_core.data.options import ProviderConfig, SettingsError
+from mpsfm_core.data.options import SettingsError
 from mpsfm_core.providers.environments import environment as environment_module
 from mpsfm_core.providers.environments import remote_provider, worker_process
 from mpsfm_core.providers.environments.environment import (
@@ -21,6 +21,7 @@ from mpsfm_core.providers.environments.environment import (
     find_environment,
 )
 from mpsfm_core.providers.environments.worker_process import WorkerLost
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.validation import run_depth
 from mpsfm_core.testing.contract import run_checks
 
