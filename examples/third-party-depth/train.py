@@ -1,4 +1,4 @@
-"""python train.py SCENE WEIGHTS.npz: fit the regression to a scene with exact depth."""
+"""Fit the regression to a scene with exact depth: python train.py SCENE WEIGHTS.npz."""
 
 import sys
 from pathlib import Path
@@ -9,7 +9,7 @@ from ridge_depth.model import COLUMNS, ROWS, Regression, features
 
 
 def read(scene, name):
-    """Features (n, 13) and depth (n,) in metres of the pixels of a view that have depth."""
+    """Read features (n, 13) and depth (n,) in meters of all pixels with known depth."""
     image = cv2.imread(str(scene / "images" / f"{name}.jpg"))[..., ::-1]
     depth = cv2.imread(str(scene / "gt_depth" / f"{name}.png"), cv2.IMREAD_UNCHANGED) / 1000.0
     known = cv2.resize(1.0 * (depth > 0), (COLUMNS, ROWS), interpolation=cv2.INTER_AREA) == 1

@@ -5,7 +5,7 @@ from mpsfm_core.testing.painted_views import decoder
 
 
 def contract(folder):
-    """Weights with which it reads the depth that is painted in the contract's views."""
+    """Write weights that decode the depth that is painted into the contract views."""
     colours, bias = decoder()
     np.savez(
         folder / "tiny.npz",

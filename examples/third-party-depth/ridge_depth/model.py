@@ -18,12 +18,12 @@ class RidgeDepth:
             self._regression = Regression(**stored)
 
     def predict(self, view):
-        depth = self._regression(features(view.image))  # metres along z, on a grid of 80 x 60
+        depth = self._regression(features(view.image))  # meters along z, 80 x 60 pixels
         return DepthPrior.from_arrays(depth)
 
 
 class Regression:
-    """Linear in the features and in random cosines of them."""
+    """Ridge regression, linear in the features and in random cosines of them."""
 
     def __init__(self, mean, scale, directions, phases, weights=None):
         self._scaling, self._cosines, self._weights = (mean, scale), (directions, phases), weights
@@ -38,7 +38,7 @@ class Regression:
 
 
 def features(rgb):
-    """Colour, place, and colour and contrast of two neighbourhoods, (60, 80, 13)."""
+    """Compute color, position, and color and contrast of two neighborhoods, (60, 80, 13)."""
     small = cv2.resize(rgb, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA) / np.float32(255)
     place = np.meshgrid(np.linspace(-1, 1, COLUMNS), np.linspace(-1, 1, ROWS))
     planes = [small, *(axis[..., None] for axis in place)]

@@ -15,6 +15,6 @@ def mpsfm_providers():
             code_license="Apache-2.0",
             weights_license="Apache-2.0",
             weights=(WeightsFile("package:ridge_depth/room.npz", license="Apache-2.0"),),
-            calibration=DepthCalibration(relative_std=0.11),  # what train.py measures
+            calibration=DepthCalibration(relative_std=0.11),  # measured by train.py
         )
     ]
