@@ -23,7 +23,7 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.optimize.bundle_adjustment import adjust_bundle
-from mpsfm_core.optimize.covariance import DAMPING, point_covariances
+from mpsfm_core.optimize.covariance import DAMPING, compute_point_covariances
 from mpsfm_core.optimize.options import SOFT_L1_OPTIONS
 from tests.optimize.bundle_reference import (
     ceres_adjuster,
@@ -129,13 +129,15 @@ def bench_covariance(repeats: int) -> dict[str, float]:
     information = dense_point_information(small) + DAMPING * np.eye(3 * len(small.points))
     inverse = np.linalg.inv(information).reshape(len(small.points), 3, -1, 3)
     expected = inverse[np.arange(len(small.points)), :, np.arange(len(small.points))]
-    error = np.linalg.norm(point_covariances(small, SOFT_L1_OPTIONS) - expected, axis=(1, 2))
+    error = np.linalg.norm(
+        compute_point_covariances(small, SOFT_L1_OPTIONS) - expected, axis=(1, 2)
+    )
     large = replace(make_problem(*SIZES["S"]), obs_log_depth=None)
     rec = to_pycolmap(large)
     options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.POINTS)
     median, results = side_by_side(
         {
-            "ours": lambda: point_covariances(large, SOFT_L1_OPTIONS),
+            "ours": lambda: compute_point_covariances(large, SOFT_L1_OPTIONS),
             "pycolmap": lambda: pycolmap.estimate_ba_covariance(options, rec, ceres_adjuster(rec)),
         },
         repeats,

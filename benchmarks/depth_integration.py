@@ -33,7 +33,7 @@ from mpsfm_core.optimize.depth_integration import (
     Anchors,
     DepthIntegrator,
 )
-from mpsfm_core.optimize.integration_energy import majorise
+from mpsfm_core.optimize.integration_energy import majorize
 from mpsfm_core.optimize.multigrid import Multigrid
 from mpsfm_core.optimize.options import IntegrationOptions
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
@@ -295,7 +295,7 @@ def bench_variance(repeats: int) -> dict[str, float]:
 def single_solve(integrator: DepthIntegrator, problem: Problem) -> float:
     """Seconds to one column of the inverse, to 1 % of its diagonal, by multigrid."""
     refined = integrator.refine(problem.anchors)
-    here = majorise(refined.log_depth, integrator._terms(problem.anchors, 1.0))
+    here = majorize(refined.log_depth, integrator._terms(problem.anchors, 1.0))
     solver = Multigrid(*here.mass.shape)
     solver.update(here.east, here.south, here.mass)
     unit = np.zeros(here.mass.shape)

@@ -24,7 +24,7 @@ from mpsfm_core.geometry.statistics import MAD_TO_STD
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.mapping.scene.kernels import max_triangulation_angles
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
-from mpsfm_core.optimize.covariance import depth_variance_of_points, point_covariances
+from mpsfm_core.optimize.covariance import compute_point_covariances, propagate_depth_variance
 from mpsfm_core.optimize.options import SOFT_L1_OPTIONS
 
 MIN_ANGLE_DEG = 2.0
@@ -47,8 +47,9 @@ def model_truth(model: pycolmap.Reconstruction, images: ImageSet) -> dict[str, D
         return {}
     problem = _triangulate(seen)
     depth = _in_camera(problem)[:, 2]
-    variance = depth_variance_of_points(
-        point_covariances(problem, SOFT_L1_OPTIONS)[seen.point], problem.rotations[seen.image]
+    variance = propagate_depth_variance(
+        compute_point_covariances(problem, SOFT_L1_OPTIONS)[seen.point],
+        problem.rotations[seen.image],
     )
     std = np.sqrt(variance) / np.maximum(depth, 1e-9)
     good = _well_placed(problem)[seen.point] & (depth > 0) & (std < MAX_LOG_STD)

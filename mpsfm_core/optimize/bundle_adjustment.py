@@ -24,10 +24,10 @@ from mpsfm_core.data import Float64
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.bundle_problem import (
     BundleProblem,
-    Prepared,
-    Run,
-    prepare,
-    workers,
+    PreparedBundle,
+    RangeExecutor,
+    prepare_bundle,
+    range_executor,
 )
 from mpsfm_core.optimize.options import BundleOptions
 
@@ -80,9 +80,9 @@ def adjust_bundle(problem: BundleProblem, options: BundleOptions | None = None) 
             or a standard deviation that is not positive.
     """
     options = options or BundleOptions()
-    prepared = prepare(problem, options)
+    prepared = prepare_bundle(problem, options)
     with (
-        workers(prepared.ranges, options.threads) as run,
+        range_executor(prepared.ranges, options.threads) as run,
         _blas().limit(limits=1, user_api="blas"),
     ):
         return _minimize(prepared, options, run)
@@ -94,10 +94,10 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def _minimize(p: Prepared, options: BundleOptions, run: Run) -> BundleResult:
+def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> BundleResult:
     """Levenberg-Marquardt with Nielsen's damping, as Ceres has it."""
-    state, trial = p.state, kernels.State(*(np.empty_like(array) for array in p.state))
-    normal = _NormalEquations(p, options, run)
+    state, trial = p.state, kernels.BundleParameters(*(np.empty_like(array) for array in p.state))
+    normal = SchurComplementSolver(p, options, run)
     damping, growth = INITIAL_DAMPING, 2.0
     initial_cost = np.inf
     converged, message = False, "iteration limit reached"
@@ -125,18 +125,20 @@ def _minimize(p: Prepared, options: BundleOptions, run: Run) -> BundleResult:
     return BundleResult(*state, initial_cost, cost, iteration, converged, message)
 
 
-class _NormalEquations:
+class SchurComplementSolver:
     """The linear system of one adjustment; its buffers are kept from step to step."""
 
-    def __init__(self, p: Prepared, options: BundleOptions, run: Run) -> None:
+    def __init__(self, p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> None:
         layout = p.bundle.layout
         poses, focals = len(layout.pair), int(layout.focal_slot.max(initial=-1)) + 1
-        size = kernels.VIEW * poses + focals
-        view = int(kernels.VIEW)
+        size = kernels.NUM_IMAGE_PARAMS * poses + focals
+        view = int(kernels.NUM_IMAGE_PARAMS)
         block, border = (len(p.pairs), view, view), (focals, view * poses)
         shapes = block, border, (focals, focals), size, size, size
-        self.parts = [kernels.System(*(np.empty(shape) for shape in shapes)) for _ in p.ranges]
-        self.scratch = [kernels.make_scratch(p.longest) for _ in p.ranges]
+        self.parts = [
+            kernels.ReducedCameraSystem(*(np.empty(shape) for shape in shapes)) for _ in p.ranges
+        ]
+        self.scratch = [kernels.allocate_buffers(p.longest) for _ in p.ranges]
         self.total = self.parts[0]
         self.eliminated = np.empty((len(p.state.points), 10))
         self.p = p
@@ -144,13 +146,13 @@ class _NormalEquations:
         self.dense = poses <= options.dense_poses
         self.tolerance = options.function_tolerance
 
-    def linearize(self, state: kernels.State, damping: float) -> float:
+    def linearize(self, state: kernels.BundleParameters, damping: float) -> float:
         """Fill the system at ``state``, eliminate its points, and return its cost."""
 
         def reduce(n: int, first: int, last: int) -> float:
             for array in self.parts[n]:
                 array.fill(0.0)
-            cost: float = kernels.reduce_points(
+            cost: float = kernels.eliminate_points(
                 first,
                 last,
                 damping,
@@ -172,12 +174,12 @@ class _NormalEquations:
         self._hold()
         return cost + self.p.scale_prior.cost(state)
 
-    def _expect_scales(self, state: kernels.State) -> None:
+    def _expect_scales(self, state: kernels.BundleParameters) -> None:
         """Add what is expected of the scales of depth maps."""
         prior, layout = self.p.scale_prior, self.p.bundle.layout
-        rows = kernels.VIEW * prior.slot + kernels.SCALE
+        rows = kernels.NUM_IMAGE_PARAMS * prior.slot + kernels.LOG_SCALE_IDX
         own = layout.pair[prior.slot, prior.slot]
-        self.total.blocks[own, kernels.SCALE, kernels.SCALE] += prior.weight
+        self.total.blocks[own, kernels.LOG_SCALE_IDX, kernels.LOG_SCALE_IDX] += prior.weight
         self.total.diagonal[rows] += prior.weight
         off = state.log_scales[prior.image] - prior.log_scale
         self.total.gradient[rows] += prior.weight * off
@@ -195,7 +197,11 @@ class _NormalEquations:
             vector[entries] = 0.0
 
     def step(
-        self, state: kernels.State, trial: kernels.State, damping: float, cost: float
+        self,
+        state: kernels.BundleParameters,
+        trial: kernels.BundleParameters,
+        damping: float,
+        cost: float,
     ) -> tuple[float, float, float]:
         """Write the next state to ``trial``.
 
@@ -211,10 +217,10 @@ class _NormalEquations:
         np.clip(focals, -MAX_FOCAL_STEP, MAX_FOCAL_STEP, out=focals)
         for old, new in zip(state[:-1], trial[:-1], strict=True):
             np.copyto(new, old)
-        kernels.move_cameras(delta, self.p.bundle.layout, state, trial)
+        kernels.update_cameras(delta, self.p.bundle.layout, state, trial)
 
         def move(n: int, first: int, last: int) -> tuple[float, float, float]:
-            costs: tuple[float, float, float] = kernels.step_points(
+            costs: tuple[float, float, float] = kernels.update_points(
                 first,
                 last,
                 damping,
@@ -237,7 +243,7 @@ class _NormalEquations:
         if not len(boost):
             return boost
         matrix = np.zeros((len(boost), len(boost)))
-        kernels.assemble(self.total, boost, self.p.bundle.layout.pair, matrix)
+        kernels.assemble_reduced_matrix(self.total, boost, self.p.bundle.layout.pair, matrix)
         # the transpose is in Fortran's order, so that nothing is copied
         _, solution, info = lapack.dposv(matrix.T, -self.total.rhs, lower=0, overwrite_a=1)
         return solution if info == 0 else np.full_like(boost, np.nan)
@@ -255,7 +261,7 @@ class _NormalEquations:
 
         def multiply(x: Float64) -> Float64:
             out = np.empty_like(x)
-            kernels.multiply(total, boost, self.p.pairs, x, out)
+            kernels.multiply_reduced_matrix(total, boost, self.p.pairs, x, out)
             return out
 
         def precondition(x: Float64) -> Float64:

@@ -5,7 +5,7 @@ run in threads (the GIL is released) and the result does not depend on how many 
 own no memory: numba's reference counting made them 1.7 times slower (our measurement), so it is
 off (``_nrt=False``) and the caller passes what they work in. Inlining halved the time before that.
 
-Observations are sorted by point, then by image. Poses and focal lengths that may move have a
+BundleObservations are sorted by point, then by image. Poses and focal lengths that may move have a
 slot each; camera-side vectors hold 7 numbers for each pose slot (rotation, translation, logarithm
 of the scale of the image's depth map), then one for each focal slot. A pose moves as
 ``R <- exp(w) R, t <- t + dt``, the scale as ``s <- s + ds``, a focal length as ``f <- f exp(a)``.
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, Float64, Int64
-from mpsfm_core.optimize.losses import evaluate
+from mpsfm_core.optimize.losses import evaluate_loss
 from mpsfm_core.support import jit
 
 Int32 = NDArray[np.int32]
@@ -31,24 +31,24 @@ MAX_SLOPE = 1e6
 MIN_DEPTH_RATIO = 0.1
 """A point's step is shortened until no depth falls below this part of itself (our choice): the
 linearised log depth would otherwise throw a point that is e times too far behind its camera."""
-SHORTER = 0.25
-MIN_LENGTH = 0.01
+STEP_REDUCTION = 0.25
+MIN_STEP_LENGTH = 0.01
 """A step that is still not safe at this part of its length is not taken at all."""
-MAX_OWN_STEPS = 10
-"""After a joint step, each point may take this many of its own, with the cameras fixed. Robust
+MAX_POINT_STEPS = 10
+"""After a joint step, each point may take this many of its own, with the cameras fixed. RobustLosses
 losses make points with outliers converge slowly; this takes a third of the iterations and half of
 the time, to a lower cost at the same tolerance (our measurement)."""
-OWN_STEP_DAMPING = 1e-6
-VIEW, FOCAL = np.int64(7), np.int64(1)
+POINT_STEP_DAMPING = 1e-6
+NUM_IMAGE_PARAMS, NUM_FOCAL_PARAMS = np.int64(7), np.int64(1)
 """Numbers of a view (its pose, then the scale of its depth map) and of a focal length."""
-SCALE = 6
+LOG_SCALE_IDX = 6
 """Which of them the scale is."""
 _ONLY = np.int64(0)
 """Row of a block that has one row."""
 
 
-class Observations(NamedTuple):
-    """Observations sorted by point, then image; those of point p are ``start[p]:start[p + 1]``.
+class BundleObservations(NamedTuple):
+    """BundleObservations sorted by point, then image; those of point p are ``start[p]:start[p + 1]``.
 
     ``weight`` is 1 / std of the pixel, ``depth_weight`` 1 / std of the log depth (0: no depth).
     """
@@ -61,9 +61,9 @@ class Observations(NamedTuple):
     depth_weight: Float64
 
 
-class Layout(NamedTuple):
+class ParameterLayout(NamedTuple):
     """Which parameters move (slot -1: constant), and where pairs of poses are stored:
-    ``pair[i, j]``, ``i <= j``, is the row of pose slots i, j in :attr:`System.blocks`, or -1. Of an
+    ``pair[i, j]``, ``i <= j``, is the row of pose slots i, j in :attr:`ReducedCameraSystem.blocks`, or -1. Of an
     image with a pose slot the scale may move (``variable_scale``), or the pose, or both."""
 
     camera_of_image: Int32
@@ -74,7 +74,7 @@ class Layout(NamedTuple):
     pair: Int32
 
 
-class Robust(NamedTuple):
+class RobustLosses(NamedTuple):
     """Loss codes and scales, both for whitened residuals."""
 
     reprojection_loss: int
@@ -83,15 +83,15 @@ class Robust(NamedTuple):
     depth_scale: float
 
 
-class Bundle(NamedTuple):
+class BundleData(NamedTuple):
     """What does not change during an adjustment."""
 
-    obs: Observations
-    layout: Layout
-    robust: Robust
+    obs: BundleObservations
+    layout: ParameterLayout
+    robust: RobustLosses
 
 
-class State(NamedTuple):
+class BundleParameters(NamedTuple):
     """What is estimated: cam_from_world (n, 3, 3), (n, 3); logarithms of the scales by which depth
     maps are multiplied (n,); intrinsics (k, 4); points (p, 3)."""
 
@@ -102,7 +102,7 @@ class State(NamedTuple):
     points: Float64
 
 
-class System(NamedTuple):
+class ReducedCameraSystem(NamedTuple):
     """The camera-side normal equations of a range of points, or summed over all.
 
     ``blocks`` (pairs, 7, 7), ``border`` (focals, 7 poses) and ``corner`` (focals, focals) hold
@@ -119,7 +119,7 @@ class System(NamedTuple):
     rhs: Float64
 
 
-class Scratch(NamedTuple):
+class EliminationBuffers(NamedTuple):
     """Working memory of one range for tracks of up to ``longest`` observations.
 
     ``y``, ``yf``: (longest, 3, 7) and (longest, 3, 1), coupling of the point with pose slots
@@ -137,7 +137,7 @@ class Scratch(NamedTuple):
     vector: Float64
 
 
-class Sight(NamedTuple):
+class LinearizedObservation(NamedTuple):
     """One observation in one state, in the camera frame.
 
     ``q`` is the rotated point, ``x, y, z`` the camera point; ``g`` is the gradient of the cost
@@ -167,15 +167,15 @@ class Sight(NamedTuple):
     hzs: float
 
 
-def make_scratch(longest: int) -> Scratch:
+def allocate_buffers(longest: int) -> EliminationBuffers:
     """Working memory for tracks of up to ``longest`` observations."""
     longest = max(longest, 1)
-    return Scratch(
+    return EliminationBuffers(
         slots=np.empty(longest, np.int64),
         focals=np.empty(longest, np.int64),
-        y=np.empty((longest, 3, VIEW)),
+        y=np.empty((longest, 3, NUM_IMAGE_PARAMS)),
         yf=np.empty((longest, 3, 1)),
-        columns=np.empty((3, VIEW)),
+        columns=np.empty((3, NUM_IMAGE_PARAMS)),
         before=np.empty((longest, 2)),
         block=np.empty((1, 10)),
         vector=np.empty(3),
@@ -187,7 +187,7 @@ _kernel, _helper = jit.kernel(**_OPTIONS), jit.helper(**_OPTIONS)
 
 
 @_kernel
-def sort_by(keys: Int32, previous: Int64, start: Int64, order: Int64) -> None:
+def counting_sort(keys: Int32, previous: Int64, start: Int64, order: Int64) -> None:
     """Stable counting sort of the rows ``previous`` by ``keys[row]``.
 
     ``start`` (keys + 2,) comes zeroed and leaves with the first position of each key in
@@ -203,7 +203,9 @@ def sort_by(keys: Int32, previous: Int64, start: Int64, order: Int64) -> None:
 
 
 @_kernel
-def number_pairs(obs: Observations, pose_slot: Int32, variable: Bool, pair: Int32) -> int:
+def number_covisible_poses(
+    obs: BundleObservations, pose_slot: Int32, variable: Bool, pair: Int32
+) -> int:
     """Number the pairs of pose slots that share a variable point; returns their count.
 
     ``pair`` (s, s) comes filled with -1 and is left so below the diagonal.
@@ -227,7 +229,9 @@ def number_pairs(obs: Observations, pose_slot: Int32, variable: Bool, pair: Int3
 
 
 @_helper
-def observe(k: int, p: int, bundle: Bundle, state: State) -> Sight:
+def linearize_observation(
+    k: int, p: int, bundle: BundleData, state: BundleParameters
+) -> LinearizedObservation:
     """See observation ``k`` of point ``p``; cost and derivatives are 0 where it is not visible."""
     obs, robust = bundle.obs, bundle.robust
     image = obs.image[k]
@@ -241,7 +245,7 @@ def observe(k: int, p: int, bundle: Bundle, state: State) -> Sight:
     z = qz + state.translations[image, 2]
     if not (z > MIN_DEPTH and z * MAX_SLOPE > abs(x) + abs(y)):
         n = 0.0
-        return Sight(False, n, qx, qy, qz, x, y, z, n, n, n, n, n, n, n, n, n, n, n)
+        return LinearizedObservation(False, n, qx, qy, qz, x, y, z, n, n, n, n, n, n, n, n, n, n, n)
     inverse = 1.0 / z
     u, v = x * inverse, y * inverse
     camera = bundle.layout.camera_of_image[image]
@@ -249,7 +253,9 @@ def observe(k: int, p: int, bundle: Bundle, state: State) -> Sight:
     fy = state.intrinsics[camera, 1] * obs.weight[k]
     ru = fx * u + (state.intrinsics[camera, 2] - obs.xy[k, 0]) * obs.weight[k]
     rv = fy * v + (state.intrinsics[camera, 3] - obs.xy[k, 1]) * obs.weight[k]
-    rho, weight = evaluate(robust.reprojection_loss, ru * ru + rv * rv, robust.reprojection_scale)
+    rho, weight = evaluate_loss(
+        robust.reprojection_loss, ru * ru + rv * rv, robust.reprojection_scale
+    )
     fx *= inverse
     fy *= inverse
     gx, gy = weight * fx * ru, weight * fy * rv
@@ -261,7 +267,7 @@ def observe(k: int, p: int, bundle: Bundle, state: State) -> Sight:
     if obs.depth_weight[k] > 0.0:
         slope_s = obs.depth_weight[k]
         rd = (np.log(z) - obs.log_depth[k] - state.log_scales[image]) * slope_s
-        depth_rho, weight = evaluate(robust.depth_loss, rd * rd, robust.depth_scale)
+        depth_rho, weight = evaluate_loss(robust.depth_loss, rd * rd, robust.depth_scale)
         slope = slope_s * inverse
         rho += depth_rho
         gz += weight * slope * rd
@@ -270,13 +276,13 @@ def observe(k: int, p: int, bundle: Bundle, state: State) -> Sight:
             gs = -weight * slope_s * rd
             hss = weight * slope_s * slope_s
             hzs = -weight * slope * slope_s
-    return Sight(
+    return LinearizedObservation(
         True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, hxz, hyz, hzz, gs, hss, hzs
     )
 
 
 @_helper
-def _fill_pose_columns(s: Sight, columns: Float64) -> None:
+def _fill_pose_columns(s: LinearizedObservation, columns: Float64) -> None:
     """columns (3, 7) <- h [dx/dw | dx/dt | scale]."""
     columns[0, 0] = s.hxz * s.qy
     columns[0, 1] = s.hxx * s.qz - s.hxz * s.qx
@@ -298,10 +304,12 @@ def _fill_pose_columns(s: Sight, columns: Float64) -> None:
 
 
 @_helper
-def _add_pose(s: Sight, columns: Float64, slot: int, row: int, system: System) -> None:
+def _add_pose(
+    s: LinearizedObservation, columns: Float64, slot: int, row: int, system: ReducedCameraSystem
+) -> None:
     """Add the pose's gradient, diagonal and the upper triangle of its own block."""
     blocks, gradient, diagonal = system.blocks, system.gradient, system.diagonal
-    n = VIEW * slot
+    n = NUM_IMAGE_PARAMS * slot
     gradient[n] += s.qy * s.gz - s.qz * s.gy
     gradient[n + 1] += s.qz * s.gx - s.qx * s.gz
     gradient[n + 2] += s.qx * s.gy - s.qy * s.gx
@@ -316,7 +324,7 @@ def _add_pose(s: Sight, columns: Float64, slot: int, row: int, system: System) -
     diagonal[n + 4] += s.hyy
     diagonal[n + 5] += s.hzz
     diagonal[n + 6] += s.hss
-    for b in range(VIEW):
+    for b in range(NUM_IMAGE_PARAMS):
         c0, c1, c2 = columns[0, b], columns[1, b], columns[2, b]
         blocks[row, 0, b] += s.qy * c2 - s.qz * c1
         if b >= 1:
@@ -334,20 +342,29 @@ def _add_pose(s: Sight, columns: Float64, slot: int, row: int, system: System) -
 
 @_helper
 def _add_focal(
-    s: Sight, columns: Float64, focal: int, slot: int, poses: int, system: System
+    s: LinearizedObservation,
+    columns: Float64,
+    focal: int,
+    slot: int,
+    poses: int,
+    system: ReducedCameraSystem,
 ) -> None:
     """Add the focal length's gradient, diagonal, own entry and coupling with the pose."""
     own = s.x * s.x * s.hxx + s.y * s.y * s.hyy
-    system.gradient[VIEW * poses + focal] += s.x * s.gx + s.y * s.gy
-    system.diagonal[VIEW * poses + focal] += own
+    system.gradient[NUM_IMAGE_PARAMS * poses + focal] += s.x * s.gx + s.y * s.gy
+    system.diagonal[NUM_IMAGE_PARAMS * poses + focal] += own
     system.corner[focal, focal] += own
     if slot >= 0:
-        for a in range(VIEW):
-            system.border[focal, VIEW * slot + a] += s.x * columns[0, a] + s.y * columns[1, a]
+        for a in range(NUM_IMAGE_PARAMS):
+            system.border[focal, NUM_IMAGE_PARAMS * slot + a] += (
+                s.x * columns[0, a] + s.y * columns[1, a]
+            )
 
 
 @_helper
-def _add_point(s: Sight, rotation: Float64, image: int, block: Float64, p: int) -> None:
+def _add_point(
+    s: LinearizedObservation, rotation: Float64, image: int, block: Float64, p: int
+) -> None:
     """block[p] (10,) += packed lower triangle of R^T h R at 0..5 and R^T g at 6..8."""
     r = rotation
     for a in range(3):
@@ -434,22 +451,28 @@ def _point_step(block: Float64, p: int, g0: float, g1: float, g2: float, step: F
 
 @_helper
 def _eliminate_from_poses(
-    count: int, z0: float, z1: float, z2: float, pair: Int32, system: System, scratch: Scratch
+    count: int,
+    z0: float,
+    z1: float,
+    z2: float,
+    pair: Int32,
+    system: ReducedCameraSystem,
+    scratch: EliminationBuffers,
 ) -> None:
     """Schur complement of a point on its poses: S_ij -= Y_i^T Y_j, rhs_i -= Y_i^T z."""
     blocks, rhs, slots, y = system.blocks, system.rhs, scratch.slots, scratch.y
     for a in range(count):
         own = pair[slots[a], slots[a]]
-        for i in range(VIEW):
+        for i in range(NUM_IMAGE_PARAMS):
             y0, y1, y2 = y[a, 0, i], y[a, 1, i], y[a, 2, i]
-            rhs[VIEW * slots[a] + i] -= y0 * z0 + y1 * z1 + y2 * z2
-            for j in range(i, VIEW):
+            rhs[NUM_IMAGE_PARAMS * slots[a] + i] -= y0 * z0 + y1 * z1 + y2 * z2
+            for j in range(i, NUM_IMAGE_PARAMS):
                 blocks[own, i, j] -= y0 * y[a, 0, j] + y1 * y[a, 1, j] + y2 * y[a, 2, j]
         for b in range(a + 1, count):
             row = pair[slots[a], slots[b]]
-            for i in range(VIEW):
+            for i in range(NUM_IMAGE_PARAMS):
                 y0, y1, y2 = y[a, 0, i], y[a, 1, i], y[a, 2, i]
-                for j in range(VIEW):
+                for j in range(NUM_IMAGE_PARAMS):
                     blocks[row, i, j] -= y0 * y[b, 0, j] + y1 * y[b, 1, j] + y2 * y[b, 2, j]
 
 
@@ -461,17 +484,17 @@ def _eliminate_from_focals(
     z1: float,
     z2: float,
     poses: int,
-    system: System,
-    scratch: Scratch,
+    system: ReducedCameraSystem,
+    scratch: EliminationBuffers,
 ) -> None:
     """Schur complement of a point on its focal lengths, against its poses and each other."""
     focals, yf, slots, y = scratch.focals, scratch.yf, scratch.slots, scratch.y
     for f in range(num_focals):
         y0, y1, y2 = yf[f, 0, 0], yf[f, 1, 0], yf[f, 2, 0]
-        system.rhs[VIEW * poses + focals[f]] -= y0 * z0 + y1 * z1 + y2 * z2
+        system.rhs[NUM_IMAGE_PARAMS * poses + focals[f]] -= y0 * z0 + y1 * z1 + y2 * z2
         for a in range(count):
-            for i in range(VIEW):
-                system.border[focals[f], VIEW * slots[a] + i] -= (
+            for i in range(NUM_IMAGE_PARAMS):
+                system.border[focals[f], NUM_IMAGE_PARAMS * slots[a] + i] -= (
                     y0 * y[a, 0, i] + y1 * y[a, 1, i] + y2 * y[a, 2, i]
                 )
         for g in range(num_focals):
@@ -490,15 +513,15 @@ def _find_or_add(values: Int64, count: int, value: int) -> int:
 
 
 @_kernel
-def reduce_points(
+def eliminate_points(
     first: int,
     last: int,
     damping: float,
-    bundle: Bundle,
-    state: State,
-    system: System,
+    bundle: BundleData,
+    state: BundleParameters,
+    system: ReducedCameraSystem,
     eliminated: Float64,
-    scratch: Scratch,
+    scratch: EliminationBuffers,
 ) -> float:
     """Linearise the points ``first:last``, eliminate them, and return their cost.
 
@@ -515,7 +538,7 @@ def reduce_points(
         for a in range(10):
             eliminated[p, a] = 0.0
         for k in range(obs.start[p], obs.start[p + 1]):
-            s = observe(k, p, bundle, state)
+            s = linearize_observation(k, p, bundle, state)
             if not s.visible:
                 continue
             cost += s.cost
@@ -536,14 +559,18 @@ def reduce_points(
                 if fresh:
                     slots[count] = slot
                     count += 1
-                _add_coupling(columns, VIEW, state.rotations, image, scratch.y, count - 1, fresh)
+                _add_coupling(
+                    columns, NUM_IMAGE_PARAMS, state.rotations, image, scratch.y, count - 1, fresh
+                )
             if focal >= 0:
                 n = _find_or_add(focals, num_focals, focal)
                 columns[0, 0] = s.x * s.hxx
                 columns[1, 0] = s.y * s.hyy
                 columns[2, 0] = s.x * s.hxz + s.y * s.hyz
                 fresh = n == num_focals
-                _add_coupling(columns, FOCAL, state.rotations, image, scratch.yf, n, fresh)
+                _add_coupling(
+                    columns, NUM_FOCAL_PARAMS, state.rotations, image, scratch.yf, n, fresh
+                )
                 num_focals = max(num_focals, n + 1)
         if not _invert_factor(eliminated, p, damping):
             for a in range(10):
@@ -554,9 +581,9 @@ def reduce_points(
         z1 = eliminated[p, 1] * g0 + eliminated[p, 2] * g1
         z2 = eliminated[p, 3] * g0 + eliminated[p, 4] * g1 + eliminated[p, 5] * g2
         for a in range(count):
-            _whiten(eliminated, p, scratch.y, a, VIEW)
+            _whiten(eliminated, p, scratch.y, a, NUM_IMAGE_PARAMS)
         for f in range(num_focals):
-            _whiten(eliminated, p, scratch.yf, f, FOCAL)
+            _whiten(eliminated, p, scratch.yf, f, NUM_FOCAL_PARAMS)
         _eliminate_from_poses(count, z0, z1, z2, layout.pair, system, scratch)
         _eliminate_from_focals(count, num_focals, z0, z1, z2, poses, system, scratch)
     return cost
@@ -567,10 +594,10 @@ def _joint_step(
     p: int,
     damping: float,
     delta: Float64,
-    bundle: Bundle,
-    state: State,
+    bundle: BundleData,
+    state: BundleParameters,
     eliminated: Float64,
-    scratch: Scratch,
+    scratch: EliminationBuffers,
 ) -> float:
     """Back-substitute: scratch.vector <- -V^-1 (g + W^T delta), the point's part of the step.
 
@@ -580,21 +607,21 @@ def _joint_step(
     obs, layout, rotation = bundle.obs, bundle.layout, state.rotations
     g0, g1, g2 = eliminated[p, 6], eliminated[p, 7], eliminated[p, 8]
     for k in range(obs.start[p], obs.start[p + 1]):
-        s = observe(k, p, bundle, state)
+        s = linearize_observation(k, p, bundle, state)
         scratch.before[k - obs.start[p], 0] = s.cost if s.visible else -1.0
         scratch.before[k - obs.start[p], 1] = s.z
         image = obs.image[k]
         dx = dy = dz = ds = 0.0
         if layout.pose_slot[image] >= 0:
-            n = VIEW * layout.pose_slot[image]
+            n = NUM_IMAGE_PARAMS * layout.pose_slot[image]
             dx = delta[n + 1] * s.qz - delta[n + 2] * s.qy + delta[n + 3]
             dy = delta[n + 2] * s.qx - delta[n] * s.qz + delta[n + 4]
             dz = delta[n] * s.qy - delta[n + 1] * s.qx + delta[n + 5]
-            ds = delta[n + SCALE]
+            ds = delta[n + LOG_SCALE_IDX]
         focal = layout.focal_slot[layout.camera_of_image[image]]
         if focal >= 0:
-            dx += s.x * delta[VIEW * len(layout.pair) + focal]
-            dy += s.y * delta[VIEW * len(layout.pair) + focal]
+            dx += s.x * delta[NUM_IMAGE_PARAMS * len(layout.pair) + focal]
+            dy += s.y * delta[NUM_IMAGE_PARAMS * len(layout.pair) + focal]
         ux = s.hxx * dx + s.hxz * dz
         uy = s.hyy * dy + s.hyz * dz
         uz = s.hxz * dx + s.hyz * dy + s.hzz * dz + s.hzs * ds
@@ -610,7 +637,9 @@ def _joint_step(
 
 
 @_helper
-def _look(p: int, bundle: Bundle, trial: State, scratch: Scratch) -> tuple[float, float, bool]:
+def _look(
+    p: int, bundle: BundleData, trial: BundleParameters, scratch: EliminationBuffers
+) -> tuple[float, float, bool]:
     """Cost of a point after a step, cost before it of what it lost from view, and whether its
     depths are safe. Fills ``scratch.block`` with the point's own normal equations."""
     obs, before, block = bundle.obs, scratch.before, scratch.block
@@ -619,7 +648,7 @@ def _look(p: int, bundle: Bundle, trial: State, scratch: Scratch) -> tuple[float
     for a in range(10):
         block[0, a] = 0.0
     for k in range(obs.start[p], obs.start[p + 1]):
-        s = observe(k, p, bundle, trial)
+        s = linearize_observation(k, p, bundle, trial)
         cost += s.cost
         _add_point(s, trial.rotations, obs.image[k], block, _ONLY)
         n = k - obs.start[p]
@@ -631,17 +660,17 @@ def _look(p: int, bundle: Bundle, trial: State, scratch: Scratch) -> tuple[float
 
 
 @_kernel
-def step_points(
+def update_points(
     first: int,
     last: int,
     damping: float,
     tolerance: float,
     delta: Float64,
-    bundle: Bundle,
-    state: State,
-    trial: State,
+    bundle: BundleData,
+    state: BundleParameters,
+    trial: BundleParameters,
     eliminated: Float64,
-    scratch: Scratch,
+    scratch: EliminationBuffers,
 ) -> tuple[float, float, float]:
     """Move the points ``first:last`` of ``trial``, whose cameras have moved by ``delta``; then
     each point by itself, while that promises to lower its cost by the part ``tolerance``.
@@ -659,13 +688,13 @@ def step_points(
         cost, lost, safe = _look(p, bundle, trial, scratch)
         length = 1.0
         while not safe and length > 0.0:
-            length = length * SHORTER if length > MIN_LENGTH else 0.0
+            length = length * STEP_REDUCTION if length > MIN_STEP_LENGTH else 0.0
             for a in range(3):
                 points[p, a] = state.points[p, a] + length * step[a]
             cost, lost, safe = _look(p, bundle, trial, scratch)
-        for _ in range(MAX_OWN_STEPS if bundle.layout.variable_point[p] else 0):
+        for _ in range(MAX_POINT_STEPS if bundle.layout.variable_point[p] else 0):
             block = scratch.block
-            if not _invert_factor(block, _ONLY, OWN_STEP_DAMPING):
+            if not _invert_factor(block, _ONLY, POINT_STEP_DAMPING):
                 break
             gain = _point_step(block, _ONLY, block[0, 6], block[0, 7], block[0, 8], step)
             if not gain > tolerance * cost:
@@ -684,7 +713,7 @@ def step_points(
 
 
 @_kernel
-def rotation_of(x: float, y: float, z: float) -> Any:
+def rotation_from_vector(x: float, y: float, z: float) -> Any:
     """Rodrigues' formula, row by row; the series near 0 keeps full precision."""
     squared = x * x + y * y + z * z
     angle = np.sqrt(squared)
@@ -702,16 +731,18 @@ def rotation_of(x: float, y: float, z: float) -> Any:
 
 
 @_kernel
-def move_cameras(delta: Float64, layout: Layout, state: State, trial: State) -> None:
+def update_cameras(
+    delta: Float64, layout: ParameterLayout, state: BundleParameters, trial: BundleParameters
+) -> None:
     """Move the cameras of ``trial``, a copy of those of ``state``, by ``delta``."""
     for image in range(len(layout.pose_slot)):
         slot = layout.pose_slot[image]
         if slot < 0:
             continue
-        n = VIEW * slot
-        turn = rotation_of(delta[n], delta[n + 1], delta[n + 2])
+        n = NUM_IMAGE_PARAMS * slot
+        turn = rotation_from_vector(delta[n], delta[n + 1], delta[n + 2])
         if layout.variable_scale[image]:
-            trial.log_scales[image] += delta[n + SCALE]
+            trial.log_scales[image] += delta[n + LOG_SCALE_IDX]
         for a in range(3):
             trial.translations[image, a] += delta[n + 3 + a]
             for b in range(3):
@@ -721,43 +752,49 @@ def move_cameras(delta: Float64, layout: Layout, state: State, trial: State) -> 
                 trial.rotations[image, a, b] = value
     for camera in range(len(layout.focal_slot)):
         if layout.focal_slot[camera] >= 0:
-            scale = np.exp(delta[VIEW * len(layout.pair) + layout.focal_slot[camera]])
+            scale = np.exp(delta[NUM_IMAGE_PARAMS * len(layout.pair) + layout.focal_slot[camera]])
             trial.intrinsics[camera, 0] *= scale
             trial.intrinsics[camera, 1] *= scale
 
 
 @_kernel
-def assemble(system: System, boost: Float64, pair: Int32, out: Float64) -> None:
+def assemble_reduced_matrix(
+    system: ReducedCameraSystem, boost: Float64, pair: Int32, out: Float64
+) -> None:
     """Write the lower triangle of the reduced matrix plus ``boost`` on its diagonal."""
     poses = len(pair)
     for i in range(poses):
         for j in range(i, poses):
             if pair[i, j] >= 0:
-                for a in range(VIEW):
-                    for b in range(a if i == j else 0, VIEW):
-                        out[VIEW * j + b, VIEW * i + a] = system.blocks[pair[i, j], a, b]
+                for a in range(NUM_IMAGE_PARAMS):
+                    for b in range(a if i == j else 0, NUM_IMAGE_PARAMS):
+                        out[NUM_IMAGE_PARAMS * j + b, NUM_IMAGE_PARAMS * i + a] = system.blocks[
+                            pair[i, j], a, b
+                        ]
     for f in range(len(system.corner)):
-        for a in range(VIEW * poses):
-            out[VIEW * poses + f, a] = system.border[f, a]
+        for a in range(NUM_IMAGE_PARAMS * poses):
+            out[NUM_IMAGE_PARAMS * poses + f, a] = system.border[f, a]
         for g in range(f + 1):
-            out[VIEW * poses + f, VIEW * poses + g] = system.corner[f, g]
+            out[NUM_IMAGE_PARAMS * poses + f, NUM_IMAGE_PARAMS * poses + g] = system.corner[f, g]
     for a in range(len(boost)):
         out[a, a] += boost[a]
 
 
 @_kernel
-def multiply(system: System, boost: Float64, pairs: Int64, x: Float64, out: Float64) -> None:
+def multiply_reduced_matrix(
+    system: ReducedCameraSystem, boost: Float64, pairs: Int64, x: Float64, out: Float64
+) -> None:
     """out (d,) <- (reduced matrix + diag(boost)) x; ``pairs`` (n, 2) are the slots of blocks."""
     for a in range(len(x)):
         out[a] = boost[a] * x[a]
     for n in range(len(pairs)):
-        i, j = VIEW * pairs[n, 0], VIEW * pairs[n, 1]
-        for a in range(VIEW):
+        i, j = NUM_IMAGE_PARAMS * pairs[n, 0], NUM_IMAGE_PARAMS * pairs[n, 1]
+        for a in range(NUM_IMAGE_PARAMS):
             value = 0.0
-            for b in range(a if i == j else 0, VIEW):
+            for b in range(a if i == j else 0, NUM_IMAGE_PARAMS):
                 value += system.blocks[n, a, b] * x[j + b]
             out[i + a] += value
-            for b in range(a + 1 if i == j else 0, VIEW):
+            for b in range(a + 1 if i == j else 0, NUM_IMAGE_PARAMS):
                 out[j + b] += system.blocks[n, a, b] * x[i + a]
     poses = system.border.shape[1]
     for f in range(len(system.corner)):
@@ -771,13 +808,13 @@ def multiply(system: System, boost: Float64, pairs: Int64, x: Float64, out: Floa
 
 
 @_kernel
-def point_covariances(
+def invert_point_blocks(
     first: int,
     last: int,
     damping: float,
-    bundle: Bundle,
-    state: State,
-    scratch: Scratch,
+    bundle: BundleData,
+    state: BundleParameters,
+    scratch: EliminationBuffers,
     out: Float64,
 ) -> None:
     """Inverse of ``V + damping I`` of each of the points ``first:last``, to out (p, 3, 3)."""
@@ -787,7 +824,7 @@ def point_covariances(
             block[0, a] = 0.0
         block[0, 0] = block[0, 2] = block[0, 5] = damping
         for k in range(bundle.obs.start[p], bundle.obs.start[p + 1]):
-            s = observe(k, p, bundle, state)
+            s = linearize_observation(k, p, bundle, state)
             _add_point(s, state.rotations, bundle.obs.image[k], block, _ONLY)
         if not _invert_factor(block, _ONLY, 0.0):
             # an unobserved direction beside strong ones: the damping drowned in rounding

@@ -24,7 +24,7 @@ MAX_BUFFER_BYTES = 1 << 30
 """Fewer ranges when their copies of the reduced system would take more than this."""
 
 Result = TypeVar("Result")
-Range = tuple[int, int, int]
+PointRange = tuple[int, int, int]
 """Number of the range, first point, end."""
 
 
@@ -80,13 +80,13 @@ class ScalePrior(NamedTuple):
     log_scale: Float64
     weight: Float64
 
-    def cost(self, state: kernels.State) -> float:
+    def cost(self, state: kernels.BundleParameters) -> float:
         """Half the sum of squares."""
         off = state.log_scales[self.image] - self.log_scale
         return 0.5 * float(off @ (self.weight * off))
 
 
-class Prepared(NamedTuple):
+class PreparedBundle(NamedTuple):
     """A checked problem as the kernels want it.
 
     ``pairs`` (b, 2): pose slots of each block of the reduced matrix. ``scale_prior``: what is
@@ -94,23 +94,23 @@ class Prepared(NamedTuple):
     slot. ``longest``: observations of a point.
     """
 
-    bundle: kernels.Bundle
-    state: kernels.State
+    bundle: kernels.BundleData
+    state: kernels.BundleParameters
     pairs: Int64
     scale_prior: ScalePrior
     held: Bool
-    ranges: list[Range]
+    ranges: list[PointRange]
     longest: int
 
 
-class Run(Protocol):
+class RangeExecutor(Protocol):
     """Calls ``function(*range)`` for each range of points, maybe in threads; returns the results
     in the order of the ranges."""
 
     def __call__(self, function: Callable[[int, int, int], Result]) -> list[Result]: ...
 
 
-def prepare(problem: BundleProblem, options: BundleOptions) -> Prepared:
+def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBundle:
     """Check the problem, copy what will change, and sort the observations by point.
 
     Raises:
@@ -125,7 +125,7 @@ def prepare(problem: BundleProblem, options: BundleOptions) -> Prepared:
     variable_scale = _mask(problem.variable_scale, "variable_scale", images, False)
     moving = variable_pose | variable_scale
     poses = np.count_nonzero(moving)
-    layout = kernels.Layout(
+    layout = kernels.ParameterLayout(
         _indices(problem.camera_of_image, "camera_of_image", images, cameras),
         _slots(moving),
         _slots(variable_focal),
@@ -133,20 +133,20 @@ def prepare(problem: BundleProblem, options: BundleOptions) -> Prepared:
         variable_scale,
         np.full((poses, poses), -1, dtype=np.int32),
     )
-    kernels.number_pairs(obs, layout.pose_slot, variable_point, layout.pair)
+    kernels.number_covisible_poses(obs, layout.pose_slot, variable_point, layout.pair)
     pairs = np.argwhere(layout.pair >= 0)
-    held = np.repeat(~variable_pose[:, None], kernels.VIEW, axis=1)
-    held[:, kernels.SCALE] = ~variable_scale
+    held = np.repeat(~variable_pose[:, None], kernels.NUM_IMAGE_PARAMS, axis=1)
+    held[:, kernels.LOG_SCALE_IDX] = ~variable_scale
     if problem.scale_anchor is not None:
         held[_scale_gauge(problem.scale_anchor, variable_pose, state)] = True
-    robust = kernels.Robust(
+    robust = kernels.RobustLosses(
         int(options.reprojection_loss),
         options.reprojection_scale,
         int(options.depth_loss),
         options.depth_scale,
     )
-    return Prepared(
-        kernels.Bundle(obs, layout, robust),
+    return PreparedBundle(
+        kernels.BundleData(obs, layout, robust),
         state,
         pairs,
         _scale_prior(problem, variable_scale, layout.pose_slot),
@@ -157,7 +157,7 @@ def prepare(problem: BundleProblem, options: BundleOptions) -> Prepared:
 
 
 @contextmanager
-def workers(ranges: list[Range], threads: int | None) -> Iterator[Run]:
+def range_executor(ranges: list[PointRange], threads: int | None) -> Iterator[RangeExecutor]:
     """Threads, if there are several ranges and processors, for as long as the context lasts."""
     count = min(len(ranges), threads or allowed())
     if count < 2:
@@ -175,9 +175,9 @@ def workers(ranges: list[Range], threads: int | None) -> Iterator[Run]:
         yield run
 
 
-def _state(problem: BundleProblem) -> kernels.State:
+def _state(problem: BundleProblem) -> kernels.BundleParameters:
     count = len(problem.rotations)
-    return kernels.State(
+    return kernels.BundleParameters(
         _numbers(problem.rotations, "rotations", (count, 3, 3)).copy(),
         _numbers(problem.translations, "translations", (count, 3)).copy(),
         _log_scales(problem.log_scales, "log_scales", count).copy(),
@@ -186,7 +186,7 @@ def _state(problem: BundleProblem) -> kernels.State:
     )
 
 
-def _observations(problem: BundleProblem, images: int, points: int) -> kernels.Observations:
+def _observations(problem: BundleProblem, images: int, points: int) -> kernels.BundleObservations:
     count = len(problem.obs_image)
     image = _indices(problem.obs_image, "obs_image", count, images)
     point = _indices(problem.obs_point, "obs_point", count, points)
@@ -200,7 +200,7 @@ def _observations(problem: BundleProblem, images: int, points: int) -> kernels.O
         std = np.where(known, problem.obs_std_log_depth, 1.0)
         depth_weight = np.where(known, _inverse_std(std, "obs_std_log_depth", count), 0.0)
     start, order = _sorted_by_point(image, point, images, points)
-    return kernels.Observations(
+    return kernels.BundleObservations(
         start, image[order], xy[order], weight[order], log_depth[order], depth_weight[order]
     )
 
@@ -211,8 +211,8 @@ def _sorted_by_point(
     """``(start, order)``: observations by point, then image."""
     by_image, order = np.empty(len(image), np.int64), np.empty(len(image), np.int64)
     start = np.zeros(points + 2, np.int64)
-    kernels.sort_by(image, np.arange(len(image)), np.zeros(images + 2, np.int64), by_image)
-    kernels.sort_by(point, by_image, start, order)
+    kernels.counting_sort(image, np.arange(len(image)), np.zeros(images + 2, np.int64), by_image)
+    kernels.counting_sort(point, by_image, start, order)
     return start[:-1], order
 
 
@@ -271,7 +271,7 @@ def _slots(variable: Bool) -> NDArray[np.int32]:
     return np.where(variable, np.cumsum(variable) - 1, -1).astype(np.int32)
 
 
-def _scale_gauge(anchor: int, variable: Bool, state: kernels.State) -> tuple[int, int]:
+def _scale_gauge(anchor: int, variable: Bool, state: kernels.BundleParameters) -> tuple[int, int]:
     """The image and the coordinate of its pose that is held for a scale."""
     if not (0 <= anchor < len(variable) and variable[anchor]) or variable.all():
         raise DataError("scale_anchor", "must be a variable pose beside a constant one")
@@ -281,9 +281,9 @@ def _scale_gauge(anchor: int, variable: Bool, state: kernels.State) -> tuple[int
     return anchor, 3 + int(np.argmax(np.abs(offset)))
 
 
-def _ranges(start: Int64, pairs: int) -> list[Range]:
+def _ranges(start: Int64, pairs: int) -> list[PointRange]:
     """Ranges of points with about equally many observations; the problem alone decides."""
-    room = MAX_BUFFER_BYTES // (8 * int(kernels.VIEW) ** 2 * max(pairs, 1))
+    room = MAX_BUFFER_BYTES // (8 * int(kernels.NUM_IMAGE_PARAMS) ** 2 * max(pairs, 1))
     count = max(1, min(MAX_RANGES, int(start[-1]) // RANGE_SIZE, room))
     ends = np.searchsorted(start, start[-1] * np.arange(1, count) / count)
     edges = [0, *ends.tolist(), len(start) - 1]

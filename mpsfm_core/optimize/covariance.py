@@ -8,14 +8,16 @@ import numpy as np
 
 from mpsfm_core.data import Float64
 from mpsfm_core.optimize import bundle_kernels as kernels
-from mpsfm_core.optimize.bundle_problem import BundleProblem, prepare, workers
+from mpsfm_core.optimize.bundle_problem import BundleProblem, prepare_bundle, range_executor
 from mpsfm_core.optimize.options import BundleOptions
 
 DAMPING = 1e-8
 """Added to the information of each coordinate, so that it has an inverse (COLMAP's default)."""
 
 
-def point_covariances(problem: BundleProblem, options: BundleOptions | None = None) -> Float64:
+def compute_point_covariances(
+    problem: BundleProblem, options: BundleOptions | None = None
+) -> Float64:
     """Covariance of each point for fixed cameras: (p, 3, 3) float64, world frame, squared units.
 
     The inverse of the point's block of the normal equations, with the weights of the robust
@@ -29,19 +31,19 @@ def point_covariances(problem: BundleProblem, options: BundleOptions | None = No
     options = options or BundleOptions()
     nothing = np.zeros(len(problem.rotations), dtype=np.bool_)
     held = replace(problem, variable_pose=nothing, variable_scale=None, scale_anchor=None)
-    p = prepare(held, options)
+    p = prepare_bundle(held, options)
     covariances = np.empty((len(p.state.points), 3, 3))
-    scratch = [kernels.make_scratch(0) for _ in p.ranges]
-    with workers(p.ranges, options.threads) as run:
+    scratch = [kernels.allocate_buffers(0) for _ in p.ranges]
+    with range_executor(p.ranges, options.threads) as run:
         run(
-            lambda n, first, last: kernels.point_covariances(
+            lambda n, first, last: kernels.invert_point_blocks(
                 first, last, DAMPING, p.bundle, p.state, scratch[n], covariances
             )
         )
     return covariances
 
 
-def depth_variance_of_points(covariances: Float64, rotations: Float64) -> Float64:
+def propagate_depth_variance(covariances: Float64, rotations: Float64) -> Float64:
     """Variance of the depth z of points in a camera: (m,) float64, squared units.
 
     ``covariances``: (m, 3, 3), world frame. ``rotations``: (m, 3, 3) or (3, 3), of

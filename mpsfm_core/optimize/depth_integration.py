@@ -15,26 +15,26 @@ from scipy import ndimage
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, NormalPrior, PinholeCamera
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.optimize.depth_variance import inverse_diagonal
+from mpsfm_core.optimize.depth_variance import compute_inverse_diagonal
 from mpsfm_core.optimize.integration_energy import (
     MAX_LOG_VARIANCE,
     MIN_LOG_VARIANCE,
+    EnergyLosses,
     EnergyTerms,
-    Losses,
-    Majoriser,
     PointTerms,
     PriorTerms,
-    majorise,
-    mean_point_energy,
-    normal_terms,
+    QuadraticMajorizer,
+    build_normal_terms,
+    compute_mean_point_energy,
+    majorize,
 )
-from mpsfm_core.optimize.multigrid import Multigrid, Solution
+from mpsfm_core.optimize.multigrid import LinearSolution, Multigrid
 from mpsfm_core.optimize.options import IntegrationOptions
-from mpsfm_core.optimize.thinning import (
-    thickened,
-    thinned_camera,
-    thinned_pixels,
-    thinned_prior,
+from mpsfm_core.optimize.subsampling import (
+    subsample_camera,
+    subsample_pixels,
+    subsample_prior,
+    upsample,
 )
 
 # Where there are normals but no prior, the filled-in depth is a prior of this variance (log depth):
@@ -100,16 +100,18 @@ class RefinedDepth:
 
 
 class _Solver:
-    """Majorises the energy of one image, and steps towards the minimum of a majoriser."""
+    """Majorises the energy of one image, and steps towards the minimum of a majorizer."""
 
     def __init__(self, terms: EnergyTerms) -> None:
         self._terms = terms
         self._multigrid = Multigrid(*terms.prior.log_depth.shape)
 
-    def majorise(self, z: Float64) -> Majoriser:
-        return majorise(z, self._terms)
+    def majorize(self, z: Float64) -> QuadraticMajorizer:
+        return majorize(z, self._terms)
 
-    def step(self, here: Majoriser, iterations: int, tolerance: float = 0.0) -> Solution:
+    def step(
+        self, here: QuadraticMajorizer, iterations: int, tolerance: float = 0.0
+    ) -> LinearSolution:
         self._multigrid.update(here.east, here.south, here.mass)
         return self._multigrid.solve(-here.gradient, iterations, tolerance)
 
@@ -151,7 +153,11 @@ class DepthIntegrator:
             self._log_depth[holes] = self._integrate_from(depth.valid)[holes]
         self._coarse: DepthIntegrator | None = None
         if camera.width >= 2 * _COARSE_COLUMNS:
-            parts = thinned_prior(depth, 2), thinned_prior(normals, 2), thinned_camera(camera, 2)
+            parts = (
+                subsample_prior(depth, 2),
+                subsample_prior(normals, 2),
+                subsample_camera(camera, 2),
+            )
             self._coarse = DepthIntegrator(*parts, options)
 
     def refine(
@@ -169,14 +175,14 @@ class DepthIntegrator:
         if start is None:
             solver = _Solver(self._terms(anchors, scale))
             z = self._log_depth + np.log(scale)
-            return self._descend_from_prior(z, solver.majorise(z), solver, anchors, scale)
+            return self._descend_from_prior(z, solver.majorize(z), solver, anchors, scale)
         z = start.log_depth + np.log(scale / start.scale)
         points = self._point_terms(anchors, self._log_depth + np.log(scale))
-        energy = mean_point_energy(z, points, self.options.point_scale)
+        energy = compute_mean_point_energy(z, points, self.options.point_scale)
         if energy <= self.options.max_point_growth * start.point_energy:
             return replace(start, log_depth=z, scale=scale, skipped=True)
         solver = _Solver(self._terms(anchors, scale))
-        return self._descend(z, solver.majorise(z), solver, scale)
+        return self._descend(z, solver.majorize(z), solver, scale)
 
     def variance(self, refined: RefinedDepth, anchors: Anchors = NO_ANCHORS) -> Float32:
         """Marginal variance of the refined log depth, (h, w) float32; infinite where not valid.
@@ -185,21 +191,26 @@ class DepthIntegrator:
         they are; times depth^2 it is the variance of depth. Costs 10 to 15 refinements.
         """
         terms = self._terms(anchors, refined.scale)
-        here = majorise(refined.log_depth, terms)
-        return inverse_diagonal(here.east, here.south, here.mass).astype(np.float32)
+        here = majorize(refined.log_depth, terms)
+        return compute_inverse_diagonal(here.east, here.south, here.mass).astype(np.float32)
 
     def _descend_from_prior(
-        self, prior: Float64, here: Majoriser, solver: _Solver, anchors: Anchors, scale: float
+        self,
+        prior: Float64,
+        here: QuadraticMajorizer,
+        solver: _Solver,
+        anchors: Anchors,
+        scale: float,
     ) -> RefinedDepth:
         """Descend from the scaled prior, or from what every second pixel makes of it."""
         if self._coarse is None:
             return self._descend(prior, here, solver, scale)
         coarse = self._coarse.refine(
-            anchors._replace(xy=thinned_pixels(np.asarray(anchors.xy), 2)), scale=scale
+            anchors._replace(xy=subsample_pixels(np.asarray(anchors.xy), 2)), scale=scale
         )
         change = coarse.log_depth - self._coarse._log_depth - np.log(scale)
-        z = prior + thickened(change, coarse.valid, prior.shape)
-        there = solver.majorise(z)
+        z = prior + upsample(change, coarse.valid, prior.shape)
+        there = solver.majorize(z)
         if not there.energy < here.energy:
             return self._descend(prior, here, solver, scale)
         limit = min(_FINE_ITERATIONS, self.options.max_iterations)
@@ -209,7 +220,7 @@ class DepthIntegrator:
     def _descend(
         self,
         z: Float64,
-        here: Majoriser,
+        here: QuadraticMajorizer,
         solver: _Solver,
         scale: float,
         max_iterations: int | None = None,
@@ -223,10 +234,10 @@ class DepthIntegrator:
         while iterations < limit and not converged:
             step = solver.step(here, options.cg_iterations)
             further = z + (options.over_relaxation if iterations else 1.0) * step.x
-            there = solver.majorise(further)
+            there = solver.majorize(further)
             if not there.energy < here.energy:
                 further = z + step.x
-                there = solver.majorise(further)
+                there = solver.majorize(further)
             iterations, cg_iterations = iterations + 1, cg_iterations + step.iterations
             converged = not here.energy - there.energy > options.tolerance * here.energy
             if there.energy < here.energy:
@@ -253,10 +264,10 @@ class DepthIntegrator:
         )
         weight = min(1.0, options.independent_normals / pixels)
         return EnergyTerms(
-            normal_terms(self._normals, self.camera, self._active, weight),
+            build_normal_terms(self._normals, self.camera, self._active, weight),
             prior,
             self._point_terms(anchors, prior.log_depth),
-            Losses(
+            EnergyLosses(
                 options.sharpness, options.normal_limit, options.prior_scale, options.point_scale
             ),
         )
@@ -277,15 +288,15 @@ class DepthIntegrator:
 
     def _integrate_from(self, known: Bool) -> Float64:
         """The map that continues known log depth along the normals, with quadratic losses."""
-        blunt = Losses(sharpness=1e-9, normal_limit=1e12, prior_scale=1e6, point_scale=1.0)
+        blunt = EnergyLosses(sharpness=1e-9, normal_limit=1e12, prior_scale=1e6, point_scale=1.0)
         terms = EnergyTerms(
-            normal_terms(self._normals, self.camera, self._active, 1.0),
+            build_normal_terms(self._normals, self.camera, self._active, 1.0),
             PriorTerms(self._log_depth, known.astype(np.float32), _FIXED),
             self._point_terms(NO_ANCHORS, self._log_depth),
             blunt,
         )
         solver = _Solver(terms)
-        step = solver.step(solver.majorise(self._log_depth), iterations=50, tolerance=1e-3)
+        step = solver.step(solver.majorize(self._log_depth), iterations=50, tolerance=1e-3)
         low, high = self._log_depth[known].min(), self._log_depth[known].max()
         margin = np.log(_MAX_CONTINUATION)
         filled: Float64 = np.nan_to_num(self._log_depth + step.x, nan=0.5 * (low + high))

@@ -62,7 +62,7 @@ class _Elimination(NamedTuple):
     gain: Float64
 
 
-def inverse_diagonal(east: Float32, south: Float32, mass: Float32) -> Float64:
+def compute_inverse_diagonal(east: Float32, south: Float32, mass: Float32) -> Float64:
     """diag(A^-1), (h, w) float64, of the operator A that `multigrid` describes.
 
     Pixels without any coupling and mass get infinity. Every other connected set of pixels needs

@@ -1,4 +1,4 @@
-"""The energy of depth integration and its quadratic majoriser around a map.
+"""The energy of depth integration and its quadratic majorizer around a map.
 
 Over the log depth z of all pixels (paper appendix B; the logarithm makes perspective linear):
 
@@ -19,7 +19,7 @@ says that the surface continues to one side, to the other, or to none. Its deriv
 sigmoid weights of the published method, which never had an energy of its own. The prior's loss goes
 on growing, 2 c^2 (sqrt(1 + s / c^2) - 1): a truncated one, as in the paper, loses strips at depth
 edges to the vague normals there. All three losses are concave in the squared residuals, so that
-re-weighted least squares majorises this energy: a step that lowers the quadratic, however inexact,
+re-weighted least squares majorizes this energy: a step that lowers the quadratic, however inexact,
 cannot raise the energy.
 """
 
@@ -46,7 +46,7 @@ MAX_LOG_VARIANCE = 1e2
 _MIN_FACING = 2e-3
 
 
-class Losses(NamedTuple):
+class EnergyLosses(NamedTuple):
     """`sharpness` and `normal_limit` of the soft minimum (in squared residuals), and the scales of
     the other losses in standard deviations."""
 
@@ -92,10 +92,10 @@ class EnergyTerms(NamedTuple):
     normals: NormalTerms
     prior: PriorTerms
     points: PointTerms
-    losses: Losses
+    losses: EnergyLosses
 
 
-class Majoriser(NamedTuple):
+class QuadraticMajorizer(NamedTuple):
     """energy + 2 gradient . step + step' A step, with A as in `multigrid`; maps are (h, w)."""
 
     energy: float
@@ -106,7 +106,7 @@ class Majoriser(NamedTuple):
     mass: Float32
 
 
-def normal_terms(
+def build_normal_terms(
     normals: NormalPrior, camera: PinholeCamera, active: Bool, weight: float
 ) -> NormalTerms:
     """Residuals of a normal map (with variance) between active pixels (h, w)."""
@@ -123,14 +123,14 @@ def normal_terms(
     return terms
 
 
-def mean_point_energy(z: Float64, points: PointTerms, scale: float) -> float:
+def compute_mean_point_energy(z: Float64, points: PointTerms, scale: float) -> float:
     """Mean share of the sparse points in the energy of a map of log depth (h, w); 0 without any."""
     offset = z[points.rows, points.columns] - points.log_depth
     energies = scale**2 * np.log1p(points.precision * offset**2 / scale**2)
     return float(energies.mean()) if len(energies) else 0.0
 
 
-def majorise(z: Float64, terms: EnergyTerms) -> Majoriser:
+def majorize(z: Float64, terms: EnergyTerms) -> QuadraticMajorizer:
     """Energy of a map of log depth (h, w), and the quadratic that touches it there."""
     framed = np.zeros((z.shape[0] + 2, z.shape[1] + 2))
     framed[1:-1, 1:-1] = z
@@ -145,7 +145,7 @@ def majorise(z: Float64, terms: EnergyTerms) -> Majoriser:
     of_points = _add_points(z, terms.points, losses.point_scale, mass, gradient)
     energy += of_points
     mean = of_points / max(len(terms.points.rows), 1)
-    return Majoriser(energy, mean, gradient[inner], east[inner], south[inner], mass)
+    return QuadraticMajorizer(energy, mean, gradient[inner], east[inner], south[inner], mass)
 
 
 @_kernel
@@ -183,7 +183,7 @@ def _add_normals(
     z: Float64,
     terms: NormalTerms,
     axis: int,
-    losses: Losses,
+    losses: EnergyLosses,
     coupling: Float32,
     gradient: Float64,
 ) -> float:
@@ -237,7 +237,7 @@ def _link_row(
     slope: Float32,
     normal: Float32,
     weight: Float32,
-    losses: Losses,
+    losses: EnergyLosses,
     coupling_ahead: Float64,
     coupling_behind: Float64,
     force_ahead: Float64,

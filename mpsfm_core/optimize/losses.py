@@ -3,7 +3,7 @@
 A loss takes the squared residual ``s`` and its scale (the residual at which it starts to bend, in
 the residual's unit) and returns ``(rho(s), rho'(s))``. An objective is ``sum(rho(s)) / 2`` and
 ``rho'`` is the weight of the residual in iteratively re-weighted least squares. Each function
-works on numpy arrays and, inside of numba kernels, on scalars; :func:`evaluate` selects one by
+works on numpy arrays and, inside of numba kernels, on scalars; :func:`evaluate_loss` selects one by
 its :class:`Loss`.
 """
 # mypy: allow-untyped-decorators
@@ -56,11 +56,11 @@ LOSSES: Mapping[Loss, Callable[[NDArray[Any], float], tuple[Any, Any]]] = Mappin
         Loss.TRUNCATED: truncated,
     }
 )
-"""The functions by name, for numpy arrays; kernels use :func:`evaluate`."""
+"""The functions by name, for numpy arrays; kernels use :func:`evaluate_loss`."""
 
 
 @jit.helper()
-def evaluate(loss: int, s: float, scale: float) -> Any:
+def evaluate_loss(loss: int, s: float, scale: float) -> Any:
     """``(rho, rho')`` of one squared residual; ``loss`` is a :class:`Loss` as an int."""
     if loss == 1:
         return soft_l1(s, scale)

@@ -46,7 +46,7 @@ _Corners = tuple[float, float, float, float]
 _NO_SQUARES: _Squares = (0.0,) * 10
 
 
-class Solution(NamedTuple):
+class LinearSolution(NamedTuple):
     """`x` (h, w) float64, CG iterations done, and the relative error when it was last looked at.
 
     That is sqrt(r' M r) with the preconditioner M, close to the energy norm of the error, relative
@@ -114,13 +114,13 @@ class Multigrid:
         finest.mass[1:-1, 1:-1] = mass
         _derive_levels(self._grids)
 
-    def solve(self, rhs: Float64, iterations: int, tolerance: float = 0.0) -> Solution:
+    def solve(self, rhs: Float64, iterations: int, tolerance: float = 0.0) -> LinearSolution:
         """Preconditioned conjugate gradients for A x = rhs (h, w) from x = 0."""
         x, direction, _ = self._vectors
         x[:] = direction[:] = 0
         self._levels[0].rhs[1:-1, 1:-1] = rhs
         done, error = _conjugate_gradients(self._grids, self._vectors, iterations, tolerance)
-        return Solution(x[1:-1, 1:-1].copy(), done, error)
+        return LinearSolution(x[1:-1, 1:-1].copy(), done, error)
 
 
 class _Grids(NamedTuple):
@@ -159,7 +159,7 @@ def _derive_levels(grids: _Grids) -> None:
 def _conjugate_gradients(
     grids: _Grids, vectors: Float64, iterations: int, tolerance: float
 ) -> tuple[int, float]:
-    """Solve for `rhs` of the finest level; iterations and the relative error as in `Solution`.
+    """Solve for `rhs` of the finest level; iterations and the relative error as in `LinearSolution`.
 
     `vectors`: x, direction and image, framed. What is left of the right-hand side takes its place.
     """

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Float64, Pose
-from mpsfm_core.optimize.bundle_kernels import MIN_DEPTH, rotation_of
+from mpsfm_core.optimize.bundle_kernels import MIN_DEPTH, rotation_from_vector
 from mpsfm_core.support import jit
 
 DAMPING = 1e-6
@@ -22,7 +22,7 @@ MAX_TURN = 1.0
 """Radians; a step that turns more comes from matches that determine no pose (ours)."""
 
 
-class Segments(NamedTuple):
+class RaySegments(NamedTuple):
     """Pixels and the segments they may see.
 
     ``near``, ``far``: (m, 3) world points; ``xy`` (m, 2) pixels; ``limit`` (m,) px, distance that
@@ -36,7 +36,7 @@ class Segments(NamedTuple):
     weight: Float64
 
 
-class _Foot(NamedTuple):
+class _NearestPoint(NamedTuple):
     """Where a projected segment comes nearest to its pixel.
 
     ``near``, ``far``: the ends in the camera, their rotated world points being ``near_q`` and
@@ -61,8 +61,8 @@ POSE = np.int64(6)
 _kernel, _helper = jit.kernel(), jit.helper()
 
 
-def distances_and_depths(
-    pose: Pose, intrinsics: Float64, segments: Segments
+def measure_segments(
+    pose: Pose, intrinsics: Float64, segments: RaySegments
 ) -> tuple[Float64, Float64]:
     """(m,) px between pixels and projected segments, and the depth of the nearest point there.
 
@@ -75,7 +75,7 @@ def distances_and_depths(
 
 
 def refine_pose(
-    pose: Pose, intrinsics: Float64, segments: Segments, *, scales: Float64
+    pose: Pose, intrinsics: Float64, segments: RaySegments, *, scales: Float64
 ) -> tuple[Float64, Float64]:
     """The pose after a Gauss-Newton step for each of the ``scales`` of the limits.
 
@@ -85,24 +85,24 @@ def refine_pose(
     rotation, translation = map(np.ascontiguousarray, pose)
     matrix, vector = np.empty((POSE, POSE)), np.empty(POSE)
     for scale in scales:
-        linearize(rotation, translation, intrinsics, segments, scale, matrix, vector)
+        linearize_pose(rotation, translation, intrinsics, segments, scale, matrix, vector)
         diagonal = matrix.diagonal()
         if not (diagonal > 0).all():
             break
         step = -np.linalg.solve(matrix + np.diag(DAMPING * diagonal), vector)
         if not np.linalg.norm(step[:3]) < MAX_TURN:
             break
-        rotation = np.array(rotation_of(step[0], step[1], step[2])) @ rotation
+        rotation = np.array(rotation_from_vector(step[0], step[1], step[2])) @ rotation
         translation = translation + step[3:]
     return rotation, translation
 
 
 @_kernel
-def linearize(
+def linearize_pose(
     rotation: Float64,
     translation: Float64,
     intrinsics: Float64,
-    segments: Segments,
+    segments: RaySegments,
     scale: float,
     matrix: Float64,
     gradient: Float64,
@@ -152,7 +152,7 @@ def _measure(
     rotation: Float64,
     translation: Float64,
     intrinsics: Float64,
-    segments: Segments,
+    segments: RaySegments,
     distances: Float64,
     depths: Float64,
 ) -> None:
@@ -166,15 +166,15 @@ def _measure(
 
 @_helper
 def _nearest(
-    i: int, rotation: Float64, translation: Float64, intrinsics: Float64, segments: Segments
-) -> _Foot:
+    i: int, rotation: Float64, translation: Float64, intrinsics: Float64, segments: RaySegments
+) -> _NearestPoint:
     near_q = _rotated(rotation, segments.near[i, 0], segments.near[i, 1], segments.near[i, 2])
     far_q = _rotated(rotation, segments.far[i, 0], segments.far[i, 1], segments.far[i, 2])
     x, y, z = translation[0], translation[1], translation[2]
     near = near_q[0] + x, near_q[1] + y, near_q[2] + z
     far = far_q[0] + x, far_q[1] + y, far_q[2] + z
     if not (near[2] > MIN_DEPTH and far[2] > MIN_DEPTH):
-        return _Foot(False, near, near_q, far, far_q, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return _NearestPoint(False, near, near_q, far, far_q, 0.0, 0.0, 0.0, 0.0, 0.0)
     du = intrinsics[0] * near[0] / near[2] + intrinsics[2] - segments.xy[i, 0]
     dv = intrinsics[1] * near[1] / near[2] + intrinsics[3] - segments.xy[i, 1]
     au = intrinsics[0] * (far[0] / far[2] - near[0] / near[2])
@@ -187,7 +187,7 @@ def _nearest(
     dv += share * av
     if not 0.0 < share < 1.0:
         au = av = 0.0
-    return _Foot(True, near, near_q, far, far_q, share, du, dv, au, av)
+    return _NearestPoint(True, near, near_q, far, far_q, share, du, dv, au, av)
 
 
 @_helper

@@ -52,7 +52,7 @@ class Axis(NamedTuple):
 
 
 class System(NamedTuple):
-    """Energy, half its gradient (n,), and the matrix of the majoriser (n, n)."""
+    """Energy, half its gradient (n,), and the matrix of the majorizer (n, n)."""
 
     energy: float
     gradient: Array
@@ -139,7 +139,7 @@ class ReferenceIntegration:
         return sp.csr_array(sp.coo_array(entries, shape=(count, count))), linked
 
     def linearise(self, z: Array) -> System:
-        """Energy and majoriser at z."""
+        """Energy and majorizer at z."""
         matrix, gradient, energy = self._prior(z)
         for axis in self.axes:
             ahead = axis.slope * (axis.ahead @ z) + axis.normal

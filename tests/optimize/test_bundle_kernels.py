@@ -7,8 +7,8 @@ import pytest
 
 from mpsfm_core.data import Float64
 from mpsfm_core.optimize import bundle_kernels as kernels
-from mpsfm_core.optimize.bundle_adjustment import BundleProblem, _NormalEquations
-from mpsfm_core.optimize.bundle_problem import Prepared, prepare, workers
+from mpsfm_core.optimize.bundle_adjustment import BundleProblem, SchurComplementSolver
+from mpsfm_core.optimize.bundle_problem import PreparedBundle, prepare_bundle, range_executor
 from mpsfm_core.optimize.options import Loss
 from tests.optimize.bundle_reference import make_problem, perturb, rotation, soft_l1
 
@@ -49,24 +49,28 @@ def small_problem() -> BundleProblem:
     )
 
 
-def moved(p: Prepared, delta: Float64, points: Float64) -> kernels.State:
+def moved(p: PreparedBundle, delta: Float64, points: Float64) -> kernels.BundleParameters:
     """The state moved by a camera-side vector, of which what is held stays, and point displacements
     (p, 3)."""
     delta = delta.copy()
     delta[: p.held.size][p.held.ravel()] = 0.0
-    trial = kernels.State(*(array.copy() for array in p.state))
-    kernels.move_cameras(delta, p.bundle.layout, p.state, trial)
+    trial = kernels.BundleParameters(*(array.copy() for array in p.state))
+    kernels.update_cameras(delta, p.bundle.layout, p.state, trial)
     trial.points[:] += points
     return trial
 
 
-def sights(p: Prepared, state: kernels.State) -> list[kernels.Sight]:
+def sights(
+    p: PreparedBundle, state: kernels.BundleParameters
+) -> list[kernels.LinearizedObservation]:
     """All observations, in the kernels' order."""
     points = np.repeat(np.arange(len(state.points)), np.diff(p.bundle.obs.start))
-    return [kernels.observe(k, point, p.bundle, state) for k, point in enumerate(points)]
+    return [
+        kernels.linearize_observation(k, point, p.bundle, state) for k, point in enumerate(points)
+    ]
 
 
-def residuals(p: Prepared, state: kernels.State) -> Float64:
+def residuals(p: PreparedBundle, state: kernels.BundleParameters) -> Float64:
     """(3 m + s,) whitened residuals, those of scales last, computed in plain numpy."""
     obs, layout = p.bundle.obs, p.bundle.layout
     points = np.repeat(np.arange(len(state.points)), np.diff(obs.start))
@@ -82,10 +86,10 @@ def residuals(p: Prepared, state: kernels.State) -> Float64:
     return np.concatenate([np.column_stack([pixel, depth]).ravel(), scales])
 
 
-def numeric_jacobian(p: Prepared) -> Float64:
+def numeric_jacobian(p: PreparedBundle) -> Float64:
     """Jacobian (3 m + s, d + 3 v) of the residuals: camera side, then variable points."""
     poses, focals = len(p.bundle.layout.pair), int(p.bundle.layout.focal_slot.max()) + 1
-    size = kernels.VIEW * poses + focals
+    size = kernels.NUM_IMAGE_PARAMS * poses + focals
     variable = np.flatnonzero(p.bundle.layout.variable_point)
     columns = []
     for n in range(size + 3 * len(variable)):
@@ -103,10 +107,10 @@ def numeric_jacobian(p: Prepared) -> Float64:
 @pytest.mark.parametrize("reprojection_loss", Loss)
 def test_gradient_of_every_loss(reprojection_loss: Loss, depth_loss: Loss) -> None:
     options = soft_l1(reprojection_loss=reprojection_loss, depth_loss=depth_loss)
-    p = prepare(small_problem(), options)
+    p = prepare_bundle(small_problem(), options)
     layout = p.bundle.layout
-    with workers(p.ranges, 1) as run:
-        normal = _NormalEquations(p, options, run)
+    with range_executor(p.ranges, 1) as run:
+        normal = SchurComplementSolver(p, options, run)
         normal.linearize(p.state, 0.0)
     variable = layout.variable_point
     by_point = np.zeros_like(p.state.points)
@@ -153,7 +157,7 @@ def test_one_residual_at_random_poses(kind: str) -> None:
         world = problem.rotations[0].T @ (camera_point - problem.translations[0])
         problem = replace(problem, points=world[None])
         trivial = soft_l1(reprojection_loss=Loss.TRIVIAL, depth_loss=Loss.TRIVIAL)
-        p = prepare(problem, trivial)
+        p = prepare_bundle(problem, trivial)
         jacobian = np.empty((3, 3))
         for a in range(3):
             step = np.zeros(3)
@@ -180,7 +184,7 @@ def test_step_solves_the_damped_normal_equations(sparse: bool, monkeypatch) -> N
     )
     monkeypatch.setattr("mpsfm_core.optimize.bundle_adjustment.CG_TOLERANCE", 1e-12)
     damping = 1e-2
-    p = prepare(small_problem(), options)
+    p = prepare_bundle(small_problem(), options)
     jacobian = numeric_jacobian(p)
     gradient = jacobian.T @ residuals(p, p.state)
     matrix = jacobian.T @ jacobian
@@ -190,10 +194,10 @@ def test_step_solves_the_damped_normal_equations(sparse: bool, monkeypatch) -> N
     diagonal[size:] = np.repeat(diagonal[size:].reshape(-1, 3).mean(axis=1), 3)
     held = diagonal == 0  # scales that are constant
     expected = np.linalg.solve(matrix + np.diag(damping * diagonal + held), -gradient)
-    with workers(p.ranges, 1) as run:
-        normal = _NormalEquations(p, options, run)
+    with range_executor(p.ranges, 1) as run:
+        normal = SchurComplementSolver(p, options, run)
         cost = normal.linearize(p.state, damping)
-        trial = kernels.State(*(np.empty_like(array) for array in p.state))
+        trial = kernels.BundleParameters(*(np.empty_like(array) for array in p.state))
         # a huge tolerance: no point moves by itself after the joint step
         normal.tolerance = np.inf
         _, _, promised = normal.step(p.state, trial, damping, cost)
@@ -210,13 +214,13 @@ def test_step_solves_the_damped_normal_equations(sparse: bool, monkeypatch) -> N
 
 def test_rotation_near_zero_and_beyond_half_a_turn() -> None:
     for vector in ([0, 0, 0], [1e-9, -1e-7, 1e-8], [9e-5, 0, 0], [1e-3, 2e-3, 0], [3, -2, 1]):
-        turn = np.array(kernels.rotation_of(*map(float, vector)))
+        turn = np.array(kernels.rotation_from_vector(*map(float, vector)))
         np.testing.assert_allclose(turn, rotation(np.array(vector)), atol=1e-15)
 
 
 def test_sorting_is_stable_and_by_point_then_image() -> None:
     problem = small_problem()
-    obs = prepare(problem, soft_l1()).bundle.obs
+    obs = prepare_bundle(problem, soft_l1()).bundle.obs
     order = np.lexsort((np.arange(len(obs.image)), problem.obs_image, problem.obs_point))
     np.testing.assert_array_equal(obs.image, problem.obs_image[order])
     np.testing.assert_array_equal(obs.xy, problem.obs_xy[order])

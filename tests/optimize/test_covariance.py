@@ -9,8 +9,8 @@ import pytest
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem
 from mpsfm_core.optimize.covariance import (
     DAMPING,
-    depth_variance_of_points,
-    point_covariances,
+    compute_point_covariances,
+    propagate_depth_variance,
 )
 from tests.optimize.bundle_reference import (
     ceres_adjuster,
@@ -30,7 +30,7 @@ def test_equals_dense_inverse(depth: bool) -> None:
     information = dense_point_information(problem) + DAMPING * np.eye(3 * count)
     inverse = np.linalg.inv(information).reshape(count, 3, count, 3)
     expected = inverse[np.arange(count), :, np.arange(count)]
-    actual = point_covariances(problem, soft_l1())
+    actual = compute_point_covariances(problem, soft_l1())
     scale = np.linalg.norm(expected, axis=(1, 2), keepdims=True)
     np.testing.assert_allclose(actual / scale, expected / scale, atol=1e-6)
     np.testing.assert_array_equal(actual, actual.transpose(0, 2, 1))
@@ -44,15 +44,15 @@ def test_equals_colmap() -> None:
     theirs = pycolmap.estimate_ba_covariance(options, rec, adjuster)
     expected = np.stack([theirs.get_point_cov(p + 1) for p in range(300)])
     np.testing.assert_allclose(
-        point_covariances(problem, soft_l1()), expected, rtol=1e-6, atol=1e-12
+        compute_point_covariances(problem, soft_l1()), expected, rtol=1e-6, atol=1e-12
     )
 
 
 def test_depth_lowers_the_variance() -> None:
     problem = make_problem(5, 40, 3)
-    with_depth = np.trace(point_covariances(problem, soft_l1()), axis1=1, axis2=2)
+    with_depth = np.trace(compute_point_covariances(problem, soft_l1()), axis1=1, axis2=2)
     without = np.trace(
-        point_covariances(replace(problem, obs_log_depth=None), soft_l1()), axis1=1, axis2=2
+        compute_point_covariances(replace(problem, obs_log_depth=None), soft_l1()), axis1=1, axis2=2
     )
     assert (with_depth < without).all()
 
@@ -76,7 +76,7 @@ def test_predicts_the_scatter_of_triangulated_depth() -> None:
     in_camera = np.einsum("nij,j->ni", turns, point) + problem.translations
     xy = 1000 * in_camera[:, :2] / in_camera[:, 2:] + 500
     trivial = soft_l1(reprojection_loss=0)
-    covariance = point_covariances(replace(problem, obs_xy=xy), trivial)
+    covariance = compute_point_covariances(replace(problem, obs_xy=xy), trivial)
     jacobian = np.empty((4, 3))
     for a in range(3):
         moved = in_camera + 1e-6 * turns[:, :, a]
@@ -84,7 +84,7 @@ def test_predicts_the_scatter_of_triangulated_depth() -> None:
     samples = rng.normal(size=(20_000, 4)) @ np.linalg.pinv(jacobian).T
     for turn in turns:
         sampled = (samples @ turn[2]).var()
-        predicted = depth_variance_of_points(covariance, turn)
+        predicted = propagate_depth_variance(covariance, turn)
         assert predicted.shape == (1,)
         assert predicted[0] == pytest.approx(sampled, rel=0.05)
 
@@ -95,8 +95,8 @@ def test_depth_variance_is_the_rotated_last_entry() -> None:
     covariances = factors @ factors.transpose(0, 2, 1)
     turns = np.stack([rotation(v) for v in rng.normal(size=(50, 3))])
     expected = [(r @ s @ r.T)[2, 2] for r, s in zip(turns, covariances, strict=True)]
-    np.testing.assert_allclose(depth_variance_of_points(covariances, turns), expected, rtol=1e-12)
-    one = depth_variance_of_points(covariances, turns[0])
+    np.testing.assert_allclose(propagate_depth_variance(covariances, turns), expected, rtol=1e-12)
+    one = propagate_depth_variance(covariances, turns[0])
     assert one[7] == pytest.approx((turns[0] @ covariances[7] @ turns[0].T)[2, 2], rel=1e-12)
 
 
@@ -112,7 +112,7 @@ def test_unobserved_directions_have_huge_but_finite_variance() -> None:
         obs_point=np.arange(4),
         obs_xy=np.full((4, 2), 500.0),
     )
-    covariances = point_covariances(problem, soft_l1())
+    covariances = compute_point_covariances(problem, soft_l1())
     assert np.isfinite(covariances).all()
     np.testing.assert_allclose(covariances[3:], np.eye(3) / DAMPING * np.ones((2, 1, 1)))
     values, vectors = np.linalg.eigh(covariances[1])

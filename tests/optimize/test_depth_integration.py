@@ -18,7 +18,7 @@ from mpsfm_core.optimize.depth_integration import (
     Anchors,
     DepthIntegrator,
 )
-from mpsfm_core.optimize.integration_energy import majorise
+from mpsfm_core.optimize.integration_energy import majorize
 from mpsfm_core.optimize.options import IntegrationOptions
 from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Plane, arc_poses, look_at, room_scene
 from tests.optimize.integration_problems import (
@@ -44,7 +44,7 @@ def test_energy_gradient_and_matrix_equal_the_reference(shape, masked):
     reference = ReferenceIntegration(depth, normals, camera_of(shape), anchors)
     terms = DepthIntegrator(depth, normals, camera_of(shape))._terms(anchors, 1.0)
     z = terms.prior.log_depth + np.random.default_rng(2).normal(0, 0.1, shape)
-    ours, expected = majorise(z, terms), reference.linearise(z.ravel())
+    ours, expected = majorize(z, terms), reference.linearise(z.ravel())
     assert ours.energy == pytest.approx(expected.energy, rel=1e-5)
     scale = np.abs(expected.gradient).max()
     np.testing.assert_allclose(ours.gradient.ravel(), expected.gradient, atol=1e-5 * scale)
@@ -79,7 +79,7 @@ def test_gradient_of_every_residual_by_finite_differences(part, seed):
     terms = only(part, DepthIntegrator(depth, normals, camera_of(shape))._terms(anchors, 1.0))
     rng = np.random.default_rng(seed + 10)
     z = terms.prior.log_depth + rng.normal(0, 0.05, shape)
-    gradient = 2 * majorise(z, terms).gradient
+    gradient = 2 * majorize(z, terms).gradient
     assert np.abs(gradient).max() > 0
     numeric = np.zeros(shape)
     h = 1e-5
@@ -87,25 +87,25 @@ def test_gradient_of_every_residual_by_finite_differences(part, seed):
         unit = np.zeros(shape)
         unit[i, j] = h
         # Fourth order: the soft minimum is strongly curved.
-        near = majorise(z + unit, terms).energy - majorise(z - unit, terms).energy
-        far = majorise(z + 2 * unit, terms).energy - majorise(z - 2 * unit, terms).energy
+        near = majorize(z + unit, terms).energy - majorize(z - unit, terms).energy
+        far = majorize(z + 2 * unit, terms).energy - majorize(z - 2 * unit, terms).energy
         numeric[i, j] = (8 * near - far) / (12 * h)
     np.testing.assert_allclose(gradient, numeric, atol=1e-6 * np.abs(gradient).max())
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_quadratic_majorises_the_energy(seed):
+def test_the_quadratic_majorizes_the_energy(seed):
     shape = (8, 9)
     depth, normals, anchors = random_problem(shape, seed, masked=0.1)
     terms = DepthIntegrator(depth, normals, camera_of(shape))._terms(anchors, 1.0)
     rng = np.random.default_rng(seed)
-    here = majorise(terms.prior.log_depth, terms)
+    here = majorize(terms.prior.log_depth, terms)
     matrix = grid_operator(here.east, here.south, here.mass)
     for size in (1e-3, 1e-2, 1e-1, 1.0):
         step = rng.normal(0, size, shape)
         quadratic = here.energy + 2 * (here.gradient * step).sum()
         quadratic += step.ravel() @ (matrix @ step.ravel())
-        energy = majorise(terms.prior.log_depth + step, terms).energy
+        energy = majorize(terms.prior.log_depth + step, terms).energy
         assert energy <= quadratic * (1 + 1e-5)
 
 
@@ -113,7 +113,7 @@ def test_the_pull_of_the_prior_never_fades():
     depth, normals, _ = random_problem((3, 4), 0)
     terms = only("prior", DepthIntegrator(depth, normals, camera_of((3, 4)))._terms(NO_ANCHORS, 1))
     pulls = [
-        majorise(terms.prior.log_depth + offset, terms).gradient for offset in (0.05, 0.5, 5.0)
+        majorize(terms.prior.log_depth + offset, terms).gradient for offset in (0.05, 0.5, 5.0)
     ]
     assert (pulls[0] > 0).all()
     assert (pulls[1] > pulls[0]).all()

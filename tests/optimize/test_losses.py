@@ -4,7 +4,7 @@ import numpy as np
 import pyceres
 import pytest
 
-from mpsfm_core.optimize.losses import LOSSES, Loss, evaluate
+from mpsfm_core.optimize.losses import LOSSES, Loss, evaluate_loss
 
 S = np.array([0.0, 1e-8, 0.3, 2.0, 2.2499, 2.2501, 40.0, 1e12])
 SCALE = 1.5
@@ -13,7 +13,7 @@ SCALE = 1.5
 @pytest.mark.parametrize("loss", Loss)
 def test_kernels_and_arrays_agree(loss: Loss) -> None:
     values, weights = LOSSES[loss](S, SCALE)
-    scalar = np.array([evaluate(int(loss), s, SCALE) for s in S])
+    scalar = np.array([evaluate_loss(int(loss), s, SCALE) for s in S])
     np.testing.assert_allclose(scalar, np.column_stack([values, weights]), rtol=1e-14)
 
 

@@ -12,9 +12,9 @@ from mpsfm_core.data import Float64, Pose
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.optimize.resection import (
     POSE,
-    Segments,
-    distances_and_depths,
-    linearize,
+    RaySegments,
+    linearize_pose,
+    measure_segments,
     refine_pose,
 )
 
@@ -34,13 +34,13 @@ def project(pose: Pose, points: Float64) -> Float64:
 
 def segments(
     count: int = 60, *, slack: float = 0.1, noise_px: float = 0.0, limit: float = 4.0, seed: int = 0
-) -> Segments:
+) -> RaySegments:
     """Points seen from the truth, each somewhere between the ends of its segment; those lie along
     the rays of a camera at the origin."""
     rng = np.random.default_rng(seed)
     points = rng.uniform([-2, -2, 3], [2, 2, 8], (count, 3))
     middle = points * np.exp(rng.uniform(-slack, slack, (count, 1)))
-    return Segments(
+    return RaySegments(
         near=middle * np.exp(-slack),
         far=middle * np.exp(slack),
         xy=project(TRUTH, points) + rng.normal(0, noise_px, (count, 2)),
@@ -55,13 +55,13 @@ def errors(pose: Pose) -> tuple[float, float]:
     return turn, float(np.linalg.norm(pose[1] - TRUTH[1]))
 
 
-def objective(pose: Pose, seen: Segments, scale: float = 1.0) -> tuple[float, Float64, Float64]:
+def objective(pose: Pose, seen: RaySegments, scale: float = 1.0) -> tuple[float, Float64, Float64]:
     matrix, gradient = np.empty((POSE, POSE)), np.empty(POSE)
-    cost = linearize(*pose, INTRINSICS, seen, scale, matrix, gradient)
+    cost = linearize_pose(*pose, INTRINSICS, seen, scale, matrix, gradient)
     return cost, gradient, matrix
 
 
-def densely(pose: Pose, seen: Segments) -> tuple[Float64, Float64]:
+def densely(pose: Pose, seen: RaySegments) -> tuple[Float64, Float64]:
     """Distances and depths by looking at many points of each segment."""
     share = np.linspace(0, 1, 20001)[:, None, None]
     points = (1 - share) * seen.near + share * seen.far
@@ -76,7 +76,7 @@ def densely(pose: Pose, seen: Segments) -> tuple[Float64, Float64]:
 def test_distance_and_depth_are_those_of_the_nearest_point_of_the_segment() -> None:
     seen = segments(slack=0.3, noise_px=5.0)
     pose = moved(TRUTH, np.array([0.01, 0.02, -0.01, 0.05, 0.02, -0.1]))
-    found, expected = distances_and_depths(pose, INTRINSICS, seen), densely(pose, seen)
+    found, expected = measure_segments(pose, INTRINSICS, seen), densely(pose, seen)
     np.testing.assert_allclose(found[0], expected[0], atol=1e-3)
     np.testing.assert_allclose(found[1], expected[1], rtol=1e-3)
 
@@ -85,7 +85,7 @@ def test_what_is_behind_the_camera_has_neither() -> None:
     seen = segments(4)
     seen.near[1] = -seen.near[1]
     seen.far[2] = -seen.far[2]
-    distance, depth = distances_and_depths(TRUTH, INTRINSICS, seen)
+    distance, depth = measure_segments(TRUTH, INTRINSICS, seen)
     assert np.isnan(distance).tolist() == np.isnan(depth).tolist() == [False, True, True, False]
 
 
@@ -130,7 +130,7 @@ def test_pose_is_found_from_far_off_among_wrong_matches() -> None:
     wrong = rng.random(200) < 0.3
     seen.xy[wrong] = rng.uniform(0, 480, (wrong.sum(), 2))
     start = moved(TRUTH, np.array([0.02, -0.02, 0.02, 0.1, 0.1, -0.1]))
-    off = distances_and_depths(start, INTRINSICS, seen)[0][~wrong]
+    off = measure_segments(start, INTRINSICS, seen)[0][~wrong]
     assert np.median(off) > 4.0
     found = refine_pose(start, INTRINSICS, seen, scales=NARROWING)
     turn, shift = errors(found)
@@ -177,5 +177,5 @@ def test_a_pose_that_nothing_determines_stays() -> None:
     found = refine_pose(TRUTH, INTRINSICS, far_off, scales=np.ones(3))
     np.testing.assert_array_equal(found[0], TRUTH[0])
     np.testing.assert_array_equal(found[1], TRUTH[1])
-    one = Segments(*(values[:1] for values in seen))
+    one = RaySegments(*(values[:1] for values in seen))
     assert np.isfinite(refine_pose(TRUTH, INTRINSICS, one, scales=np.ones(3))[1]).all()

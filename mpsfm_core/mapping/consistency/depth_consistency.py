@@ -48,7 +48,7 @@ from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.refinement.depth_noise import local_noise, witnesses
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.optimize.depth_integration import RefinedDepth
-from mpsfm_core.optimize.thinning import thinned, thinned_camera, thinning_step
+from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, subsample_camera
 from mpsfm_core.support import jit
 
 STEPS = 4
@@ -169,20 +169,20 @@ class DepthConsistencyCheck:
 
     def _make_grid(self, image: int, std_factor: float) -> _Grid:
         depth_map = self._scene.maps[image]
-        step = thinning_step(depth_map.valid.shape[1], self._options.map_width)
-        depth = thinned(depth_map.depth, step)
-        valid = thinned(depth_map.valid, step)
-        std = thinned(depth_map.log_std, step) * np.float32(std_factor)
+        step = compute_subsampling_step(depth_map.valid.shape[1], self._options.map_width)
+        depth = subsample(depth_map.depth, step)
+        valid = subsample(depth_map.valid, step)
+        std = subsample(depth_map.log_std, step) * np.float32(std_factor)
         if self._options.weigh_evidence:
             local = local_noise(self._scene, image, witnesses(self._scene, image), std_factor)
-            std = thinned(depth_map.log_std, step) * thinned(local, step)
+            std = subsample(depth_map.log_std, step) * subsample(local, step)
         # A pixel's error of place is one of depth at edges and where sight grazes a surface.
         around = np.ones((3, 3))
         nearest = cv2.erode(np.where(valid, depth, np.float32(np.inf)), around)
         if self._fills_holes:
             std = np.where(valid, std, cv2.dilate(np.where(valid, std, np.float32(0)), around))
             depth, valid = np.where(valid, depth, nearest), np.isfinite(nearest)
-        params = np.array(thinned_camera(depth_map.camera, step).params)
+        params = np.array(subsample_camera(depth_map.camera, step).params)
         return _Grid(depth, np.maximum(std, np.float32(1e-6)), valid, nearest, params)
 
 

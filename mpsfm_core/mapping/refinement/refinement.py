@@ -20,14 +20,14 @@ from mpsfm_core.mapping.registration.image_selection import find_local_bundle
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, lift_low_parallax
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
-from mpsfm_core.optimize.covariance import depth_variance_of_points, point_covariances
+from mpsfm_core.optimize.covariance import compute_point_covariances, propagate_depth_variance
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
 from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, Loss
-from mpsfm_core.optimize.thinning import (
-    thinned_camera,
-    thinned_pixels,
-    thinned_prior,
-    thinning_step,
+from mpsfm_core.optimize.subsampling import (
+    compute_subsampling_step,
+    subsample_camera,
+    subsample_pixels,
+    subsample_prior,
 )
 from mpsfm_core.support.threads import each
 
@@ -286,12 +286,12 @@ class Refiner:
         points = tracks.point_of[keypoints]
         rows = keypoints - scene.graph.offsets[image]
         rotation = np.broadcast_to(scene.rotations[image], (len(points), 3, 3))
-        variance = depth_variance_of_points(covariances[points], rotation)
+        variance = propagate_depth_variance(covariances[points], rotation)
         ratio = z / np.maximum(depth_map.scale * depth_map.prior_at_keypoints(rows), 1e-12)
         good = (angles[points] >= self.options.anchor_min_angle_deg) & (z > 0)
         good &= np.isfinite(variance) & (variance > 0)
         good &= ~depth_map.keypoint_valid[rows] | self._near(ratio)
-        xy = thinned_pixels(depth_map.keypoints[rows][good], self._step(image))
+        xy = subsample_pixels(depth_map.keypoints[rows][good], self._step(image))
         anchors = Anchors(xy, z[good], variance[good])
         refined = self._integrator(image).refine(
             anchors, scale=depth_map.scale, start=depth_map.refined
@@ -344,17 +344,17 @@ class Refiner:
     def _integrator(self, image: int) -> DepthIntegrator:
         """The integrator of an image; the measured noise scales what its depth prior is worth."""
         depth_map, step = self.scene.maps[image], self._step(image)
-        camera = thinned_camera(depth_map.camera, step)
+        camera = subsample_camera(depth_map.camera, step)
         integrator = self._integrators.get(image)
         if integrator is not None and integrator.camera == camera:
             return integrator
-        prior, noise = thinned_prior(depth_map.prior, step), self._assumed
+        prior, noise = subsample_prior(depth_map.prior, step), self._assumed
         assert prior.variance is not None  # MappingImage checks it
         options = self.options.integration
         worth = max(noise.independent_pixels(prior.depth.size), options.independent_depths)
         integrator = self._integrators[image] = DepthIntegrator(
             replace(prior, variance=prior.variance * np.float32(noise.multiplier**2)),
-            thinned_prior(depth_map.normals, step),
+            subsample_prior(depth_map.normals, step),
             camera,
             options.model_copy(update={"independent_depths": worth}),
         )
@@ -362,7 +362,9 @@ class Refiner:
 
     def _step(self, image: int) -> int:
         """How far apart the pixels are on which an image's depth is refined."""
-        return thinning_step(self.scene.maps[image].prior.shape[1], self.options.map_width)
+        return compute_subsampling_step(
+            self.scene.maps[image].prior.shape[1], self.options.map_width
+        )
 
     def _observed_depth(self, image: int) -> tuple[Int64, Float64]:
         """Keypoints of an image that observe points, and the points' depth in the image."""
@@ -437,7 +439,7 @@ class Refiner:
         wanted[tracks.point_of[observations[scene.mask(seen_by)[images]]]] = True
         observations = observations[wanted[tracks.point_of[observations]]]
         images = scene.graph.image_of[observations]
-        covariances = point_covariances(
+        covariances = compute_point_covariances(
             BundleProblem(
                 rotations=scene.rotations,
                 translations=scene.translations,

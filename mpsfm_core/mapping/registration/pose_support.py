@@ -1,8 +1,10 @@
-"""How much the matches of a new image support a pose, and the pose nearby that they support most.
+"""Support of a pose by 2D-3D correspondences, and its local maximization.
 
-A match supports a pose if its keypoint lies near the segment onto which the other keypoint's ray
-projects between the depths that the prior allows, and if the depth that follows fits the new
-image's own prior. Where the other depth is unknown, the segment is all of the ray that may be seen.
+A correspondence projects to a segment in the new image: the projection of the matched keypoint's
+ray between the nearest and farthest depth that the prior allows. It supports a pose (is an inlier)
+if the keypoint is close to this segment and the resulting depth agrees with the new image's prior.
+The support is the weighted MSAC score ``sum_i w_i (1 - r_i^2)`` with ``r_i`` the larger of both
+residuals relative to its threshold, truncated at 1.
 """
 
 from __future__ import annotations
@@ -16,125 +18,154 @@ from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration.correspondences import PoseCorrespondences
 from mpsfm_core.mapping.registration.pose_hypotheses import PoseHypothesis
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.optimize.resection import Segments, distances_and_depths, refine_pose
+from mpsfm_core.optimize.resection import RaySegments, measure_segments, refine_pose
 
 REFINEMENT_SCALES = np.maximum(5.0 * 0.8 ** np.arange(12), 1.0)
-"""Of the limit up to which a match counts, from one step to the next: a pose of RANSAC from lifted
-points may be off by pixels first (ours)."""
+"""Factors of the inlier threshold in successive Gauss-Newton steps. They start large because a
+RANSAC pose from lifted points can be off by pixels. [ours]"""
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose:
-    """``cam_from_world``, its source, and the support of the reference image with most of it.
-
-    ``support`` is the truncated quadratic score (MSAC) by which hypotheses are compared, in terms
-    of the matches' weights, as is ``inlier_ratio``; ``num_inliers`` counts what they are worth.
-    """
+    """Pose of an image and its support by the reference image that supports it most."""
 
     rotation: Float64
+    """(3, 3) ``cam_from_world``."""
     translation: Float64
+    """(3,) ``cam_from_world``."""
     source: str
+    """Name of the estimator."""
     support: float
+    """Weighted MSAC score; hypotheses are compared by it."""
     num_inliers: int
+    """Inliers; those of unknown depth count by their depth weight."""
     inlier_ratio: float
+    """Weighted share of the correspondences that are inliers, in [0, 1]."""
 
     @property
     def hypothesis(self) -> PoseHypothesis:
-        """The pose alone, to be rated again."""
+        """The pose without its support."""
         return PoseHypothesis(self.rotation, self.translation, self.source)
 
 
 def score_pose(
     scene: Scene,
-    found: PoseCorrespondences,
+    correspondences: PoseCorrespondences,
     hypothesis: PoseHypothesis,
     options: RegistrationOptions,
 ) -> ScoredPose:
-    """A pose with the support that the correspondences give it."""
-    misfit = _misfits(scene, found, hypothesis, options)
-    inlier = misfit < 1
+    """Compute the support of a pose by its correspondences.
 
-    def per_reference(values: Float64) -> Float64:
-        sums = np.bincount(found.references, values, minlength=scene.num_images)
+    Args:
+        scene: The scene with the registered images.
+        correspondences: Correspondences of the image.
+        hypothesis: The pose.
+        options: ``max_support_error_px`` and ``depth_deviations`` are the inlier thresholds.
+    """
+    residuals = _compute_residuals(scene, correspondences, hypothesis, options)
+    inlier = residuals < 1
+
+    def sum_per_reference(values: Float64) -> Float64:
+        sums = np.bincount(correspondences.references, values, minlength=scene.num_images)
         return sums.astype(np.float64)
 
-    support = per_reference(found.weights * (1 - misfit**2))
+    support = sum_per_reference(correspondences.weights * (1 - residuals**2))
     best = int(np.argmax(support))
-    total = per_reference(found.weights)[best]
+    total = sum_per_reference(correspondences.weights)[best]
+    inlier_weight = sum_per_reference(correspondences.weights * inlier)[best]
     return ScoredPose(
         *hypothesis,
         float(support[best]),
-        int(per_reference(found.depth_weights * inlier)[best]),
-        float(per_reference(found.weights * inlier)[best] / total) if total else 0.0,
+        int(sum_per_reference(correspondences.depth_weights * inlier)[best]),
+        float(inlier_weight / total) if total else 0.0,
     )
 
 
 def maximize_support(
-    scene: Scene, found: PoseCorrespondences, pose: ScoredPose, options: RegistrationOptions
+    scene: Scene,
+    correspondences: PoseCorrespondences,
+    pose: ScoredPose,
+    options: RegistrationOptions,
 ) -> ScoredPose:
-    """The pose nearby at which keypoints lie nearest to their segments, rated."""
-    if not len(found.keypoints):
+    """Refine a pose to minimize the distances of keypoints to their projected segments.
+
+    The objective is Tukey's biweight (see :func:`mpsfm_core.optimize.resection.refine_pose`). The
+    pose is returned unchanged if there are no correspondences.
+    """
+    if not len(correspondences.keypoints):
         return pose
     rotation, translation = refine_pose(
         (pose.rotation, pose.translation),
-        _intrinsics(scene, found),
-        _segments(scene, found, options),
+        _get_intrinsics(scene, correspondences),
+        _make_segments(scene, correspondences, options),
         scales=REFINEMENT_SCALES,
     )
-    return score_pose(scene, found, PoseHypothesis(rotation, translation, pose.source), options)
+    refined = PoseHypothesis(rotation, translation, pose.source)
+    return score_pose(scene, correspondences, refined, options)
 
 
-def _intrinsics(scene: Scene, found: PoseCorrespondences) -> Float64:
-    """fx, fy, cx, cy of the image that the keypoints are of."""
-    intrinsics: Float64 = scene.intrinsics[scene.graph.image_of[found.keypoints[0]]]
+def _get_intrinsics(scene: Scene, correspondences: PoseCorrespondences) -> Float64:
+    """Return fx, fy, cx, cy of the image that the correspondences belong to."""
+    image = scene.graph.image_of[correspondences.keypoints[0]]
+    intrinsics: Float64 = scene.intrinsics[image]
     return intrinsics
 
 
-def _segments(scene: Scene, found: PoseCorrespondences, options: RegistrationOptions) -> Segments:
-    std = scene.keypoint_std_px[scene.graph.image_of[found.keypoints]]
-    return Segments(
-        near=found.near,
-        far=found.far,
-        xy=scene.keypoints[found.keypoints],
-        limit=options.max_support_error_px * std,
-        weight=found.weights,
+def _make_segments(
+    scene: Scene, correspondences: PoseCorrespondences, options: RegistrationOptions
+) -> RaySegments:
+    std_px = scene.keypoint_std_px[scene.graph.image_of[correspondences.keypoints]]
+    return RaySegments(
+        near=correspondences.near_points,
+        far=correspondences.far_points,
+        xy=scene.keypoints[correspondences.keypoints],
+        limit=options.max_support_error_px * std_px,
+        weight=correspondences.weights,
     )
 
 
-def _misfits(
+def _compute_residuals(
     scene: Scene,
-    found: PoseCorrespondences,
+    correspondences: PoseCorrespondences,
     pose: PoseHypothesis,
     options: RegistrationOptions,
 ) -> Float64:
-    """(m,) how far each match is from supporting a pose, in terms of the limits; at most 1."""
-    if not len(found.keypoints):
+    """Return (m,) the residuals of a pose relative to their thresholds, truncated at 1."""
+    if not len(correspondences.keypoints):
         return np.empty(0)
-    segments = _segments(scene, found, options)
-    distance, depth = distances_and_depths(
-        (pose.rotation, pose.translation), _intrinsics(scene, found), segments
+    segments = _make_segments(scene, correspondences, options)
+    distances_px, depths = measure_segments(
+        (pose.rotation, pose.translation), _get_intrinsics(scene, correspondences), segments
     )
-    misfits = distance / segments.limit
-    misfits = np.fmax(misfits, _depth_misfits(scene, found, depth, misfits < 1, options))
-    return np.where(misfits < 1, misfits, 1.0)
+    residuals = distances_px / segments.limit
+    depth_residuals = _compute_depth_residuals(
+        scene, correspondences, depths, residuals < 1, options
+    )
+    residuals = np.fmax(residuals, depth_residuals)
+    return np.where(residuals < 1, residuals, 1.0)
 
 
-def _depth_misfits(
+def _compute_depth_residuals(
     scene: Scene,
-    found: PoseCorrespondences,
-    depth: Float64,
-    near: Bool,
+    correspondences: PoseCorrespondences,
+    depths: Float64,
+    is_near: Bool,
     options: RegistrationOptions,
 ) -> Float64:
-    """(m,) how far depths in the new image are from its prior, up to one scale; NaN: unknown."""
-    misfits = np.full(len(depth), np.nan)
-    image = int(scene.graph.image_of[found.keypoints[0]])
-    rows = found.keypoints - scene.graph.offsets[image]
-    known = found.known & scene.maps[image].keypoint_valid[rows] & (depth > 0)
-    if (known & near).any():
-        log_ratio = np.log(depth[known] / scene.maps[image].prior_at_keypoints(rows[known]))
-        own = scene.keypoint_log_std[found.keypoints[known]]
-        other = scene.keypoint_log_std[found.matched[known]]
-        limit = options.depth_deviations * np.hypot(own, other)
-        misfits[known] = np.abs(log_ratio - np.median(log_ratio[near[known]])) / limit
-    return misfits
+    """Return (m,) residuals of log depth to the new image's prior, relative to the threshold.
+
+    The scale of the prior is the median ratio over the keypoints near their segments. The residual
+    is NaN if a depth is unknown.
+    """
+    residuals = np.full(len(depths), np.nan)
+    image = int(scene.graph.image_of[correspondences.keypoints[0]])
+    rows = correspondences.keypoints - scene.graph.offsets[image]
+    known = correspondences.depth_known & scene.maps[image].keypoint_valid[rows] & (depths > 0)
+    if (known & is_near).any():
+        log_ratio = np.log(depths[known] / scene.maps[image].prior_at_keypoints(rows[known]))
+        image_std = scene.keypoint_log_std[correspondences.keypoints[known]]
+        reference_std = scene.keypoint_log_std[correspondences.matched_keypoints[known]]
+        limit = options.depth_deviations * np.hypot(image_std, reference_std)
+        log_scale = np.median(log_ratio[is_near[known]])
+        residuals[known] = np.abs(log_ratio - log_scale) / limit
+    return residuals

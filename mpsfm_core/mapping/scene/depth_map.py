@@ -7,7 +7,7 @@ import numpy as np
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage, PinholeCamera
 from mpsfm_core.geometry import sample_bilinear, scale_pixels
 from mpsfm_core.optimize.depth_integration import RefinedDepth
-from mpsfm_core.optimize.thinning import thickened, thinned, thinning_step
+from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, upsample
 
 
 class DepthMap:
@@ -82,10 +82,10 @@ class DepthMap:
         self.refined = refined
         self._best = refined.depth
         if refined.log_depth.shape != self.prior.shape:
-            step = thinning_step(self.prior.shape[1], refined.log_depth.shape[1])
-            depth, valid = thinned(self.prior.depth, step), thinned(self.prior.valid, step)
+            step = compute_subsampling_step(self.prior.shape[1], refined.log_depth.shape[1])
+            depth, valid = subsample(self.prior.depth, step), subsample(self.prior.valid, step)
             change = refined.log_depth - np.log(refined.scale * np.where(valid, depth, 1.0))
-            factor = np.exp(thickened(change, valid, self.prior.shape))
+            factor = np.exp(upsample(change, valid, self.prior.shape))
             self._best = self.prior.depth * np.float32(refined.scale) * factor
         self._best_at = self._sample(self._best)[0]
         self.set_scale(refined.scale)

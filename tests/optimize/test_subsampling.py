@@ -5,12 +5,12 @@ import pytest
 
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.geometry import pixel_centers, unproject
-from mpsfm_core.optimize.thinning import (
-    thickened,
-    thinned,
-    thinned_camera,
-    thinned_pixels,
-    thinning_step,
+from mpsfm_core.optimize.subsampling import (
+    compute_subsampling_step,
+    subsample,
+    subsample_camera,
+    subsample_pixels,
+    upsample,
 )
 
 CAMERA = PinholeCamera(37, 26, 30.0, 31.0, 18.2, 13.1)
@@ -20,13 +20,15 @@ CAMERA = PinholeCamera(37, 26, 30.0, 31.0, 18.2, 13.1)
 def test_thinned_pixels_see_what_they_saw(step: int) -> None:
     xy = pixel_centers(CAMERA.width, CAMERA.height)
     rays = unproject(CAMERA, xy, np.ones(xy.shape[:2]))
-    camera = thinned_camera(CAMERA, step)
+    camera = subsample_camera(CAMERA, step)
     centers = pixel_centers(camera.width, camera.height)
     np.testing.assert_allclose(
-        unproject(camera, centers, np.ones(centers.shape[:2])), thinned(rays, step), atol=1e-12
+        unproject(camera, centers, np.ones(centers.shape[:2])), subsample(rays, step), atol=1e-12
     )
     np.testing.assert_allclose(
-        thinned_pixels(thinned(xy, step).reshape(-1, 2), step), centers.reshape(-1, 2), atol=1e-12
+        subsample_pixels(subsample(xy, step).reshape(-1, 2), step),
+        centers.reshape(-1, 2),
+        atol=1e-12,
     )
 
 
@@ -34,8 +36,8 @@ def test_thinned_pixels_see_what_they_saw(step: int) -> None:
 def test_a_plane_comes_back_from_its_thinned_form(step: int) -> None:
     rows, columns = np.mgrid[:26, :37]
     plane = 0.3 * rows - 0.2 * columns + 1.0
-    thin = thinned(plane, step)
-    back = thickened(thin, np.ones(thin.shape, dtype=np.bool_), plane.shape)
+    thin = subsample(plane, step)
+    back = upsample(thin, np.ones(thin.shape, dtype=np.bool_), plane.shape)
     inside = (slice(step, -step),) * 2  # beyond the outer pixels nothing is known
     np.testing.assert_allclose(back[inside], plane[inside], atol=1e-5)
 
@@ -44,10 +46,15 @@ def test_pixels_that_are_not_valid_count_nothing() -> None:
     thin = np.full((13, 18), 2.0)
     valid = np.ones(thin.shape, dtype=np.bool_)
     thin[4:7, 5:8], valid[4:7, 5:8] = np.nan, False
-    back = thickened(thin, valid, (26, 37))
+    back = upsample(thin, valid, (26, 37))
     assert set(np.unique(back)) == {0.0, 2.0}
     assert back[11, 13] == 0.0
 
 
 def test_the_step_leaves_about_as_many_columns_as_wanted() -> None:
-    assert [thinning_step(columns, 200) for columns in (50, 200, 387, 640)] == [1, 1, 2, 3]
+    assert [compute_subsampling_step(columns, 200) for columns in (50, 200, 387, 640)] == [
+        1,
+        1,
+        2,
+        3,
+    ]

@@ -14,31 +14,31 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 Prior = TypeVar("Prior", DepthPrior, NormalPrior)
 
 
-def thinning_step(columns: int, wanted: int) -> int:
+def compute_subsampling_step(columns: int, wanted: int) -> int:
     """n such that every n-th of so many columns leaves about the wanted number."""
     return max(1, round(columns / wanted))
 
 
-def thinned(values: NDArray[Scalar], step: int) -> NDArray[Scalar]:
+def subsample(values: NDArray[Scalar], step: int) -> NDArray[Scalar]:
     """(h, w, ...): every ``step``-th row and column, from the middle of the first ``step``."""
     # in one piece, as kernels are compiled for
     return np.ascontiguousarray(values[step // 2 :: step, step // 2 :: step])
 
 
-def thinned_prior(prior: Prior, step: int) -> Prior:
-    """A depth or normal prior on the grid that :func:`thinned` leaves; itself for a step of 1."""
+def subsample_prior(prior: Prior, step: int) -> Prior:
+    """A depth or normal prior on the grid that :func:`subsample` leaves; itself for a step of 1."""
     if step == 1:
         return prior
     maps: dict[str, Any] = {
-        field.name: thinned(value, step)
+        field.name: subsample(value, step)
         for field in fields(prior)
         if isinstance(value := getattr(prior, field.name), np.ndarray)
     }
     return replace(prior, **maps)
 
 
-def thinned_camera(camera: PinholeCamera, step: int) -> PinholeCamera:
-    """The camera of the grid that :func:`thinned` leaves of a map."""
+def subsample_camera(camera: PinholeCamera, step: int) -> PinholeCamera:
+    """The camera of the grid that :func:`subsample` leaves of a map."""
     columns, rows = (len(range(step // 2, size, step)) for size in camera.size)
     fx, fy, cx, cy = camera.params
     offset = _offset(step)
@@ -47,19 +47,19 @@ def thinned_camera(camera: PinholeCamera, step: int) -> PinholeCamera:
     )
 
 
-def thinned_pixels(xy: Float64, step: int) -> Float64:
+def subsample_pixels(xy: Float64, step: int) -> Float64:
     """Pixels (n, 2) of a map in its thinned grid."""
     pixels: Float64 = xy / step - _offset(step)
     return pixels
 
 
-def thickened(values: Float64, valid: Bool, shape: tuple[int, int]) -> Float32:
+def upsample(values: Float64, valid: Bool, shape: tuple[int, int]) -> Float32:
     """Bilinear interpolation of a thinned map back to the grid ``shape`` (h, w) it came from.
 
     Pixels that are not valid count nothing; 0 where nothing valid is near.
     """
     rows, columns = shape
-    step = thinning_step(columns, values.shape[1])
+    step = compute_subsampling_step(columns, values.shape[1])
     known = np.stack([np.where(valid, values, 0), valid], axis=-1).astype(np.float32)
     known = _stretched(_stretched(known, rows, step).swapaxes(0, 1), columns, step)
     total, share = np.moveaxis(known.swapaxes(0, 1), -1, 0)
