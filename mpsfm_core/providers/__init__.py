@@ -1,4 +1,4 @@
-"""Everything that predicts something from pixels: protocols, hooks and the registry of plugins."""
+"""Plugin providers: protocols, hooks and specifications. See :mod:`registry` for discovery."""
 
 from mpsfm_core.providers.protocols import (
     API_VERSION,

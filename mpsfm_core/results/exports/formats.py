@@ -1,4 +1,4 @@
-"""The table of formats, and the one function that exports."""
+"""Export formats of the core and of plugins, and the export function."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from mpsfm_core.support.files import replacing
 from mpsfm_core.support.format_versions import VERSION
 
 DESCRIPTION = "export.json"
-"""Beside every export: what it holds, its unit, which way is up, and how it came from the run."""
+"""File in every export: number of images and points, unit, orientation, transform."""
 
 DESCRIPTION_FORMAT = 1
-"""Of :data:`DESCRIPTION`."""
+"""Version of :data:`DESCRIPTION`."""
 
 
 FORMATS = (
@@ -38,14 +38,14 @@ FORMATS = (
         "transforms.json with undistorted photos, depth, normals and points",
         nerfstudio.ENTRIES,
         nerfstudio.write,
-        turned=True,
+        align_gravity=True,
     ),
     ExportFormat(
         "gsplat",
         "COLMAP folder of undistorted photos with points, depth and normals for splatting",
         gsplat.ENTRIES,
         gsplat.write,
-        turned=True,
+        align_gravity=True,
     ),
     ExportFormat(
         "colmap-db",
@@ -59,25 +59,26 @@ FORMATS = (
         "points and cameras as glTF, for Blender and browsers",
         glb.ENTRIES,
         glb.write,
-        turned=True,
+        align_gravity=True,
     ),
     ExportFormat("bundler", "bundle.out of Bundler, undistorted", bundler.ENTRIES, bundler.write),
     ExportFormat("nvm", "N-View Match of VisualSFM, undistorted", nvm.ENTRIES, nvm.write),
 )
-"""Those of the core."""
+"""Formats of the core."""
 
 
 def known_formats(registry: Registry | None = None) -> dict[str, ExportFormat]:
-    """All formats by name: the core's, then the plugins'.
+    """Return all formats of the core and of plugins by name.
 
-    ``registry``: by default that of all installed plugins.
+    Args:
+        registry: plugins; by default all installed plugins.
     """
     registry = registry or Registry.discover()
-    brought = [one for more in registry.call_hook("mpsfm_export_formats") for one in more]
-    known: dict[str, ExportFormat] = {}
-    for one in (*FORMATS, *brought):
-        known.setdefault(one.name, one)
-    return known
+    plugin_formats = [f for formats in registry.call_hook("mpsfm_export_formats") for f in formats]
+    by_name: dict[str, ExportFormat] = {}
+    for export_format in (*FORMATS, *plugin_formats):
+        by_name.setdefault(export_format.name, export_format)
+    return by_name
 
 
 def export(
@@ -89,15 +90,22 @@ def export(
     turn: bool | None = None,
     registry: Registry | None = None,
 ) -> dict[str, Any]:
-    """Write a result folder or COLMAP model in another format.
+    """Export a result folder or COLMAP model to another format.
 
-    ``output``: folder, by default ``exports/FORMAT`` below ``folder``. ``photos``: folder of the
-    photos, if they are not where the run found them. ``turn``: whether gravity becomes -z and the
-    middle the origin, None for what suits the format. ``registry``: by default that of all
-    installed plugins, which may bring formats.
+    Args:
+        folder: result folder or COLMAP model.
+        format_name: name of the format, see :func:`known_formats`.
+        output: folder to write, by default ``exports/FORMAT`` below ``folder``.
+        photos: folder of the images, if it has moved since the run.
+        turn: True to rotate gravity to -z and move the origin to the median point; None for the
+            default of the format.
+        registry: plugins; by default all installed plugins.
 
-    Returns what :data:`DESCRIPTION` says. Raises :class:`InputError` when the input is damaged or
-    lacks what the format needs.
+    Returns:
+        The content of :data:`DESCRIPTION`, and ``output``.
+
+    Raises:
+        InputError: the format is unknown, or the input is damaged or incomplete.
     """
     known = known_formats(registry)
     if format_name not in known:
@@ -106,7 +114,7 @@ def export(
     chosen = known[format_name]
     source = ExportSource.read(folder, photos)
     if turn is None:
-        turn = chosen.turned and not source.is_georeferenced
+        turn = chosen.align_gravity and not source.is_georeferenced
     if turn:
         source = source.turned()
     output = output or folder / "exports" / format_name
@@ -123,7 +131,7 @@ def _writer_of(chosen: ExportFormat) -> Callable[[ExportSource, Path], None]:
         return chosen.write
     try:
         writer: Callable[[ExportSource, Path], None] = resolve_name(chosen.write)
-    except Exception as error:  # a plugin's
+    except Exception as error:  # plugin code may raise anything
         text = f"format {chosen.name!r} cannot be written: {type(error).__name__}: {error}"
         raise InputError(text) from error
     return writer

@@ -23,6 +23,6 @@ def mpsfm_export_formats() -> Sequence[ExportFormat]:
             "recording for the rerun viewer: cameras, photos, points, depth maps",
             ("scene.rrd",),
             "mpsfm_rerun.export:write",
-            turned=True,
+            align_gravity=True,
         )
     ]
