@@ -91,10 +91,12 @@ def test_readme(folder: Path) -> None:
     text = (folder / "README.md").read_text(encoding="utf-8")
     assert text.startswith(f"# {folder.name}\n")
     assert f"pip install {folder.name}" in text or f"pip install '{folder.name}" in text
-    assert re.search(r"^## Licences?$", text, re.MULTILINE)
+    sections = re.findall(r"^## (.*)$", text, re.MULTILINE)
+    assert sections[:3] == ["Provides", "Install", "Use"]
+    assert sections[-1] == "License"
     assert "```yaml" in text or "export " in text
     overview = folder.parents[1] / "README.md"
-    assert f"| [{folder.name}](plugins/{folder.name}) |" in overview.read_text(encoding="utf-8")
+    assert f"[{folder.name}](plugins/{folder.name})" in overview.read_text(encoding="utf-8")
 
 
 def test_the_meta_distribution_names_every_plugin() -> None:
