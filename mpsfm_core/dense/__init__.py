@@ -1,1 +1,1 @@
-"""Dense geometry of a finished reconstruction: multi-view depth with honest variance."""
+"""Dense geometry of a reconstruction: stereo depth with variance, fusion, mesh."""

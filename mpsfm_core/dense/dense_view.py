@@ -1,4 +1,4 @@
-"""One posed photo as the dense stage sees it: grey values and depth on one grid."""
+"""Posed views for stereo: gray values and known depth on one grid."""
 
 from __future__ import annotations
 
@@ -13,55 +13,68 @@ from mpsfm_core.geometry import resize_map
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 
 
-def dense_grid_size(size: tuple[int, int], longer_side: int) -> tuple[int, int]:
-    """(width, height) of the grid for a photo of this size."""
-    factor = min(1.0, longer_side / max(size))
+def dense_grid_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
+    """Return (width, height) of the grid for an image; `max_size` limits the longer side."""
+    factor = min(1.0, max_size / max(size))
     return max(2, round(size[0] * factor)), max(2, round(size[1] * factor))
 
 
 @dataclass(frozen=True, eq=False)
 class PosedGrid:
-    """Where the pixels of a photo look: ``camera`` on its grid, ``rotation`` (3, 3) and
-    ``translation`` (3,), ``cam_from_world``."""
+    """Pixel grid with intrinsics and pose."""
 
     camera: PinholeCamera
+    """Intrinsics of the grid."""
     rotation: Float64
+    """(3, 3) rotation of ``cam_from_world``."""
     translation: Float64
+    """(3,) translation of ``cam_from_world``, world units."""
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """(rows, columns)."""
         return self.camera.height, self.camera.width
 
-    def pixels_from(self, other: PosedGrid) -> tuple[Float64, Float64]:
-        """``(turned, shift)``: pixel (x, y, 1) of ``other`` with depth d is here at the homogeneous
-        pixel ``d * turned @ (x, y, 1) + shift``."""
-        rotation = self.rotation @ other.rotation.T
-        translation = self.translation - rotation @ other.translation
+    def pixels_from(self, source: PosedGrid) -> tuple[Float64, Float64]:
+        """Return the projection of another grid's pixels, ``d * matrix @ (x, y, 1) + offset``.
+
+        Args:
+            source: Grid with the pixel (x, y) at depth d.
+
+        Returns:
+            Matrix (3, 3) and offset (3,). The sum is a homogeneous pixel of this grid.
+        """
+        rotation = self.rotation @ source.rotation.T
+        translation = self.translation - rotation @ source.translation
         matrix = self.camera.matrix
-        return matrix @ rotation @ np.linalg.inv(other.camera.matrix), matrix @ translation
+        return matrix @ rotation @ np.linalg.inv(source.camera.matrix), matrix @ translation
 
 
 @dataclass(frozen=True, eq=False)
 class DenseView(PosedGrid):
-    """A photo on its grid.
+    """Undistorted view with its known depth on one grid."""
 
-    ``grey``: (h, w) float32 in [0, 1]. ``usable``: (h, w) bool, False where the photo is masked.
-    ``log_depth``, ``log_std``: (h, w) float32, depth known before and its std, natural logarithm of
-    world units; where nothing was known what was known around, with a std that says so.
-    """
-
-    grey: Float32
+    gray: Float32
+    """(h, w) gray values in [0, 1]."""
     usable: Bool
+    """(h, w) mask, False at masked pixels."""
     log_depth: Float32
+    """(h, w) natural logarithm of the known depth in world units; holes are filled from around."""
     log_std: Float32
+    """(h, w) std of ``log_depth``; ``UNKNOWN_LOG_STD`` in holes."""
 
     @classmethod
-    def of(cls, image: RegisteredImage, view: View, max_size: int) -> DenseView:
-        """A registered image with its photo, the longer side ``max_size`` at most."""
+    def from_view(cls, image: RegisteredImage, view: View, max_size: int) -> DenseView:
+        """Resize a view and the depth map of its registered image to the stereo grid.
+
+        Args:
+            image: Registered image with pose and depth map.
+            view: Undistorted view of the image.
+            max_size: Maximum of the longer side in pixels.
+        """
         rows, columns = view.image.shape[:2]
         width, height = dense_grid_size((columns, rows), max_size)
-        grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+        gray = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
         usable = np.ones((height, width), np.bool_)
         if view.mask is not None:
             usable = resize_map(view.mask, width, height, linear=False) > 0
@@ -70,14 +83,14 @@ class DenseView(PosedGrid):
             image.camera.resized(width, height),
             image.rotation,
             image.translation,
-            resize_map(grey, width, height) / np.float32(255),
+            resize_map(gray, width, height) / np.float32(255),
             usable,
             log_depth,
             log_std,
         )
 
-    def reduced(self, factor: int) -> DenseView:
-        """On a grid with so many times fewer rows and columns."""
+    def downsample(self, factor: int) -> DenseView:
+        """Return the view on a grid with `factor` times fewer rows and columns."""
         if factor == 1:
             return self
         width, height = (max(2, size // factor) for size in self.camera.size)
@@ -85,7 +98,7 @@ class DenseView(PosedGrid):
             self.camera.resized(width, height),
             self.rotation,
             self.translation,
-            resize_map(self.grey, width, height),
+            resize_map(self.gray, width, height),
             resize_map(self.usable, width, height, linear=False) > 0,
             resize_map(self.log_depth, width, height),
             resize_map(self.log_std, width, height),
@@ -93,44 +106,54 @@ class DenseView(PosedGrid):
 
     @property
     def grid(self) -> PosedGrid:
-        """Without the photo and what is known of its depth."""
+        """Intrinsics and pose without pixel data."""
         return PosedGrid(self.camera, self.rotation, self.translation)
 
 
 def resample_known_depth(depth: DepthPrior, width: int, height: int) -> tuple[Float32, Float32]:
-    """:attr:`DenseView.log_depth` and its std of a refined map, on a grid of this size.
+    """Resample a depth map and its std in log depth to a grid.
 
-    What lies between two samples of different surfaces is on neither: where the mean is further
-    from the nearest sample than that may be off, the sample counts; beside holes it does too.
+    Linear interpolation across a depth edge would give a depth on neither surface. The nearest
+    sample replaces the interpolated value if both differ by more than the std, and next to holes.
+
+    Args:
+        depth: Refined depth map with variance.
+        width: Columns of the grid.
+        height: Rows of the grid.
+
+    Returns:
+        Log depth and its std, both (h, w).
     """
-    log_depth, log_std = _known(depth)
-    smooth, smooth_std = (resize_map(each, width, height) for each in (log_depth, log_std))
-    nearest, std = (resize_map(each, width, height, linear=False) for each in (log_depth, log_std))
-    valid = resize_map(depth.valid.astype(np.float32), width, height)
-    between = (np.abs(smooth - nearest) > std) | ((valid > 0) & (valid < 1))
-    return np.where(between, nearest, smooth), np.where(between, std, smooth_std)
+    log_depth, log_std = _log_depth_and_std(depth)
+    smooth, smooth_std = (resize_map(map_, width, height) for map_ in (log_depth, log_std))
+    nearest, nearest_std = (
+        resize_map(map_, width, height, linear=False) for map_ in (log_depth, log_std)
+    )
+    valid_ratio = resize_map(depth.valid.astype(np.float32), width, height)
+    at_edge = (np.abs(smooth - nearest) > nearest_std) | ((valid_ratio > 0) & (valid_ratio < 1))
+    return np.where(at_edge, nearest, smooth), np.where(at_edge, nearest_std, smooth_std)
 
 
-def _known(depth: DepthPrior) -> tuple[Float32, Float32]:
-    assert depth.variance is not None  # a refined map always has one
+def _log_depth_and_std(depth: DepthPrior) -> tuple[Float32, Float32]:
+    """Return log depth without holes and its std, both (h, w)."""
+    assert depth.variance is not None  # a refined map always has a variance
     valid = depth.valid
     if not valid.any():
         zero = np.zeros(depth.shape, np.float32)
         return zero, zero + np.float32(UNKNOWN_LOG_STD)
-    known = _without_holes(np.log(np.where(valid, depth.depth, 1)).astype(np.float32), valid)
+    log_depth = _fill_holes(np.log(np.where(valid, depth.depth, 1)).astype(np.float32), valid)
     std = np.sqrt(depth.variance) / np.where(valid, depth.depth, 1)
-    return known, np.where(valid, std, UNKNOWN_LOG_STD).astype(np.float32)
+    return log_depth, np.where(valid, std, UNKNOWN_LOG_STD).astype(np.float32)
 
 
-def _without_holes(values: Float32, valid: Bool) -> Float32:
-    """The values (h, w), and where they are not valid the mean of what is valid around, taken as
-    wide as the hole is."""
+def _fill_holes(values: Float32, valid: Bool) -> Float32:
+    """Fill invalid pixels by pull-push: means over valid neighbors on ever coarser grids."""
     if valid.all():
         return values
     width, height = ((size + 1) // 2 for size in values.shape[::-1])
-    share = resize_map(valid.astype(np.float32), width, height)
+    valid_ratio = resize_map(valid.astype(np.float32), width, height)
     total = resize_map(np.where(valid, values, np.float32(0)), width, height)
-    around = share > 0
-    mean = (total / np.where(around, share, 1)).astype(np.float32)
-    coarse = _without_holes(mean, around)
+    coarse_valid = valid_ratio > 0
+    mean = (total / np.where(coarse_valid, valid_ratio, 1)).astype(np.float32)
+    coarse = _fill_holes(mean, coarse_valid)
     return np.where(valid, values, resize_map(coarse, *values.shape[::-1]))

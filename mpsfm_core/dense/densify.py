@@ -1,8 +1,13 @@
 """Densification: replace refined depth maps by multi-view stereo depth where images overlap.
 
-The stages follow the order of the data: select source views, match each view by plane-sweep stereo,
-compare the depth maps of neighboring views, estimate the scale uncertainty, and fuse stereo depth
-with the known depth.
+The stages in the order of the data:
+
+1. Select source views (:mod:`~mpsfm_core.dense.view_selection`).
+2. Match each view by plane-sweep stereo (:mod:`~mpsfm_core.dense.stereo`).
+3. Compare the depth maps of neighbors (:mod:`~mpsfm_core.dense.geometric_consistency`).
+4. Estimate the uncertainty of poses and scales (:mod:`~mpsfm_core.dense.epipolar_error`,
+   :mod:`~mpsfm_core.dense.scale_uncertainty`).
+5. Fuse stereo depth with known depth (:mod:`~mpsfm_core.dense.depth_posterior`).
 """
 
 from __future__ import annotations
@@ -48,7 +53,7 @@ from mpsfm_core.support.threads import allowed
 
 _T = TypeVar("_T", bound=np.generic)
 _MAX_COST = 0.9
-"""Matching cost from which a pixel counts as not measured; textureless images match anything [ours]."""
+"""Maximum matching cost of a measured pixel; textureless images match anything [ours]."""
 _MAX_SPLAT_STDS = 1.5
 """Largest deviation of splatted depth from the known depth, in stds of the latter.
 
@@ -78,9 +83,11 @@ class DenseReport:
 
 
 class ArrayStore(Protocol):
-    """Stores an array in memory or on disk and returns an array of equal values."""
+    """Storage of large arrays, in memory or on disk."""
 
-    def __call__(self, array: NDArray[_T]) -> NDArray[_T]: ...
+    def __call__(self, array: NDArray[_T]) -> NDArray[_T]:
+        """Store an array and return an array of equal values."""
+        ...
 
 
 def store_in_memory(array: NDArray[_T]) -> NDArray[_T]:
@@ -89,7 +96,7 @@ def store_in_memory(array: NDArray[_T]) -> NDArray[_T]:
 
 
 class StereoCheckpoints(Protocol):
-    """Stores stereo depth per image, so that an interrupted run can resume."""
+    """Storage of stereo depth per image, so that an interrupted run can resume."""
 
     def load(self, name: str) -> StereoDepth | None:
         """Return the stereo depth of an image, or None.
@@ -310,8 +317,8 @@ def _merge_stereo_depth(
 ) -> LogDepthMap:
     """Merge the consistent depth of an image with depth splatted from its neighbors.
 
-    Pixels that other views confirm use their own depth. Elsewhere the confirmed pixels of neighbors
-    fill in if they are close to the known depth.
+    Pixels that other views confirm use their own depth. The other pixels use confirmed depth of
+    neighbors if it is close to the known depth.
     """
     image, confirmed = matched[row], consistency[row].confirmed
     log_depth = image.log_depth + consistency[row].mean_change

@@ -1,10 +1,9 @@
-"""Known depth where nothing was measured, moved as the measured depth beside it says.
+"""Depth completion: correct known depth where stereo measured nothing.
 
-Two things are known there. The ratio of known to true depth is much the same at neighbours, and
-about 1. And surfaces are flat: inverse depth is linear in the image on a plane. How far either
-holds differs between networks and photos, and what was measured tells: the one by how far known
-depth is off there, the other by how much measured surfaces bend. Both are linear in the ratio, and
-so is what was measured: one sparse least squares.
+Two assumptions constrain a pixel without measurement. The ratio of known to true depth is smooth
+and close to 1. Surfaces are planar, and inverse depth of a plane is linear in the image. Measured
+pixels estimate the variance of both assumptions. Both are linear in the ratio, and so are the
+measurements: completion is one sparse linear least-squares problem.
 """
 
 from __future__ import annotations
@@ -18,79 +17,84 @@ from scipy.sparse.linalg import splu
 from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.geometry.statistics import ONE_SIGMA
 
-_FARTHEST = 1.0
-"""Of log depth that a map is moved at most: planes reach beyond infinity (ours; none came so far
-on rendered_kitchen)."""
+_MAX_CORRECTION = 1.0
+"""Largest correction of log depth; extrapolated planes reach beyond infinity [ours]."""
 
 
 class MeasuredCorrection(NamedTuple):
-    """What was measured, on a coarse grid (h, w).
-
-    ``change``: of log depth, from what was known. ``precision``: 1 / variance, 0 where nothing was
-    measured.
-    """
+    """Measured corrections of the known depth on a coarse grid."""
 
     change: Float32
+    """(h, w) from known to measured log depth."""
     precision: Float32
+    """(h, w) inverse variance of the change, 0 where nothing was measured."""
 
 
 class PlanarityPrior(NamedTuple):
-    """What is known of second differences of inverse depth, relative to it.
-
-    ``bends`` (m, n): of a grid of n pixels, applied to its ratios of known to true depth.
-    ``weight`` (m,): 1 / variance.
-    """
+    """Gaussian prior on second differences of inverse depth, relative to inverse depth."""
 
     bends: csr_array
+    """(m, n) maps the n ratios of known to true depth to m relative second differences."""
     weight: Float64
+    """(m,) inverse variance of each second difference."""
 
 
 def estimate_planarity(
-    log_depth: Float32, hole: Bool, found: MeasuredCorrection, least: float
+    log_depth: Float32, hole: Bool, correction: MeasuredCorrection, min_std: float
 ) -> PlanarityPrior:
-    """How flat the surfaces of a photo are.
+    """Estimate how planar the surfaces of an image are.
 
-    ``log_depth``: (h, w), what was known; in each ``hole`` it is what was known around. ``found``:
-    what was measured. ``least``: the smallest std of log depth.
-    The std is that of measured bends. Where the known map bends as much there may be an edge: half
-    the weight. At the rim of a hole it tells nothing of edges, and where nothing was measured
-    nothing is known to be flat.
+    The std is that of measured second differences. If the known map bends as much, there may be an
+    edge, and the weight is halved. The rim of a hole shows no edges, so its weight is 0. Without
+    measurements all weights are 0.
+
+    Args:
+        log_depth: (h, w) known log depth; holes are filled from around.
+        hole: (h, w) mask of pixels without known depth.
+        correction: Measured corrections on the same grid.
+        min_std: Minimum std of log depth.
     """
     second = _second_differences(*log_depth.shape)
     inverse = np.exp(-log_depth.astype(np.float64)).ravel()
     size = abs(second)
     relative = size.sum(axis=1) / (size @ inverse)
     bends = csr_array(diags_array(relative) @ second @ diags_array(inverse))
-    inside = size @ (found.precision.ravel() == 0).astype(np.float64) == 0
-    if not inside.any():
+    measured = size @ (correction.precision.ravel() == 0).astype(np.float64) == 0
+    if not measured.any():
         return PlanarityPrior(bends, np.zeros(len(relative)))
-    measured = (bends @ np.exp(-found.change.astype(np.float64)).ravel())[inside]
-    std = max(float(np.quantile(np.abs(measured), ONE_SIGMA)), least)
-    known = bends @ np.ones(len(inverse))
-    holes = size @ hole.ravel().astype(np.float64)
-    alike = (holes == 0) | (holes == size.sum(axis=1))
-    return PlanarityPrior(bends, alike / (std**2 + known**2))
+    measured_bends = (bends @ np.exp(-correction.change.astype(np.float64)).ravel())[measured]
+    std = max(float(np.quantile(np.abs(measured_bends), ONE_SIGMA)), min_std)
+    known_bends = bends @ np.ones(len(inverse))
+    hole_weight = size @ hole.ravel().astype(np.float64)
+    not_at_rim = (hole_weight == 0) | (hole_weight == size.sum(axis=1))
+    return PlanarityPrior(bends, not_at_rim / (std**2 + known_bends**2))
 
 
 def solve_depth_correction(
-    field: tuple[Float32, Float32, Float32], flat: PlanarityPrior, found: MeasuredCorrection
+    field: tuple[Float32, Float32, Float32], planarity: PlanarityPrior, measured: MeasuredCorrection
 ) -> Float32:
-    """By how much known log depth is moved, (h, w).
+    """Solve for the correction of the known log depth at every pixel.
 
-    ``field``: the ratio as a Markov random field, couplings (east, south) of a pixel with its
-    neighbours, and with 1. ``flat``: of the photo. ``found``: what was measured.
+    Args:
+        field: Gaussian Markov random field of the ratio of known to true depth: couplings with the
+            east and south neighbor and with 1, each (h, w).
+        planarity: Planarity prior of the image.
+        measured: Measured corrections.
+
+    Returns:
+        (h, w) change of log depth.
     """
-    height, width = found.change.shape
+    height, width = measured.change.shape
     east, south, mass = (each.astype(np.float64) for each in field)
     across = kron(eye_array(height), _differences(width))
     down = kron(_differences(height), eye_array(width))
-    ratio = np.exp(-found.change.astype(np.float64)).ravel()
-    told = found.precision.ravel() / ratio**2
+    ratio = np.exp(-measured.change.astype(np.float64)).ravel()
+    ratio_precision = measured.precision.ravel() / ratio**2
     matrix = (
         across.T @ diags_array(east[:, :-1].ravel()) @ across
         + down.T @ diags_array(south[:-1].ravel()) @ down
-        + flat.bends.T @ diags_array(flat.weight) @ flat.bends
-        + diags_array(told + mass.ravel())
+        + planarity.bends.T @ diags_array(planarity.weight) @ planarity.bends
+        + diags_array(ratio_precision + mass.ravel())
     )
     factors = splu(
         matrix.tocsc(),
@@ -98,20 +102,23 @@ def solve_depth_correction(
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    solved = factors.solve(told * ratio + mass.ravel()).reshape(height, width)
-    farthest = np.exp(_FARTHEST)
-    moved: Float32 = -np.log(np.clip(solved, 1 / farthest, farthest)).astype(np.float32)
-    return moved
+    solved = factors.solve(ratio_precision * ratio + mass.ravel()).reshape(height, width)
+    max_ratio = np.exp(_MAX_CORRECTION)
+    correction: Float32 = -np.log(np.clip(solved, 1 / max_ratio, max_ratio)).astype(np.float32)
+    return correction
 
 
 def _differences(n: int) -> csr_array:
-    """Of neighbours, (n - 1, n)."""
+    """Build the operator of forward differences, (n - 1, n)."""
     return csr_array(eye_array(n - 1, n, k=1) - eye_array(n - 1, n))
 
 
 def _second_differences(height: int, width: int) -> csr_array:
-    """Along rows, along columns and of both, (m, n) of a grid of n pixels: the sum of their squares
-    is the same whichever way a surface bends."""
+    """Build the operator of all second differences, (m, n) for n pixels.
+
+    Rows, columns and mixed differences are weighted so that the sum of squares is invariant to
+    rotation (the Frobenius norm of the Hessian).
+    """
     down, across = _differences(height), _differences(width)
     rows = kron(eye_array(height), _differences(width - 1) @ across)
     columns = kron(_differences(height - 1) @ down, eye_array(width))

@@ -1,4 +1,4 @@
-"""What is known of depth when there is no prior: the range of the points that an image sees."""
+"""Depth prior from sparse points, for models without depth maps."""
 
 from __future__ import annotations
 
@@ -7,23 +7,28 @@ import numpy as np
 from mpsfm_core.data import DepthPrior, Float64
 
 _GRID = (8, 8)
-"""The map is the same everywhere, so its grid does not matter."""
-_RANGE = (2.0, 98.0)
-"""Percentiles of the depth of points; beyond lie the wrong ones."""
+"""Shape of the map. The map is constant, so the shape has no influence."""
+_RANGE_PERCENTILES = (2.0, 98.0)
+"""Percentiles of the point depths that bound the range; points outside may be outliers."""
 _RANGE_STDS = 1.5
-"""Std that the range reaches to either side; the search goes a little further."""
+"""Half width of the range in stds. Stereo searches slightly further."""
 _MIN_LOG_STD = 0.1
+"""Minimum std of log depth."""
 
 
 def depth_prior_from_points(depths: Float64) -> DepthPrior | None:
-    """One depth for the whole image, with a std that covers the points' (n,) depths.
+    """Build a constant depth prior whose std covers the depths of an image's points.
 
-    None without points in front of the camera.
+    Args:
+        depths: (n,) depths of the points in the camera frame, world units.
+
+    Returns:
+        The prior, or None without points in front of the camera.
     """
-    ahead = depths[depths > 0]
-    if not len(ahead):
+    positive = depths[depths > 0]
+    if not len(positive):
         return None
-    near, far = np.log(np.percentile(ahead, _RANGE))
+    near, far = np.log(np.percentile(positive, _RANGE_PERCENTILES))
     depth = np.full(_GRID, np.exp((near + far) / 2), np.float32)
     std = max((far - near) / 2 / _RANGE_STDS, _MIN_LOG_STD)
     return DepthPrior.from_arrays(depth, (std * depth) ** 2, metric=False)

@@ -1,9 +1,9 @@
-"""How far poses are off, in pixels, as the photos themselves show.
+"""Pose errors of image pairs, measured as patch offsets from epipolar lines.
 
-A pixel with its depth lies in another view on a line, wherever its depth. What the patch around it
-lies beside that line is an error of the poses, and nothing else is as large. Along the line poses
-are off as much, but there depth gives way: two views of the same pair agree on the wrong depth.
-Where few patches are found at all, two views hardly show the same.
+The depth of a pixel moves its projection along the epipolar line only. The offset of a matched
+patch perpendicular to the line is therefore a pose error. Pose errors along the line are invisible,
+because the matched depth absorbs them. If few patches match at all, both images hardly show the
+same surface.
 """
 
 from __future__ import annotations
@@ -18,59 +18,65 @@ from mpsfm_core.dense.dense_view import DenseView
 from mpsfm_core.geometry.patch_alignment import align_patches
 from mpsfm_core.geometry.statistics import ONE_SIGMA
 
-PATCHES = 100
-"""Of a photo that are looked for in each other one (ours)."""
-RADIUS = 7
-"""Of a patch, pixels of the map; what lies further off is not found (ours)."""
+MAX_PATCHES = 100
+"""Maximum number of patches per image pair [ours]."""
+PATCH_RADIUS_PX = 7
+"""Radius of a patch and largest offset of a match, in pixels of the depth map [ours]."""
 MIN_CORRELATION = 0.8
-"""Of patches that show the same (ours)."""
-_NOISE_PX = 1.5
-"""Within which noise of a reduced photo hangs together."""
-_STEP = 1e-2
-"""Of log depth, that tells the direction of the line."""
+"""Minimum NCC of a matched patch [ours]."""
+_NOISE_CORRELATION_PX = 1.5
+"""Correlation length of the noise of a downsampled image, in pixels."""
+_LOG_DEPTH_STEP = 1e-2
+"""Step of log depth for the numeric direction of the epipolar line."""
 
 
 class PatchOffsets(NamedTuple):
-    """Patches of a photo, looked for in another one.
+    """Offsets of matched patches from their epipolar lines."""
 
-    ``beside_lines``: (n,) float64, pixels of the other map, of those that were found. ``found``:
-    their share, 0 to 1.
-    """
-
-    beside_lines: Float64
-    found: float
+    epipolar_px: Float64
+    """(n,) signed distance of each matched patch from its line, pixels of the source view."""
+    matched_ratio: float
+    """Ratio of patches that match, in [0, 1]."""
 
 
 def estimate_pose_error_px(pairs: Iterable[PatchOffsets]) -> float:
-    """Std of the offsets beside the lines of a photo's pairs; 0 where no patch tells."""
-    offsets = np.abs(np.concatenate([np.zeros(0), *(pair.beside_lines for pair in pairs)]))
+    """Return the std of the epipolar offsets of an image's pairs in pixels; 0 without matches."""
+    offsets = np.abs(np.concatenate([np.zeros(0), *(pair.epipolar_px for pair in pairs)]))
     return float(np.quantile(offsets, ONE_SIGMA)) if len(offsets) else 0.0
 
 
 def measure_patch_offsets(
-    view: DenseView, log_depth: Float32, other: DenseView, which: Bool
+    view: DenseView, log_depth: Float32, source: DenseView, mask: Bool
 ) -> PatchOffsets:
-    """Look for patches of the ``view``, evenly spread over ``which`` (h, w), where their
-    ``log_depth`` (h, w) puts them in the ``other`` one."""
-    rows, columns = np.nonzero(which)
-    chosen = np.linspace(0, len(rows) - 1, min(PATCHES, len(rows))).astype(np.int64)
-    rows, columns = rows[chosen], columns[chosen]
+    """Match patches of a view near their projections in a source view.
+
+    Args:
+        view: Reference view.
+        log_depth: (h, w) log depth of the reference view.
+        source: View to search.
+        mask: (h, w) pixels from which patch centers are sampled evenly.
+    """
+    rows, columns = np.nonzero(mask)
+    sampled = np.linspace(0, len(rows) - 1, min(MAX_PATCHES, len(rows))).astype(np.int64)
+    rows, columns = rows[sampled], columns[sampled]
     xy = np.stack([columns, rows], axis=1).astype(np.float64) + 0.5
     depth: Float64 = np.exp(log_depth[rows, columns].astype(np.float64))
-    turned, shift = other.pixels_from(view)
+    matrix, offset = source.pixels_from(view)
 
-    def seen(pixels: Float64, depths: Float64) -> Float64:
-        place = depths[:, None] * (pixels @ turned[:, :2].T + turned[:, 2]) + shift
-        at: Float64 = place[:, :2] / place[:, 2:]
-        return at
+    def project_to_source(pixels: Float64, depths: Float64) -> Float64:
+        homogeneous = depths[:, None] * (pixels @ matrix[:, :2].T + matrix[:, 2]) + offset
+        projected: Float64 = homogeneous[:, :2] / homogeneous[:, 2:]
+        return projected
 
-    at = seen(xy, depth)
-    warp = np.stack([seen(xy + step, depth) - at for step in np.eye(2)], axis=2)
-    along = seen(xy, depth * np.exp(_STEP)) - at
-    length = np.linalg.norm(along, axis=1)
-    found = align_patches(view.grey, other.grey, xy, at, warp, RADIUS, _NOISE_PX)
-    near = np.linalg.norm(found.shift, axis=1) < RADIUS
-    tells = (found.correlation > MIN_CORRELATION) & near & (length > 0)
-    x, y = found.shift[tells].T
-    beside = (y * along[tells, 0] - x * along[tells, 1]) / length[tells]
-    return PatchOffsets(beside, len(beside) / max(len(chosen), 1))
+    source_xy = project_to_source(xy, depth)
+    warp = np.stack([project_to_source(xy + step, depth) - source_xy for step in np.eye(2)], axis=2)
+    line = project_to_source(xy, depth * np.exp(_LOG_DEPTH_STEP)) - source_xy
+    length = np.linalg.norm(line, axis=1)
+    alignment = align_patches(
+        view.gray, source.gray, xy, source_xy, warp, PATCH_RADIUS_PX, _NOISE_CORRELATION_PX
+    )
+    near = np.linalg.norm(alignment.shift, axis=1) < PATCH_RADIUS_PX
+    matched = (alignment.correlation > MIN_CORRELATION) & near & (length > 0)
+    x, y = alignment.shift[matched].T
+    epipolar_px = (y * line[matched, 0] - x * line[matched, 1]) / length[matched]
+    return PatchOffsets(epipolar_px, len(epipolar_px) / max(len(sampled), 1))

@@ -1,4 +1,4 @@
-"""One point cloud from the depth maps of all images, every surface once."""
+"""Fusion of the depth maps of all images into one point cloud without duplicate surfaces."""
 
 # mypy: allow-untyped-decorators
 
@@ -18,43 +18,43 @@ from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.support.jit import kernel
 from mpsfm_core.support.threads import each
 
-_T = TypeVar("_T")
+_MAX_NEIGHBORS = 8
+"""Maximum number of images that vote on the points of one image, by overlap."""
+_MIN_PIXEL_RATIO = 0.25
+"""Ratio of the most certain pixels that always pass; networks may declare large stds [ours]."""
+_DUPLICATE_DISTANCE = 0.02
+"""Relative distance up to which consistent points are duplicates, whatever their std [ours]."""
+_DOMINANT_STD_RATIO = 0.5
+"""Std ratio below which the more certain of two consistent points replaces the other at any
+distance [ours]."""
 
-_NEIGHBORS = 8
-"""Images that vote on the points of one image: those that see most of it."""
-_SUREST = 0.25
-"""Share of the pixels, surest first, that stay in any case: a network that promises little still
-gives a cloud (ours)."""
-_SAME = 0.02
-"""Relative distance up to which points that agree are one, whatever their std (ours)."""
-_MUCH_SURER = 0.5
-"""Std of an image, in that of another that agrees, with which its surface stands for the other's at
-any distance (ours)."""
+_T = TypeVar("_T")
 
 
 class _ConsistencyVotes(NamedTuple):
-    """Of points (n,): which stay, which of them an image shows that is more certain, and how many
-    images agree on each, its own counted."""
+    """Votes of neighboring images on n points of one image."""
 
-    stays: Bool
-    better_elsewhere: Bool
+    consistent: Bool
+    """(n,) mask of points that at least as many images confirm as see through."""
+    duplicate: Bool
+    """(n,) mask of points that a more certain image shows too."""
     views: UInt8
+    """(n,) number of images that agree, including the point's own."""
 
 
 class FusedPointCloud(NamedTuple):
-    """Points of a surface, (n, ...).
-
-    ``points``: (n, 3) float64, world. ``colors``: (n, 3) uint8, RGB. ``normals``: (n, 3) float32,
-    unit, towards the camera that saw the point; zero where the depth map says none. ``std``: (n,)
-    float32, of the depth, world units. ``views``: (n,) uint8, images whose depth agrees, its own
-    counted: 1 for what one image alone says.
-    """
+    """Point cloud with n points."""
 
     points: Float64
+    """(n, 3) float64 positions, world frame."""
     colors: UInt8
+    """(n, 3) uint8 RGB."""
     normals: Float32
+    """(n, 3) float32 unit normals facing the camera of the point, world frame; 0 if undefined."""
     std: Float32
+    """(n,) float32 std of the depth, world units."""
     views: UInt8
+    """(n,) uint8 number of images whose depth agrees, including the point's own (>= 1)."""
 
 
 def fuse_depth_maps(
@@ -63,67 +63,79 @@ def fuse_depth_maps(
     options: ResultOptions,
     seed: int = 0,
 ) -> FusedPointCloud:
-    """Where images agree on a surface it is taken from the one that is most certain.
+    """Fuse depth maps into one cloud; duplicates are taken from the most certain image.
 
-    Left out are uncertain pixels, those that more images see through than confirm, and images
-    without a confirmed pose. Above ``options.dense_max_points`` a random share of each map's pixels
-    is taken.
+    Uncertain pixels, inconsistent pixels and images without confirmed pose are left out. If the
+    cloud exceeds `options.dense_max_points`, each map is subsampled randomly.
+
+    Args:
+        reconstruction: Posed images with depth maps.
+        view_of: Returns the undistorted view of an image name, for the colors.
+        options: Options of the results.
+        seed: Seed of the subsampling.
     """
     images = reconstruction.confirmed_images
 
-    def kept(_: int, pixels: Int64, verdict: _ConsistencyVotes) -> tuple[Int64, UInt8]:
-        ours = verdict.stays & ~verdict.better_elsewhere
-        return pixels[ours], verdict.views[ours]
+    def select_unique(_: int, pixels: Int64, votes: _ConsistencyVotes) -> tuple[Int64, UInt8]:
+        mask = votes.consistent & ~votes.duplicate
+        return pixels[mask], votes.views[mask]
 
-    found = _judged(images, options, kept)
-    total = sum(len(pixels) for pixels, _ in found)
-    share = min(1.0, options.dense_max_points / max(1, total))
+    selected = _vote_on_images(images, options, select_unique)
+    total = sum(len(pixels) for pixels, _ in selected)
+    ratio = min(1.0, options.dense_max_points / max(1, total))
     rng = np.random.default_rng(seed)
-    for row, (pixels, views) in enumerate(found):
-        chosen = np.sort(rng.choice(len(pixels), int(share * len(pixels)), replace=False))
-        found[row] = pixels[chosen], views[chosen]
+    for row, (pixels, views) in enumerate(selected):
+        sampled = np.sort(rng.choice(len(pixels), int(ratio * len(pixels)), replace=False))
+        selected[row] = pixels[sampled], views[sampled]
 
-    def part(row: int) -> FusedPointCloud:
-        image, (pixels, views) = images[row], found[row]
-        points, variance = _lift(image, pixels)
-        colors = _colors(view_of(image.name), image, pixels)
-        normals = _normals(image).reshape(-1, 3)[pixels]
+    def build_cloud(row: int) -> FusedPointCloud:
+        image, (pixels, views) = images[row], selected[row]
+        points, variance = _unproject_pixels(image, pixels)
+        colors = _sample_colors(view_of(image.name), image, pixels)
+        normals = _compute_normals(image).reshape(-1, 3)[pixels]
         return FusedPointCloud(points, colors, normals, np.sqrt(variance).astype(np.float32), views)
 
-    parts = [_EMPTY, *each(part, range(len(images)))]
+    parts = [_EMPTY, *each(build_cloud, range(len(images)))]
     return FusedPointCloud(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def consistent_pixels(images: Sequence[RegisteredImage], options: ResultOptions) -> list[Bool]:
-    """For each image (h, w): certain pixels that not more images see through than confirm."""
+def compute_consistent_masks(
+    images: Sequence[RegisteredImage], options: ResultOptions
+) -> list[Bool]:
+    """Compute the mask (h, w) of certain and consistent pixels of each image."""
 
-    def mask(row: int, pixels: Int64, verdict: _ConsistencyVotes) -> Bool:
-        which = np.zeros(images[row].depth.shape, np.bool_)
-        which.ravel()[pixels[verdict.stays]] = True
-        return which
+    def build_mask(row: int, pixels: Int64, votes: _ConsistencyVotes) -> Bool:
+        mask = np.zeros(images[row].depth.shape, np.bool_)
+        mask.ravel()[pixels[votes.consistent]] = True
+        return mask
 
-    return _judged(images, options, mask)
+    return _vote_on_images(images, options, build_mask)
 
 
-def _judged(
+def _vote_on_images(
     images: Sequence[RegisteredImage],
     options: ResultOptions,
-    take: Callable[[int, Int64, _ConsistencyVotes], _T],
+    select: Callable[[int, Int64, _ConsistencyVotes], _T],
 ) -> list[_T]:
-    """What is taken of each image: of its row, its certain pixels, flat, and what the others say
-    of them."""
-    limit = max(options.dense_max_relative_std, _std_of_surest(images))
-    usable = [_certain(image, limit) for image in images]
-    near = select_source_views(images, _NEIGHBORS)
+    """Vote on the certain pixels of each image and return the selection of each image.
 
-    def judged(row: int) -> _T:
+    Args:
+        images: Images with confirmed poses.
+        options: Options of the results.
+        select: Called with the image's row, its certain pixels (flat indices) and their votes.
+    """
+    max_relative_std = max(options.dense_max_relative_std, _relative_std_of_best_pixels(images))
+    usable = [_certain_pixels(image, max_relative_std) for image in images]
+    neighbors = select_source_views(images, _MAX_NEIGHBORS)
+
+    def vote_on_image(row: int) -> _T:
         pixels = np.flatnonzero(usable[row])
-        points, variance = _lift(images[row], pixels)
-        others = [(images[j], usable[j], j < row) for j in near[row]]
-        verdict = _votes(points, variance, others, options.dense_consistency_sigmas)
-        return take(row, pixels, verdict)
+        points, variance = _unproject_pixels(images[row], pixels)
+        voters = [(images[j], usable[j], j < row) for j in neighbors[row]]
+        votes = _vote_on_points(points, variance, voters, options.dense_consistency_sigmas)
+        return select(row, pixels, votes)
 
-    return each(judged, range(len(images)))
+    return each(vote_on_image, range(len(images)))
 
 
 _EMPTY = FusedPointCloud(
@@ -135,28 +147,29 @@ _EMPTY = FusedPointCloud(
 )
 
 
-def _std_of_surest(images: Sequence[RegisteredImage]) -> float:
-    """The largest relative std of the share that stays; the median over the images."""
-    spreads = [
-        np.quantile(np.sqrt(_variance(image)[valid]) / image.depth.depth[valid], _SUREST)
+def _relative_std_of_best_pixels(images: Sequence[RegisteredImage]) -> float:
+    """Return the relative std at the `_MIN_PIXEL_RATIO` quantile, median over the images."""
+    quantiles = [
+        np.quantile(np.sqrt(_variance(image)[valid]) / image.depth.depth[valid], _MIN_PIXEL_RATIO)
         for image in images
         if (valid := image.depth.valid).any()
     ]
-    return float(np.median(spreads)) if spreads else 0.0
+    return float(np.median(quantiles)) if quantiles else 0.0
 
 
-def _certain(image: RegisteredImage, max_relative_std: float) -> Bool:
+def _certain_pixels(image: RegisteredImage, max_relative_std: float) -> Bool:
+    """Return the mask (h, w) of valid pixels with a low relative std."""
     certain: Bool = _variance(image) <= (max_relative_std * image.depth.depth) ** 2
     return certain & image.depth.valid
 
 
 def _variance(image: RegisteredImage) -> Float32:
-    assert image.depth.variance is not None  # a refined map always has one
+    assert image.depth.variance is not None  # a refined map always has a variance
     return image.depth.variance
 
 
-def _lift(image: RegisteredImage, pixels: Int64) -> tuple[Float64, Float64]:
-    """World points (n, 3) of flat pixel indices of the map, and their depth variance (n,)."""
+def _unproject_pixels(image: RegisteredImage, pixels: Int64) -> tuple[Float64, Float64]:
+    """Return world points (n, 3) and depth variances (n,) of flat pixel indices."""
     height, width = image.depth.shape
     camera = image.camera.resized(width, height)
     xy = pixel_centers(width, height).reshape(-1, 2)[pixels]
@@ -165,75 +178,81 @@ def _lift(image: RegisteredImage, pixels: Int64) -> tuple[Float64, Float64]:
     return world, _variance(image).ravel()[pixels].astype(np.float64)
 
 
-def _votes(
+def _vote_on_points(
     points: Float64,
     variance: Float64,
-    others: Sequence[tuple[RegisteredImage, Bool, bool]],
+    voters: Sequence[tuple[RegisteredImage, Bool, bool]],
     sigmas: float,
 ) -> _ConsistencyVotes:
-    """What other images say of points.
+    """Count which images confirm, see through or duplicate the points of one image.
 
-    ``others``: images, which of their pixels may become points, and whether they come first among
-    equally certain ones.
+    Args:
+        points: (n, 3) world points.
+        variance: (n,) variance of their depth.
+        voters: Other images, masks of their certain pixels, and whether they win ties of variance.
+        sigmas: Largest difference of consistent depths in stds.
     """
     votes = np.zeros(len(points), np.int64)
     views = np.ones(len(points), np.uint8)
-    theirs = np.zeros(len(points), np.bool_)
-    for other, usable, first in others:
-        height, width = other.depth.shape
-        camera = other.camera.resized(width, height)
-        turned, shift = camera.matrix @ other.rotation, camera.matrix @ other.translation
-        map_ = (other.depth.depth, other.depth.valid, _variance(other), usable)
-        _vote(points, variance, turned, shift, *map_, first, sigmas, votes, views, theirs)
-    return _ConsistencyVotes(votes >= 0, theirs, views)
+    duplicate = np.zeros(len(points), np.bool_)
+    for voter, usable, wins_ties in voters:
+        height, width = voter.depth.shape
+        camera = voter.camera.resized(width, height)
+        projection = camera.matrix @ voter.rotation, camera.matrix @ voter.translation
+        maps = (voter.depth.depth, voter.depth.valid, _variance(voter), usable)
+        _vote(points, variance, *projection, *maps, wins_ties, sigmas, votes, views, duplicate)
+    return _ConsistencyVotes(votes >= 0, duplicate, views)
 
 
 @kernel()
 def _vote(
     points: Float64,
     variance: Float64,
-    turned: Float64,
-    shift: Float64,
+    matrix: Float64,
+    offset: Float64,
     depth: Float32,
     valid: Bool,
     depth_variance: Float32,
     usable: Bool,
-    first: bool,
+    wins_ties: bool,
     sigmas: float,
     votes: Int64,
     views: UInt8,
-    theirs: Bool,
+    duplicate: Bool,
 ) -> None:
-    """Add what one image says to ``votes``, ``views`` and ``theirs``; a point is there at the
-    homogeneous pixel ``turned @ point + shift``."""
+    """Add the votes of one image to `votes`, `views` and `duplicate`.
+
+    A point projects to the homogeneous pixel ``matrix @ point + offset`` of the voter.
+    """
     height, width = depth.shape
     for k in range(len(points)):
-        u, v, z = shift
+        u, v, z = offset
         for axis in range(3):
-            u += turned[0, axis] * points[k, axis]
-            v += turned[1, axis] * points[k, axis]
-            z += turned[2, axis] * points[k, axis]
+            u += matrix[0, axis] * points[k, axis]
+            v += matrix[1, axis] * points[k, axis]
+            z += matrix[2, axis] * points[k, axis]
         if z <= 0 or u < 0 or v < 0 or u > width * z or v > height * z:
             continue
         row, column = min(int(v / z), height - 1), min(int(u / z), width - 1)
         if not valid[row, column]:
             continue
-        ahead, other_variance = depth[row, column] - z, depth_variance[row, column]
-        limit = sigmas * math.sqrt(variance[k] + other_variance)
-        if ahead > limit:
+        difference, voter_variance = depth[row, column] - z, depth_variance[row, column]
+        limit = sigmas * math.sqrt(variance[k] + voter_variance)
+        if difference > limit:  # the voter sees through the point
             votes[k] -= 1
-        if abs(ahead) > limit:
+        if abs(difference) > limit:
             continue
         votes[k] += 1
         views[k] += 1
-        surer = other_variance < variance[k] or (first and other_variance == variance[k])
-        same = abs(ahead) <= _SAME * z or other_variance <= _MUCH_SURER**2 * variance[k]
-        if surer and same and usable[row, column]:
-            theirs[k] = True
+        better = voter_variance < variance[k] or (wins_ties and voter_variance == variance[k])
+        close = abs(difference) <= _DUPLICATE_DISTANCE * z
+        replaces = close or voter_variance <= _DOMINANT_STD_RATIO**2 * variance[k]
+        if better and replaces and usable[row, column]:
+            duplicate[k] = True
 
 
-def _normals(image: RegisteredImage) -> Float32:
-    """World normals (h, w, 3) float32 of a map; zero at holes and borders."""
+def _compute_normals(image: RegisteredImage) -> Float32:
+    """Compute world normals (h, w, 3) of a depth map; zero at holes and borders."""
     height, width = image.depth.shape
     camera = image.camera.resized(width, height)
     local = unproject(camera, pixel_centers(width, height), image.depth.depth)
@@ -248,7 +267,7 @@ def _normals(image: RegisteredImage) -> Float32:
     return normals
 
 
-def _colors(view: View, image: RegisteredImage, pixels: Int64) -> UInt8:
+def _sample_colors(view: View, image: RegisteredImage, pixels: Int64) -> UInt8:
     height, width = image.depth.shape
     small = resize_map(view.image, width, height).reshape(-1, 3)[pixels]
     return np.round(small).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Whether views agree on the depth that each of them found by itself."""
+"""Geometric consistency: check whether the depth maps of several views agree."""
 # mypy: allow-untyped-decorators
 
 from __future__ import annotations
@@ -16,177 +16,192 @@ from mpsfm_core.dense.dense_view import PosedGrid
 from mpsfm_core.geometry.statistics import ONE_SIGMA
 from mpsfm_core.support.jit import kernel
 
-_STDS = 3.0
-"""Difference of two depths in std that still agree."""
+_MAX_DIFFERENCE_STDS = 3.0
+"""Largest difference of consistent depths in stds."""
 _MIN_TOLERANCE, _MAX_TOLERANCE = 0.005, 0.05
-"""Of log depth: poses are not exact, and wide ranges agree with anything (ours)."""
-_ALIKE = 0.3
-"""Correlation of the errors of maps that agree: with it 72, 76 and 76 % of the measured pixels of
-rendered_kitchen `all` (FastDepth, degraded and true depth) are within their std, 75, 79 and 77 % if
-the mean of maps were no surer than one of them (ours)."""
-_CHANCE = 0.5
-"""Share of a pair's agreement above which chance may be all of it (ours)."""
-_MIN_FOUND = 0.25
-"""Of the patches of such a pair, found in the other photo: in hololens_room 0.2 to 0.8 where the
-pose of a pair is right to 5 degrees (but one of hardly any pixels, 0.14), 0 to 0.26 where it is
-wrong by more than 30 (ours)."""
+"""Bounds of the tolerance in log depth, for inexact poses and large stds [ours]."""
+_ERROR_CORRELATION = 0.3
+"""Correlation of the errors of consistent depth maps [tuned: benchmarks.dense]."""
+_COINCIDENCE_RATIO = 0.5
+"""Ratio of near misses to agreements above which all agreements may be coincidental [ours]."""
+_MIN_PATCH_RATIO = 0.25
+"""Minimum ratio of matched patches that proves a pair with many near misses.
+
+Pairs with correct poses reach 0.2 to 0.8 on hololens_room [ours]."""
 
 
 @dataclass(frozen=True, eq=False)
 class GeometricConsistency:
-    """What other views say of a map, (h, w).
-
-    ``views``: uint16, how many agree; one is enough, as two wrong depths rarely do (of those that
-    one of three views confirms 95 % are right to 2 % on rendered_kitchen, whatever the others say).
-    ``mean_change``: float32, from our log depth to the mean of ours and those that agree.
-    ``match_std_px``: std of a match that the differences of depths that agree speak for, NaN
-    without any. ``pose_std_px``: what errors of poses add, which no difference shows.
-    """
+    """Consistency of one depth map with the depth maps of other views."""
 
     views: NDArray[np.uint16]
+    """(h, w) number of views that agree. One suffices: two wrong depths rarely agree."""
     mean_change: Float32
+    """(h, w) from this map's log depth to the mean of all consistent log depths."""
     match_std_px: float
+    """Std of a match in pixels, estimated from the differences; NaN without agreement."""
     pose_std_px: float = 0.0
+    """Std that pose errors add, in pixels. The differences do not contain this error."""
 
     @property
     def confirmed(self) -> Bool:
-        """(h, w), where a view agrees."""
+        """(h, w) mask of pixels that at least one other view confirms."""
         return self.views > 0
 
     @property
     def std_px(self) -> Float32:
-        """(h, w), of the mean of a map and those that agree. Errors of maps hang together, which
-        makes their differences smaller and their mean less sure."""
+        """(h, w) std of the mean of consistent depths in pixels.
+
+        Errors of the maps are correlated: their differences underestimate the error of the mean.
+        """
         views = self.views.astype(np.float32)
-        mean = self.match_std_px**2 * (1 + _ALIKE * views) / ((1 - _ALIKE) * (1 + views))
+        correlation = _ERROR_CORRELATION
+        mean = self.match_std_px**2 * (1 + correlation * views) / ((1 - correlation) * (1 + views))
         std: Float32 = np.sqrt(mean + self.pose_std_px**2).astype(np.float32)
         return std
 
 
 class PosedDepth(NamedTuple):
-    """A map of a view: log depth and its std, (h, w)."""
+    """Depth map with its pose."""
 
     grid: PosedGrid
     log_depth: Float32
+    """(h, w) log depth."""
     log_std: Float32
+    """(h, w) std of the log depth."""
 
 
 class DepthDifferences(NamedTuple):
-    """From a map to that of another view, (h, w).
-
-    ``log_depth``: float32, at the same points, NaN where they do not agree or the other does not
-    see the point. ``beyond``: bool, where they differ by more than agrees, up to twice as much.
-    """
+    """Differences from a depth map to the depth map of another view."""
 
     log_depth: Float32
-    beyond: Bool
+    """(h, w) difference of log depth; NaN where both disagree or the other view sees no point."""
+    near_miss: Bool
+    """(h, w) mask of pixels that differ by one to two times the tolerance."""
 
     @property
     def agree(self) -> Bool:
-        """(h, w)."""
+        """(h, w) mask of consistent pixels."""
         return np.isfinite(self.log_depth)
 
     def where(self, usable: Bool) -> DepthDifferences:
-        """Of usable pixels (h, w) alone."""
+        """Return the differences of the usable pixels, mask (h, w)."""
         return DepthDifferences(
-            np.where(usable, self.log_depth, np.float32(np.nan)), self.beyond & usable
+            np.where(usable, self.log_depth, np.float32(np.nan)), self.near_miss & usable
         )
 
-    def by_chance(self, patches_found: float) -> bool:
-        """Whether the pair may agree by chance, which puts as many depths beyond as it lets agree.
+    def is_coincidental(self, matched_patch_ratio: float) -> bool:
+        """Return True if the agreement may be coincidental.
 
-        ``patches_found``: share of the patches that agree, found at about the same place.
+        Coincidental agreement has as many near misses as agreements.
+
+        Args:
+            matched_patch_ratio: Ratio of the agreeing patches whose appearance also matches.
         """
-        beyond, agree = int(self.beyond.sum()), int(self.agree.sum())
-        return beyond > _CHANCE * agree and patches_found < _MIN_FOUND
+        near_miss, agree = int(self.near_miss.sum()), int(self.agree.sum())
+        return near_miss > _COINCIDENCE_RATIO * agree and matched_patch_ratio < _MIN_PATCH_RATIO
 
 
-def compare_depths(own: PosedDepth, other: PosedDepth) -> DepthDifferences:
-    """From our log depth to that of another view."""
-    differences = np.full(own.log_depth.shape, np.nan, np.float32)
-    beyond = np.zeros(differences.shape, np.bool_)
-    turned, shift = other.grid.pixels_from(own.grid)
-    _compare(*own[1:], turned, shift, *other[1:], differences, beyond)
-    return DepthDifferences(differences, beyond)
+def compare_depths(reference: PosedDepth, source: PosedDepth) -> DepthDifferences:
+    """Warp a depth map into a source view and compare the log depths there."""
+    differences = np.full(reference.log_depth.shape, np.nan, np.float32)
+    near_miss = np.zeros(differences.shape, np.bool_)
+    matrix, offset = source.grid.pixels_from(reference.grid)
+    _compare(*reference[1:], matrix, offset, *source[1:], differences, near_miss)
+    return DepthDifferences(differences, near_miss)
 
 
 def evaluate_consistency(
     parallax: Float32, differences: Iterable[Float32], pose_std_px: float = 0.0
 ) -> GeometricConsistency:
-    """What :attr:`DepthDifferences.log_depth` of other views say together of a map (h, w).
+    """Merge the differences to several views and estimate the std of a match.
 
-    ``parallax``: (h, w), pixels that a point moves when its log depth changes by one. A difference
-    has the errors of two matches. ``pose_std_px``: see :class:`GeometricConsistency`.
+    A difference contains the errors of two matches.
+
+    Args:
+        parallax: (h, w) pixels that a point moves per unit of log depth.
+        differences: :attr:`DepthDifferences.log_depth` of each view, (h, w).
+        pose_std_px: :attr:`GeometricConsistency.pose_std_px`.
     """
-    views, change, moved = np.zeros(parallax.shape, np.uint16), np.zeros_like(parallax), []
-    for each in differences:
-        agree = np.isfinite(each)
+    views, change, moves_px = np.zeros(parallax.shape, np.uint16), np.zeros_like(parallax), []
+    for difference in differences:
+        agree = np.isfinite(difference)
         views += agree
-        change[agree] += each[agree]
-        moved.append(np.abs(each[agree]) * parallax[agree])
-    all_moved = np.concatenate([np.zeros(0, np.float32), *moved])
-    std = float(np.quantile(all_moved, ONE_SIGMA)) / math.sqrt(2) if len(all_moved) else math.nan
+        change[agree] += difference[agree]
+        moves_px.append(np.abs(difference[agree]) * parallax[agree])
+    moves = np.concatenate([np.zeros(0, np.float32), *moves_px])
+    std = float(np.quantile(moves, ONE_SIGMA)) / math.sqrt(2) if len(moves) else math.nan
     return GeometricConsistency(views, change / (1 + views.astype(np.float32)), std, pose_std_px)
 
 
-def splat_depth(grid: PosedGrid, others: Iterable[tuple[PosedGrid, Float32, Bool]]) -> Float32:
-    """Log depth (h, w) that the given pixels of other views have in this one: the nearest at each
-    pixel, infinite where there is none."""
-    seen = np.full(grid.shape, np.inf, np.float32)
-    for other, depth, which in others:
-        turned, shift = grid.pixels_from(other)
-        _splat(depth, which, turned, shift, seen)
-    return seen
+def splat_depth(grid: PosedGrid, sources: Iterable[tuple[PosedGrid, Float32, Bool]]) -> Float32:
+    """Project masked pixels of other views into a grid and keep the nearest depth per pixel.
+
+    Args:
+        grid: Target grid.
+        sources: Grid, log depth (h, w) and mask (h, w) of each source view.
+
+    Returns:
+        Log depth (h, w), infinite where no pixel projects.
+    """
+    splatted = np.full(grid.shape, np.inf, np.float32)
+    for source, depth, mask in sources:
+        matrix, offset = grid.pixels_from(source)
+        _splat(depth, mask, matrix, offset, splatted)
+    return splatted
 
 
 @kernel()
 def _compare(
     log_depth: Float32,
     log_std: Float32,
-    turned: Float64,
-    shift: Float64,
-    other: Float32,
-    other_std: Float32,
+    matrix: Float64,
+    offset: Float64,
+    source: Float32,
+    source_std: Float32,
     differences: Float32,
-    beyond: Bool,
+    near_miss: Bool,
 ) -> None:
+    """Write differences and near misses; see :func:`compare_depths`."""
     height, width = log_depth.shape
-    rows, columns = other.shape
+    rows, columns = source.shape
     for i in range(height):
         for j in range(width):
             x, y = j + 0.5, i + 0.5
             depth = math.exp(log_depth[i, j])
-            w = depth * (turned[2, 0] * x + turned[2, 1] * y + turned[2, 2]) + shift[2]
+            w = depth * (matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]) + offset[2]
             if w <= 1e-6:
                 continue
-            u = (depth * (turned[0, 0] * x + turned[0, 1] * y + turned[0, 2]) + shift[0]) / w
-            v = (depth * (turned[1, 0] * x + turned[1, 1] * y + turned[1, 2]) + shift[1]) / w
+            u = (depth * (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]) + offset[0]) / w
+            v = (depth * (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]) + offset[1]) / w
             if u < 0 or v < 0 or u >= columns or v >= rows:
                 continue
             r, c = int(v), int(u)
-            variance = log_std[i, j] ** 2 + other_std[r, c] ** 2
-            tolerance = min(max(_STDS * math.sqrt(variance), _MIN_TOLERANCE), _MAX_TOLERANCE)
-            difference = other[r, c] - math.log(w)
+            variance = log_std[i, j] ** 2 + source_std[r, c] ** 2
+            limit = _MAX_DIFFERENCE_STDS * math.sqrt(variance)
+            tolerance = min(max(limit, _MIN_TOLERANCE), _MAX_TOLERANCE)
+            difference = source[r, c] - math.log(w)
             if abs(difference) <= tolerance:
                 differences[i, j] = difference
             elif abs(difference) <= 2 * tolerance:
-                beyond[i, j] = True
+                near_miss[i, j] = True
 
 
 @kernel()
-def _splat(depth: Float32, which: Bool, turned: Float64, shift: Float64, seen: Float32) -> None:
+def _splat(depth: Float32, mask: Bool, matrix: Float64, offset: Float64, splatted: Float32) -> None:
+    """Project the masked log depths of one view; see :func:`splat_depth`."""
     height, width = depth.shape
-    rows, columns = seen.shape
+    rows, columns = splatted.shape
     for i in range(height):
         for j in range(width):
-            if not which[i, j]:
+            if not mask[i, j]:
                 continue
             x, y, d = j + 0.5, i + 0.5, math.exp(depth[i, j])
-            w = d * (turned[2, 0] * x + turned[2, 1] * y + turned[2, 2]) + shift[2]
+            w = d * (matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]) + offset[2]
             if w <= 1e-6:
                 continue
-            u = (d * (turned[0, 0] * x + turned[0, 1] * y + turned[0, 2]) + shift[0]) / w
-            v = (d * (turned[1, 0] * x + turned[1, 1] * y + turned[1, 2]) + shift[1]) / w
+            u = (d * (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]) + offset[0]) / w
+            v = (d * (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]) + offset[1]) / w
             if u >= 0 and v >= 0 and u < columns and v < rows:
                 r, c = int(v), int(u)
-                seen[r, c] = min(seen[r, c], np.float32(math.log(w)))
+                splatted[r, c] = min(splatted[r, c], np.float32(math.log(w)))

@@ -1,8 +1,9 @@
-"""One triangle mesh from the depth maps of all images.
+"""Triangle mesh from the depth maps of all images.
 
-The maps are joined in a truncated signed distance field (Curless and Levoy, SIGGRAPH 1996), each
-pixel with the weight that its variance gives it. The field is made block by block, only where a
-surface is, so that memory does not grow with the scene; scikit-image turns blocks into triangles.
+The maps are integrated into a truncated signed distance field (TSDF; Curless and Levoy, SIGGRAPH
+1996), where the inverse variance weights each pixel. Blocks of the field exist only around
+surfaces, so that memory does not grow with the volume. Marching cubes of scikit-image extracts the
+triangles.
 """
 # mypy: allow-untyped-decorators
 
@@ -18,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.dense.fusion import consistent_pixels
+from mpsfm_core.dense.fusion import compute_consistent_masks
 from mpsfm_core.dense.options import MeshOptions
 from mpsfm_core.geometry import (
     camera_center,
@@ -34,64 +35,76 @@ from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredIm
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.support.jit import kernel
 
-_BLOCK = 64
+_BLOCK_SIZE = 64
 """Voxels along a side of a block."""
-_BAND_VOXELS = 3.0
-"""Half the width of the field around a surface at least, in voxels: a cell and its neighbours."""
-_BAND_STDS = 3.0
-"""The same in std of the depth: noise must not make two surfaces of one."""
-_SAME_VERTEX = 1e-3
-"""Distance in voxels below which vertices of neighbouring blocks are one: rounding of float32."""
+_TRUNCATION_VOXELS = 3.0
+"""Minimum truncation distance in voxels: a cell and its neighbors."""
+_TRUNCATION_STDS = 3.0
+"""Minimum truncation distance in stds of depth, so that noise does not split a surface."""
+_MERGE_DISTANCE = 1e-3
+"""Distance in voxels below which vertices of neighboring blocks merge, above float32 rounding."""
 _CORNERS = np.array(list(product((0.0, 1.0), repeat=3)))
 
 
 class TriangleMesh(NamedTuple):
-    """``vertices``: (n, 3) float64, world. ``triangles``: (m, 3) int64, rows of the vertices,
-    anticlockwise as the cameras saw them. ``colors``: (n, 3) uint8, RGB."""
+    """Triangle mesh with vertex colors."""
 
     vertices: Float64
+    """(n, 3) float64 positions, world frame."""
     triangles: Int64
+    """(m, 3) int64 vertex indices, counterclockwise as the cameras see them."""
     colors: UInt8
+    """(n, 3) uint8 RGB."""
 
 
-class _Map(NamedTuple):
-    """A depth map as the field takes it: 0 where there is none; weights are 1 / variance."""
+class _WeightedDepth(NamedTuple):
+    """Depth map with TSDF weights."""
 
     image: RegisteredImage
     intrinsics: Float64
+    """(4,) fx, fy, cx, cy on the grid of the map."""
     depth: Float32
+    """(h, w) depth, 0 at holes."""
     weight: Float32
+    """(h, w) inverse variance, 0 at holes."""
 
     @property
     def points(self) -> Float64:
-        """World points (n, 3)."""
+        """World points of all pixels with depth, (n, 3)."""
         height, width = self.depth.shape
-        known = self.depth > 0
-        xy = pixel_centers(width, height)[known]
+        valid = self.depth > 0
+        xy = pixel_centers(width, height)[valid]
         camera = self.image.camera.resized(width, height)
         rotation, translation = self.image.rotation, self.image.translation
-        local = unproject(camera, xy, self.depth[known])
+        local = unproject(camera, xy, self.depth[valid])
         points: Float64 = local @ rotation + camera_center(rotation, translation)
         return points
 
-    def showing(self, vertices: Float64, tolerance: float) -> tuple[Int64, Float64]:
-        """Rows of the vertices (n, 3) that this map has, and their pixels (k, 2).
+    def find_visible(self, vertices: Float64, tolerance: float) -> tuple[Int64, Float64]:
+        """Find the vertices on the surface of this depth map.
 
-        Behind the edge of an object the field ends in a wall as long as it is wide, for some images
-        look past the edge and the others do not know what is behind: no map has it.
-        ``tolerance``: of depth, besides that of its std.
+        Behind an object's edge the TSDF ends in a false wall: some images see past the edge, others
+        have no depth there. No depth map shows this wall.
+
+        Args:
+            vertices: (n, 3) world positions.
+            tolerance: Minimum tolerance of depth, world units; the std may allow more.
+
+        Returns:
+            Vertex indices (k,) and their pixels (k, 2).
         """
         height, width = self.depth.shape
         local = transform(self.image.rotation, self.image.translation, vertices)
         xy = project(self.image.camera.resized(width, height), local)
         rows = np.flatnonzero(inside(xy, (width, height)) & (local[:, 2] > 0))
         depth, weight = (sample_nearest(grid, xy[rows]) for grid in (self.depth, self.weight))
-        allowed = np.maximum(tolerance, _BAND_STDS / np.sqrt(np.where(weight > 0, weight, np.inf)))
-        rows = rows[(depth > 0) & (np.abs(depth - local[rows, 2]) <= allowed)]
+        std_tolerance = _TRUNCATION_STDS / np.sqrt(np.where(weight > 0, weight, np.inf))
+        max_difference = np.maximum(tolerance, std_tolerance)
+        rows = rows[(depth > 0) & (np.abs(depth - local[rows, 2]) <= max_difference)]
         return rows, xy[rows]
 
     def may_see(self, low: Float64, high: Float64) -> bool:
-        """Whether a box may lie in the image; False only if it surely does not."""
+        """Return False only if the box between two world corners is certainly not in the image."""
         corners = low + _CORNERS * (high - low)
         local = transform(self.image.rotation, self.image.translation, corners)
         if (local[:, 2] <= 0).any():
@@ -104,37 +117,49 @@ class _Map(NamedTuple):
 def mesh_depth_maps(
     reconstruction: Reconstruction, view_of: Callable[[str], View], options: MeshOptions
 ) -> TriangleMesh:
-    """The surface that the maps agree on, open where no image looks.
+    """Mesh the surface of all depth maps; unobserved regions stay open.
 
-    ``view_of``: undistorted view by name, for the colours. Uncertain pixels and those that other
-    images see through are left out, as they are of the cloud.
+    Uncertain and inconsistent pixels are left out, as in the fused point cloud.
+
+    Args:
+        reconstruction: Posed images with depth maps.
+        view_of: Returns the undistorted view of an image name, for the colors.
+        options: Options of the mesh.
 
     Raises:
         InputError: scikit-image is not installed, no pixel is certain, or no surface is found.
     """
-    marching_cubes, simplify = _libraries()
+    marching_cubes, simplify = _import_libraries()
     images = reconstruction.confirmed_images
+    masks = compute_consistent_masks(images, ResultOptions())
     maps = [
-        _map(image, mask)
-        for image, mask in zip(images, consistent_pixels(images, ResultOptions()), strict=True)
-        if mask.any()
+        _weight_depth(image, mask) for image, mask in zip(images, masks, strict=True) if mask.any()
     ]
     if not maps:
-        raise InputError("no pixel of the depth maps is certain, so there is no surface")
-    pixel = np.median([np.median(m.depth[m.depth > 0]) / m.intrinsics[0] for m in maps])
+        raise InputError(
+            "cannot build a mesh: no pixel of the depth maps is certain and consistent; "
+            "run `mpsfm dense` first, or add photos with more overlap"
+        )
+    pixel_size = np.median([np.median(m.depth[m.depth > 0]) / m.intrinsics[0] for m in maps])
     std = np.median([np.median(m.weight[m.depth > 0] ** -0.5) for m in maps])
-    voxel = float(options.voxel_px * pixel)
-    band = max(_BAND_VOXELS * voxel, _BAND_STDS * float(std))
-    pieces = [_surface(maps, block, voxel, band, marching_cubes) for block in _blocks(maps, voxel)]
-    vertices, triangles = _joined([piece for piece in pieces if piece is not None], voxel)
-    shown = np.zeros(len(vertices), np.bool_)
-    for each in maps:
-        shown[each.showing(vertices, voxel)[0]] = True
-    triangles = triangles[shown[triangles].all(axis=1)]
-    triangles = _without_islands(vertices, triangles, band)
+    voxel = float(options.voxel_px * pixel_size)
+    truncation = max(_TRUNCATION_VOXELS * voxel, _TRUNCATION_STDS * float(std))
+    surfaces = [
+        _extract_block_surface(maps, block, voxel, truncation, marching_cubes)
+        for block in _find_surface_blocks(maps, voxel)
+    ]
+    vertices, triangles = _merge_surfaces([s for s in surfaces if s is not None], voxel)
+    visible = np.zeros(len(vertices), np.bool_)
+    for map_ in maps:
+        visible[map_.find_visible(vertices, voxel)[0]] = True
+    triangles = triangles[visible[triangles].all(axis=1)]
+    triangles = _remove_islands(vertices, triangles, truncation)
     if not len(triangles):
-        raise InputError("the depth maps have no surface in common")
-    vertices, triangles = _used(vertices, triangles)
+        raise InputError(
+            "cannot build a mesh: the depth maps have no surface in common; "
+            "add photos with more overlap"
+        )
+    vertices, triangles = _remove_unused_vertices(vertices, triangles)
     if len(triangles) > options.max_triangles:
         points, faces = simplify(
             vertices.astype(np.float32),
@@ -142,64 +167,73 @@ def mesh_depth_maps(
             target_count=options.max_triangles,
         )
         vertices, triangles = points.astype(np.float64), faces.astype(np.int64)
-    return TriangleMesh(vertices, triangles, _colors(vertices, maps, view_of, voxel))
+    return TriangleMesh(vertices, triangles, _color_vertices(vertices, maps, view_of, voxel))
 
 
-def _libraries() -> tuple[Any, Any]:
+def _import_libraries() -> tuple[Any, Any]:
+    """Import `marching_cubes` and `simplify` of the optional dependencies."""
     try:
         from fast_simplification import simplify
         from skimage.measure import marching_cubes
     except ImportError as error:
         raise InputError(
-            f"a mesh needs scikit-image and fast-simplification ({error}): "
-            "pip install 'mpsfm-core[mesh]'"
+            f"cannot build a mesh: scikit-image or fast-simplification is missing ({error}); "
+            "run pip install 'mpsfm-core[mesh]'"
         ) from error
     return marching_cubes, simplify
 
 
-def _map(image: RegisteredImage, mask: Bool) -> _Map:
+def _weight_depth(image: RegisteredImage, mask: Bool) -> _WeightedDepth:
     height, width = image.depth.shape
     variance = image.depth.variance
-    assert variance is not None  # of a refined map always
-    smallest = np.finfo(np.float32).tiny
-    weight = np.where(mask, 1 / np.maximum(variance, smallest), 0).astype(np.float32)
+    assert variance is not None  # a refined map always has a variance
+    min_variance = np.finfo(np.float32).tiny
+    weight = np.where(mask, 1 / np.maximum(variance, min_variance), 0).astype(np.float32)
     depth = np.where(mask, image.depth.depth, 0).astype(np.float32)
-    return _Map(image, image.camera.resized(width, height).params, depth, weight)
+    return _WeightedDepth(image, image.camera.resized(width, height).params, depth, weight)
 
 
-def _blocks(maps: Sequence[_Map], voxel: float) -> Int64:
-    """Those (b, 3) that have a point, in a fixed order."""
-    found = [np.zeros((0, 3), np.int64)]
-    for each in maps:
-        # a point at a face counts for both sides: the surface may pass on the other one
-        points = each.points / (voxel * _BLOCK)
-        shifted = [np.floor(points + (corner - 0.5) / _BLOCK) for corner in _CORNERS]
-        found.append(np.unique(np.concatenate(shifted).astype(np.int64), axis=0))
-    blocks: Int64 = np.unique(np.concatenate(found), axis=0)
+def _find_surface_blocks(maps: Sequence[_WeightedDepth], voxel: float) -> Int64:
+    """Return the integer coordinates (b, 3) of the blocks with points, in a fixed order."""
+    blocks_per_map = [np.zeros((0, 3), np.int64)]
+    for map_ in maps:
+        # A point at a face counts for both blocks, because the surface may pass on either side.
+        points = map_.points / (voxel * _BLOCK_SIZE)
+        shifted = [np.floor(points + (corner - 0.5) / _BLOCK_SIZE) for corner in _CORNERS]
+        blocks_per_map.append(np.unique(np.concatenate(shifted).astype(np.int64), axis=0))
+    blocks: Int64 = np.unique(np.concatenate(blocks_per_map), axis=0)
     return blocks
 
 
-def _surface(
-    maps: Sequence[_Map], block: Int64, voxel: float, band: float, marching_cubes: Any
+def _extract_block_surface(
+    maps: Sequence[_WeightedDepth],
+    block: Int64,
+    voxel: float,
+    truncation: float,
+    marching_cubes: Any,
 ) -> tuple[Float64, Int64] | None:
-    """Vertices and triangles of a block; None without a surface."""
-    origin: Float64 = (block * (voxel * _BLOCK)).astype(np.float64)
-    size = _BLOCK + 1
+    """Integrate the TSDF of one block and extract its triangles.
+
+    Returns:
+        World vertices (n, 3) and triangles (m, 3), or None without a surface.
+    """
+    origin: Float64 = (block * (voxel * _BLOCK_SIZE)).astype(np.float64)
+    size = _BLOCK_SIZE + 1
     total = np.zeros((size, size, size), np.float32)
     weight = np.zeros_like(total)
-    for each in maps:
-        if each.may_see(origin - band, origin + voxel * _BLOCK + band):
-            rotation, translation = each.image.rotation, each.image.translation
-            camera, grids = each.intrinsics, (each.depth, each.weight)
-            _integrate(origin, voxel, rotation, translation, camera, *grids, band, total, weight)
-    seen = weight > 0
-    field = np.where(seen, total / np.where(seen, weight, 1), np.float32(band))
-    if not (field[seen] < 0).any() or not (field[seen] > 0).any():
+    for map_ in maps:
+        if map_.may_see(origin - truncation, origin + voxel * _BLOCK_SIZE + truncation):
+            pose = map_.image.rotation, map_.image.translation
+            camera, grids = map_.intrinsics, (map_.depth, map_.weight)
+            _integrate(origin, voxel, *pose, camera, *grids, truncation, total, weight)
+    observed = weight > 0
+    field = np.where(observed, total / np.where(observed, weight, 1), np.float32(truncation))
+    if not (field[observed] < 0).any() or not (field[observed] > 0).any():
         return None
     try:
-        # anticlockwise from where the field is positive, which is the cameras' side
-        vertices, triangles, *_ = marching_cubes(field, 0.0, mask=seen)
-    except (ValueError, RuntimeError):  # no cell whose corners were all seen has a surface
+        # Counterclockwise as seen from positive distances, the side of the cameras.
+        vertices, triangles, *_ = marching_cubes(field, 0.0, mask=observed)
+    except (ValueError, RuntimeError):  # no fully observed cell contains a surface
         return None
     return origin + voxel * vertices.astype(np.float64), triangles.astype(np.int64)
 
@@ -213,13 +247,23 @@ def _integrate(
     camera: Float64,
     depth: Float32,
     pixel_weight: Float32,
-    band: float,
+    truncation: float,
     total: Float32,
     weight: Float32,
 ) -> None:
-    """Add what a map says: weighted distance along the ray to its surface, and the weight.
+    """Integrate one depth map into the TSDF of a block.
 
-    ``camera``: fx, fy, cx, cy on the map's grid. ``total``, ``weight``: (n, n, n), changed.
+    Args:
+        origin: (3,) world position of the first voxel.
+        voxel: Voxel size, world units.
+        rotation: (3, 3) of ``cam_from_world``.
+        translation: (3,) of ``cam_from_world``.
+        camera: (4,) fx, fy, cx, cy on the grid of the map.
+        depth: (h, w) depth, 0 at holes.
+        pixel_weight: (h, w) weights.
+        truncation: Truncation distance, world units.
+        total: (n, n, n) weighted sum of signed distances, updated.
+        weight: (n, n, n) sum of weights, updated.
     """
     height, width = depth.shape
     a, b, c = total.shape
@@ -240,61 +284,66 @@ def _integrate(
                 if not (0 <= u < width and 0 <= v < height):
                     continue
                 row, column = int(v), int(u)
-                ahead = depth[row, column] - w
-                if depth[row, column] <= 0 or ahead < -band:
+                distance = depth[row, column] - w
+                if depth[row, column] <= 0 or distance < -truncation:
                     continue
-                here = pixel_weight[row, column]
-                total[i, j, k] += here * min(ahead, band)
-                weight[i, j, k] += here
+                w_pixel = pixel_weight[row, column]
+                total[i, j, k] += w_pixel * min(distance, truncation)
+                weight[i, j, k] += w_pixel
 
 
-def _joined(pieces: Sequence[tuple[Float64, Int64]], voxel: float) -> tuple[Float64, Int64]:
-    """The blocks' surfaces as one: vertices on faces between blocks are in both."""
-    if not pieces:
+def _merge_surfaces(
+    surfaces: Sequence[tuple[Float64, Int64]], voxel: float
+) -> tuple[Float64, Int64]:
+    """Merge the surfaces of blocks at the vertices on their common faces."""
+    if not surfaces:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in pieces[:-1])])
-    vertices = np.concatenate([vertices for vertices, _ in pieces])
-    triangles = np.concatenate([t + s for (_, t), s in zip(pieces, starts, strict=True)])
-    cells = np.round(vertices / (voxel * _SAME_VERTEX)).astype(np.int64)
-    _, first, number = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    triangles = number.ravel()[triangles]
-    flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
-    return vertices[first], triangles[~flat]
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces[:-1])])
+    vertices = np.concatenate([vertices for vertices, _ in surfaces])
+    triangles = np.concatenate([t + s for (_, t), s in zip(surfaces, starts, strict=True)])
+    cells = np.round(vertices / (voxel * _MERGE_DISTANCE)).astype(np.int64)
+    _, first, vertex_ids = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    triangles = vertex_ids.ravel()[triangles]
+    degenerate = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
+    return vertices[first], triangles[~degenerate]
 
 
-def _without_islands(vertices: Float64, triangles: Int64, band: float) -> Int64:
-    """Without connected pieces that are no larger than the field is wide: they may be noise."""
+def _remove_islands(vertices: Float64, triangles: Int64, truncation: float) -> Int64:
+    """Remove connected components no larger than the TSDF band, which may be noise."""
     edges = np.concatenate([triangles[:, :2], triangles[:, 1:]])
     links = coo_array((np.ones(len(edges), np.bool_), edges.T), shape=(len(vertices),) * 2)
-    count, piece = connected_components(links, directed=False)
+    count, component = connected_components(links, directed=False)
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    np.minimum.at(low, piece, vertices)
-    np.maximum.at(high, piece, vertices)
-    large = (high - low).max(axis=1) > 2 * band
-    kept: Int64 = triangles[large[piece[triangles[:, 0]]]]
-    return kept
+    np.minimum.at(low, component, vertices)
+    np.maximum.at(high, component, vertices)
+    large = (high - low).max(axis=1) > 2 * truncation
+    filtered: Int64 = triangles[large[component[triangles[:, 0]]]]
+    return filtered
 
 
-def _used(vertices: Float64, triangles: Int64) -> tuple[Float64, Int64]:
-    """Without the vertices that no triangle has."""
-    rows, numbers = np.unique(triangles, return_inverse=True)
-    return vertices[rows], numbers.reshape(triangles.shape)
+def _remove_unused_vertices(vertices: Float64, triangles: Int64) -> tuple[Float64, Int64]:
+    """Remove the vertices without triangles."""
+    rows, vertex_ids = np.unique(triangles, return_inverse=True)
+    return vertices[rows], vertex_ids.reshape(triangles.shape)
 
 
-def _colors(
-    vertices: Float64, maps: Sequence[_Map], view_of: Callable[[str], View], tolerance: float
+def _color_vertices(
+    vertices: Float64,
+    maps: Sequence[_WeightedDepth],
+    view_of: Callable[[str], View],
+    tolerance: float,
 ) -> UInt8:
-    """Mean colour in the images that show a vertex, weighted as their depth; else grey."""
+    """Average the colors of a vertex over the images that see the vertex; gray without any."""
     total = np.zeros((len(vertices), 3))
     weight = np.zeros(len(vertices))
-    for each in maps:
-        rows, xy = each.showing(vertices, tolerance)
-        height, width = each.depth.shape
-        here = sample_nearest(each.weight, xy).astype(np.float64)
-        photo = resize_map(view_of(each.image.name).image, width, height)
-        total[rows] += here[:, None] * sample_nearest(photo, xy)
-        weight[rows] += here
-    grey = np.full((len(vertices), 3), 128.0)
-    mean = np.divide(total, weight[:, None], out=grey, where=weight[:, None] > 0)
+    for map_ in maps:
+        rows, xy = map_.find_visible(vertices, tolerance)
+        height, width = map_.depth.shape
+        map_weight = sample_nearest(map_.weight, xy).astype(np.float64)
+        pixels = resize_map(view_of(map_.image.name).image, width, height)
+        total[rows] += map_weight[:, None] * sample_nearest(pixels, xy)
+        weight[rows] += map_weight
+    gray = np.full((len(vertices), 3), 128.0)
+    mean = np.divide(total, weight[:, None], out=gray, where=weight[:, None] > 0)
     colors: UInt8 = np.round(mean).astype(np.uint8)
     return colors

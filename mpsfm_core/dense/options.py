@@ -1,5 +1,7 @@
-"""Settings of the dense stage and of the mesh. Those without a source are ours: first choices, and
-what a few photos of one scene say; ``python -m benchmarks.dense`` measures them."""
+"""Options of densification and meshing.
+
+Defaults without a source tag are ours; `benchmarks.dense` measures them.
+"""
 
 from __future__ import annotations
 
@@ -9,42 +11,44 @@ from mpsfm_core.data.options import Options
 
 
 class DenseOptions(Options):
-    """Multi-view depth, after the mapper."""
+    """Multi-view stereo after mapping."""
 
     enabled: bool = True
-    """Measure depth in the photos; off: the maps stay as the mapper refined them."""
+    """Run multi-view stereo; if off, the depth maps stay as the mapper refined them."""
     max_size: int = Field(640, ge=64)
-    """Longer side of the maps in pixels; larger photos are reduced."""
+    """Maximum of the longer side of the depth maps in pixels; higher is finer and slower."""
     num_sources: int = Field(5, ge=1)
-    """Views that a photo is matched with, at most."""
+    """Maximum number of source views per view; higher is more complete and slower."""
     range_stds: float = Field(2.0, gt=0)
-    """Depth is searched within so many std of the refined depth."""
+    """Half width of the depth search range in stds of the refined depth."""
     max_labels: int = Field(96, ge=8)
-    """Depths that are tried at a pixel, at most."""
+    """Maximum number of depth hypotheses per pixel; higher samples wide ranges more finely."""
     window_radius: int = Field(3, ge=1)
-    """Of the windows that are compared, pixels of the level."""
+    """Radius of the NCC window in pixels of the pyramid level; higher is smoother."""
     grey_noise: float = Field(2.0, gt=0)
-    """Std of grey values (of 255) that counts as no texture."""
+    """Std of image noise in gray levels of 255; higher treats more texture as noise."""
     view_share: float = Field(0.5, gt=0, le=1)
-    """Share of the views that see a point, best first, that judge a depth: others are occluded."""
+    """Ratio of the views that see a point whose costs are averaged, the lowest costs first.
+
+    The other views count as occluded. Higher is less robust to occlusion."""
     prior_weight: float = Field(0.02, ge=0)
-    """Of the squared deviation from the refined depth, in std, beside a cost of 0 to 1."""
+    """Weight of the squared deviation from the refined depth in stds; costs are in [0, 1]."""
     small_step: float = Field(0.04, ge=0)
-    """Penalty of neighbours one label apart (semi-global matching, P1)."""
+    """Penalty P1 of semi-global matching for neighbors one label apart."""
     large_step: float = Field(1.6, ge=0)
-    """Of neighbours further apart (P2); lower across edges of the photo."""
+    """Penalty P2 of semi-global matching for larger steps; image edges reduce the penalty."""
     match_std_px: float = Field(0.5, gt=0)
-    """Std of a match in pixels of the map, by which views agree; how they differ then says what
-    it is."""
+    """Nominal std of a match in pixels, for the tolerance of the geometric consistency check."""
     correlation_px: float = Field(40.0, gt=0)
-    """Distance over which errors of the refined depth hang together, pixels of the map."""
+    """Correlation length of the error of the refined depth, in pixels of the depth map."""
 
 
 class MeshOptions(Options):
-    """One triangle mesh from the maps."""
+    """Triangle mesh from the depth maps."""
 
     voxel_px: float = Field(2.0, gt=0)
-    """Size of a voxel, in pixels of the maps at their median depth: what one pixel tells apart is
-    noise, and memory grows with the third power."""
+    """Voxel size in pixels of the depth maps at their median depth.
+
+    Lower resolves noise rather than surface, and memory grows with the third power."""
     max_triangles: int = Field(500_000, ge=4)
-    """More are joined where the surface is flat (about 20 bytes each in the files)."""
+    """Maximum number of triangles; a larger mesh is simplified (about 20 bytes each on disk)."""

@@ -1,12 +1,11 @@
-"""How far the scale of what pairs of views measure may be off, beside that of the others.
+"""Scale uncertainty of stereo depth between image pairs.
 
-Two views tell depth up to the length of their baseline, and agree with each other whatever it is.
-Lengths are tied where two pairs have a photo in common: by the pixels that both confirm, and by the
-depth that was known of that photo before, which joins what either pair measured of it. Known depth
-of one photo is tied to that of all by what it declares. Errors add up along a chain of such ties.
-The log scales of pairs, of known maps and of the world are unknowns, a tie says that two are equal,
-and the std is that of an unknown beside the mean of all pairs.
-Where the mapper had no depth, something else holds the scales, of which a model says nothing.
+The depth of an image pair is known up to the length of its baseline. Two kinds of constraints link
+the log scales of pairs that share an image: pixels that both pairs confirm, and the known depth of
+the image. The declared std of known depth links the scale of each depth map to the world.
+The log scales of pairs, known depth maps and the world form a Gaussian network, in which a
+constraint equates two scales up to its variance. The reported std is the marginal std
+of a scale relative to the mean of all pairs.
 """
 
 from __future__ import annotations
@@ -23,29 +22,29 @@ from scipy.sparse.linalg import splu
 from mpsfm_core.data import Float32, Float64, Int64
 from mpsfm_core.geometry.statistics import ONE_SIGMA
 
-_LEAST_STD = 1e-6
-"""Of a tie: none is better."""
-_ALIKE = 0.5
-"""Correlation of the scales of known maps of photos that pairs join: network and scene are the same
-(with FastDepth 0.1 to 0.7 in rendered_kitchen and the fountain, as their true scales say; ours)."""
-_COLUMNS = 256
-"""Of an inverse that are held at once."""
+_MIN_CONSTRAINT_STD = 1e-6
+"""Minimum std of a constraint in log scale; avoids infinite precision."""
+_SCALE_CORRELATION = 0.5
+"""Correlation of the scale errors of known depth maps in one component.
+
+The maps come from one network and one scene; FastDepth reaches 0.1 to 0.7 on two scenes [ours]."""
+_BLOCK_COLUMNS = 256
+"""Columns of the inverse that are solved together; bounds the memory."""
 
 
 class ScaleConstraints(NamedTuple):
-    """What one photo says of the pairs that it makes with others.
+    """Scale constraints that one image measures between its k pairs and its known depth."""
 
-    ``others`` (k,): those views. ``pixels`` (k,): how many of its pixels each confirms.
-    ``shared`` (k, k), symmetric: 1 / variance of the difference of two pairs' log scales, of the
-    pixels that both confirm. ``known`` (k,): the same of the known depth and each pair.
-    ``known_std``: of the log scale of the known depth.
-    """
-
-    others: list[int]
+    sources: list[int]
+    """(k,) indices of the other image of each pair."""
     pixels: Int64
+    """(k,) number of pixels that each pair confirms."""
     shared: Float64
+    """(k, k) symmetric precision of the log scale difference of two pairs, from shared pixels."""
     known: Float64
+    """(k,) precision of the log scale difference between the known depth and each pair."""
     known_std: float
+    """Declared std of the log scale of the known depth."""
 
 
 def measure_scale_constraints(
@@ -54,104 +53,125 @@ def measure_scale_constraints(
     known_std: float,
     correlation_px: float,
 ) -> ScaleConstraints:
-    """Compare what the pairs of a photo say of it, all (h, w) of its map.
+    """Measure the scale constraints of one image.
+
+    All k pairs that confirm a pixel are equally certain, and their common error (the image's own)
+    cancels. The mean difference of shared pixels bounds the variance from below, independent of
+    their number. The known depth is as uncertain in the region of a pair as its distance to the
+    measured depth, because errors of a depth map are correlated over the region.
 
     Args:
-        differences: other view -> what :func:`~mpsfm_core.dense.geometric_consistency.compare_depths`
-            says of it.
-        change: from the log depth that was known before to the measured one.
-        known_std: declared, of that depth.
-        correlation_px: distance over which errors hang together, in pixels of the map. So large a
-            square is one observation.
-
-    Of k pairs that confirm a pixel each is as sure as the others, and what they have in common, the
-    photo's own error, tells nothing. They differ by as much as shared pixels differ in the mean,
-    whatever their number. Known depth is as far off in the region of a pair as the distance of
-    known and measured depth there: errors of a map hang together over the region.
+        differences: Source image -> (h, w) differences from
+            :func:`~mpsfm_core.dense.geometric_consistency.compare_depths`.
+        change: (h, w) from the known to the measured log depth.
+        known_std: Declared std of the known log depth.
+        correlation_px: Correlation length of errors in pixels; a square of this side counts as one
+            observation.
     """
-    confirmed = {other: np.isfinite(map_) for other, map_ in differences.items()}
-    others = [other for other, which in confirmed.items() if which.any()]
-    off = [np.quantile(np.abs(change[confirmed[each]]), ONE_SIGMA) for each in others]
-    known = np.maximum(np.array(off, np.float64), _LEAST_STD) ** -2
-    views = np.sum([confirmed[each] for each in others], axis=0)
-    shared = np.zeros((len(others), len(others)))
-    for a, b in combinations(range(len(others)), 2):
-        both = confirmed[others[a]] & confirmed[others[b]]
-        patches = np.count_nonzero(both) // correlation_px**2
-        if patches:
-            between = differences[others[a]][both] - differences[others[b]][both]
-            variance = float(between.mean()) ** 2 + float(between.var()) / patches
-            share = float(np.mean(2 / views[both]))
-            shared[a, b] = shared[b, a] = share / max(variance, _LEAST_STD**2)
-    pixels = np.array([np.count_nonzero(confirmed[each]) for each in others], np.int64)
-    return ScaleConstraints(others, pixels, shared, known, known_std)
+    confirmed = {source: np.isfinite(map_) for source, map_ in differences.items()}
+    sources = [source for source, mask in confirmed.items() if mask.any()]
+    known_errors = [np.quantile(np.abs(change[confirmed[j]]), ONE_SIGMA) for j in sources]
+    known = np.maximum(np.array(known_errors, np.float64), _MIN_CONSTRAINT_STD) ** -2
+    num_views = np.sum([confirmed[j] for j in sources], axis=0)
+    shared = np.zeros((len(sources), len(sources)))
+    for a, b in combinations(range(len(sources)), 2):
+        both = confirmed[sources[a]] & confirmed[sources[b]]
+        observations = np.count_nonzero(both) // correlation_px**2
+        if observations:
+            difference = differences[sources[a]][both] - differences[sources[b]][both]
+            variance = float(difference.mean()) ** 2 + float(difference.var()) / observations
+            weight = float(np.mean(2 / num_views[both]))
+            shared[a, b] = shared[b, a] = weight / max(variance, _MIN_CONSTRAINT_STD**2)
+    pixels = np.array([np.count_nonzero(confirmed[j]) for j in sources], np.int64)
+    return ScaleConstraints(sources, pixels, shared, known, known_std)
 
 
-def estimate_scale_stds(photos: Mapping[int, ScaleConstraints]) -> dict[int, float]:
-    """Of each photo the std of the log scale of what was measured of it: that of its pairs, each as
-    far as it confirms pixels; that of its known depth where none does. 0 if there is no pair.
+def estimate_scale_stds(images: Mapping[int, ScaleConstraints]) -> dict[int, float]:
+    """Estimate the std of the log scale of each image's stereo depth.
 
-    ``photos``: by view, whose numbers are those of :attr:`ScaleConstraints.others`.
+    The variance of an image is the mean of its pairs, weighted by confirmed pixels. An image
+    without pairs has the variance of its known depth. Without any pair all stds are 0.
+
+    Args:
+        images: Image index -> constraints, with the indices of :attr:`ScaleConstraints.sources`.
     """
-    numbers: dict[tuple[int, int], int] = {}
+    pair_ids: dict[tuple[int, int], int] = {}
     pairs = {
-        view: np.array(
-            [numbers.setdefault((min(view, j), max(view, j)), len(numbers)) for j in ties.others],
+        i: np.array(
+            [pair_ids.setdefault((min(i, j), max(i, j)), len(pair_ids)) for j in each.sources],
             np.int64,
         )
-        for view, ties in photos.items()
+        for i, each in images.items()
     }
-    if not numbers:
-        return dict.fromkeys(photos, 0.0)
-    maps = {view: len(numbers) + row for row, view in enumerate(photos)}
-    count = len(numbers) + len(maps)
+    if not pair_ids:
+        return dict.fromkeys(images, 0.0)
+    map_ids = {i: len(pair_ids) + row for row, i in enumerate(images)}
+    count = len(pair_ids) + len(map_ids)
     rows, columns, values, weight = [], [], [], np.zeros(count)
-    for view, ties in photos.items():
-        own = pairs[view]
-        a, b = np.nonzero(np.triu(ties.shared))
-        rows += [own[a], own]
-        columns += [own[b], np.full(len(own), maps[view])]
-        values += [ties.shared[a, b], ties.known]
-        weight[own] += ties.pixels
-    one_way = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    half = coo_array(one_way, shape=(count, count)).tocsr()
-    to_world = _ties_to_world(
-        half, list(maps.values()), [each.known_std for each in photos.values()]
+    for i, constraints in images.items():
+        a, b = np.nonzero(np.triu(constraints.shared))
+        rows += [pairs[i][a], pairs[i]]
+        columns += [pairs[i][b], np.full(len(pairs[i]), map_ids[i])]
+        values += [constraints.shared[a, b], constraints.known]
+        weight[pairs[i]] += constraints.pixels
+    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    upper = coo_array(entries, shape=(count, count)).tocsr()
+    world_precision = _world_precision(
+        upper, list(map_ids.values()), [each.known_std for each in images.values()]
     )
-    variance = _variance_beside_mean(csr_array(half + half.T), to_world, weight / weight.sum())
+    variance = _variance_relative_to_mean(
+        csr_array(upper + upper.T), world_precision, weight / weight.sum()
+    )
     return {
-        view: float(
-            np.average(variance[pairs[view]], weights=ties.pixels) ** 0.5
-            if ties.others
-            else variance[maps[view]] ** 0.5
+        i: float(
+            np.average(variance[pairs[i]], weights=constraints.pixels) ** 0.5
+            if constraints.sources
+            else variance[map_ids[i]] ** 0.5
         )
-        for view, ties in photos.items()
+        for i, constraints in images.items()
     }
 
 
-def _ties_to_world(precision: csr_array, maps: list[int], stds: list[float]) -> Float64:
-    """(n,) 1 / variance of each unknown beside the world, of which only ``maps`` tell.
+def _world_precision(precision: csr_array, maps: list[int], stds: list[float]) -> Float64:
+    """Compute the precision of each unknown relative to the world.
 
-    ``stds``: of these. Errors of those that ties of this ``precision`` (n, n) join hang together.
+    Only known depth maps have one. Maps of one component have correlated scale errors, so their
+    precision is reduced.
+
+    Args:
+        precision: (n, n) precision of the constraints between unknowns.
+        maps: Unknowns that are known depth maps.
+        stds: Declared std of the log scale of each map.
+
+    Returns:
+        (n,) precision, 0 for pairs.
     """
-    groups = connected_components(precision, directed=False)[1][maps]
-    joined = np.bincount(groups)[groups]
-    to_world = np.zeros(precision.shape[0])
-    to_world[maps] = 1 / ((1 + _ALIKE * (joined - 1)) * np.square(stds))
-    return to_world
+    components = connected_components(precision, directed=False)[1][maps]
+    component_sizes = np.bincount(components)[components]
+    world = np.zeros(precision.shape[0])
+    world[maps] = 1 / ((1 + _SCALE_CORRELATION * (component_sizes - 1)) * np.square(stds))
+    return world
 
 
-def _variance_beside_mean(precision: csr_array, to_world: Float64, weight: Float64) -> Float64:
-    """Of n unknowns whose differences are known to be 0 with this ``precision`` (n, n), and
-    themselves with that ``to_world`` (n,): variance (n,) of each less their mean by ``weight``
-    (n,), which sums up to 1."""
-    system = diags_array(precision.sum(axis=1) + to_world) - precision
+def _variance_relative_to_mean(
+    precision: csr_array, world_precision: Float64, weight: Float64
+) -> Float64:
+    """Compute the variance of each unknown minus the weighted mean of all.
+
+    Args:
+        precision: (n, n) precision of the differences of unknowns.
+        world_precision: (n,) precision of each unknown itself.
+        weight: (n,) weights of the mean, with sum 1.
+    """
+    system = diags_array(precision.sum(axis=1) + world_precision) - precision
     solve = splu(system.tocsc()).solve
     count = len(weight)
-    sums, own = solve(weight), np.zeros(count)
-    for start in range(0, count, _COLUMNS):
-        width = min(_COLUMNS, count - start)
+    covariance_with_mean, diagonal = solve(weight), np.zeros(count)
+    for start in range(0, count, _BLOCK_COLUMNS):
+        width = min(_BLOCK_COLUMNS, count - start)
         columns = solve(np.eye(count, width, -start))
-        own[start : start + width] = columns[start : start + width].diagonal()
-    variance: Float64 = np.maximum(own - 2 * sums + weight @ sums, 0)
+        diagonal[start : start + width] = columns[start : start + width].diagonal()
+    variance: Float64 = np.maximum(
+        diagonal - 2 * covariance_with_mean + weight @ covariance_with_mean, 0
+    )
     return variance

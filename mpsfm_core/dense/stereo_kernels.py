@@ -1,6 +1,6 @@
-"""Compiled loops of multi-view matching: warps along a surface, correlation, aggregation.
+"""Compiled loops of multi-view stereo: NCC costs along a surface, semi-global matching.
 
-Images and maps are float32 grids of one size, labels are offsets of log depth from a base surface.
+Images and maps are float32 grids of one size. Labels are offsets of log depth from a base surface.
 """
 # mypy: allow-untyped-decorators
 
@@ -14,12 +14,12 @@ from mpsfm_core.data import Float32, Float64, UInt8
 from mpsfm_core.support.jit import kernel
 
 _FASTMATH = {"contract", "reassoc", "arcp"}
-"""Sums in any order; NaN and infinity keep their meaning."""
+"""LLVM flags that allow reordered sums but keep NaN and infinity."""
 
 UNSEEN = 255
-"""Cost of a label at which a view does not see the pixel."""
-WORST = 250
-"""Of a label that a view contradicts: correlation 0 or less."""
+"""Cost of a label whose projection is outside of the source view."""
+MAX_COST = 250
+"""Cost of a label with an NCC of 0 or less; costs are stored in units of 1 / 250."""
 
 
 @kernel(fastmath=_FASTMATH)
@@ -28,22 +28,26 @@ def compute_ncc_costs(
     base: Float32,
     offsets: Float64,
     source: Float32,
-    turned: Float64,
-    shift: Float64,
+    matrix: Float64,
+    offset: Float64,
     radius: int,
     noise: float,
     costs: UInt8,
 ) -> None:
-    """Cost of each label by one source view: 1 - correlation of windows, in 250ths.
+    """Compute the photo-consistency cost ``250 * (1 - NCC)`` of each label in one source view.
 
-    The window is warped with each pixel's own depth, so that it is slanted as the base surface is.
+    Each pixel of a window is warped with its own depth, so the window follows the base surface.
 
     Args:
-        reference, base: (h, w) grey values, and depth of the base surface (0: unknown).
-        offsets: (k,) of log depth. source: (H, W) grey values.
-        turned, shift: (3, 3), (3,): a pixel (x, y, 1) of depth d is seen at d * turned @ (x, y, 1)
-            + shift, homogeneous pixels of the source.
-        radius: of the window. noise: variance of grey values that is no texture.
+        reference: (h, w) gray values of the reference view.
+        base: (h, w) depth of the base surface, 0 where unknown.
+        offsets: (k,) offsets of log depth.
+        source: (H, W) gray values of the source view.
+        matrix: (3, 3); pixel (x, y) of depth d projects to the homogeneous pixel
+            ``d * matrix @ (x, y, 1) + offset``.
+        offset: (3,) offset of the projection.
+        radius: Radius of the window in pixels.
+        noise: Variance of gray values that counts as noise.
         costs: (k, h, w) uint8, written.
     """
     height, width = reference.shape
@@ -55,20 +59,20 @@ def compute_ncc_costs(
         factor = np.float32(math.exp(offsets[label]))
         for i in range(height):
             y = i + 0.5
-            start0 = turned[0, 1] * y + turned[0, 2]
-            start1 = turned[1, 1] * y + turned[1, 2]
-            start2 = turned[2, 1] * y + turned[2, 2]
+            start0 = matrix[0, 1] * y + matrix[0, 2]
+            start1 = matrix[1, 1] * y + matrix[1, 2]
+            start2 = matrix[2, 1] * y + matrix[2, 2]
             for j in range(width):
                 x = j + 0.5
                 depth = base[i, j] * factor
-                w = depth * (turned[2, 0] * x + start2) + shift[2]
+                w = depth * (matrix[2, 0] * x + start2) + offset[2]
                 warped[i, j] = 0.0
                 seen[i, j] = 0.0
                 if depth <= 0.0 or w <= 1e-6:
                     continue
                 inverse = 1.0 / w
-                u = (depth * (turned[0, 0] * x + start0) + shift[0]) * inverse - 0.5
-                v = (depth * (turned[1, 0] * x + start1) + shift[1]) * inverse - 0.5
+                u = (depth * (matrix[0, 0] * x + start0) + offset[0]) * inverse - 0.5
+                v = (depth * (matrix[1, 0] * x + start1) + offset[1]) * inverse - 0.5
                 if u < 0.0 or v < 0.0 or u >= columns - 1 or v >= rows - 1:
                     continue
                 c, r = int(u), int(v)
@@ -82,13 +86,14 @@ def compute_ncc_costs(
             column_sums[:] = 0.0
             for k in range(first, last + 1):
                 for j in range(width):
-                    ours, theirs, weight = reference[k, j], warped[k, j], seen[k, j]
+                    reference_value, source_value = reference[k, j], warped[k, j]
+                    weight = seen[k, j]
                     column_sums[0, j] += weight
-                    column_sums[1, j] += ours * weight
-                    column_sums[2, j] += theirs
-                    column_sums[3, j] += ours * ours * weight
-                    column_sums[4, j] += theirs * theirs
-                    column_sums[5, j] += ours * theirs
+                    column_sums[1, j] += reference_value * weight
+                    column_sums[2, j] += source_value
+                    column_sums[3, j] += reference_value * reference_value * weight
+                    column_sums[4, j] += source_value * source_value
+                    column_sums[5, j] += reference_value * source_value
             for j in range(width):
                 if seen[i, j] == 0.0:
                     costs[label, i, j] = UNSEEN
@@ -102,23 +107,26 @@ def compute_ncc_costs(
                     s22 += column_sums[4, k]
                     s12 += column_sums[5, k]
                 inverse_n = np.float32(1.0) / n
-                ours = s11 * inverse_n - (s1 * inverse_n) ** 2 + noise
-                theirs = s22 * inverse_n - (s2 * inverse_n) ** 2 + noise
-                both = s12 * inverse_n - s1 * s2 * inverse_n * inverse_n
-                correlation = both / math.sqrt(max(ours * theirs, 1e-12))
-                cost = (1.0 - correlation) * WORST
-                costs[label, i, j] = np.uint8(min(max(cost, 0.0), WORST))
+                reference_variance = s11 * inverse_n - (s1 * inverse_n) ** 2 + noise
+                source_variance = s22 * inverse_n - (s2 * inverse_n) ** 2 + noise
+                covariance = s12 * inverse_n - s1 * s2 * inverse_n * inverse_n
+                ncc = covariance / math.sqrt(max(reference_variance * source_variance, 1e-12))
+                cost = (1.0 - ncc) * MAX_COST
+                costs[label, i, j] = np.uint8(min(max(cost, 0.0), MAX_COST))
 
 
 @kernel(fastmath=_FASTMATH)
-def merge_view_costs(costs: UInt8, share: float, unseen: float, joined: Float32) -> None:
-    """Mean cost over the better views of each pixel and label.
+def merge_view_costs(costs: UInt8, ratio: float, unseen: float, merged: Float32) -> None:
+    """Average the lowest costs over the source views, for each pixel and label.
 
-    ``costs``: (v, k, h, w). ``share``: of the views that see a pixel, which count (rounded up).
-    ``unseen``: cost where none does, 0 to 1. ``joined``: (h, w, k) float32 in [0, 1], written.
+    Args:
+        costs: (v, k, h, w) costs of v views.
+        ratio: Ratio of the views that see a pixel to average, rounded up.
+        unseen: Cost in [0, 1] if no view sees a pixel.
+        merged: (h, w, k) float32 in [0, 1], written.
     """
     views, labels, height, width = costs.shape
-    each = np.empty(views, np.int64)
+    sorted_costs = np.empty(views, np.int64)
     for i in range(height):
         for label in range(labels):
             for j in range(width):
@@ -127,19 +135,19 @@ def merge_view_costs(costs: UInt8, share: float, unseen: float, joined: Float32)
                     cost = costs[view, label, i, j]
                     if cost != UNSEEN:
                         k = n
-                        while k > 0 and each[k - 1] > cost:
-                            each[k] = each[k - 1]
+                        while k > 0 and sorted_costs[k - 1] > cost:
+                            sorted_costs[k] = sorted_costs[k - 1]
                             k -= 1
-                        each[k] = cost
+                        sorted_costs[k] = cost
                         n += 1
                 if n == 0:
-                    joined[i, j, label] = unseen
+                    merged[i, j, label] = unseen
                     continue
-                kept = max(1, math.ceil(share * n - 1e-6))
+                num_used = max(1, math.ceil(ratio * n - 1e-6))
                 total = 0
-                for k in range(kept):
-                    total += each[k]
-                joined[i, j, label] = total / (WORST * kept)
+                for k in range(num_used):
+                    total += sorted_costs[k]
+                merged[i, j, label] = total / (MAX_COST * num_used)
 
 
 @kernel(fastmath=_FASTMATH)
@@ -153,7 +161,7 @@ def _aggregate_path(
     column_step: int,
     total: Float32,
 ) -> None:
-    """One direction of semi-global matching, added to ``total``."""
+    """Add the costs of one path direction of semi-global matching to `total`."""
     height, width, labels = costs.shape
     before = np.zeros((width, labels), np.float32)
     here = np.zeros((width, labels), np.float32)
@@ -197,11 +205,15 @@ def _aggregate_path(
 def aggregate_costs(
     costs: Float32, guide: Float32, small: float, large: float, edge: float, total: Float32
 ) -> None:
-    """Semi-global matching along eight directions.
+    """Aggregate costs by semi-global matching along eight directions.
 
-    ``costs``: (h, w, k). ``guide``: (h, w) grey values. ``small``, ``large``: penalties of steps of
-    one label and of more; the latter is halved where grey values differ by ``edge``. ``total``:
-    (h, w, k) float32, the sum over directions is added.
+    Args:
+        costs: (h, w, k) costs of k labels.
+        guide: (h, w) gray values.
+        small: Penalty P1 of a step of one label.
+        large: Penalty P2 of a larger step.
+        edge: Difference of gray values that halves P2.
+        total: (h, w, k) float32, the sum over the directions is added.
     """
     for row_step in (-1, 0, 1):
         for column_step in (-1, 0, 1):
@@ -213,10 +225,14 @@ def aggregate_costs(
 def select_labels(
     total: Float32, costs: Float32, offsets: Float64, offset: Float32, cost: Float32
 ) -> None:
-    """Offset of log depth of the best label, between labels by a parabola, and its own cost.
+    """Select the label of the lowest aggregated cost, refined by a parabola.
 
-    ``total``: aggregated costs (h, w, k), ``costs``: those before. ``offsets``: (k,) of the labels,
-    evenly spaced. ``offset``, ``cost``: (h, w) float32, written.
+    Args:
+        total: (h, w, k) aggregated costs.
+        costs: (h, w, k) costs before aggregation.
+        offsets: (k,) offsets of log depth of the labels, evenly spaced.
+        offset: (h, w) float32, offset of the selected label, written.
+        cost: (h, w) float32, cost of the selected label before aggregation, written.
     """
     height, width, labels = total.shape
     step = offsets[1] - offsets[0]

@@ -1,4 +1,4 @@
-"""Which views a photo is matched with: those that see the same surface at a good angle."""
+"""View selection by common surface and triangulation angle."""
 
 # mypy: allow-untyped-decorators
 
@@ -15,70 +15,77 @@ from mpsfm_core.geometry import camera_center, pixel_centers, sample_nearest, un
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 from mpsfm_core.support.jit import kernel
 
-_ROWS = 16
-"""Of the grid of pixels that overlap is measured on."""
-_ENOUGH_DEG, _WIDE_DEG = 8.0, 15.0
-"""Parallax that is enough, and above which windows begin to look different; MVSNet's score has 5
-degrees and spreads of 1 below and 10 above."""
+_GRID_ROWS = 16
+"""Rows of the pixel grid on which overlap is measured."""
+_FULL_SCORE_DEG, _WIDE_DEG = 8.0, 15.0
+"""Triangulation angle of full score, and angle above which the score falls.
+
+The score of MVSNet has its maximum at 5 degrees, with spreads of 1 below and 10 above [ours]."""
 _MIN_GAIN = 0.02
-"""Mean gain a pixel, below which a view adds nothing (ours)."""
-_HIDDEN_STDS = 1.5
-"""A point so far behind what a view sees is hidden there, in std of depth (ours)."""
+"""Minimum mean gain per pixel of a useful view [ours]."""
+_OCCLUSION_STDS = 1.5
+"""Distance behind the visible surface, in stds of log depth, of an occluded point [ours]."""
 
 
 class _SampledViews(NamedTuple):
-    """What is looked at of m views: a grid of pixels of each, of ``columns`` (m,) columns.
-
-    ``params`` (m, 4): fx, fy, cx, cy of the grids. ``log_depth`` (m, rows, most columns),
-    ``log_std`` (m,). ``points``: of each view its own (n, 3), world.
-    """
+    """Pixel grids of m views; a grid has ``_GRID_ROWS`` rows."""
 
     params: Float64
+    """(m, 4) intrinsics (fx, fy, cx, cy) of the grids."""
     columns: Int64
+    """(m,) columns of the grids."""
     rotations: Float64
+    """(m, 3, 3) rotations of ``cam_from_world``."""
     translations: Float64
+    """(m, 3) translations of ``cam_from_world``."""
     centers: Float64
+    """(m, 3) camera centers, world frame."""
     log_depth: Float64
+    """(m, rows, max columns) log depth."""
     log_std: Float64
+    """(m,) median std of log depth."""
     points: list[Float64]
+    """(n, 3) world points of each view's grid."""
 
 
-def select_source_views(images: Sequence[RegisteredImage], limit: int) -> list[list[int]]:
-    """For each image the positions of at most ``limit`` others, the most useful first.
+def select_source_views(images: Sequence[RegisteredImage], max_sources: int) -> list[list[int]]:
+    """Select up to `max_sources` source views for each image, the most useful first.
 
-    Taken one after the other: each by what it adds where others see little.
+    Greedy selection: each step adds the view with the largest gain, where pixels that selected
+    views already cover count less.
     """
     if not images:
         return []
-    views = _sample(images)
-    return [_sources(views, row, limit) for row in range(len(images))]
+    views = _sample_views(images)
+    return [_select_sources(views, row, max_sources) for row in range(len(images))]
 
 
-def _sample(images: Sequence[RegisteredImage]) -> _SampledViews:
+def _sample_views(images: Sequence[RegisteredImage]) -> _SampledViews:
+    """Sample pose, depth and points of each image on a coarse grid."""
     ratios = [image.camera.width / image.camera.height for image in images]
-    columns = np.array([max(2, round(_ROWS * ratio)) for ratio in ratios])
+    columns = np.array([max(2, round(_GRID_ROWS * ratio)) for ratio in ratios])
     cameras = [
-        image.camera.resized(int(width), _ROWS)
+        image.camera.resized(int(width), _GRID_ROWS)
         for image, width in zip(images, columns, strict=True)
     ]
     rotations = np.stack([image.rotation for image in images])
     translations = np.stack([image.translation for image in images])
     centers = camera_center(rotations, translations)
-    log_depth = np.zeros((len(images), _ROWS, columns.max()))
+    log_depth = np.zeros((len(images), _GRID_ROWS, columns.max()))
     log_std = np.ones(len(images))
     points = []
     for row, (image, camera) in enumerate(zip(images, cameras, strict=True)):
         xy = pixel_centers(camera.width, camera.height).reshape(-1, 2)
-        on_map = xy * (np.array(image.depth.shape[::-1]) / camera.size)
-        depth = sample_nearest(image.depth.depth, on_map).astype(np.float64)
-        valid = sample_nearest(image.depth.valid, on_map)
+        map_xy = xy * (np.array(image.depth.shape[::-1]) / camera.size)
+        depth = sample_nearest(image.depth.depth, map_xy).astype(np.float64)
+        valid = sample_nearest(image.depth.valid, map_xy)
         depth = np.where(valid, depth, np.median(depth[valid]) if valid.any() else 1.0)
         variance = image.depth.variance
-        assert variance is not None  # of a refined map always
+        assert variance is not None  # a refined map always has a variance
         if valid.any():
-            spread = np.sqrt(sample_nearest(variance, on_map)) / depth
-            log_std[row] = np.median(spread[valid])
-        log_depth[row, :, : camera.width] = np.log(depth).reshape(_ROWS, -1)
+            relative_std = np.sqrt(sample_nearest(variance, map_xy)) / depth
+            log_std[row] = np.median(relative_std[valid])
+        log_depth[row, :, : camera.width] = np.log(depth).reshape(_GRID_ROWS, -1)
         points.append(unproject(camera, xy, depth) @ image.rotation + centers[row])
     params = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras])
     return _SampledViews(
@@ -86,25 +93,26 @@ def _sample(images: Sequence[RegisteredImage]) -> _SampledViews:
     )
 
 
-def _sources(views: _SampledViews, row: int, limit: int) -> list[int]:
-    gains = np.zeros((len(views.points), len(views.points[row])))
-    _gains(row, views.points[row], *views[:-1], gains)
-    chosen: list[int] = []
-    have = np.zeros(gains.shape[1])
-    for _ in range(min(limit, len(gains) - 1)):
-        added = (gains / (1 + have)).mean(axis=1)
-        added[chosen] = 0
-        best = int(added.argmax())
-        if added[best] < _MIN_GAIN:
+def _select_sources(views: _SampledViews, row: int, max_sources: int) -> list[int]:
+    """Select the source views of one image greedily."""
+    scores = np.zeros((len(views.points), len(views.points[row])))
+    _score_points(row, views.points[row], *views[:-1], scores)
+    selected: list[int] = []
+    covered = np.zeros(scores.shape[1])
+    for _ in range(min(max_sources, len(scores) - 1)):
+        gain = (scores / (1 + covered)).mean(axis=1)
+        gain[selected] = 0
+        best = int(gain.argmax())
+        if gain[best] < _MIN_GAIN:
             break
-        chosen.append(best)
-        have += gains[best]
-    return chosen
+        selected.append(best)
+        covered += scores[best]
+    return selected
 
 
 @kernel()
-def _gains(
-    own: int,
+def _score_points(
+    reference: int,
     points: Float64,
     params: Float64,
     columns: Int64,
@@ -113,16 +121,23 @@ def _gains(
     centers: Float64,
     log_depth: Float64,
     log_std: Float64,
-    gains: Float64,
+    scores: Float64,
 ) -> None:
-    """What each other view says about each of our points, 0 to 1: (m, n)."""
+    """Score in [0, 1] how well each view measures each point of the reference view.
+
+    The score is the product of terms for triangulation angle and relative distance, and 0 for
+    occluded points.
+
+    The arrays from `params` to `log_std` are those of :class:`_SampledViews`. `points` are the (n,
+    3) world points of the view `reference`. `scores` (m, n) is written.
+    """
     rows = log_depth.shape[1]
-    for other in range(len(params)):
-        if other == own:
+    for source in range(len(params)):
+        if source == reference:
             continue
-        fx, fy, cx, cy = params[other]
-        rotation, translation = rotations[other], translations[other]
-        hidden = _HIDDEN_STDS * max(log_std[own], log_std[other])
+        fx, fy, cx, cy = params[source]
+        rotation, translation = rotations[source], translations[source]
+        max_behind = _OCCLUSION_STDS * max(log_std[reference], log_std[source])
         for k in range(len(points)):
             point = points[k]
             x, y, z = translation
@@ -133,19 +148,19 @@ def _gains(
             if z <= 0:
                 continue
             u, v = fx * x / z + cx, fy * y / z + cy
-            if u < 0 or v < 0 or u > columns[other] or v > rows:
+            if u < 0 or v < 0 or u > columns[source] or v > rows:
                 continue
-            column, row = min(int(u), columns[other] - 1), min(int(v), rows - 1)
-            if math.log(z) - log_depth[other, row, column] >= hidden:
+            column, row = min(int(u), columns[source] - 1), min(int(v), rows - 1)
+            if math.log(z) - log_depth[source, row, column] >= max_behind:
                 continue
-            ours, theirs, cosine = 0.0, 0.0, 0.0
+            d1, d2, dot = 0.0, 0.0, 0.0  # squared distances to both centers, dot product of rays
             for axis in range(3):
-                a, b = point[axis] - centers[own, axis], point[axis] - centers[other, axis]
-                ours, theirs, cosine = ours + a * a, theirs + b * b, cosine + a * b
-            if cosine <= 0:
+                a, b = point[axis] - centers[reference, axis], point[axis] - centers[source, axis]
+                d1, d2, dot = d1 + a * a, d2 + b * b, dot + a * b
+            if dot <= 0:
                 continue
-            lengths = math.sqrt(ours * theirs)
-            angle = math.degrees(math.acos(min(cosine / lengths, 1.0)))
-            wide = max(angle - _WIDE_DEG, 0.0) / _WIDE_DEG
-            nearer = math.sqrt(min(ours, theirs) / max(ours, theirs))
-            gains[other, k] = min(angle / _ENOUGH_DEG, 1.0) * math.exp(-(wide**2) / 2) * nearer
+            angle = math.degrees(math.acos(min(dot / math.sqrt(d1 * d2), 1.0)))
+            excess = max(angle - _WIDE_DEG, 0.0) / _WIDE_DEG
+            distance_ratio = math.sqrt(min(d1, d2) / max(d1, d2))
+            angle_score = min(angle / _FULL_SCORE_DEG, 1.0) * math.exp(-(excess**2) / 2)
+            scores[source, k] = angle_score * distance_ratio

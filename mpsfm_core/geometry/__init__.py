@@ -1,4 +1,4 @@
-"""Projection, transforms, robust statistics and patch alignment: each formula once."""
+"""Projection, transforms, robust statistics and patch alignment."""
 
 from mpsfm_core.geometry.projection import (
     inside,

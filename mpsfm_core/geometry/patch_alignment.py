@@ -1,9 +1,9 @@
-"""Where patches of one image lie in another, to a fraction of a pixel.
+"""Subpixel patch alignment by inverse compositional Lucas-Kanade.
 
-Lucas and Kanade's alignment in its inverse compositional form (Baker and Matthews, Lucas-Kanade 20
-Years On, IJCV 2004): gradients and Hessian are the template's and are made once. Patches are
-weighed by a Gaussian and compared without their mean and contrast, so that brightness and gain do
-not matter. The warp is a translation first, then affine.
+The method is that of Baker and Matthews, "Lucas-Kanade 20 Years On" (IJCV 2004).
+Gradients and the Hessian come from the template and are computed once. A Gaussian weights the
+patch. The residual is invariant to brightness and gain. The warp is a translation first, then
+affine.
 """
 
 # mypy: allow-untyped-decorators
@@ -18,80 +18,87 @@ import numpy as np
 from mpsfm_core.data import Float32, Float64
 from mpsfm_core.support.jit import helper, kernel
 
-WINDOW = 0.6
-"""Std of the Gaussian window in terms of the patch's radius (ours)."""
-_ROUNDS = 12
-"""Of each of the two warps, at most."""
-_CONVERGED_PX = 0.1, 0.01
-"""Steps after which the two are near enough."""
+WINDOW_STD_RATIO = 0.6
+"""Std of the Gaussian window relative to the radius of the patch [ours]."""
+_MAX_ITERATIONS = 12
+"""Maximum number of iterations of each warp model."""
+_CONVERGENCE_PX = 0.1, 0.01
+"""Step sizes at which the translation and the affine warp have converged."""
 _DAMPING = 0.01
-"""Of the affine part, relative to its Hessian's diagonal (ours)."""
-_REGULAR = 1e-9
-"""Added to the diagonal of a Hessian, of intensities of unit contrast per pixel."""
-_TRANSLATION = 2
-_AFFINE = 6
-_FIRST = 2
-"""Place of the derivatives in a basis."""
-_FLAT = 1e-3
-"""Grey levels: a patch of smaller contrast shows nothing."""
+"""Damping of the affine parameters, relative to the diagonal of the Hessian [ours]."""
+_REGULARIZATION = 1e-9
+"""Value added to the diagonal of the Hessian."""
+_NUM_TRANSLATION = 2
+"""Parameters of a translation."""
+_NUM_AFFINE = 6
+"""Parameters of an affine warp."""
+_DERIVATIVES = 2
+"""Index of the first derivative in a basis."""
+_MIN_CONTRAST = 1e-3
+"""Minimum std of gray values in a patch."""
 
 
-class Alignment(NamedTuple):
-    """Of n patches. ``shift``: (n, 2), from where the patch was looked for to where it lies.
-    ``warp``: (n, 2, 2), offsets in the template to offsets in the other image. ``correlation``:
-    (n,), -1 where a patch could not be compared. ``covariance``: (n, 2, 2) of the shift, pixels^2,
-    for the noise that is left between the patches."""
+class PatchAlignment(NamedTuple):
+    """Alignment of n patches."""
 
     shift: Float64
+    """(n, 2) from the initial to the aligned position, pixels of the searched image."""
     warp: Float64
+    """(n, 2, 2) maps offsets in the template to offsets in the searched image."""
     correlation: Float64
+    """(n,) NCC of the aligned patches, -1 where alignment failed."""
     covariance: Float64
+    """(n, 2, 2) covariance of the shift from image noise, pixels^2."""
 
 
 def align_patches(
     template: Float32,
     searched: Float32,
-    in_template: Float64,
-    in_searched: Float64,
+    template_xy: Float64,
+    searched_xy: Float64,
     warp: Float64,
     radius: int,
     correlation_length: float,
-) -> Alignment:
-    """Find patches of ``template`` (h, w) in ``searched`` (h, w), both grey.
+) -> PatchAlignment:
+    """Align patches of one image to another.
 
     Args:
-        in_template, in_searched: (n, 2) centres of the patches and where to look for them, COLMAP
-            pixels (centres of pixels at .5).
-        warp: (n, 2, 2) offsets in the template to offsets in the other image, to begin with.
-        radius: of the round patch, pixels of the template.
-        correlation_length: pixels of the template within which noise of the images hangs together.
+        template: (h, w) gray values of the image with the patches.
+        searched: (h, w) gray values of the other image.
+        template_xy: (n, 2) centers of the patches, COLMAP pixels.
+        searched_xy: (n, 2) initial positions, COLMAP pixels.
+        warp: (n, 2, 2) initial warps, template offsets to offsets in the other image.
+        radius: Radius of the round patch in pixels of the template.
+        correlation_length: Correlation length of image noise in pixels of the template.
     """
-    offsets, window = _samples(radius)
-    # Samples stand for two pixels each; weights of independent ones would sum up so.
-    independent = 1.0 / ((window**2).sum() / 2 * correlation_length**2)
-    return Alignment(
+    offsets, window = _sample_patch(radius)
+    # Effective number of independent pixels; each sample represents two pixels.
+    num_independent = 1.0 / ((window**2).sum() / 2 * correlation_length**2)
+    return PatchAlignment(
         *_align(
             template,
             searched,
-            in_template - 0.5,
-            in_searched - 0.5,
+            template_xy - 0.5,
+            searched_xy - 0.5,
             np.ascontiguousarray(warp, dtype=np.float64),
             radius,
             offsets,
             window,
-            max(1.0, independent),
+            max(1.0, num_independent),
         )
     )
 
 
-def _samples(radius: int) -> tuple[Float64, Float64]:
-    """Pixels of a round patch from its centre (q, 2), and their weights. Every other one, like the
-    black fields of a chessboard: smooth images have nothing more to say in between."""
+def _sample_patch(radius: int) -> tuple[Float64, Float64]:
+    """Return offsets (q, 2) and weights (q,) of the samples of a round patch.
+
+    Only every other pixel is sampled, in a checkerboard, because images are smooth.
+    """
     line = np.arange(-radius, radius + 1, dtype=np.float64)
-    x, y = (each.ravel() for each in np.meshgrid(line, line))
-    chosen = ((x + y) % 2 == 0) & (np.hypot(x, y) <= radius)
-    offsets = np.stack([x[chosen], y[chosen]], axis=1)
-    window = np.exp(-0.5 * (offsets**2).sum(axis=1) / (WINDOW * radius) ** 2)
+    x, y = (grid.ravel() for grid in np.meshgrid(line, line))
+    sampled = ((x + y) % 2 == 0) & (np.hypot(x, y) <= radius)
+    offsets = np.stack([x[sampled], y[sampled]], axis=1)
+    window = np.exp(-0.5 * (offsets**2).sum(axis=1) / (WINDOW_STD_RATIO * radius) ** 2)
     return offsets, window / window.sum()
 
 
@@ -99,62 +106,65 @@ def _samples(radius: int) -> tuple[Float64, Float64]:
 def _align(
     template: Float32,
     searched: Float32,
-    in_template: Float64,
-    in_searched: Float64,
+    template_xy: Float64,
+    searched_xy: Float64,
     warps: Float64,
     radius: int,
     offsets: Float64,
     window: Float64,
-    independent: float,
+    num_independent: float,
 ) -> tuple[Float64, Float64, Float64, Float64]:
-    count = len(in_template)
+    """Align each patch; returns the fields of :class:`PatchAlignment`."""
+    count = len(template_xy)
     shifts = np.zeros((count, 2))
-    found = np.zeros((count, 2, 2))
+    refined_warps = np.zeros((count, 2, 2))
     correlations = np.full(count, -1.0)
     covariances = np.zeros((count, 2, 2))
-    basis = np.empty((len(window), _FIRST + _AFFINE))
-    hessian = np.empty((_AFFINE, _AFFINE))
-    inverse = np.empty((_AFFINE, _AFFINE))
-    slopes = np.empty(_AFFINE)
-    step = np.empty(_AFFINE)
+    basis = np.empty((len(window), _DERIVATIVES + _NUM_AFFINE))
+    hessian = np.empty((_NUM_AFFINE, _NUM_AFFINE))
+    inverse = np.empty((_NUM_AFFINE, _NUM_AFFINE))
+    gradient = np.empty(_NUM_AFFINE)
+    step = np.empty(_NUM_AFFINE)
     for n in range(count):
-        if not _derive(template, in_template[n], radius, offsets, window, basis, hessian):
+        if not _derive(template, template_xy[n], radius, offsets, window, basis, hessian):
             continue
-        warp, at = found[n], in_searched[n].copy()
+        warp, at = refined_warps[n], searched_xy[n].copy()
         warp[:] = warps[n]
-        parameters, rounds, fresh = _TRANSLATION, 0, True
+        parameters, iteration, invert_hessian = _NUM_TRANSLATION, 0, True
         correlation = 1.0
         while correlation >= 0.0:
-            correlation = _compare(searched, at, warp, radius, offsets, basis, slopes)
-            if rounds == _ROUNDS and parameters == _AFFINE:
+            correlation = _compare(searched, at, warp, radius, offsets, basis, gradient)
+            if iteration == _MAX_ITERATIONS and parameters == _NUM_AFFINE:
                 break
-            if fresh:
+            if invert_hessian:
                 _invert(hessian, parameters, inverse)
-                fresh = False
-            _solve(inverse, slopes, parameters, radius, step)
+                invert_hessian = False
+            _solve(inverse, gradient, parameters, radius, step)
             _compose(warp, at, step)
-            rounds += 1
-            if math.hypot(step[0], step[1]) < _CONVERGED_PX[int(parameters == _AFFINE)]:
-                rounds = _ROUNDS
-            if rounds == _ROUNDS and parameters == _TRANSLATION:
-                parameters, rounds, fresh = _AFFINE, 0, True
+            iteration += 1
+            if math.hypot(step[0], step[1]) < _CONVERGENCE_PX[int(parameters == _NUM_AFFINE)]:
+                iteration = _MAX_ITERATIONS
+            if iteration == _MAX_ITERATIONS and parameters == _NUM_TRANSLATION:
+                parameters, iteration, invert_hessian = _NUM_AFFINE, 0, True
         if correlation < 0.0:
             continue
         correlations[n] = correlation
-        # Of the translation in the template, the affine part free; then in the other image.
-        noise = 2.0 * (1.0 - correlation) / independent
+        # Covariance of the translation in the template with free affine parameters, transformed to
+        # the other image by the warp.
+        noise = 2.0 * (1.0 - correlation) / num_independent
         for i in range(2):
-            shifts[n, i] = at[i] - in_searched[n, i]
+            shifts[n, i] = at[i] - searched_xy[n, i]
             for j in range(2):
                 for k in range(2):
                     for m in range(2):
                         moved = warp[i, k] * inverse[k, m] * warp[j, m]
                         covariances[n, i, j] += noise * moved
-    return shifts, found, correlations, covariances
+    return shifts, refined_warps, correlations, covariances
 
 
 @helper()
 def _bilinear(image: Float32, x: float, y: float) -> float:
+    """Interpolate an image at an array position."""
     column, row = int(x), int(y)
     right, down = x - column, y - row
     above = image[row, column] * (1.0 - right) + image[row, column + 1] * right
@@ -165,7 +175,7 @@ def _bilinear(image: Float32, x: float, y: float) -> float:
 
 @helper()
 def _inside(image: Float32, x: float, y: float, reach_x: float, reach_y: float) -> bool:
-    """Whether all can be interpolated that is so near to a place; not if that is no number."""
+    """Return True if a box around (x, y) can be interpolated; False for NaN."""
     fits_x = x - reach_x >= 0.0 and x + reach_x < image.shape[1] - 1
     return fits_x and y - reach_y >= 0.0 and y + reach_y < image.shape[0] - 1
 
@@ -180,11 +190,24 @@ def _derive(
     basis: Float64,
     hessian: Float64,
 ) -> bool:
-    """What another patch is multiplied with, sample by sample: the window, the window times the
-    template without its mean and of unit contrast, and the window times the template's derivatives
-    by the parameters of a warp, two of a translation and four of an affine map with offsets in
-    terms of the radius. What a change of mean and contrast explains is taken out of them. False
-    where the template leaves the image or is flat."""
+    """Compute the basis and the Hessian of a template patch.
+
+    The basis has 8 columns per sample: the window; the window times the normalized template; and
+    the window times the derivatives by 2 translation and 4 affine parameters. Affine offsets are
+    relative to the radius. The derivatives are orthogonal to changes of mean and contrast.
+
+    Args:
+        image: (h, w) gray values.
+        at: (2,) center of the patch, array position.
+        radius: Radius of the patch.
+        offsets: (q, 2) samples.
+        window: (q,) weights.
+        basis: (q, 8), written.
+        hessian: (6, 6), written.
+
+    Returns:
+        False if the patch leaves the image or has no contrast.
+    """
     if not _inside(image, at[0], at[1], radius + 1.0, radius + 1.0):
         return False
     mean, square = 0.0, 0.0
@@ -197,32 +220,32 @@ def _derive(
         basis[q, 2] = 0.5 * (_bilinear(image, x + 1.0, y) - _bilinear(image, x - 1.0, y))
         basis[q, 3] = 0.5 * (_bilinear(image, x, y + 1.0) - _bilinear(image, x, y - 1.0))
     variance = square - mean * mean
-    if not variance > _FLAT**2:
+    if not variance > _MIN_CONTRAST**2:
         return False
     scale = 1.0 / math.sqrt(variance)
-    means, along = np.zeros(_AFFINE), np.zeros(_AFFINE)
+    means, along = np.zeros(_NUM_AFFINE), np.zeros(_NUM_AFFINE)
     for q in range(len(window)):
         weight, value = window[q], (basis[q, 1] - mean) * scale
         dx, dy = offsets[q, 0] / radius, offsets[q, 1] / radius
         gx, gy = basis[q, 2] * scale, basis[q, 3] * scale
         basis[q, 0], basis[q, 1] = weight, weight * value
-        slopes = basis[q, _FIRST:]
-        slopes[0], slopes[1] = gx, gy
-        slopes[2], slopes[3] = gx * dx, gx * dy
-        slopes[4], slopes[5] = gy * dx, gy * dy
-        for k in range(_AFFINE):
-            means[k] += weight * slopes[k]
-            along[k] += weight * value * slopes[k]
+        gradient = basis[q, _DERIVATIVES:]
+        gradient[0], gradient[1] = gx, gy
+        gradient[2], gradient[3] = gx * dx, gx * dy
+        gradient[4], gradient[5] = gy * dx, gy * dy
+        for k in range(_NUM_AFFINE):
+            means[k] += weight * gradient[k]
+            along[k] += weight * value * gradient[k]
     hessian[:] = 0.0
     for q in range(len(window)):
-        slopes, weight = basis[q, _FIRST:], window[q]
-        for i in range(_AFFINE):
-            slopes[i] -= means[i] + along[i] * basis[q, 1] / weight
+        gradient, weight = basis[q, _DERIVATIVES:], window[q]
+        for i in range(_NUM_AFFINE):
+            gradient[i] -= means[i] + along[i] * basis[q, 1] / weight
             for j in range(i + 1):
-                hessian[i, j] += weight * slopes[i] * slopes[j]
-        for i in range(_AFFINE):
-            slopes[i] *= weight
-    for i in range(_AFFINE):
+                hessian[i, j] += weight * gradient[i] * gradient[j]
+        for i in range(_NUM_AFFINE):
+            gradient[i] *= weight
+    for i in range(_NUM_AFFINE):
         for j in range(i):
             hessian[j, i] = hessian[i, j]
     return True
@@ -236,10 +259,22 @@ def _compare(
     radius: int,
     offsets: Float64,
     basis: Float64,
-    slopes: Float64,
+    gradient: Float64,
 ) -> float:
-    """Correlation of the template with the patch at a place under a warp, -1 where that leaves the
-    image or is flat; ``slopes``: products of the template's derivatives and that patch."""
+    """Compute the NCC of the template with a warped patch of another image.
+
+    Args:
+        image: (h, w) gray values of the other image.
+        at: (2,) center of the patch, array position.
+        warp: (2, 2) template offsets to offsets in the other image.
+        radius: Radius of the template patch.
+        offsets: (q, 2) samples.
+        basis: (q, 8) basis of the template, see :func:`_derive`.
+        gradient: (6,) products of the template's derivatives with the patch, written.
+
+    Returns:
+        The NCC, or -1 if the patch leaves the image or has no contrast.
+    """
     reach_x = radius * math.hypot(warp[0, 0], warp[0, 1])
     reach_y = radius * math.hypot(warp[1, 0], warp[1, 1])
     if not _inside(image, at[0], at[1], reach_x, reach_y):
@@ -261,23 +296,22 @@ def _compare(
         s4 += value * basis[q, 6]
         s5 += value * basis[q, 7]
     variance = square - mean * mean
-    if not variance > _FLAT**2:
+    if not variance > _MIN_CONTRAST**2:
         return -1.0
     scale = 1.0 / math.sqrt(variance)
-    slopes[0], slopes[1], slopes[2] = s0 * scale, s1 * scale, s2 * scale
-    slopes[3], slopes[4], slopes[5] = s3 * scale, s4 * scale, s5 * scale
+    gradient[0], gradient[1], gradient[2] = s0 * scale, s1 * scale, s2 * scale
+    gradient[3], gradient[4], gradient[5] = s3 * scale, s4 * scale, s5 * scale
     return product * scale
 
 
 @helper()
 def _invert(matrix: Float64, size: int, inverse: Float64) -> None:
-    """Inverse of the leading block of a Hessian, its affine part damped, into that block of
-    ``inverse``; Gauss and Jordan's way, in place."""
+    """Invert the leading block of a Hessian with damped affine part by Gauss-Jordan elimination."""
     for i in range(size):
         for j in range(size):
             inverse[i, j] = matrix[i, j]
-        inverse[i, i] += _REGULAR
-        if i >= _TRANSLATION:
+        inverse[i, i] += _REGULARIZATION
+        if i >= _NUM_TRANSLATION:
             inverse[i, i] *= 1.0 + _DAMPING
     for k in range(size):
         pivot = 1.0 / inverse[k, k]
@@ -293,19 +327,21 @@ def _invert(matrix: Float64, size: int, inverse: Float64) -> None:
 
 
 @helper()
-def _solve(inverse: Float64, slopes: Float64, parameters: int, radius: int, step: Float64) -> None:
-    """The warp of the template that explains the difference of the patches best."""
+def _solve(
+    inverse: Float64, gradient: Float64, parameters: int, radius: int, step: Float64
+) -> None:
+    """Solve for the Gauss-Newton step of the warp parameters."""
     step[:] = 0.0
     for i in range(parameters):
         for j in range(parameters):
-            step[i] += inverse[i, j] * slopes[j]
-        if i >= _TRANSLATION:
+            step[i] += inverse[i, j] * gradient[j]
+        if i >= _NUM_TRANSLATION:
             step[i] /= radius
 
 
 @helper()
 def _compose(warp: Float64, at: Float64, step: Float64) -> None:
-    """The warp after the inverse of a step."""
+    """Compose the warp with the inverse of a step, in place."""
     a, b, c, d = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
     determinant = a * d - b * c
     w00 = (warp[0, 0] * d - warp[0, 1] * c) / determinant

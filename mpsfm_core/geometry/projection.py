@@ -1,8 +1,8 @@
-"""Pixels, rays and projection of a pinhole camera, and maps sampled at pixels.
+"""Projection and unprojection of a pinhole camera, and sampling of maps.
 
-All functions are vectorised over leading axes. Pixels follow COLMAP: the centre of the first pixel
-is (0.5, 0.5), so the value at ``map[row, col]`` lies at ``(col + 0.5, row + 0.5)``, and resizing a
-W x H view to w x h maps ``x`` to ``x * w / W`` exactly.
+All functions are vectorized over leading axes. Pixels follow COLMAP: the center of the first pixel
+is (0.5, 0.5), so ``map[row, col]`` is the value at ``(col + 0.5, row + 0.5)``. Resizing a W x H
+view to w x h maps ``x`` to ``x * w / W`` exactly.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera
 
 
 def pixel_centers(width: int, height: int) -> Float64:
-    """Centres of all pixels of a grid, (height, width, 2) float64, COLMAP pixels."""
+    """Return the centers of all pixels of a grid, (height, width, 2) float64, COLMAP pixels."""
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([u, v], axis=-1)
 
 
 def rays(camera: PinholeCamera, xy: Float64) -> Float64:
-    """Rays with z = 1 through pixels ``xy`` (..., 2): (..., 3) float64, camera frame."""
+    """Return the rays with z = 1 through pixels (..., 2), (..., 3) float64, camera frame."""
     x = (xy[..., 0] - camera.cx) / camera.fx
     y = (xy[..., 1] - camera.cy) / camera.fy
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
 def unproject(camera: PinholeCamera, xy: Float64, depth: NDArray[Any]) -> Float64:
-    """Lift pixels (..., 2) with z-depth (...) to points (..., 3) in the camera frame."""
+    """Unproject pixels (..., 2) with z-depth (...) to points (..., 3) in the camera frame."""
     return rays(camera, xy) * np.asarray(depth, dtype=np.float64)[..., None]
 
 
 def project(camera: PinholeCamera, points: Float64) -> Float64:
     """Project points (..., 3) in the camera frame to pixels (..., 2).
 
-    Points with z <= 0 have no image; their result is NaN.
+    Points with z <= 0 give NaN.
     """
     z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
     x = camera.fx * points[..., 0] / z + camera.cx
@@ -45,12 +45,12 @@ def project(camera: PinholeCamera, points: Float64) -> Float64:
 
 
 def scale_pixels(xy: Float64, from_size: tuple[int, int], to_size: tuple[int, int]) -> Float64:
-    """Pixels of a view of size (W, H) expressed on a grid of size (w, h) covering it."""
+    """Scale pixels (..., 2) of a view of size (W, H) to a grid of size (w, h)."""
     return xy * (np.array(to_size, dtype=np.float64) / np.array(from_size, dtype=np.float64))
 
 
 def inside(xy: Float64, size: tuple[int, int]) -> Bool:
-    """True for pixels (..., 2) inside of a view of size (width, height); False for NaN."""
+    """Return True for pixels (..., 2) inside a view of size (width, height); False for NaN."""
     x, y = xy[..., 0], xy[..., 1]
     with np.errstate(invalid="ignore"):
         result: Bool = (x >= 0) & (y >= 0) & (x <= size[0]) & (y <= size[1])
@@ -58,21 +58,22 @@ def inside(xy: Float64, size: tuple[int, int]) -> Bool:
 
 
 def sample_nearest(values: NDArray[Any], xy: Float64) -> NDArray[Any]:
-    """Values (h, w, ...) at the pixels (n, 2) of the map's own grid, clamped to its border."""
+    """Sample the nearest values (n, ...) of a map at its pixels (n, 2), clamped to the map."""
     col = np.clip(np.floor(xy[:, 0]).astype(np.int64), 0, values.shape[1] - 1)
     row = np.clip(np.floor(xy[:, 1]).astype(np.int64), 0, values.shape[0] - 1)
     return values[row, col]
 
 
 def sample_bilinear(values: NDArray[Any], valid: Bool, xy: Float64) -> tuple[Float64, Bool]:
-    """Bilinear samples of a map at pixels of the map's own grid.
+    """Sample a map bilinearly; the outer half pixel takes the border's values.
 
     Args:
-        values: (h, w) map. valid: (h, w) bool. xy: (n, 2), COLMAP pixels of this grid.
+        values: (h, w) map.
+        valid: (h, w) mask.
+        xy: (n, 2) COLMAP pixels of the map.
 
     Returns:
-        ``(samples, ok)``: (n,) float64 and (n,) bool. ``ok`` is True where all pixels that have
-        weight are valid. The outer half pixel takes the border's values.
+        Samples (n,) float64, and a mask (n,), True where all pixels with weight are valid.
     """
     height, width = values.shape
     x = np.clip(np.nan_to_num(xy[:, 0]) - 0.5, 0, width - 1)
@@ -95,11 +96,18 @@ def sample_bilinear(values: NDArray[Any], valid: Bool, xy: Float64) -> tuple[Flo
 
 
 def resize_map(values: NDArray[Any], width: int, height: int, *, linear: bool = True) -> Float32:
-    """Resize a map (h, w) or (h, w, c) to height x width, float32.
+    """Resize a map to a grid.
 
-    ``linear``: bilinear, averaging over areas when shrinking; else nearest.
+    Args:
+        values: (h, w) or (h, w, c) map.
+        width: Columns of the grid.
+        height: Rows of the grid.
+        linear: Use area averages to shrink and bilinear interpolation to enlarge; else nearest.
+
+    Returns:
+        (height, width) or (height, width, c) float32.
     """
-    import cv2  # here, as plugins and the command line import this module and must start fast
+    import cv2  # local, because plugins and the command line import this module and must start fast
 
     values = np.ascontiguousarray(values, dtype=np.float32)
     if values.shape[:2] == (height, width):
@@ -111,9 +119,14 @@ def resize_map(values: NDArray[Any], width: int, height: int, *, linear: bool = 
 
 
 def log_depth_steps(depth: Float32, valid: Bool) -> Float32:
-    """Largest step of log depth to a 4-neighbour, (h, w) float32, >= 0; e.g. 0.1 for 10 %.
+    """Compute the largest step of log depth to a 4-neighbor; 0.1 is about 10 %.
 
-    ``depth``, ``valid``: (h, w). Steps to or from invalid pixels do not count.
+    Args:
+        depth: (h, w) depth.
+        valid: (h, w) mask. Steps to or from invalid pixels do not count.
+
+    Returns:
+        (h, w) float32, >= 0.
     """
     steps = np.zeros(depth.shape, dtype=np.float32)
     log_depth = np.log(np.where(valid, depth, np.float32(1)))

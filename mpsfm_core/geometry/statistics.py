@@ -7,30 +7,36 @@ import numpy as np
 from mpsfm_core.data import Float64, Int64
 
 MAD_TO_STD = 1.4826
-"""Of normal errors: from the median of their absolute values to their std."""
+"""Std of normal errors relative to the median of their absolute values."""
 ONE_SIGMA = 0.683
-"""Share within one std of a normal distribution."""
+"""Probability within one std of a normal distribution."""
 
 
-def weighted_quantile(values: Float64, weights: Float64, share: float) -> float:
-    """The value below which this share of the weight lies; both (n,)."""
+def weighted_quantile(values: Float64, weights: Float64, ratio: float) -> float:
+    """Return the value below which this ratio of the total weight falls; both (n,)."""
     order = np.argsort(values)
-    cumulated = np.cumsum(weights[order])
-    place = int(np.searchsorted(cumulated, share * cumulated[-1]))
-    return float(values[order[min(place, len(order) - 1)]])
+    cumulative = np.cumsum(weights[order])
+    position = int(np.searchsorted(cumulative, ratio * cumulative[-1]))
+    return float(values[order[min(position, len(order) - 1)]])
 
 
 def group_medians(values: Float64, groups: Int64, count: int) -> Float64:
-    """(count,) median of the values (m,) of each group; NaN for those without any.
+    """Compute the median of each group.
 
-    ``groups``: (m,) int, the group of each, in [0, count).
+    Args:
+        values: (m,) values.
+        groups: (m,) group of each value, in [0, count).
+        count: Number of groups.
+
+    Returns:
+        (count,) medians, NaN for empty groups.
     """
     order = np.lexsort((values, groups))
     sizes = np.bincount(groups, minlength=count)
     first = np.cumsum(sizes) - sizes
     medians = np.full(count, np.nan)
-    some = sizes > 0
+    nonempty = sizes > 0
     low, high = first + (sizes - 1) // 2, first + sizes // 2
     ordered = values[order]
-    medians[some] = (ordered[low[some]] + ordered[high[some]]) / 2
+    medians[nonempty] = (ordered[low[nonempty]] + ordered[high[nonempty]]) / 2
     return medians

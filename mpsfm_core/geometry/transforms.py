@@ -1,4 +1,4 @@
-"""Rigid transforms, camera centres and angles."""
+"""Rigid transforms, camera centers and angles."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mpsfm_core.data import Float64
 
 
 def rotation_angle_deg(rotation: Float64) -> Float64:
-    """Angle of rotations (..., 3, 3) in degrees, accurate near 0 and 180."""
+    """Compute the angle of rotations (..., 3, 3) in degrees, accurate near 0 and 180."""
     sine = 0.5 * np.linalg.norm(
         np.stack(
             [
@@ -26,7 +26,7 @@ def rotation_angle_deg(rotation: Float64) -> Float64:
 
 
 def angle_between_deg(a: Float64, b: Float64) -> Float64:
-    """Angle between vectors (..., 3) in degrees, [0, 180], accurate for small angles."""
+    """Compute the angle between vectors (..., 3) in [0, 180] degrees, accurate near 0."""
     (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
     sine = np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2)
     cosine = ax * bx + ay * by + az * bz
@@ -35,10 +35,13 @@ def angle_between_deg(a: Float64, b: Float64) -> Float64:
 
 
 def triangulation_angle_deg(center_a: Float64, center_b: Float64, points: Float64) -> Float64:
-    """Angle at points (..., 3) between the rays to two camera centres (..., 3), [0, 90] deg.
+    """Compute the triangulation angle of points (..., 3) to two camera centers (..., 3).
 
-    The true angle, folded as COLMAP does: rays that point in opposite directions are as badly
-    conditioned as parallel ones.
+    Angles above 90 degrees are folded as in COLMAP, because opposite rays are as ill-conditioned as
+    parallel rays.
+
+    Returns:
+        (...) angles in [0, 90] degrees.
     """
     angle = angle_between_deg(points - center_a, points - center_b)
     folded: Float64 = np.minimum(angle, 180.0 - angle)
@@ -46,24 +49,24 @@ def triangulation_angle_deg(center_a: Float64, center_b: Float64, points: Float6
 
 
 def camera_center(rotation: Float64, translation: Float64) -> Float64:
-    """Centres (..., 3) of cameras with ``cam_from_world`` rotation (..., 3, 3), t (..., 3)."""
+    """Compute camera centers (..., 3) from ``cam_from_world`` rotations and translations."""
     center: Float64 = -np.einsum("...ji,...j->...i", rotation, translation)
     return center
 
 
 def transform(rotation: Float64, translation: Float64, points: Float64) -> Float64:
-    """``R x + t`` for points (n, 3)."""
+    """Transform points (n, 3) by ``R x + t``."""
     moved: Float64 = points @ rotation.T + translation
     return moved
 
 
 def invert(rotation: Float64, translation: Float64) -> tuple[Float64, Float64]:
-    """Inverse of one rigid transform."""
+    """Invert a rigid transform (3, 3), (3,)."""
     return rotation.T, -rotation.T @ translation
 
 
 def compose(
     b_from_a: tuple[Float64, Float64], a_from_world: tuple[Float64, Float64]
 ) -> tuple[Float64, Float64]:
-    """``b_from_world`` from ``b_from_a`` and ``a_from_world``."""
+    """Compose ``b_from_a`` and ``a_from_world`` to ``b_from_world``."""
     return b_from_a[0] @ a_from_world[0], b_from_a[0] @ a_from_world[1] + b_from_a[1]

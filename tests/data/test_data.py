@@ -1,4 +1,4 @@
-"""Constructors that clean up what networks put out."""
+"""Tests of constructors that normalize the output of networks."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from mpsfm_core.providers import require_features
 FEATURES = Features(np.zeros((0, 2)), np.zeros((0, 8), np.float32), np.zeros(0, np.float32))
 
 
-def test_matches_from_arrays_of_any_type_have_scores_within_range() -> None:
+def test_sparse_matches_from_arrays_converts_dtypes_and_clips_scores() -> None:
     found = SparseMatches.from_arrays(np.array([[0.0, 2.0], [1.0, 0.0]]), np.array([1.2, -0.1]))
     assert found.indices.dtype == np.int64 and found.indices.tolist() == [[0, 2], [1, 0]]
     assert found.scores.dtype == np.float32 and found.scores.tolist() == [1.0, 0.0]
 
 
-def test_of_several_matches_of_a_feature_the_most_certain_stays() -> None:
+def test_best_first_keeps_highest_score_per_feature() -> None:
     indices = np.array([[0, 5], [1, 5], [1, 6], [2, 7], [3, 6]])
     found = SparseMatches.best_first(indices, np.array([0.2, 0.9, 0.8, 0.3, 0.5]))
-    # (1, 6) goes with its feature 1, but has not taken feature 6 from (3, 6)
+    # (1, 6) loses to (1, 5), so feature 6 stays available for (3, 6)
     assert found.indices.tolist() == [[1, 5], [3, 6], [2, 7]]
     np.testing.assert_allclose(found.scores, [0.9, 0.5, 0.3])
 
 
-def test_a_matcher_that_needs_features_says_so() -> None:
+def test_require_features_without_features_raises() -> None:
     assert require_features("x matches features", FEATURES, FEATURES) == (FEATURES, FEATURES)
     with pytest.raises(ProviderError, match="x matches features: choose a features provider"):
         require_features("x matches features", FEATURES, None)

@@ -1,4 +1,4 @@
-"""An analytic room whose poses are exact and whose depth is not."""
+"""Fixture: an analytic room with exact poses and inexact depth maps."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ STD = 0.15
 
 @dataclass(frozen=True)
 class Room:
-    """Images with smooth errors of depth, their photos, and the true depth by name."""
+    """Images with smooth depth errors, their views, and the true depth by name."""
 
     reconstruction: Reconstruction
     views: Mapping[str, View]
     truth: Mapping[str, Float32]
 
     def errors(self, reconstruction: Reconstruction) -> dict[str, np.ndarray]:
-        """Relative error of depth of each image on the photo's grid."""
+        """Return the relative depth error of each image on the grid of the view."""
         return {
             image.name: np.abs(image.depth.depth / self.truth[image.name] - 1)
             for image in reconstruction.images

@@ -1,4 +1,4 @@
-"""The dense stage on an analytic room, and on what photos can be like."""
+"""Tests of densification on an analytic room and on difficult images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OPTIONS = DenseOptions(correlation_px=20)
 
 
 def changed(room, change: Callable[[int, np.ndarray], np.ndarray]) -> Callable[[str], View]:
-    """The photos with other grey values."""
+    """Return a loader of views with changed pixels."""
 
     def view_of(name: str) -> View:
         view = room.views[name]
@@ -33,7 +33,7 @@ def changed(room, change: Callable[[int, np.ndarray], np.ndarray]) -> Callable[[
     return view_of
 
 
-def test_depth_is_measured_where_views_overlap(room) -> None:
+def test_densify_improves_depth_of_overlapping_views(room) -> None:
     dense, report = densify(room.reconstruction, room.views.__getitem__, OPTIONS)
     before, after = room.errors(room.reconstruction), room.errors(dense)
     for name, error in after.items():
@@ -42,7 +42,7 @@ def test_depth_is_measured_where_views_overlap(room) -> None:
         assert report.confirmed[name] > 0.6 and name not in report.sources[name]
 
 
-def test_the_stated_std_is_about_the_error(room) -> None:
+def test_densify_std_is_calibrated(room) -> None:
     dense, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS)
     error = np.concatenate([e.ravel() for e in room.errors(dense).values()])
     depths = [image.depth for image in dense.images]
@@ -52,7 +52,7 @@ def test_the_stated_std_is_about_the_error(room) -> None:
     assert error[certain].mean() < error[~certain].mean()
 
 
-def test_a_sensor_s_depth_stays_and_its_holes_are_measured(room) -> None:
+def test_densify_keeps_sensor_depth_and_fills_holes(room) -> None:
     images, holes = [], {}
     for number, image in enumerate(room.reconstruction.images):
         depth = room.truth[image.name]
@@ -71,26 +71,26 @@ def test_a_sensor_s_depth_stays_and_its_holes_are_measured(room) -> None:
         assert error[hole].mean() < 0.1
 
 
-def test_scales_that_hang_on_known_depth_are_less_sure(room) -> None:
-    # without shared pixels (a correlation as long as the map) only known depth ties the pairs
+def test_densify_poses_from_depth_add_scale_variance(room) -> None:
+    # Without shared pixels (correlation length of the map) only known depth constrains the pairs.
     loose = OPTIONS.model_copy(update={"correlation_px": 1000.0})
     tied, _ = densify(room.reconstruction, room.views.__getitem__, loose)
     fixed, _ = densify(room.reconstruction, room.views.__getitem__, loose, poses_use_depth=False)
     for a, b in zip(tied.images, fixed.images, strict=True):
         np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
         added = (a.depth.variance - b.depth.variance) / a.depth.depth**2
-        np.testing.assert_allclose(added, added.mean(), rtol=1e-2)  # of the photo as a whole
+        np.testing.assert_allclose(added, added.mean(), rtol=1e-2)  # constant over the image
         assert 0.003 < added.mean() ** 0.5 < 0.1
 
 
-def test_threads_do_not_change_the_result(room) -> None:
+def test_densify_is_independent_of_threads(room) -> None:
     one, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS, workers=1)
     two, _ = densify(room.reconstruction, room.views.__getitem__, OPTIONS, workers=2)
     for a, b in zip(one.images, two.images, strict=True):
         np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
 
 
-def test_maps_may_lie_on_disk(room, tmp_path: Path) -> None:
+def test_densify_with_arrays_on_disk_is_identical(room, tmp_path: Path) -> None:
     there, report = densify(room.reconstruction, room.views.__getitem__, OPTIONS)
     store = DiskArrays(tmp_path, in_memory=0).store
     here, same = densify(room.reconstruction, room.views.__getitem__, OPTIONS, store_array=store)
@@ -100,7 +100,7 @@ def test_maps_may_lie_on_disk(room, tmp_path: Path) -> None:
         np.testing.assert_array_equal(report.measured[a.name], same.measured[a.name])
 
 
-def test_photos_that_agree_by_chance_measure_nothing(room) -> None:
+def test_densify_unrelated_images_measure_nothing(room) -> None:
     def unrelated(index: int, image: np.ndarray) -> np.ndarray:
         noise = np.random.default_rng(index).random(image.shape[:2]).astype(np.float32)
         grey = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX)
@@ -112,7 +112,7 @@ def test_photos_that_agree_by_chance_measure_nothing(room) -> None:
         np.testing.assert_allclose(image.depth.depth, before.depth.depth, rtol=1e-5)
 
 
-def test_exposure_may_change_from_photo_to_photo(room) -> None:
+def test_densify_is_invariant_to_exposure(room) -> None:
     def exposed(index: int, image: np.ndarray) -> np.ndarray:
         return np.clip(image * (0.6 + 0.2 * index) + 8 * index, 0, 255).astype(np.uint8)
 
@@ -121,7 +121,7 @@ def test_exposure_may_change_from_photo_to_photo(room) -> None:
 
 
 @pytest.mark.parametrize("value", [0, 255])
-def test_photos_that_show_nothing_leave_depth_as_it_is(room, value: int) -> None:
+def test_densify_blank_images_keep_depth(room, value: int) -> None:
     blank = changed(room, lambda _, image: np.full_like(image, value))
     dense, _ = densify(room.reconstruction, blank, OPTIONS)
     before, after = room.errors(room.reconstruction), room.errors(dense)
@@ -129,7 +129,7 @@ def test_photos_that_show_nothing_leave_depth_as_it_is(room, value: int) -> None
         assert after[name].mean() < 1.1 * before[name].mean()
 
 
-def test_one_photo_or_none_that_overlaps_keeps_its_map(room) -> None:
+def test_densify_without_overlap_keeps_depth(room) -> None:
     first = room.reconstruction.images[0]
     away = replace(first, name="1.png", translation=first.translation + 100)
     for images in ((first,), (first, away)):
@@ -139,7 +139,7 @@ def test_one_photo_or_none_that_overlaps_keeps_its_map(room) -> None:
         assert report.confirmed["0.png"] == 0 and not report.sources["0.png"]
 
 
-def test_an_unconfirmed_pose_is_not_used(room) -> None:
+def test_densify_ignores_unconfirmed_pose(room) -> None:
     images = list(room.reconstruction.images)
     images[1] = replace(images[1], confirmed=False)
     guessed = replace(room.reconstruction, images=tuple(images))
@@ -148,8 +148,8 @@ def test_an_unconfirmed_pose_is_not_used(room) -> None:
     assert all("1.png" not in sources for sources in report.sources.values())
 
 
-class Dies:
-    """Keeps what two images give, and ends the run at the third."""
+class FailingCheckpoints:
+    """Checkpoints of two images; interrupts the run at the third."""
 
     def __init__(self, kept: DenseCheckpoints) -> None:
         self.kept, self.loaded, self.saved = kept, 0, 0
@@ -166,7 +166,7 @@ class Dies:
         self.kept.save(name, depth)
 
 
-def test_a_run_goes_on_with_what_a_killed_one_found(room, tmp_path: Path) -> None:
+def test_densify_resumes_from_checkpoints(room, tmp_path: Path) -> None:
     def checkpoints(photos: list[str]) -> DenseCheckpoints:
         return DenseCheckpoints(tmp_path, room.reconstruction, photos, OPTIONS)
 
@@ -178,9 +178,9 @@ def test_a_run_goes_on_with_what_a_killed_one_found(room, tmp_path: Path) -> Non
             room.views.__getitem__,
             OPTIONS,
             workers=1,
-            checkpoints=Dies(checkpoints(keys)),
+            checkpoints=FailingCheckpoints(checkpoints(keys)),
         )
-    second = Dies(checkpoints(keys))
+    second = FailingCheckpoints(checkpoints(keys))
     again, _ = densify(
         room.reconstruction, room.views.__getitem__, OPTIONS, workers=1, checkpoints=second
     )
@@ -194,7 +194,7 @@ def test_a_run_goes_on_with_what_a_killed_one_found(room, tmp_path: Path) -> Non
     assert not list(tmp_path.rglob("*.npz"))
 
 
-def test_a_full_disk_ends_no_run(
+def test_densify_with_full_disk_finishes(
     room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(*_: object) -> None:
@@ -208,14 +208,16 @@ def test_a_full_disk_ends_no_run(
     assert "the disk is full" in caplog.text
 
 
-def test_no_depth_between_two_surfaces_is_made_up(room) -> None:
-    """A map of a quarter of the photo's size, with a step that its std cannot explain."""
+def test_dense_view_does_not_interpolate_across_depth_edge(room) -> None:
+    """A coarse depth map with a step that its std cannot explain."""
     image, size = room.reconstruction.images[0], 16
     depth = np.where(np.arange(size) < size // 2, 2.0, 4.0) * np.ones((size, 1))
     known = DepthPrior.from_arrays(depth, (0.01 * depth) ** 2)
-    view = DenseView.of(replace(image, depth=known), room.views[image.name], OPTIONS.max_size)
+    view = DenseView.from_view(
+        replace(image, depth=known), room.views[image.name], OPTIONS.max_size
+    )
     assert view.log_depth.shape[1] >= 2 * size
     np.testing.assert_allclose(np.unique(np.exp(view.log_depth)), [2, 4], rtol=1e-6)
     unsure = replace(image, depth=DepthPrior.from_arrays(depth, depth**2))
-    view = DenseView.of(unsure, room.views[image.name], OPTIONS.max_size)
+    view = DenseView.from_view(unsure, room.views[image.name], OPTIONS.max_size)
     assert len(np.unique(view.log_depth)) > 2

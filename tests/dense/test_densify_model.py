@@ -1,4 +1,4 @@
-"""Depth for a COLMAP model that brings no depth."""
+"""Tests of densification of a COLMAP model without depth maps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mpsfm_core.testing.synthetic.scenes import room_scene
 
 @pytest.fixture
 def model(room, tmp_path: Path) -> Path:
-    """``sparse/`` with exact poses and some points of the room, ``photos/`` beside it."""
+    """Write `sparse/` with exact poses and points of the room, and `photos/`."""
     images = room.reconstruction.images
     first = images[0]
     camera = first.camera
@@ -46,7 +46,7 @@ def model(room, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_depth_is_found_from_the_range_of_the_points_alone(room, model: Path) -> None:
+def test_dense_command_uses_depth_range_of_points(room, model: Path) -> None:
     arguments = ["dense", str(model), str(model / "photos"), "-o", str(model / "out")]
     result = CliRunner().invoke(build_app(), arguments)
     assert result.exit_code == 0 and "confirmed" in result.output
@@ -59,7 +59,7 @@ def test_depth_is_found_from_the_range_of_the_points_alone(room, model: Path) ->
     assert len(read_ply(model / "out" / "dense.ply")[0]) > 1000
 
 
-def test_a_model_without_points_is_told(model: Path) -> None:
+def test_densify_model_without_points_raises(model: Path) -> None:
     import pycolmap
 
     bare = pycolmap.Reconstruction(str(model / "sparse"))
@@ -71,7 +71,7 @@ def test_a_model_without_points_is_told(model: Path) -> None:
     assert not (model / "out").exists()
 
 
-def test_other_photos_are_told(model: Path, tmp_path: Path) -> None:
+def test_densify_model_with_other_images_raises(model: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.mkdir()
     for name in ("x.png", "y.png"):
@@ -80,7 +80,7 @@ def test_other_photos_are_told(model: Path, tmp_path: Path) -> None:
         densify_model(model, other, model / "out")
 
 
-def test_the_range_of_points_behind_the_camera_does_not_count() -> None:
+def test_depth_prior_from_points_ignores_points_behind_camera() -> None:
     found = depth_prior_from_points(np.array([-3.0, 1.0, 2.0, 4.0]))
     assert isinstance(found, DepthPrior)
     assert found.depth == pytest.approx(2.0, rel=0.1)

@@ -1,4 +1,4 @@
-"""Depth that was known and depth that was measured, joined."""
+"""Tests of the fusion of known and measured depth."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ def observed(rng: np.random.Generator, std: float, stated: float) -> LogDepthMap
 
 
 @pytest.mark.parametrize("known_std", [0.003, 0.01, 0.05])
-def test_the_stated_std_is_that_of_the_joined_depth(known_std: float) -> None:
-    """Whatever std the known depth declares."""
+def test_fuse_known_depth_std_is_calibrated(known_std: float) -> None:
     rng = np.random.default_rng(0)
     measured, known = observed(rng, 0.01, 0.01), observed(rng, known_std, stated=0.1)
     joined = fuse_known_depth(measured, known)
@@ -33,7 +32,7 @@ def test_the_stated_std_is_that_of_the_joined_depth(known_std: float) -> None:
     assert 0.6 < within < 0.9
 
 
-def test_what_was_not_measured_stays_unknown() -> None:
+def test_fuse_known_depth_keeps_unmeasured_pixels_unknown() -> None:
     rng = np.random.default_rng(0)
     measured, known = observed(rng, 0.01, 0.01), observed(rng, 0.01, 0.01)
     measured.log_std[:10] = np.inf
@@ -43,7 +42,7 @@ def test_what_was_not_measured_stays_unknown() -> None:
     assert fuse_known_depth(measured, known) is measured
 
 
-def test_only_what_was_known_tells_how_sure_it_was() -> None:
+def test_fuse_known_depth_ignores_holes() -> None:
     rng = np.random.default_rng(0)
     measured, known = observed(rng, 0.01, 0.01), observed(rng, 0.003, stated=0.1)
     whole = fuse_known_depth(measured, known)
@@ -58,7 +57,7 @@ def test_only_what_was_known_tells_how_sure_it_was() -> None:
     np.testing.assert_allclose(joined.log_std[~hole], whole.log_std[~hole], rtol=0.1)
 
 
-def test_known_depth_beside_a_hole_stays() -> None:
+def test_posterior_keeps_known_depth_next_to_hole() -> None:
     hole = np.zeros(SHAPE, np.bool_)
     hole[22:58, 31:70] = True
     known = LogDepthMap(

@@ -1,4 +1,4 @@
-"""What photos show of wrong poses: offsets beside the lines on which depth is searched."""
+"""Tests of pose errors from patch offsets perpendicular to epipolar lines."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 
 ACROSS, ALONG = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
-"""Axes of a turn that moves pixels across the lines of a camera that moved sideways, or along."""
+"""Rotation axes that move pixels across or along the epipolar lines of a sideways motion."""
 
 
 def turned(image: RegisteredImage, axis: list[float], pixels: float) -> RegisteredImage:
-    """The image with a pose that is wrong by about so many pixels."""
+    """Rotate the pose of an image by an angle of about so many pixels."""
     turn = Rotation.from_rotvec(np.array(axis) * pixels / image.camera.fx).as_matrix()
     return replace(image, rotation=turn @ image.rotation, translation=turn @ image.translation)
 
 
-def looked_for(room, axis: list[float], pixels: float) -> PatchOffsets:
-    """Patches of the first photo of a room in the second one, which stands wrong."""
+def match_patches(room, axis: list[float], pixels: float) -> PatchOffsets:
+    """Match patches of the first image in the second, whose pose is wrong."""
     first, second = room.reconstruction.images[:2]
     one, other = (
-        DenseView.of(image, room.views[image.name], max(image.camera.size))
+        DenseView.from_view(image, room.views[image.name], max(image.camera.size))
         for image in (first, turned(second, axis, pixels))
     )
     depth = np.log(room.truth[first.name])
@@ -41,21 +41,21 @@ def looked_for(room, axis: list[float], pixels: float) -> PatchOffsets:
 
 
 @pytest.mark.parametrize(("axis", "pixels"), [(ACROSS, 0.0), (ALONG, 2.0)])
-def test_right_poses_and_what_depth_may_explain_leave_nothing(
+def test_pose_error_along_epipolar_line_is_invisible(
     room, axis: list[float], pixels: float
 ) -> None:
-    seen = looked_for(room, axis, pixels)
-    assert estimate_pose_error_px([seen]) < 0.25 and seen.found > 0.5
+    seen = match_patches(room, axis, pixels)
+    assert estimate_pose_error_px([seen]) < 0.25 and seen.matched_ratio > 0.5
 
 
 @pytest.mark.parametrize("pixels", [1.0, 3.0])
-def test_errors_across_the_lines_are_measured(room, pixels: float) -> None:
-    assert estimate_pose_error_px([looked_for(room, ACROSS, pixels)]) == pytest.approx(
+def test_pose_error_across_epipolar_line_is_measured(room, pixels: float) -> None:
+    assert estimate_pose_error_px([match_patches(room, ACROSS, pixels)]) == pytest.approx(
         pixels, rel=0.15
     )
 
 
-def test_depth_is_less_sure_where_poses_are_wrong(room) -> None:
+def test_densify_pose_error_increases_std(room) -> None:
     def median_std(images: tuple[RegisteredImage, ...]) -> float:
         result, report = densify(replace(room.reconstruction, images=images), view_of, options)
         stated = []
@@ -73,14 +73,14 @@ def test_depth_is_less_sure_where_poses_are_wrong(room) -> None:
     assert median_std(wrong) > 2 * median_std(images)
 
 
-def test_without_pixels_nothing_is_said(room) -> None:
+def test_patch_offsets_without_pixels_are_empty(room) -> None:
     image = room.reconstruction.images[0]
-    view = DenseView.of(image, room.views[image.name], max(image.camera.size))
+    view = DenseView.from_view(image, room.views[image.name], max(image.camera.size))
     depth = np.log(room.truth[image.name])
     nothing = measure_patch_offsets(view, depth, view, np.zeros(depth.shape, np.bool_))
-    assert nothing.found == 0.0
+    assert nothing.matched_ratio == 0.0
     assert estimate_pose_error_px([nothing]) == estimate_pose_error_px([]) == 0.0
 
 
-def test_patches_are_not_found_in_photos_of_something_else(room) -> None:
-    assert looked_for(room, ACROSS, 60.0).found < 0.1
+def test_patch_offsets_of_other_texture_have_low_ratio(room) -> None:
+    assert match_patches(room, ACROSS, 60.0).matched_ratio < 0.1

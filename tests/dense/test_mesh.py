@@ -1,4 +1,4 @@
-"""A mesh from depth maps of a room whose surfaces are known."""
+"""Tests of the mesh from depth maps of a room with known surfaces."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STD = 0.01
 
 
 def measured(room: Room, std: float = STD, seed: int = 0) -> Reconstruction:
-    """True depth with independent relative noise."""
+    """Return true depth with independent relative noise."""
     rng = np.random.default_rng(seed)
     images = []
     for image in room.reconstruction.images:
@@ -44,7 +44,7 @@ def measured(room: Room, std: float = STD, seed: int = 0) -> Reconstruction:
 
 
 def surface(room: Room) -> np.ndarray:
-    """World points of all true maps."""
+    """Return the world points of all true depth maps."""
     parts = []
     for image in room.reconstruction.images:
         local = unproject(CAMERA, pixel_centers(*CAMERA.size), room.truth[image.name])
@@ -57,7 +57,7 @@ def mesh(room: Room) -> TriangleMesh:
     return mesh_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
 
 
-def test_the_mesh_lies_on_the_surfaces_and_covers_them(room: Room, mesh: TriangleMesh) -> None:
+def test_mesh_is_accurate_and_complete(room: Room, mesh: TriangleMesh) -> None:
     truth = surface(room)
     depth = float(np.median(np.concatenate([t.ravel() for t in room.truth.values()])))
     pixel = depth / CAMERA.fx
@@ -67,7 +67,7 @@ def test_the_mesh_lies_on_the_surfaces_and_covers_them(room: Room, mesh: Triangl
     assert (to_mesh < 4 * pixel).mean() > 0.95
 
 
-def test_averaging_makes_it_smoother_than_the_maps(room: Room, mesh: TriangleMesh) -> None:
+def test_mesh_is_smoother_than_depth_maps(room: Room, mesh: TriangleMesh) -> None:
     image = room.reconstruction.images[0]
     local = mesh.vertices @ image.rotation.T + image.translation
     xy = CAMERA.fx * local[:, :2] / local[:, 2:] + (CAMERA.cx, CAMERA.cy)
@@ -77,7 +77,7 @@ def test_averaging_makes_it_smoother_than_the_maps(room: Room, mesh: TriangleMes
     assert np.median(np.abs(error)) < 0.5 * STD
 
 
-def test_triangles_face_the_cameras_and_have_the_photos_colours(room: Room) -> None:
+def test_triangles_face_cameras_and_have_image_colors(room: Room) -> None:
     mesh = mesh_depth_maps(measured(room, std=0.0), room.views.__getitem__, MeshOptions())
     corners = mesh.vertices[mesh.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -93,7 +93,7 @@ def test_triangles_face_the_cameras_and_have_the_photos_colours(room: Room) -> N
     assert np.median(np.abs(mesh.colors[nearest] - seen)) < 20
 
 
-def test_the_number_of_triangles_has_a_limit(room: Room, mesh: TriangleMesh) -> None:
+def test_max_triangles_limits_mesh(room: Room, mesh: TriangleMesh) -> None:
     limit = len(mesh.triangles) // 4
     options = MeshOptions(max_triangles=limit)
     small = mesh_depth_maps(measured(room), room.views.__getitem__, options)
@@ -101,7 +101,7 @@ def test_the_number_of_triangles_has_a_limit(room: Room, mesh: TriangleMesh) -> 
     assert np.median(cKDTree(surface(room)).query(small.vertices)[0]) < 0.05
 
 
-def test_a_wrong_uncertain_map_does_not_bend_what_others_know(room: Room) -> None:
+def test_mesh_ignores_uncertain_wrong_map(room: Room) -> None:
     exact = measured(room)
     wrong = exact.images[1].depth
     vague = DepthPrior.from_arrays(wrong.depth * 1.04, (0.05 * wrong.depth) ** 2)
@@ -113,12 +113,12 @@ def test_a_wrong_uncertain_map_does_not_bend_what_others_know(room: Room) -> Non
     assert np.median(to_truth) < 0.25 * 0.04 * np.median(wrong.depth)
 
 
-def test_maps_without_a_certain_pixel_are_told(room: Room) -> None:
+def test_mesh_without_valid_pixels_raises(room: Room) -> None:
     none = [
         replace(i, depth=DepthPrior(i.depth.depth, i.depth.variance, np.zeros_like(i.depth.valid)))
         for i in room.reconstruction.images
     ]
-    with pytest.raises(InputError, match="no pixel"):
+    with pytest.raises(InputError, match="no pixel of the depth maps is certain"):
         mesh_depth_maps(
             replace(room.reconstruction, images=tuple(none)),
             room.views.__getitem__,
@@ -126,7 +126,7 @@ def test_maps_without_a_certain_pixel_are_told(room: Room) -> None:
         )
 
 
-def test_missing_libraries_are_told(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mesh_without_libraries_raises(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
     with pytest.raises(InputError, match=r"mpsfm-core\[mesh\]"):
         mesh_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
@@ -134,7 +134,7 @@ def test_missing_libraries_are_told(room: Room, monkeypatch: pytest.MonkeyPatch)
 
 @pytest.fixture
 def result(room: Room, tmp_path: Path) -> Path:
-    """A folder with a model, depth maps and photos."""
+    """Create a folder with a model, depth maps and images."""
     exact = measured(room)
     nothing = np.zeros((0, 2))
     cameras, colors = [colmap_from_pinhole(CAMERA)] * len(exact.images), np.zeros((0, 3), np.uint8)
@@ -147,7 +147,7 @@ def result(room: Room, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_command_writes_files_that_others_read(result: Path) -> None:
+def test_mesh_command_writes_ply_and_glb(result: Path) -> None:
     done = CliRunner().invoke(build_app(), ["mesh", str(result), "--set", "max_triangles=2000"])
     assert done.exit_code == 0, done.output
     ply = trimesh.load(result / "mesh.ply", process=False)
@@ -162,7 +162,7 @@ def test_the_command_writes_files_that_others_read(result: Path) -> None:
     assert primitive["mode"] == 4 and {"POSITION", "COLOR_0"} == set(primitive["attributes"])
 
 
-def test_a_folder_without_depth_is_told(result: Path) -> None:
+def test_mesh_command_without_depth_maps_fails(result: Path) -> None:
     for path in (result / "depth").iterdir():
         path.unlink()
     done = CliRunner().invoke(build_app(), ["mesh", str(result)])

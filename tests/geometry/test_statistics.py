@@ -1,4 +1,4 @@
-"""Robust statistics against numpy."""
+"""Tests of robust statistics against numpy."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import numpy as np
 from mpsfm_core.geometry.statistics import MAD_TO_STD, group_medians
 
 
-def test_medians_of_groups() -> None:
+def test_group_medians_match_numpy() -> None:
     rng = np.random.default_rng(0)
     values, groups = rng.normal(size=101), rng.integers(0, 7, 101)
-    groups[groups == 3] = 4  # nobody is in this one
+    groups[groups == 3] = 4  # an empty group
     medians = group_medians(values, groups, 8)
     for group in range(8):
         own = values[groups == group]
@@ -20,6 +20,6 @@ def test_medians_of_groups() -> None:
             assert np.isnan(medians[group])
 
 
-def test_the_median_of_normal_errors_tells_their_std() -> None:
+def test_mad_to_std_normal_errors_gives_std() -> None:
     errors = np.random.default_rng(0).normal(0, 2, 100_000)
     assert np.isclose(MAD_TO_STD * np.median(np.abs(errors)), 2, rtol=0.01)
