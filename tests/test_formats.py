@@ -38,7 +38,7 @@ from mpsfm_core.report.page import render
 from mpsfm_core.report.result_folder import ResultFolder
 from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.exports.source import ExportSource
-from mpsfm_core.support.files import claimed
+from mpsfm_core.support.files import lock_output_folder
 from mpsfm_core.support.format_versions import VERSION, check_version
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -299,5 +299,5 @@ def test_an_exchange_follows_no_link(tmp_path: Path) -> None:
 
 
 def exchange_in(output: Path) -> None:
-    with claimed(output):
+    with lock_output_folder(output):
         pass

@@ -36,12 +36,12 @@ def doctor(
     from mpsfm_core.extraction.cache import cache_folder
     from mpsfm_core.pipeline.provider_resolution import preview_providers
     from mpsfm_core.providers.registry import Registry, core_version
-    from mpsfm_core.support.threads import cores
+    from mpsfm_core.support.threads import count_cores
 
     registry = Registry.discover()
     _heading("this machine")
     _line("mpsfm", f"{core_version()}, Python {platform.python_version()}, {platform.system()}")
-    _line("processor", f"{cores()} cores{_memory()}")
+    _line("processor", f"{count_cores()} cores{_memory()}")
     _line("GPU", _gpu())
     folder = cache_folder(cache)
     _line("cache", f"{folder}, {size_text(cache_size(folder))} (mpsfm cache prune makes it less)")

@@ -30,7 +30,7 @@ from mpsfm_core.providers.provider_config import (
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.calibration_file import CALIBRATIONS, read_values
 from mpsfm_core.support.format_versions import VERSION, check_version
-from mpsfm_core.support.yaml_text import line_of, parse_assignment, parse_yaml
+from mpsfm_core.support.yaml_text import find_line, parse_assignment, parse_yaml
 
 _CAREFUL = ("features", "matcher", "dense_matcher", "multiview")
 """Blocks that quick matching does not go with unasked: who names a matcher wants that one, and what
@@ -104,7 +104,7 @@ class _Layer:
 
     def place(self, path: SettingPath) -> str:
         """``FILE:LINE`` of an entry, or the override's text."""
-        line = line_of(self.text, path) if self.text else None
+        line = find_line(self.text, path) if self.text else None
         return f"{self.source}:{line}" if line else self.source
 
 

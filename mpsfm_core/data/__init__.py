@@ -10,7 +10,7 @@ frame that face the camera (``n . ray < 0``); pixels follow COLMAP (the centre o
 """
 
 from mpsfm_core.data.arrays import Bool, Float32, Float64, Int64, Pose, UInt8
-from mpsfm_core.data.cameras import PinholeCamera, View, along_rays
+from mpsfm_core.data.cameras import PinholeCamera, View, dot_with_rays
 from mpsfm_core.data.features import DenseMatches, Features, PairMatches, SparseMatches
 from mpsfm_core.data.mapping_problem import (
     MappingImage,
@@ -22,7 +22,7 @@ from mpsfm_core.data.mapping_problem import (
 from mpsfm_core.data.priors import (
     UNIT_NORMAL_TOLERANCE,
     DepthPrior,
-    GroupPrior,
+    MultiViewPrior,
     NormalPrior,
     PairDepth,
 )
@@ -35,7 +35,7 @@ __all__ = [
     "Features",
     "Float32",
     "Float64",
-    "GroupPrior",
+    "MultiViewPrior",
     "Int64",
     "MappingImage",
     "MappingProblem",
@@ -50,5 +50,5 @@ __all__ = [
     "UInt8",
     "VerifiedPair",
     "View",
-    "along_rays",
+    "dot_with_rays",
 ]

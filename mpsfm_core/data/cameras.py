@@ -78,7 +78,7 @@ class View:
             require_array(self, "mask", np.bool_, (height, width))
 
 
-def along_rays(camera: PinholeCamera, normals: NDArray[Any]) -> Float64:
+def dot_with_rays(camera: PinholeCamera, normals: NDArray[Any]) -> Float64:
     """Dot products (h, w) of a map of vectors (h, w, 3) that covers the camera's view, on a grid
     of any size, with the unit rays through its pixels: negative where a normal faces the camera."""
     height, width = normals.shape[:2]

@@ -80,7 +80,7 @@ class SparseMatches:
         return cls(indices.astype(np.int64), certain)
 
     @classmethod
-    def best_first(cls, indices: NDArray[Any], scores: NDArray[Any]) -> SparseMatches:
+    def from_best_scores(cls, indices: NDArray[Any], scores: NDArray[Any]) -> SparseMatches:
         """As :meth:`from_arrays`; of several matches of one feature the most certain stays."""
         order = np.argsort(-scores, kind="stable")
         for column in (0, 1):

@@ -16,7 +16,7 @@ from mpsfm_core.data.arrays import (
     require_finite,
     require_positive_where_valid,
 )
-from mpsfm_core.data.cameras import PinholeCamera, along_rays
+from mpsfm_core.data.cameras import PinholeCamera, dot_with_rays
 from mpsfm_core.data.errors import DataError
 
 UNIT_NORMAL_TOLERANCE = 1e-3
@@ -119,7 +119,7 @@ class NormalPrior:
         length = np.linalg.norm(finite, axis=-1)
         usable = length > 1e-6
         if camera is not None:
-            usable &= along_rays(camera, finite) < 0
+            usable &= dot_with_rays(camera, finite) < 0
         if valid is not None:
             usable &= np.asarray(valid, dtype=np.bool_)
         if variance is not None:
@@ -144,7 +144,7 @@ class PairDepth:
 
 
 @dataclass(frozen=True, eq=False)
-class GroupPrior:
+class MultiViewPrior:
     """What a multi-view network sees in a group of n views: all of it in one frame and one unit.
 
     ``depth``: one prior a view, in the order of the views. They share one unit: metres if

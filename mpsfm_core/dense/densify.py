@@ -49,7 +49,7 @@ from mpsfm_core.dense.stereo import StereoDepth, match_stereo_depth
 from mpsfm_core.dense.view_selection import select_source_views
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.support.threads import allowed
+from mpsfm_core.support.threads import thread_limit
 
 _T = TypeVar("_T", bound=np.generic)
 _MAX_COST = 0.9
@@ -191,7 +191,7 @@ def densify(
 
     rows = [row for row, views_ in enumerate(sources) if views_]
     matched: dict[int, _MatchedImage] = {}
-    with ThreadPoolExecutor(workers or allowed()) as pool:
+    with ThreadPoolExecutor(workers or thread_limit()) as pool:
         for row, image in zip(rows, pool.map(match_image, rows), strict=True):
             matched[row] = image
             progress(len(matched), len(rows))

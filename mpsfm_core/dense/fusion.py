@@ -16,7 +16,7 @@ from mpsfm_core.geometry import camera_center, pixel_centers, resize_map, unproj
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.support.jit import kernel
-from mpsfm_core.support.threads import each
+from mpsfm_core.support.threads import parallel_map
 
 _MAX_NEIGHBORS = 8
 """Maximum number of images that vote on the points of one image, by overlap."""
@@ -95,7 +95,7 @@ def fuse_depth_maps(
         normals = _compute_normals(image).reshape(-1, 3)[pixels]
         return FusedPointCloud(points, colors, normals, np.sqrt(variance).astype(np.float32), views)
 
-    parts = [_EMPTY, *each(build_cloud, range(len(images)))]
+    parts = [_EMPTY, *parallel_map(build_cloud, range(len(images)))]
     return FusedPointCloud(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -135,7 +135,7 @@ def _vote_on_images(
         votes = _vote_on_points(points, variance, voters, options.dense_consistency_sigmas)
         return select(row, pixels, votes)
 
-    return each(vote_on_image, range(len(images)))
+    return parallel_map(vote_on_image, range(len(images)))
 
 
 _EMPTY = FusedPointCloud(

@@ -24,7 +24,7 @@ from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.pipeline.stages import peak_memory_mb
-from mpsfm_core.support.threads import limited
+from mpsfm_core.support.threads import limit_threads
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -90,7 +90,7 @@ def run_method(task: MethodRun) -> Outcome:
     found: Sequence[Reconstruction] = ()
     dense, error = None, ""
     try:
-        with limited(task.threads):
+        with limit_threads(task.threads):
             if task.method == CHAIN:
                 models = chained_poses(task.problem, task.options.seed)
             elif task.method != OURS:
@@ -103,7 +103,7 @@ def run_method(task: MethodRun) -> Outcome:
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
     if task.dense is not None and found:
         try:
-            with limited(task.threads):
+            with limit_threads(task.threads):
                 dense = task.dense.measure(found[0], task.problem)
         except Exception as raised:  # the poses stand
             error = f"dense: {type(raised).__name__}: {raised}"

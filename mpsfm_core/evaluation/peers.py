@@ -19,7 +19,7 @@ import pycolmap
 from mpsfm_core.data import Float64, MappingProblem, Pose, VerifiedPair
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.inputs.models import reconstruction_poses
-from mpsfm_core.support.threads import allowed
+from mpsfm_core.support.threads import thread_limit
 
 Models = Mapping[int, pycolmap.Reconstruction]
 
@@ -36,7 +36,7 @@ def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path],
         options.structure_less_registration_fallback = structure_less
         options.min_model_size = 2
         options.extract_colors = False
-        options.num_threads = allowed()
+        options.num_threads = thread_limit()
         options.random_seed = 0
         options.ba_refine_focal_length = False
         options.ba_refine_extra_params = False
@@ -57,7 +57,7 @@ def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path],
 def _global(database: Path, output: Path) -> Models:
     options = pycolmap.GlobalPipelineOptions()
     options.min_model_size = 2
-    options.num_threads = allowed()
+    options.num_threads = thread_limit()
     options.random_seed = 0
     options.mapper.bundle_adjustment.refine_focal_length = False
     options.mapper.bundle_adjustment.refine_extra_params = False

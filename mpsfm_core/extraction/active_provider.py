@@ -17,7 +17,7 @@ from mpsfm_core.providers import API_VERSION, Capability, Kind, ProviderContext,
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore, file_sha256, is_remote
-from mpsfm_core.support.threads import cores
+from mpsfm_core.support.threads import count_cores
 
 T = TypeVar("T")
 
@@ -177,14 +177,14 @@ def run_with_timeout(seconds: float | None, compute: Callable[[], T]) -> T:
 
 def worker_count(runtime: RuntimeOptions) -> int:
     """Threads that a stage runs on."""
-    return runtime.workers or min(_MAX_WORKERS, cores())
+    return runtime.workers or min(_MAX_WORKERS, count_cores())
 
 
 def thread_count(runtime: RuntimeOptions) -> int:
     """Threads that one provider may use itself."""
     if runtime.workers is not None:
         return runtime.threads
-    return max(runtime.threads, cores() // worker_count(runtime))
+    return max(runtime.threads, count_cores() // worker_count(runtime))
 
 
 def _device(runtime: RuntimeOptions, spec: ProviderSpec) -> str:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data.errors import OutputError
 from mpsfm_core.providers.weights import CACHE_VARIABLE
-from mpsfm_core.support.files import remove_unfinished, write_file
+from mpsfm_core.support.files import remove_temporary_files, write_file
 from mpsfm_core.support.npz import read_npz
 
 _log = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ class Cache:
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = cache_folder(folder) / "extraction"
         self._unfinished = self.folder / "unfinished"
-        remove_unfinished(self._unfinished)
+        remove_temporary_files(self._unfinished)
 
     def load(self, kind: str, key: str, cls: type[T]) -> T | None:
         """The entry as an object of ``cls``, None when there is none that can be read."""

@@ -11,7 +11,7 @@ import numpy as np
 from mpsfm_core.data import (
     DepthPrior,
     Features,
-    GroupPrior,
+    MultiViewPrior,
     NormalPrior,
     PairMatches,
     SparseMatches,
@@ -46,7 +46,7 @@ EMPTY_RESULTS: Mapping[type, Callable[[], object]] = MappingProxyType(
         Features: lambda: Features(np.zeros((0, 2)), np.zeros((0, 0), dtype=np.float32)),
         DepthPrior: _depth,
         NormalPrior: _normals,
-        GroupPrior: lambda: GroupPrior(()),
+        MultiViewPrior: lambda: MultiViewPrior(()),
         JointPrior: lambda: JointPrior(_depth(), _normals()),
         PairMatches: _matches,
     }

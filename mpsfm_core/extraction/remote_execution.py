@@ -32,7 +32,7 @@ from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.providers import Executor
 from mpsfm_core.providers.first_party import EXECUTORS
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.support.threads import limited
+from mpsfm_core.support.threads import limit_threads
 
 THREADS = "threads"
 
@@ -98,7 +98,7 @@ class RemoteStep:
     config: Config
 
     def __call__(self, item: Any) -> None:
-        with limited(thread_count(self.config.runtime)):
+        with limit_threads(thread_count(self.config.runtime)):
             _worker_state(self).work[self.stage](item)
 
 

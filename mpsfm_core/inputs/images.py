@@ -1,4 +1,4 @@
-"""The images of a run: found, checked, given cameras, and loaded as views when needed."""
+"""Images of a run: search, checks, cameras, and undistorted views on demand."""
 
 from __future__ import annotations
 
@@ -41,55 +41,57 @@ from mpsfm_core.inputs.undistortion import (
     undistort_pixels,
 )
 from mpsfm_core.support.lru_cache import LruCache
-from mpsfm_core.support.threads import allowed
+from mpsfm_core.support.threads import thread_limit
 
 _log = logging.getLogger(__name__)
 
 FocalSource = Literal["intrinsics", "exif", "provider", "default"]
 
 CACHED_BYTES = 512 << 20
-"""Decoded views that are kept: the matcher asks for each image many times."""
-_CACHED_WARPS = 2
-"""A warp has 8 bytes a pixel, and neighbouring images mostly share a camera."""
+"""Size of the cache of decoded views in bytes: the matcher reads each image many times."""
+_CACHED_MAPS = 2
+"""Number of cached undistortion maps, 8 bytes a pixel each; neighboring images share a camera."""
 _READERS = 4
-"""Threads that read and hash files, at most."""
-_MENTIONED = 5
+"""Maximum number of threads that read and hash files."""
+_MAX_LISTED = 5
+"""Maximum number of names in a message."""
 
 
 @dataclass(frozen=True, eq=False)
 class SourceImage:
-    """One photo.
-
-    ``name``: path below the images folder, forward slashes. ``camera``: the original camera, for
-    the upright image; ``camera_id`` is the number in the intrinsics file, or counts distinct
-    cameras. ``pinhole``: the camera of the undistorted (maybe reduced) view. ``focal_known``:
-    False when the focal length is a guess: EXIF's, a provider's or the default. ``digest``: SHA-256
-    of the file. ``orientation``: EXIF's, of the stored pixels. ``gps``: where it was
-    taken, if EXIF says it.
-    """
+    """One image file with its cameras."""
 
     name: str
+    """Path below the images folder, with forward slashes."""
     path: Path
+    """Path of the file."""
     camera: pycolmap.Camera
+    """Camera of the upright original image. ``camera_id`` is the number in the intrinsics file, or
+    counts distinct cameras."""
     pinhole: PinholeCamera
+    """Camera of the undistorted and possibly reduced view."""
     focal_source: FocalSource
+    """Source of the focal length."""
     digest: str
+    """SHA-256 of the file."""
     orientation: int = 1
+    """EXIF orientation of the stored pixels."""
     gps: GpsPosition | None = None
+    """Position in EXIF, None if there is none."""
 
     def original_pixels(self, xy: Float64) -> Float64:
-        """Pixels (n, 2) of the undistorted view as pixels of the upright original image."""
+        """Map pixels (n, 2) of the undistorted view to pixels of the upright original image."""
         return distort_pixels(self.pinhole, self.camera, xy)
 
     def view_pixels(self, xy: Float64) -> Float64:
-        """Pixels (n, 2) of the upright original image as pixels of the undistorted view."""
+        """Map pixels (n, 2) of the upright original image to pixels of the undistorted view."""
         return undistort_pixels(self.pinhole, self.camera, xy)
 
     def refined_camera(self, pinhole: PinholeCamera) -> pycolmap.Camera:
-        """The original camera, with the focal length that a refined camera of the view has.
+        """Return the original camera with the focal length of a refined camera of the view.
 
-        Focal lengths are refined when they were a guess, and guessed cameras have no distortion,
-        so that scaling the focal length is exact.
+        Only guessed focal lengths are refined, and guessed cameras have no distortion. Scaling the
+        focal length is therefore exact.
         """
         camera = pycolmap.Camera(self.camera.todict())
         params = np.array(camera.params)
@@ -99,20 +101,20 @@ class SourceImage:
 
     @property
     def focal_known(self) -> bool:
-        """Whether the focal length need not be refined."""
+        """True if intrinsics were given, so that the focal length is not refined."""
         return self.focal_source == "intrinsics"
 
     @property
     def original_size(self) -> tuple[int, int]:
-        """(width, height) of the upright original image."""
+        """(width, height) of the upright original image in pixels."""
         return self.camera.width, self.camera.height
 
 
 class ImageSet:
-    """Images of a run in a fixed order, with their views on demand.
+    """Images of a run in a fixed order, with undistorted views on demand.
 
-    At most about 512 MB of decoded views are kept. Methods may be called from several threads.
-    ``left_out``: damaged photos -> what is wrong with them.
+    Caches about 512 MB of decoded views. Methods may be called from several threads. ``left_out``
+    maps the names of damaged images to their faults.
     """
 
     def __init__(
@@ -124,11 +126,13 @@ class ImageSet:
         self.images = tuple(images)
         self.left_out = dict(left_out or {})
         self._options = options
-        self._views: LruCache[int, View] = LruCache(CACHED_BYTES, _bytes)
-        self._warps: LruCache[str, UndistortionMap] = LruCache(_CACHED_WARPS, lambda _: 1)
+        self._views: LruCache[int, View] = LruCache(CACHED_BYTES, _count_bytes)
+        self._undistortion_maps: LruCache[str, UndistortionMap] = LruCache(
+            _CACHED_MAPS, lambda _: 1
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.images, self._options)  # decoded views stay where they are
+        return type(self), (self.images, self._options)  # decoded views are not pickled
 
     def __len__(self) -> int:
         return len(self.images)
@@ -145,16 +149,19 @@ class ImageSet:
         return [image.name for image in self.images]
 
     def view(self, index: int) -> View:
-        """The undistorted view of an image, decoded now or recently.
+        """Return the undistorted view of an image; decode it unless it is cached.
 
-        Raises :class:`InputError` when the file (or its mask) is unreadable or has changed.
+        Raises:
+            InputError: the file or its mask is unreadable or has changed since the start.
         """
         return self._views.get(index, lambda: self._load(self.images[index]))
 
     def with_focals(self, focals: Mapping[int, float]) -> ImageSet:
-        """The same images, with other focal lengths where they are the default.
+        """Return the images with predicted instead of default focal lengths.
 
-        ``focals``: camera id -> pixels of the original image; still a guess.
+        Args:
+            focals: camera id -> focal length in pixels of the original image. The focal lengths
+                still count as guesses.
         """
 
         def changed(image: SourceImage) -> SourceImage:
@@ -169,17 +176,17 @@ class ImageSet:
         return ImageSet(images, self._options, self.left_out)
 
     def mask(self, index: int) -> Bool | None:
-        """The mask of a view; does not decode the image when there is none."""
+        """Return the mask of a view; do not decode the image if it has none."""
         image = self.images[index]
         if is_pinhole(image.camera) and self._mask_path(image) is None:
             return None
         return self.view(index).mask
 
     def pixel_key(self, index: int) -> str:
-        """Names the content of a view: equal keys mean equal pixels and mask.
+        """Return a cache key of a view: equal keys mean equal pixels and mask.
 
-        Made of the file's hash and all that undistortion and reduction depend on; intrinsics of
-        an image that needs no undistortion do not enter.
+        Hashes the file and all parameters of undistortion and reduction. Intrinsics of an image
+        without distortion are not part of the key.
         """
         image = self.images[index]
         parts = [image.digest, str(image.pinhole.size)]
@@ -202,12 +209,14 @@ class ImageSet:
             return View(image.name, pixels, image.pinhole, mask)
         size = _reduced_size(image.original_size, self._options.max_image_size)
         camera = resize_camera(image.camera, size)
-        warp = self._warps.get(camera_key(camera), lambda: UndistortionMap(camera, image.pinhole))
-        pixels = warp.image(_resize(pixels, size))
+        undistortion = self._undistortion_maps.get(
+            camera_key(camera), lambda: UndistortionMap(camera, image.pinhole)
+        )
+        pixels = undistortion.image(_resize(pixels, size))
         if mask is not None:
-            mask = warp.mask(_resize_mask(mask, size))
-        elif not warp.valid.all():
-            mask = warp.valid
+            mask = undistortion.mask(_resize_mask(mask, size))
+        elif not undistortion.valid.all():
+            mask = undistortion.valid
         return View(image.name, pixels, image.pinhole, mask)
 
     def _mask_path(self, image: SourceImage) -> Path | None:
@@ -241,22 +250,23 @@ def load_images(
     without: Path | None = None,
     names: Sequence[str] | None = None,
 ) -> ImageSet:
-    """Find the images of a folder (and its subfolders), check them, and find their cameras.
+    """Find the images of a folder and its subfolders, check them, and assign cameras.
 
     Args:
         folder: images, in the formats of :data:`mpsfm_core.inputs.image_decoding.EXTENSIONS`.
         intrinsics: ``intrinsics.yaml``, a COLMAP model (folder or ``cameras.txt``) or
-            ``transforms.json``, for the images upright (after EXIF rotation). Without it focal
+            ``transforms.json``, for upright images (after EXIF rotation). Without it focal
             lengths come from EXIF, else from ``options.default_focal_ratio`` with a warning.
-        image_list: text file with one name a line (``#`` starts a comment); its order is kept.
+        image_list: text file with one name a line (``#`` starts a comment); its order is used.
         options: see :class:`InputOptions`.
-        model: COLMAP model or ``transforms.json`` of some of the images. Without ``intrinsics``
-            they have its cameras, and the others too if it has just one of their size.
-        names: these images only, instead of all or of those of ``image_list``; one is enough.
+        model: COLMAP model or ``transforms.json`` of some of the images. Without ``intrinsics`` the
+            images use its cameras. Unlisted images use the model's only camera of their size.
+        without: subfolder to skip, such as the output folder.
+        names: only these images, instead of all or those of ``image_list``; one is enough.
 
     Raises:
-        InputError: no or only one image, unreadable files, names of the list that do not exist
-            or come twice, intrinsics that do not fit. The message names the file.
+        InputError: fewer than two images, unreadable files, missing or repeated names in the list,
+            or intrinsics that do not fit. The message names the file.
     """
     options = options or InputOptions()
     if options.masks is not None and not options.masks.is_dir():
@@ -264,31 +274,31 @@ def load_images(
     if names is None:
         names = find_images(folder, without)
         if image_list is not None:
-            names = _listed(image_list, names, folder)
+            names = _read_listed_names(image_list, names, folder)
         if len(names) < 2:
-            found = f"only one image, {names[0]!r}" if names else "no images"
+            content = f"only one image, {names[0]!r}" if names else "no images"
             source = image_list or folder
-            raise InputError(f"{source} has {found}: a reconstruction needs two or more")
-    known = _read_cameras(intrinsics, names)
-    partial = _read_cameras(model, names) if known is None else None
-    with ThreadPoolExecutor(min(_READERS, allowed())) as pool:
+            raise InputError(f"{source} has {content}: a reconstruction needs two or more")
+    given = _read_cameras(intrinsics, names)
+    partial = _read_cameras(model, names) if given is None else None
+    with ThreadPoolExecutor(min(_READERS, thread_limit())) as pool:
         files = list(pool.map(lambda name: _probe(folder / name, options), names))
     left_out = {name: file.fault for name, file in zip(names, files, strict=True) if file.fault}
-    _judge(left_out, len(names), options)
+    _report_damaged(left_out, len(names), options)
     guesses = _CameraGuesses(options, partial.max_id if partial else 0)
     images = []
     for name, file in zip(names, files, strict=True):
         if file.fault:
             continue
         focal: FocalSource = "intrinsics"
-        if known is not None:
-            camera = known.camera(name, file.size)
-        elif (usual := partial and partial.usual_camera(name, file.size)) is not None:
-            camera = usual
+        if given is not None:
+            camera = given.camera(name, file.size)
+        elif (shared := partial and partial.usual_camera(name, file.size)) is not None:
+            camera = shared
         else:
             camera, focal = guesses.camera(file)
         images.append(_source_image(name, folder / name, file, camera, focal, options))
-    _warn_of_default(images, options)
+    _warn_of_default_focal_lengths(images, options)
     return ImageSet(images, options, left_out)
 
 
@@ -298,7 +308,7 @@ def _read_cameras(path: Path | None, names: Sequence[str]) -> Intrinsics | None:
 
 @dataclass(frozen=True)
 class _ProbedImage:
-    """A probed image file: upright size, header and hash; or why it is unreadable."""
+    """Upright size, header and hash of an image file, or the reason why it is unreadable."""
 
     size: tuple[int, int]
     header: ImageHeader
@@ -308,7 +318,7 @@ class _ProbedImage:
 
 
 class _CameraGuesses:
-    """Cameras from EXIF, else the default; equal ones share an id above ``max_id``."""
+    """Creates cameras from EXIF or the default focal length; equal cameras share an id."""
 
     def __init__(self, options: InputOptions, max_id: int) -> None:
         self._options = options
@@ -316,7 +326,7 @@ class _CameraGuesses:
         self._ids: dict[tuple[tuple[int, int], float], int] = {}
 
     def camera(self, file: _ProbedImage) -> tuple[pycolmap.Camera, FocalSource]:
-        """A SIMPLE_PINHOLE camera with the principal point in the centre."""
+        """Return a SIMPLE_PINHOLE camera and the source of its focal length."""
         source: FocalSource = "exif"
         focal = file.header.focal_px(*file.size)
         if focal is None:
@@ -339,7 +349,7 @@ def _source_image(
 
 
 def _simple_camera(size: tuple[int, int], focal: float, number: int) -> pycolmap.Camera:
-    """A SIMPLE_PINHOLE camera with the principal point in the centre."""
+    """Return a SIMPLE_PINHOLE camera with the principal point in the center."""
     width, height = size
     params = [focal, width / 2, height / 2]
     return pycolmap.Camera(
@@ -348,7 +358,7 @@ def _simple_camera(size: tuple[int, int], focal: float, number: int) -> pycolmap
 
 
 def _view_camera(camera: pycolmap.Camera, options: InputOptions) -> PinholeCamera:
-    """The camera of the view that is made of an image."""
+    """Return the camera of the undistorted and possibly reduced view."""
     original = camera.width, camera.height
     size = _reduced_size(original, options.max_image_size)
     reduced = camera if size == original else resize_camera(camera, size)
@@ -356,62 +366,68 @@ def _view_camera(camera: pycolmap.Camera, options: InputOptions) -> PinholeCamer
 
 
 def find_images(folder: Path, without: Path | None = None) -> list[str]:
-    """Names of all images below the folder, in natural order.
+    """Find all images below a folder.
 
-    Hidden files are left out, and what lies in the subfolder ``without`` or in one that has a
-    :data:`SUMMARY`: that holds results.
+    Skips hidden files, the subfolder ``without``, and subfolders with results (those that contain
+    :data:`SUMMARY`).
+
+    Returns:
+        Names relative to the folder, in natural order.
     """
     if not folder.is_dir():
         if folder.exists():
-            raise InputError(f"{folder} is neither a folder of photos nor a video")
+            raise InputError(
+                f"{folder} is neither a folder of photos nor a video; give one of them"
+            )
         raise InputError(f"images folder {folder} does not exist")
-    found = []
-    own = _below(without, folder)
+    names = []
+    skipped = _find_below(without, folder)
     for path in folder.rglob("*"):
         relative = path.relative_to(folder)
         hidden = any(part.startswith(".") for part in relative.parts)
         if path.suffix.lower() not in EXTENSIONS or hidden or not path.is_file():
             continue
         parents = [folder / parent for parent in relative.parents[:-1]]
-        if not any(parent == own or (parent / SUMMARY).is_file() for parent in parents):
-            found.append(relative.as_posix())
-    return sorted(found, key=_natural)
+        if not any(parent == skipped or (parent / SUMMARY).is_file() for parent in parents):
+            names.append(relative.as_posix())
+    return sorted(names, key=_natural_sort_key)
 
 
 def check_output_folder(output: Path, folder: Path) -> None:
-    """Raise :class:`InputError` if results in ``output`` would lie among photos."""
+    """Raise :class:`InputError` if ``output`` is the images folder or a subfolder with images."""
     if output.resolve() == folder.resolve():
         raise InputError(
-            f"{output} is the folder of the photos: results must not lie among them; choose "
-            f"another output folder, as {output / 'reconstruction'}"
+            f"{output} is the folder of the photos, and results must not be mixed with them. "
+            f"Choose another output folder, such as {output / 'reconstruction'}"
         )
-    inside = _below(output, folder)
+    inside = _find_below(output, folder)
     if inside is None or not inside.is_dir() or (inside / SUMMARY).is_file():
         return
     if photos := find_images(inside):
         raise InputError(
-            f"{output} is a subfolder of the photos and holds {len(photos)} of them, as "
-            f"{photos[0]}: results must not lie among them; choose another output folder"
+            f"{output} is a subfolder of the photos with {len(photos)} of them, such as "
+            f"{photos[0]}. Results must not be mixed with photos; choose another output folder"
         )
 
 
-def _below(inner: Path | None, folder: Path) -> Path | None:
-    """A folder as a path that begins with ``folder``, None if it is not below it."""
+def _find_below(inner: Path | None, folder: Path) -> Path | None:
+    """Return ``inner`` as a path that starts with ``folder``, None if it is not below."""
     if inner is None or not inner.resolve().is_relative_to(folder.resolve()):
         return None
     return folder / inner.resolve().relative_to(folder.resolve())
 
 
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sorts ``img2`` before ``img10``: names of a sequence are in the order they were taken."""
+def _natural_sort_key(name: str) -> list[tuple[int, int, str]]:
+    """Return a key that sorts ``img2`` before ``img10``."""
     parts = re.split(r"(\d+)", name)
     return [(1, int(p), p) if p.isdecimal() else (0, 0, p) for p in parts]
 
 
 def read_image_list(path: Path) -> list[str]:
-    """The names in a text file with one name a line; ``#`` starts a comment line.
+    """Read a text file with one image name a line; ``#`` starts a comment line.
 
-    Raises :class:`InputError` when the file cannot be read.
+    Raises:
+        InputError: the file cannot be read.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -420,7 +436,7 @@ def read_image_list(path: Path) -> list[str]:
     return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
-def _listed(image_list: Path, names: list[str], folder: Path) -> list[str]:
+def _read_listed_names(image_list: Path, names: list[str], folder: Path) -> list[str]:
     listed = read_image_list(image_list)
     available, seen = set(names), set()
     for name in listed:
@@ -453,13 +469,13 @@ def _probe(path: Path, options: InputOptions) -> _ProbedImage:
     return _ProbedImage(size, header, hashlib.sha256(data).hexdigest(), gps=read_gps(data))
 
 
-def _judge(left_out: Mapping[str, str], total: int, options: InputOptions) -> None:
-    """Warn of damaged photos, or raise if they end the run."""
+def _report_damaged(left_out: Mapping[str, str], total: int, options: InputOptions) -> None:
+    """Warn of damaged images; raise if ``strict`` or if too many are damaged."""
     if not left_out:
         return
     faults = list(left_out.values())
-    rest = len(faults) - _MENTIONED
-    text = "; ".join(faults[:_MENTIONED]) + (f"; and {rest} more" if rest > 0 else "")
+    rest = len(faults) - _MAX_LISTED
+    text = "; ".join(faults[:_MAX_LISTED]) + (f"; and {rest} more" if rest > 0 else "")
     if options.strict:
         raise InputError(f"{text} (inputs.strict=false leaves damaged photos out)")
     if len(faults) > total / 2 or total - len(faults) < 2:
@@ -467,16 +483,16 @@ def _judge(left_out: Mapping[str, str], total: int, options: InputOptions) -> No
     _log.warning("%d of %d photos are damaged and left out: %s", len(faults), total, text)
 
 
-def _warn_of_default(images: Sequence[SourceImage], options: InputOptions) -> None:
+def _warn_of_default_focal_lengths(images: Sequence[SourceImage], options: InputOptions) -> None:
     guessed = [image.name for image in images if image.focal_source == "default"]
     if guessed:
         _log.warning(
-            "%d of %d images (%s%s) have no known focal length: assuming %g times the longer "
-            "side; give intrinsics for a better result",
+            "%d of %d images (%s%s) have no known focal length. %g times the longer side "
+            "is assumed; give --intrinsics for a better result",
             len(guessed),
             len(images),
-            ", ".join(guessed[:_MENTIONED]),
-            ", ..." if len(guessed) > _MENTIONED else "",
+            ", ".join(guessed[:_MAX_LISTED]),
+            ", ..." if len(guessed) > _MAX_LISTED else "",
             options.default_focal_ratio,
         )
 
@@ -503,5 +519,5 @@ def _resize_mask(mask: Bool, size: tuple[int, int]) -> Bool:
     return allowed
 
 
-def _bytes(view: View) -> int:
+def _count_bytes(view: View) -> int:
     return view.image.nbytes + (0 if view.mask is None else view.mask.nbytes)

@@ -1,4 +1,4 @@
-"""Keypoints and matches that another program made, for the images of a run."""
+"""Import of keypoints and matches from a COLMAP database or hloc's files."""
 
 from __future__ import annotations
 
@@ -22,56 +22,60 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class ImportedMatches:
-    """``keypoints``: of each image (n, 2) float64, pixels of its view. ``std_px``: their noise, of
-    each image. ``matches``: (smaller, larger position of the images) -> rows of keypoints.
-    ``source``: for people.
-    """
+    """Keypoints and matches of the images of a run."""
 
     source: str
+    """Files that were read, for messages."""
     keypoints: tuple[Float64, ...]
+    """Keypoints of each image, (n, 2) float64, pixels of the undistorted view."""
     std_px: tuple[float, ...]
+    """Keypoint noise of each image, standard deviation in pixels of the view."""
     matches: Mapping[Pair, SparseMatches]
+    """(smaller, larger image index) -> matches as rows of keypoints."""
 
 
 def matches_from_database(path: Path, images: ImageSet) -> ImportedMatches:
-    """Keypoints and matches of a COLMAP database.
+    """Import keypoints and matches of a COLMAP database.
 
-    Raises :class:`InputError` when it is damaged, has none of the images or no matches of them, or
-    is of photos of another size.
+    Raises:
+        InputError: the database is damaged, has none of the images, has no matches between them,
+            or its images have another size.
     """
     database = read_database(path)
-    found = match_names(images.names, database.images)
+    matched = match_names(images.names, database.images)
     builder = _Builder(str(path), images)
     for index, image in enumerate(images):
-        number = database.images.get(found.get(image.name, ""), -1)
+        number = database.images.get(matched.get(image.name, ""), -1)
         if number in database.keypoints:
             camera = database.cameras[database.camera_of[number]]
             builder.add(index, database.keypoints[number], (camera.width, camera.height), 1.0)
-    position = {database.images[name]: images.names.index(own) for own, name in found.items()}
+    index_of = {
+        database.images[theirs]: images.names.index(ours) for ours, theirs in matched.items()
+    }
     for (first, second), indices in sorted(database.matches.items()):
-        if first in position and second in position:
+        if first in index_of and second in index_of:
             scores = np.ones(len(indices), np.float32)
-            builder.match(position[first], position[second], indices, scores)
+            builder.match(index_of[first], index_of[second], indices, scores)
     return builder.finish()
 
 
 def matches_from_hloc(features: Path, matches: Path, images: ImageSet) -> ImportedMatches:
-    """Keypoints and matches of hloc's files. Raises as :func:`matches_from_database`."""
+    """Import keypoints and matches of hloc; raise as :func:`matches_from_database`."""
     files = HlocFiles(features, matches)
-    found = match_names(images.names, files.names())
+    matched = match_names(images.names, files.names())
     builder = _Builder(f"{features} and {matches}", images)
     for index, image in enumerate(images):
-        if image.name in found:
-            keypoints, std_px = files.keypoints(found[image.name])
-            builder.add(index, keypoints, files.size(found[image.name]), std_px)
-    position = {name: images.names.index(own) for own, name in found.items()}
-    for first, second, indices, scores in files.pairs(list(position)):
-        builder.match(position[first], position[second], indices, scores)
+        if image.name in matched:
+            keypoints, std_px = files.keypoints(matched[image.name])
+            builder.add(index, keypoints, files.size(matched[image.name]), std_px)
+    index_of = {theirs: images.names.index(ours) for ours, theirs in matched.items()}
+    for first, second, indices, scores in files.pairs(list(index_of)):
+        builder.match(index_of[first], index_of[second], indices, scores)
     return builder.finish()
 
 
 class _Builder:
-    """From rows and pixels of the files to rows and pixels of the views."""
+    """Converts keypoints and matches of stored images to those of undistorted views."""
 
     def __init__(self, source: str, images: ImageSet) -> None:
         self._source = source
@@ -84,36 +88,36 @@ class _Builder:
     def add(
         self, index: int, keypoints: Float64, size: tuple[int, int] | None, std_px: float
     ) -> None:
-        """Keypoints of an image; those that its undistorted view does not show fall away."""
+        """Add the keypoints of an image; drop those outside of the undistorted view."""
         image = self._images[index]
         xy = image.view_pixels(_upright(self._source, image, keypoints, size))
-        kept = np.isfinite(xy).all(axis=1) & inside(xy, image.pinhole.size)
-        self._keypoints[index] = np.ascontiguousarray(xy[kept])
-        self._rows[index] = np.where(kept, np.cumsum(kept) - 1, -1)
+        visible = np.isfinite(xy).all(axis=1) & inside(xy, image.pinhole.size)
+        self._keypoints[index] = np.ascontiguousarray(xy[visible])
+        self._rows[index] = np.where(visible, np.cumsum(visible) - 1, -1)
         self._std_px[index] = std_px * image.pinhole.width / image.original_size[0]
 
     def match(self, first: int, second: int, indices: Int64, scores: Float32) -> None:
-        """Matches of two images, as rows of what was added."""
+        """Add matches of two images; ``indices`` (m, 2) are rows of the added keypoints."""
         if first == second or not len(indices):
             return
         if first > second:
             first, second, indices = second, first, indices[:, ::-1]
         columns = []
         for index, rows in zip((first, second), indices.T, strict=True):
-            known = self._rows.get(index, np.zeros(0, np.int64))
-            if rows.min() < 0 or rows.max() >= len(known):
+            new_rows = self._rows.get(index, np.zeros(0, np.int64))
+            if rows.min() < 0 or rows.max() >= len(new_rows):
                 name = self._images[index].name
                 raise InputError(
                     f"{self._source}: a match refers to keypoint {rows.max()} of {name!r}, which "
-                    f"has {len(known)}"
+                    f"has {len(new_rows)}"
                 )
-            columns.append(known[rows])
-        moved = np.stack(columns, axis=1)
-        kept = (moved >= 0).all(axis=1)
-        self._matches[first, second] = SparseMatches.best_first(moved[kept], scores[kept])
+            columns.append(new_rows[rows])
+        matches = np.stack(columns, axis=1)
+        visible = (matches >= 0).all(axis=1)
+        self._matches[first, second] = SparseMatches.from_best_scores(matches[visible], scores[visible])
 
     def finish(self) -> ImportedMatches:
-        """The result; raises :class:`InputError` if it is empty."""
+        """Return the imported matches; raise :class:`InputError` if there are none."""
         if not self._rows:
             raise InputError(f"{self._source}: has keypoints of none of the images, names differ")
         if not self._matches:
@@ -126,7 +130,7 @@ class _Builder:
 def _upright(
     source: str, image: SourceImage, keypoints: Float64, size: tuple[int, int] | None
 ) -> Float64:
-    """Keypoints of a stored photo as pixels of the upright one."""
+    """Map keypoints of a stored image to pixels of the upright image."""
     width, height = image.original_size
     stored = (height, width) if image.orientation >= 5 else (width, height)
     if size is None or size == stored:

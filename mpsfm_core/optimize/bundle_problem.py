@@ -15,7 +15,7 @@ from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.options import BundleOptions
-from mpsfm_core.support.threads import allowed
+from mpsfm_core.support.threads import thread_limit
 
 RANGE_SIZE = 8000
 """Observations that are worth a thread of their own (our choice; about 2 ms a step)."""
@@ -159,7 +159,7 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
 @contextmanager
 def range_executor(ranges: list[PointRange], threads: int | None) -> Iterator[RangeExecutor]:
     """Threads, if there are several ranges and processors, for as long as the context lasts."""
-    count = min(len(ranges), threads or allowed())
+    count = min(len(ranges), threads or thread_limit())
     if count < 2:
 
         def run_here(function: Callable[[int, int, int], Result]) -> list[Result]:

@@ -29,10 +29,10 @@ from mpsfm_core.dense.stereo import StereoDepth
 from mpsfm_core.extraction.cache import Cache, cache_folder, content_key
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
-from mpsfm_core.mapping.state import Frozen, fingerprint
+from mpsfm_core.mapping.state import CheckpointArrays, fingerprint
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import core_version
-from mpsfm_core.support.files import remove_unfinished, write_file
+from mpsfm_core.support.files import remove_temporary_files, write_file
 from mpsfm_core.support.npz import read_npz
 
 _log = logging.getLogger(__name__)
@@ -84,8 +84,8 @@ class MappingCheckpoints:
         with suppress(OSError):
             self._path.unlink()
 
-    def load(self) -> Frozen | None:
-        """As :class:`mpsfm_core.mapping.checkpoints.Checkpoints`."""
+    def load(self) -> CheckpointArrays | None:
+        """As :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`."""
         self._clear_up()
         if not self._path.is_file():
             return None
@@ -104,15 +104,15 @@ class MappingCheckpoints:
         return arrays
 
     def unreadable(self, reason: str) -> None:
-        """As :class:`mpsfm_core.mapping.checkpoints.Checkpoints`."""
+        """As :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`."""
         self._stages.notice(f"the checkpoint of this mapping is not used: {reason}; starting anew")
 
     def due(self) -> bool:
-        """As :class:`mpsfm_core.mapping.checkpoints.Checkpoints`."""
+        """As :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`."""
         return not self._failed and time.monotonic() - self._last >= self._wait_s
 
-    def save(self, state: Frozen, registered: int) -> None:
-        """As :class:`mpsfm_core.mapping.checkpoints.Checkpoints`.
+    def save(self, state: CheckpointArrays, registered: int) -> None:
+        """As :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`.
 
         A disk that is full ends no run: it goes on without checkpoints, and says so.
         """
@@ -140,7 +140,7 @@ class MappingCheckpoints:
         return self._folder / "unfinished"
 
     def _clear_up(self) -> None:
-        remove_unfinished(self._unfinished)
+        remove_temporary_files(self._unfinished)
         for path in self._folder.glob("*.npz"):
             with suppress(OSError):
                 if time.time() - path.stat().st_mtime > _KEPT_S:
@@ -192,7 +192,7 @@ class DenseCheckpoints:
         return content_key(self._all, name)
 
 
-def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], Frozen]:
+def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], CheckpointArrays]:
     """Header and state of a file; raises :class:`DataError` when it is damaged."""
     try:
         arrays = read_npz(path)

@@ -36,7 +36,7 @@ from mpsfm_core.inputs.matches import (
 from mpsfm_core.inputs.models import match_names, read_model, read_poses, reconstruction_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
-from mpsfm_core.mapping.initialization.seed_poses import select_seed_images, apply_seed_poses
+from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
 from mpsfm_core.pipeline import precompile, resources
@@ -59,9 +59,9 @@ from mpsfm_core.results.summary import FORMAT as SUMMARY_FORMAT
 from mpsfm_core.results.summary import describe_images, describe_pairs, describe_reconstructions
 from mpsfm_core.results.writer import ComponentResult, update_summary, write_failure, write_results
 from mpsfm_core.support.disk_arrays import DiskArrays
-from mpsfm_core.support.files import claimed, replacing
+from mpsfm_core.support.files import lock_output_folder, replace_entries
 from mpsfm_core.support.format_versions import VERSION
-from mpsfm_core.support.threads import allowed, limited
+from mpsfm_core.support.threads import limit_threads, thread_limit
 
 PathLike = str | Path
 
@@ -137,10 +137,10 @@ def reconstruct(
     folder, target = Path(images), _path(output)
     run = _Run(config, registry, target, fresh)
     with ExitStack() as stack:
-        stack.enter_context(limited(config.runtime.workers))
+        stack.enter_context(limit_threads(config.runtime.workers))
         if target is not None:
             check_output_folder(target, folder)
-            stack.enter_context(claimed(target))
+            stack.enter_context(lock_output_folder(target))
         elif is_video(folder):
             raise InputError(f"{folder}: a video needs an output folder, for its frames")
         stack.enter_context(run.watching_processes())
@@ -196,7 +196,7 @@ class _Run:
             with stage("video"):
                 folder = self._frames(folder)
         self._folder = folder
-        compilation = precompile.start_compilation() if allowed() > 1 else None
+        compilation = precompile.start_compilation() if thread_limit() > 1 else None
         with stage("inputs"):
             images = load_images(
                 folder,
@@ -559,7 +559,7 @@ def densify_model(
         InputError: model or photos cannot be read, names do not match, the model has no points, or
             ``output`` cannot be written.
     """
-    with claimed(Path(output)), limited(workers):
+    with lock_output_folder(Path(output)), limit_threads(workers):
         return _densify_model(Path(model), Path(images), Path(output), options)
 
 
@@ -592,7 +592,7 @@ def _densify_model(
         store_array=disk.store,
         poses_use_depth=poses_use_depth,
     )
-    with replacing(output, (SPARSE, DENSE, DEPTH)) as folder:
+    with replace_entries(output, (SPARSE, DENSE, DEPTH)) as folder:
         write_model(folder / SPARSE, colmap)
         write_depth_maps(folder / DEPTH, dense)
         write_cloud(folder / DENSE, fuse_depth_maps(dense, view_of, ResultOptions()))
@@ -642,7 +642,7 @@ def mesh_model(
         InputError: folder or photos cannot be read, there are no depth maps, they show no surface,
             or the libraries for meshes are not installed.
     """
-    with claimed(Path(folder)):
+    with lock_output_folder(Path(folder)):
         source = ExportSource.read(Path(folder), _path(photos))
         poses = reconstruction_poses(source.model)
         files = [source.folder / DEPTH / f"{name}.npz" for name in source.names]
@@ -651,6 +651,6 @@ def mesh_model(
         if not known.images:
             raise InputError(f"{folder}: has no depth maps; mpsfm dense makes them")
         mesh = mesh_depth_maps(known, _view_of(source.images), options or MeshOptions())
-        with replacing(source.folder, MESH) as written:
+        with replace_entries(source.folder, MESH) as written:
             write_mesh(written, mesh, source)
     return mesh

@@ -43,7 +43,7 @@ from mpsfm_core.data import (
     DepthPrior,
     Features,
     Float32,
-    GroupPrior,
+    MultiViewPrior,
     NormalPrior,
     PairMatches,
     SceneState,
@@ -175,7 +175,7 @@ class NormalsProvider(Protocol):
 class MultiViewProvider(Protocol):
     """Network that predicts the depth of several views jointly."""
 
-    def predict_group(self, views: Sequence[View]) -> GroupPrior:
+    def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
         """Predict the depth of a group of views in one common unit.
 
         Args:

@@ -23,14 +23,14 @@ from mpsfm_core.data import (
     Features,
     Float32,
     Float64,
-    GroupPrior,
+    MultiViewPrior,
     NormalPrior,
     PairDepth,
     PairMatches,
     PinholeCamera,
     SparseMatches,
     View,
-    along_rays,
+    dot_with_rays,
 )
 from mpsfm_core.data.errors import DataError, MpsfmError, ProviderOutputError, ProviderRunError
 from mpsfm_core.providers import (
@@ -93,7 +93,7 @@ def run_normals(
 
 def run_multiview(
     spec: ProviderSpec, provider: MultiViewProvider, views: Sequence[View]
-) -> GroupPrior:
+) -> MultiViewPrior:
     """Predict the depth of a group of views."""
     with provider_errors(spec, _group_name(views)):
         return validate_multiview(spec, views, provider.predict_group(tuple(views)))
@@ -153,11 +153,11 @@ def validate_normals(spec: ProviderSpec, view: View, output: object) -> NormalPr
         return prior
 
 
-def validate_multiview(spec: ProviderSpec, views: Sequence[View], output: object) -> GroupPrior:
-    """Rules: type and values of :class:`GroupPrior`; one prior a view, each as for depth; poses and
+def validate_multiview(spec: ProviderSpec, views: Sequence[View], output: object) -> MultiViewPrior:
+    """Rules: type and values of :class:`MultiViewPrior`; one prior a view, each as for depth; poses and
     intrinsics where the spec promises them."""
     with _rules(spec, _group_name(views)):
-        group = _checked(output, GroupPrior, "output")
+        group = _checked(output, MultiViewPrior, "output")
         if not isinstance(group.depth, tuple) or len(group.depth) != len(views):
             found = len(group.depth) if isinstance(group.depth, tuple) else _type(group.depth)
             raise DataError("depth", f"must be a tuple of {len(views)} priors, got {found}")
@@ -258,7 +258,7 @@ Checked = TypeVar(
     "Checked",
     DepthPrior,
     NormalPrior,
-    GroupPrior,
+    MultiViewPrior,
     Features,
     SparseMatches,
     DenseMatches,
@@ -284,7 +284,7 @@ def _check_depth(spec: ProviderSpec, output: object, field: str) -> DepthPrior:
 
 
 def _facing(prior: NormalPrior, camera: PinholeCamera) -> None:
-    away = (along_rays(camera, prior.normals) > FACING_TOLERANCE)[prior.valid]
+    away = (dot_with_rays(camera, prior.normals) > FACING_TOLERANCE)[prior.valid]
     if away.any():
         share = f"{100 * away.mean():.3g} % of the valid pixels"
         raise DataError("normals", f"must face the camera (n . ray < 0), not so at {share}")

@@ -1,4 +1,4 @@
-"""``report.html``: one file with everything in it."""
+"""Writer of ``report.html``, one self-contained file."""
 
 from __future__ import annotations
 
@@ -24,29 +24,37 @@ from mpsfm_core.report.points import PointSet, dense_points, sparse_points
 from mpsfm_core.report.reasons import explain_image, explain_pair
 from mpsfm_core.report.result_folder import PairMatches, PriorMaps, RefinedMap, ResultFolder
 from mpsfm_core.support.files import write_file
-from mpsfm_core.support.threads import each
+from mpsfm_core.support.threads import parallel_map
 from mpsfm_core.support.yaml_text import write_yaml
 
-DENSE_POINTS = 280_000
-SPARSE_POINTS = 40_000
-"""12 bytes a point, 16 in base64: 5 MB together, and quick to turn on a laptop."""
-PICTURE_BYTES = 9_000_000
-"""Of all pictures together; where there are many photos, each gets a smaller picture."""
+MAX_DENSE_POINTS = 280_000
+MAX_SPARSE_POINTS = 40_000
+"""Maximum numbers of points; 16 bytes each in base64, 5 MB together."""
+MAX_PICTURE_BYTES = 9_000_000
+"""Maximum size of all pictures together in bytes; with many images each picture is smaller."""
 _PHOTO_SIDE = (192, 800)
+"""Minimum and maximum of the longer side of an image in pixels."""
 _MAP_SIDE = (128, 360)
-_BYTES_A_PIXEL = 0.16
-"""Of WebP at our quality in base64, photos and maps of real rooms (measured)."""
-_PICTURES_OF_MAPS = 4
-_COORDINATES = 0xFFFF
-_USUAL_STD = 0.2
-"""Relative std that is brightest where nothing was reconstructed (ours)."""
+"""Minimum and maximum of the longer side of a map in pixels."""
+_BYTES_PER_PIXEL = 0.16
+"""Mean size of WebP in base64 at our quality, measured on indoor images."""
+_NUM_MAPS = 4
+"""Number of maps per image."""
+_MAX_COORDINATE = 0xFFFF
+"""Range of 16-bit coordinates."""
+_DEFAULT_MAX_STD = 0.2
+"""Brightest relative std of a map if no image is registered."""
 
 
 def write_report(folder: Path) -> Path:
-    """Make the page of a finished result folder anew; returns its path.
+    """Write the report page of a finished result folder.
 
-    Raises :class:`~mpsfm_core.data.errors.InputError` when the folder holds no results or damaged
-    ones, :class:`OSError` when the disk is full.
+    Returns:
+        Path of the page.
+
+    Raises:
+        InputError: the folder has no results, or they are damaged.
+        OSError: the disk is full.
     """
     result = ResultFolder.open(folder)
     try:
@@ -54,13 +62,13 @@ def write_report(folder: Path) -> Path:
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
         if isinstance(error, MpsfmError):
             raise
-        raise InputError(f"{folder}: its results are damaged: {error!r}") from error
+        raise InputError(f"{folder}: the results are damaged: {error!r}") from error
     write_file(folder / REPORT, text.encode("utf-8"))
     return folder / REPORT
 
 
 def render(result: ResultFolder) -> str:
-    """The page as text."""
+    """Return the report page as HTML text."""
     parts = {
         "TITLE": html.escape(result.path.resolve().name),
         "STYLE": _asset("page.css"),
@@ -82,44 +90,44 @@ def _asset(name: str) -> str:
 
 
 def _script_safe(data: str) -> str:
-    """JSON that nothing in it can end the script element around it."""
+    """Escape JSON so that it cannot end the script element that contains it."""
     return data.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
 def _payload(result: ResultFolder) -> dict[str, Any]:
     summary = result.summary
-    maps = dict(zip(result.names, each(result.refined, result.names), strict=True))
-    used = [refined for refined in maps.values() if refined is not None]
-    photos = _Photos(result, maps)
+    maps = dict(zip(result.names, parallel_map(result.refined, result.names), strict=True))
+    refined_maps = [refined for refined in maps.values() if refined is not None]
+    photos = _ImageEntries(result, maps)
     ids = {name: row for row, name in enumerate(result.names)}
     return {
         "folder": result.path.resolve().name,
         "verdict": asdict(verdict(summary)),
         "findings": [asdict(finding) for finding in findings(summary)],
-        "photos": each(photos.describe, result.names),
+        "photos": parallel_map(photos.describe, result.names),
         "pairs": _pairs(summary, ids),
         "lines": {
             f"{ids[pair.image_a]} {ids[pair.image_b]}": photos.lines(pair)
-            for pair in result.lines()
+            for pair in result.matches()
             if pair.image_a in ids and pair.image_b in ids
         },
         "points": {
-            "sparse": _points(sparse_points(result.model, used, SPARSE_POINTS)),
-            "dense": _points(dense_points(result.dense_cloud(), used, DENSE_POINTS)),
+            "sparse": _points(sparse_points(result.model, refined_maps, MAX_SPARSE_POINTS)),
+            "dense": _points(dense_points(result.dense_cloud(), refined_maps, MAX_DENSE_POINTS)),
         },
-        "up": _up(used),
+        "up": _estimate_up(refined_maps),
         "reconstructions": summary["reconstructions"],
         "providers": summary["providers"],
         "stages": {name: stage["seconds"] for name, stage in summary["stages"].items()},
         "steps": {name: step["seconds"] for name, step in summary["mapping_steps"].items()},
-        "memory_mb": _peak(summary),
+        "memory_mb": _find_peak_memory(summary),
         "config": write_yaml(summary["config"]),
         "versions": summary["versions"],
     }
 
 
-class _Photos:
-    """What the page says and shows of each photo."""
+class _ImageEntries:
+    """Collects statistics and pictures of each image for the page."""
 
     def __init__(self, result: ResultFolder, maps: Mapping[str, RefinedMap | None]) -> None:
         self._result = result
@@ -138,10 +146,11 @@ class _Photos:
             for refined in maps.values()
             if refined is not None and refined.valid.any()
         ]
-        self._most_std = max(stds, default=_USUAL_STD)
+        self._max_std = max(stds, default=_DEFAULT_MAX_STD)
         self._views: dict[str, tuple[int, int]] = {}
 
     def describe(self, name: str) -> dict[str, Any]:
+        """Return status, statistics, pose and pictures of an image."""
         images = self._result.summary["images"]
         reason = {**images["unregistered"], **images["unconfirmed"]}.get(name)
         explained = None if reason is None else explain_image(reason)
@@ -172,15 +181,15 @@ class _Photos:
         }
 
     def lines(self, pair: PairMatches) -> str:
-        """Matches in shares of the widths and heights of both views: ax, ay, bx, by, uint16."""
+        """Encode matches as (ax, ay, bx, by) uint16, relative to the sizes of both views."""
         sides = []
         for name, points in ((pair.image_a, pair.points_a), (pair.image_b, pair.points_b)):
             size = np.array(self._views.get(name, (1, 1)))
-            sides.append(np.clip(points / size, 0, 1) * _COORDINATES)
+            sides.append(np.clip(points / size, 0, 1) * _MAX_COORDINATE)
         return _base64(np.concatenate(sides, axis=1).astype("<u2"))
 
     def _in_model(self, name: str) -> dict[str, Any]:
-        """Its points in the model and their mean reprojection error there."""
+        """Return the number of points of an image and their mean reprojection error in pixels."""
         image = self._images.get(name)
         if image is None:
             return {"points": 0, "error": None}
@@ -193,7 +202,7 @@ class _Photos:
         return {"points": len(errors), "error": float(np.mean(errors)) if errors else None}
 
     def _camera(self, name: str, prior: PriorMaps | None) -> dict[str, Any]:
-        """Where it stands (world from camera, 3 x 4 by rows) and what it sees at depth 1."""
+        """Return ``world_from_cam`` (3 x 4, row-major) and the image borders at depth 1."""
         image = self._images.get(name)
         if image is None:
             return {"pose": None}
@@ -216,28 +225,30 @@ class _Photos:
         picture = self._result.picture(name)
         if picture is not None:
             made["photo"] = {"src": pictures.photo(picture, sizes.photo)}
-        seen = None
+        refined_range = None
         if refined is not None:
-            seen = pictures.range_of(refined.depth, refined.valid)
+            refined_range = pictures.range_of(refined.depth, refined.valid)
         if prior is not None:
             factor = _scale_between(prior, refined)
             depth = (prior.depth * factor).astype(np.float32)
-            span = seen or pictures.range_of(depth, prior.valid)
+            span = refined_range or pictures.range_of(depth, prior.valid)
             legend = f"{span[0]:.3g} to {span[1]:.3g}"
             made["prior"] = {
                 "src": pictures.depth_map(depth, prior.valid, span, sizes.maps),
-                "legend": f"red {legend} blue, scaled to the reconstruction" if seen else legend,
+                "legend": f"red {legend} blue, scaled to the reconstruction"
+                if refined_range
+                else legend,
             }
-        if refined is not None and seen is not None:
+        if refined is not None and refined_range is not None:
             made["refined"] = {
-                "src": pictures.depth_map(refined.depth, refined.valid, seen, sizes.maps),
-                "legend": f"red {seen[0]:.3g} to {seen[1]:.3g} blue",
+                "src": pictures.depth_map(refined.depth, refined.valid, refined_range, sizes.maps),
+                "legend": f"red {refined_range[0]:.3g} to {refined_range[1]:.3g} blue",
             }
         std = refined or prior
         if std is not None:
             made["std"] = {
-                "src": pictures.std_map(std.relative_std, std.valid, self._most_std, sizes.maps),
-                "legend": f"dark 0 to {self._most_std:.0%} of the depth bright",
+                "src": pictures.std_map(std.relative_std, std.valid, self._max_std, sizes.maps),
+                "legend": f"dark 0 to {self._max_std:.0%} of the depth bright",
             }
         if prior is not None:
             made["normals"] = {
@@ -249,16 +260,16 @@ class _Photos:
 
 @dataclass(frozen=True)
 class _PictureSizes:
-    """Longer sides in pixels of a photo and of a map."""
+    """Longer sides of an image and of a map in pixels."""
 
     photo: int
     maps: int
 
     @classmethod
     def of(cls, count: int) -> _PictureSizes:
-        """As large as so many photos can be within :data:`PICTURE_BYTES`."""
-        full = 0.75 * (_PHOTO_SIDE[1] ** 2 + _PICTURES_OF_MAPS * _MAP_SIDE[1] ** 2)
-        share = (PICTURE_BYTES / (max(count, 1) * full * _BYTES_A_PIXEL)) ** 0.5
+        """Return the largest sizes of ``count`` images within :data:`MAX_PICTURE_BYTES`."""
+        full = 0.75 * (_PHOTO_SIDE[1] ** 2 + _NUM_MAPS * _MAP_SIDE[1] ** 2)
+        share = (MAX_PICTURE_BYTES / (max(count, 1) * full * _BYTES_PER_PIXEL)) ** 0.5
         return cls(
             int(np.clip(share * _PHOTO_SIDE[1], *_PHOTO_SIDE)),
             int(np.clip(share * _MAP_SIDE[1], *_MAP_SIDE)),
@@ -266,7 +277,7 @@ class _PictureSizes:
 
 
 def _scale_between(prior: PriorMaps, refined: RefinedMap | None) -> float:
-    """What brings the prior to the scale of the refined depth."""
+    """Return the median ratio of refined depth to prior depth."""
     if refined is None or refined.depth.shape != prior.depth.shape:
         return 1.0
     both = refined.valid & prior.valid
@@ -274,7 +285,7 @@ def _scale_between(prior: PriorMaps, refined: RefinedMap | None) -> float:
 
 
 def _pairs(summary: Mapping[str, Any], ids: Mapping[str, int]) -> list[list[Any]]:
-    """Rows of both images, matches, inliers, and why the pair was dropped or cannot start."""
+    """Return indices, matches, inliers and the reason of rejection of each pair."""
     return [
         [
             *(ids[name] for name in pair["images"]),
@@ -294,13 +305,13 @@ def _why_unused(pair: Mapping[str, Any]) -> str:
 
 
 def _points(points: PointSet) -> dict[str, Any]:
-    """Positions on a grid of 16 bits, colours and values in bytes."""
+    """Encode positions with 16 bits, colors and values with 8 bits."""
     count = len(points.xyz)
     low = np.zeros(3)
     step = np.ones(3)
     if count:
         low = points.xyz.min(axis=0)
-        step = np.maximum(np.ptp(points.xyz, axis=0), 1e-9) / _COORDINATES
+        step = np.maximum(np.ptp(points.xyz, axis=0), 1e-9) / _MAX_COORDINATE
     return {
         "count": count,
         "low": low.tolist(),
@@ -316,7 +327,7 @@ def _points(points: PointSet) -> dict[str, Any]:
 
 
 def _values(values: NDArray[np.float32], unit: str) -> dict[str, Any]:
-    """In 255 steps from the least to nearly the most, 255 where there is none."""
+    """Encode values in 255 steps from the minimum to the 98th percentile; 255 means none."""
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, [0, 98]).tolist() if len(known) else (0.0, 0.0)
     share = (np.nan_to_num(values, nan=high) - low) / max(high - low, 1e-9)
@@ -324,14 +335,14 @@ def _values(values: NDArray[np.float32], unit: str) -> dict[str, Any]:
     return {"bytes": _base64(steps.astype(np.uint8)), "low": low, "high": high, "unit": unit}
 
 
-def _up(maps: list[RefinedMap]) -> list[float]:
-    """Where up is in the world for people who hold cameras upright, a unit vector."""
+def _estimate_up(maps: list[RefinedMap]) -> list[float]:
+    """Return the mean up axis of the cameras in the world, a unit vector."""
     mean: Float64 = -np.sum([refined.rotation[1] for refined in maps], axis=0, dtype=np.float64)
     length = np.linalg.norm(mean)
     return _rounded(mean / length) if length > 1e-6 else [0.0, -1.0, 0.0]
 
 
-def _peak(summary: Mapping[str, Any]) -> float | None:
+def _find_peak_memory(summary: Mapping[str, Any]) -> float | None:
     peaks = [stage["peak_memory_mb"] for stage in summary["stages"].values()]
     return max((peak for peak in peaks if peak is not None), default=None)
 

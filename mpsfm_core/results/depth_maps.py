@@ -1,4 +1,4 @@
-"""Refined depth maps as files."""
+"""Files of refined depth maps."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.npz import read_npz, write_npz
-from mpsfm_core.support.threads import each
+from mpsfm_core.support.threads import parallel_map
 
 FORMAT = 1
-"""Of the files."""
+"""Version of the files."""
 
 
 def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
-    """Write ``folder/NAME.npz`` for each registered image, NAME with its own extension.
+    """Write ``folder/NAME.npz`` for each registered image (NAME includes its extension).
 
     Arrays: ``depth`` (h, w) float32, z in the units of the model; ``variance`` (h, w) float32,
     those units squared; ``valid`` (h, w) bool; ``camera`` (4,) float64, fx, fy, cx, cy on this
@@ -29,7 +29,7 @@ def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
 
     def write(image: RegisteredImage) -> None:
         height, width = image.depth.shape
-        assert image.depth.variance is not None  # of a refined map always
+        assert image.depth.variance is not None  # refined maps have a variance
         arrays: dict[str, Any] = {
             VERSION: np.array(FORMAT),
             "depth": image.depth.depth,
@@ -40,13 +40,21 @@ def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
         }
         write_npz(folder / f"{image.name}.npz", **arrays)
 
-    each(write, reconstruction.images)
+    parallel_map(write, reconstruction.images)
 
 
 def read_depth_map(path: Path, scale: float = 1.0) -> tuple[PinholeCamera, DepthPrior]:
-    """The grid and the depth, times ``scale``, of a file that :func:`write_depth_maps` wrote.
+    """Read a depth map that :func:`write_depth_maps` wrote.
 
-    Raises :class:`InputError` when it is damaged, of a newer version or something else.
+    Args:
+        path: file to read.
+        scale: factor of the depth.
+
+    Returns:
+        The camera of the depth grid, and the scaled depth.
+
+    Raises:
+        InputError: the file is damaged, of a newer version or not a depth map.
     """
     arrays = load_depth_map(path)
     try:
@@ -56,17 +64,18 @@ def read_depth_map(path: Path, scale: float = 1.0) -> tuple[PinholeCamera, Depth
         scaled = depth * np.float32(scale), variance * np.float32(scale**2)
         return grid, DepthPrior(*scaled, arrays["valid"])
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: is no depth map of a run: {error}") from error
+        raise InputError(f"{path} is not a depth map of a run: {error}") from error
 
 
 def load_depth_map(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a file that :func:`write_depth_maps` wrote, unchecked but for their version.
+    """Read the arrays of a depth map without checking their content.
 
-    Raises :class:`InputError` when it is damaged or of a newer version.
+    Raises:
+        InputError: the file is damaged or of a newer version.
     """
     try:
         arrays = read_npz(path)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is no depth map of a run, or damaged: {error}") from error
+        raise InputError(f"{path} is damaged or not a depth map of a run: {error}") from error
     check_version(arrays, FORMAT, path)
     return arrays

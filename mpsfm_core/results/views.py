@@ -1,6 +1,6 @@
-"""What the mapper was given, as files: small views, priors and verified matches.
+"""Files of the mapper's input for the report: small views, priors and verified matches.
 
-They are what a report is made from, and tell why a run failed when there is nothing else.
+They are also written for a failed run, to show the cause.
 """
 
 from __future__ import annotations
@@ -14,25 +14,35 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import Float64, MappingImage, MappingProblem, UInt8, View
 from mpsfm_core.support.npz import write_npz
-from mpsfm_core.support.threads import each
+from mpsfm_core.support.threads import parallel_map
 
 PICTURE_SIDE = 960
-"""Longer side of the pictures in pixels: enough to judge a photo on a screen."""
+"""Longer side of the images in pixels."""
 PICTURE_QUALITY = 80
+"""WebP quality."""
 MATCHES_A_PAIR = 100
-"""Of a pair at most; enough to see what was matched."""
+"""Maximum number of written matches of a pair."""
 MATCHES = "matches.npz"
+"""File of the matches in the folder."""
 
 
 def write_views(folder: Path, problem: MappingProblem, view_of: Callable[[str], View]) -> None:
     """Write ``NAME.webp`` and ``NAME.npz`` for every image, and ``matches.npz``.
 
-    ``NAME.webp``: the undistorted view, reduced. ``NAME.npz``: ``depth`` (h, w) float32, the
-    prior in its own units; ``relative_std`` (h, w) float16, of that depth; ``normals`` (h, w, 3)
-    float16, unit, camera frame; ``valid`` (h, w) bool, of the depth; ``camera`` (6,) float64,
-    width, height, fx, fy, cx, cy of the view. ``matches.npz``: ``names`` (n,) of all images,
-    ``pairs`` (p, 2) int64 rows of names, ``starts`` (p + 1,) int64 rows where the matches of each
-    pair begin in ``points_a`` and ``points_b``, (m, 2) float32, pixels of the views.
+    ``NAME.webp`` is the undistorted view, reduced. Arrays of ``NAME.npz``:
+
+    * ``depth`` (h, w) float32, prior in its own units
+    * ``relative_std`` (h, w) float16, std of the depth over the depth
+    * ``normals`` (h, w, 3) float16, unit, camera frame
+    * ``valid`` (h, w) bool, of the depth
+    * ``camera`` (6,) float64, width, height, fx, fy, cx, cy of the view
+
+    Arrays of ``matches.npz``:
+
+    * ``names`` (n,) of all images
+    * ``pairs`` (p, 2) int64, rows of ``names``
+    * ``starts`` (p + 1,) int64, first row of each pair in ``points_a`` and ``points_b``
+    * ``points_a``, ``points_b`` (m, 2) float32, pixels of the views
     """
 
     def write(image: MappingImage) -> None:
@@ -46,12 +56,12 @@ def write_views(folder: Path, problem: MappingProblem, view_of: Callable[[str], 
         )
         _write_picture(folder / f"{image.name}.webp", view_of(image.name).image)
 
-    each(write, problem.images)
+    parallel_map(write, problem.images)
     _write_matches(folder / MATCHES, problem)
 
 
 def _relative_std(image: MappingImage) -> NDArray[np.float16]:
-    assert image.depth.variance is not None  # MappingImage checks it
+    assert image.depth.variance is not None  # MappingImage requires a variance
     depth = np.where(image.depth.valid, image.depth.depth, 1)
     std = np.sqrt(np.where(image.depth.valid, image.depth.variance, 0)) / depth
     return np.asarray(np.minimum(std, np.finfo(np.float16).max), np.float16)

@@ -1,20 +1,19 @@
-"""Writes everything a run leaves behind, as a whole or not at all.
+"""Writer of the result folder; replaces earlier results atomically.
 
 ::
 
-    OUTPUT/sparse/          COLMAP model of the original photos (binary)
-           sparse_text/     the same as text, if asked for
-           components/N/    models of further, disconnected groups of images, largest first, each
-                            with its own depth/ and dense.ply
-           undistorted/     images/ and sparse/ for tools that want pinhole cameras; only written
-                            when a photo is distorted
-           points.ply       the points of the first model
-           dense.ply        the refined depth maps, fused
+    OUTPUT/sparse/          COLMAP model of the original images, binary
+           sparse_text/     the same model as text (results.text_model)
+           components/N/    models of further components, largest first, each with depth/ and
+                            dense.ply
+           undistorted/     images/ and sparse/ with pinhole cameras, if an image is distorted
+           points.ply       triangulated points of the largest component
+           dense.ply        fused depth maps
            depth/NAME.npz   refined depth, variance and camera of each registered image
-           mesh.ply, .glb   made later, from the depth maps
-           transforms.json  for nerfstudio, if asked for
+           mesh.ply, .glb   surface mesh, made after the run from the depth maps
+           transforms.json  cameras for nerfstudio (results.nerfstudio)
            views/           small views, priors and matches of all images, for the report
-           summary.json     what was used, what came out, and why not more
+           summary.json     configuration, results, and reasons of missing images
 """
 
 from __future__ import annotations
@@ -53,23 +52,23 @@ from mpsfm_core.results.original_images import OriginalImages, exported_image_na
 from mpsfm_core.results.ply import write_cloud, write_ply
 from mpsfm_core.results.transforms_json import supports_camera, write_transforms
 from mpsfm_core.results.views import write_views
-from mpsfm_core.support.files import replacing, write_file
+from mpsfm_core.support.files import replace_entries, write_file
 
 
 @dataclass(frozen=True, eq=False)
 class ComponentResult:
-    """A reconstruction ready to be written.
-
-    ``colors``: (p, 3) uint8, RGB of each point. ``model``: COLMAP model of the original photos.
-    """
+    """Reconstruction of one component with its COLMAP model."""
 
     reconstruction: Reconstruction
+    """Poses, points and refined depth maps."""
     colors: UInt8
+    """(p, 3) uint8 RGB of each point."""
     model: pycolmap.Reconstruction
+    """COLMAP model of the original images."""
 
     @classmethod
     def of(cls, reconstruction: Reconstruction, photos: OriginalImages) -> ComponentResult:
-        """Colour the points and build the model."""
+        """Color the points and build the COLMAP model."""
         colors = average_point_colors(reconstruction, photos.keypoints(reconstruction), photos.view)
         cameras = [photos.original_camera(image) for image in reconstruction.images]
         keypoints = photos.original_keypoints(reconstruction)
@@ -77,7 +76,7 @@ class ComponentResult:
         return cls(reconstruction, colors, model)
 
     def undistorted(self, photos: OriginalImages) -> pycolmap.Reconstruction:
-        """The model of the undistorted views."""
+        """Build the COLMAP model of the undistorted views."""
         cameras = [colmap_from_pinhole(image.camera) for image in self.reconstruction.images]
         keypoints = photos.keypoints(self.reconstruction)
         images = (replace(i, name=exported_image_name(i.name)) for i in self.reconstruction.images)
@@ -93,27 +92,34 @@ def write_results(
     summarize: Callable[[], Mapping[str, Any]],
     seed: int = 0,
 ) -> None:
-    """Write a successful run.
+    """Write the results of a successful run.
 
-    ``components``: one at least, largest first. ``summarize``: gives the plain data of the
-    summary, called when all else is written. ``seed``: of the choice of pixels for ``dense.ply``.
-    Raises what :func:`mpsfm_core.support.files.replacing` raises.
+    Args:
+        output: result folder.
+        components: at least one, largest first.
+        photos: original images.
+        options: files to write.
+        summarize: returns the plain data of the summary; called after all else is written.
+        seed: seed of the choice of pixels for ``dense.ply``.
+
+    Raises:
+        OSError: as :func:`mpsfm_core.support.files.replace_entries`.
     """
-    best, rest = components[0], components[1:]
-    with replacing(output, ENTRIES) as folder:
-        write_model(folder / SPARSE, best.model)
+    largest, others = components[0], components[1:]
+    with replace_entries(output, ENTRIES) as folder:
+        write_model(folder / SPARSE, largest.model)
         if options.text_model:
-            write_model(folder / SPARSE_TEXT, best.model, text=True)
-        for number, component in enumerate(rest, start=1):
-            own = folder / COMPONENTS / str(number)
-            write_model(own, component.model)
-            _write_dense(own, component, photos, options, seed)
-        write_ply(folder / POINTS, best.reconstruction.points, best.colors)
-        _write_dense(folder, best, photos, options, seed)
-        if photos.any_distorted(best.reconstruction):
-            _write_undistorted(folder / UNDISTORTED, best, photos)
+            write_model(folder / SPARSE_TEXT, largest.model, text=True)
+        for number, component in enumerate(others, start=1):
+            subfolder = folder / COMPONENTS / str(number)
+            write_model(subfolder, component.model)
+            _write_dense(subfolder, component, photos, options, seed)
+        write_ply(folder / POINTS, largest.reconstruction.points, largest.colors)
+        _write_dense(folder, largest, photos, options, seed)
+        if photos.any_distorted(largest.reconstruction):
+            _write_undistorted(folder / UNDISTORTED, largest, photos)
         if options.nerfstudio:
-            _write_nerfstudio(folder / TRANSFORMS, output, best, photos)
+            _write_nerfstudio(folder / TRANSFORMS, output, largest, photos)
         if options.report:
             write_views(folder / VIEWS, photos.problem, photos.view)
         _write_json(folder / SUMMARY, summarize())
@@ -126,7 +132,7 @@ def _write_dense(
     options: ResultOptions,
     seed: int,
 ) -> None:
-    """The depth maps and their cloud, as far as they are asked for."""
+    """Write the fused point cloud and the depth maps if enabled."""
     if options.dense_cloud:
         cloud = fuse_depth_maps(component.reconstruction, photos.view, options, seed)
         write_cloud(folder / DENSE, cloud)
@@ -135,15 +141,15 @@ def _write_dense(
 
 
 def update_summary(output: Path, summary: Mapping[str, Any]) -> None:
-    """Write the summary once more, when the rest is in place; raises :class:`OSError`."""
+    """Replace the summary after the results were written; raise :class:`OSError` on failure."""
     write_file(output / SUMMARY, _json_text(summary))
 
 
 def write_failure(
     output: Path, photos: OriginalImages, options: ResultOptions, summary: Mapping[str, Any]
 ) -> None:
-    """Write summary and views of a run without reconstruction; earlier results stay."""
-    with replacing(output, (VIEWS, REPORT, SUMMARY)) as folder:
+    """Write summary and views of a failed run; keep earlier models."""
+    with replace_entries(output, (VIEWS, REPORT, SUMMARY)) as folder:
         if options.report:
             write_views(folder / VIEWS, photos.problem, photos.view)
         _write_json(folder / SUMMARY, summary)
@@ -158,7 +164,7 @@ def _write_undistorted(folder: Path, component: ComponentResult, photos: Origina
 def _write_nerfstudio(
     path: Path, output: Path, component: ComponentResult, photos: OriginalImages
 ) -> None:
-    """The photos themselves where the format has their cameras, else the undistorted views."""
+    """Write ``transforms.json`` of the originals, or of views if the format needs it."""
     images = component.reconstruction.images
     if all(supports_camera(camera) for camera in component.model.cameras.values()):
         model = component.model

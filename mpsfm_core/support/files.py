@@ -68,7 +68,7 @@ def write_file(
         raise
 
 
-def remove_unfinished(folder: Path) -> None:
+def remove_temporary_files(folder: Path) -> None:
     """Take away what killed processes left of :func:`write_file` in its ``temporary`` folder."""
     for path in folder.glob(f".*{_TEMPORARY}"):
         with suppress(OSError), path.open("rb") as file:
@@ -77,7 +77,7 @@ def remove_unfinished(folder: Path) -> None:
 
 
 @contextmanager
-def claimed(output: Path) -> Iterator[None]:
+def lock_output_folder(output: Path) -> Iterator[None]:
     """Have an output folder to oneself, made if need be and found writable.
 
     What an earlier run that was killed left there is finished or taken away. A folder that was made
@@ -101,13 +101,13 @@ def claimed(output: Path) -> Iterator[None]:
 
 
 @contextmanager
-def replacing(output: Path, entries: tuple[str, ...]) -> Iterator[Path]:
+def replace_entries(output: Path, entries: tuple[str, ...]) -> Iterator[Path]:
     """A scratch folder whose content takes the place of ``output``'s ``entries`` on success.
 
     ``entries``: names below ``output`` that belong to us. When the block ends well, the old ones
     are taken away and what the block wrote takes their place, by renaming; nothing else in
     ``output`` is touched. When it fails, or is interrupted, ``output`` is as it was before. When
-    the process is killed amid the renaming, the next :func:`claimed` finishes it.
+    the process is killed amid the renaming, the next :func:`lock_output_folder` finishes it.
 
     Raises:
         InputError: ``output`` cannot be a folder or cannot be written.

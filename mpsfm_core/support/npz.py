@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_BYTES = 4_000_000_000
+MAX_BYTES = 4_000_000_000
 """Of the arrays of a file, or its own size where that is more: a small file can stand for any
 number of zeros (ours: 16 bytes for each of the most pixels that a photo may have)."""
 
@@ -37,8 +37,8 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         try:
             with zipfile.ZipFile(file) as archive:
                 size = sum(entry.file_size for entry in archive.infolist())
-            if size > max(MOST_BYTES, path.stat().st_size):
-                raise ValueError(f"unpacks to {size / 1e6:.0f} MB, {MOST_BYTES / 1e6:.0f} at most")
+            if size > max(MAX_BYTES, path.stat().st_size):
+                raise ValueError(f"unpacks to {size / 1e6:.0f} MB, {MAX_BYTES / 1e6:.0f} at most")
             file.seek(0)
             with np.load(file, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}

@@ -1,6 +1,6 @@
 """Number of threads of a run: its own worker threads and those of BLAS, OpenMP and OpenCV.
 
-A run sets the limit once with :func:`limited`, and thread pools read it with :func:`allowed`.
+A run sets the limit once with :func:`limit_threads`, and thread pools read it with :func:`thread_limit`.
 Providers get their number of threads from their context, because networks have thread pools of
 their own.
 """
@@ -26,7 +26,7 @@ Result = TypeVar("Result")
 _LIMIT: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
-def cores(groups: ControlGroups | None = None) -> int:
+def count_cores(groups: ControlGroups | None = None) -> int:
     """Return the number of processors that this process may use.
 
     Respects the CPU affinity and the CPU quota of containers. A fraction of a core counts as one.
@@ -42,22 +42,22 @@ def cores(groups: ControlGroups | None = None) -> int:
     return available if quota is None else max(1, min(available, math.ceil(quota)))
 
 
-def allowed() -> int:
+def thread_limit() -> int:
     """Return the number of threads that the caller may keep busy; without a limit, one per core."""
-    return _LIMIT.get() or cores()
+    return _LIMIT.get() or count_cores()
 
 
-def each(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Call a function on every item in :func:`allowed` threads; return the results in order."""
-    with ThreadPoolExecutor(allowed()) as pool:
+def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """Call a function on every item in :func:`thread_limit` threads; return the results in order."""
+    with ThreadPoolExecutor(thread_limit()) as pool:
         return list(pool.map(function, items))
 
 
 @contextmanager
-def limited(count: int | None) -> Iterator[None]:
+def limit_threads(count: int | None) -> Iterator[None]:
     """Limit the number of busy threads inside a ``with`` block.
 
-    The limit of :func:`allowed` applies to the calling thread, the limit of libraries to the whole
+    The limit of :func:`thread_limit` applies to the calling thread, the limit of libraries to the whole
     process. OpenCV gets one thread, because several worker threads call it at the same time.
 
     Args:
@@ -66,7 +66,7 @@ def limited(count: int | None) -> Iterator[None]:
     token, opencv = _LIMIT.set(count), cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        with threadpool_limits(allowed()):
+        with threadpool_limits(thread_limit()):
             yield
     finally:
         cv2.setNumThreads(opencv)

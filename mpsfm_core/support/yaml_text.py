@@ -83,7 +83,7 @@ def write_yaml(value: Any) -> str:
     return text
 
 
-def line_of(text: str, path: tuple[str | int, ...]) -> int | None:
+def find_line(text: str, path: tuple[str | int, ...]) -> int | None:
     """Line (from 1) where the entry at ``path`` begins in a YAML text, None when it is absent."""
     node = yaml.compose(text, Loader=_Loader)
     line = None

@@ -1,4 +1,4 @@
-"""The provider under test, and what a check can ask of it."""
+"""One provider under test: its setup, its instances and validated calls with synthetic examples."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary, WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core.data import DepthPrior, Features, GroupPrior, View
+from mpsfm_core.data import DepthPrior, Features, MultiViewPrior, View
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.providers import Capability, Kind, ProviderContext, ProviderSpec, validation
 from mpsfm_core.providers.provider_config import ProviderConfig
@@ -24,6 +24,7 @@ from mpsfm_core.testing.ground_truth_provider import GROUND_TRUTH_SPECS, GroundT
 from mpsfm_core.testing.outcome import CheckSkipped
 
 TruthSource = Literal["painted", "prepared", "image", "none"]
+"""Source from which a provider can derive the correct answer, see :class:`ContractSetup`."""
 
 _RUN: Mapping[Kind, Callable[..., Any]] = MappingProxyType(
     {
@@ -34,36 +35,35 @@ _RUN: Mapping[Kind, Callable[..., Any]] = MappingProxyType(
     }
 )
 
-GIVEN_RELATIVE_STD = 0.02
-"""Of the exact depth that a normals provider with ``needs-depth`` is given."""
+AUXILIARY_RELATIVE_STD = 0.02
+"""Relative std of the exact depth prior that a normals provider with ``needs-depth`` receives."""
 
 
 @dataclass(frozen=True)
 class ContractSetup:
-    """How a provider is put under test, and from where it can know the right answer.
+    """Setup of a provider for the contract: options, and the source of the correct answer.
 
-    ``options``: of the provider; without weights at hand, those of a stand-in network that the
-    function in ``ProviderSpec.contract`` writes into the folder it is given:
-    ``def contract(folder: Path) -> ContractSetup``.
+    A plugin returns it from the function that ``ProviderSpec.contract`` names:
+    ``def contract(folder: Path) -> ContractSetup``. ``folder`` is an empty temporary folder.
 
-    ``knows``, by default ``"image"`` for features, matchers and retrieval, else ``"none"``:
+    The values of ``truth_source``:
 
-    * ``"painted"``: a stand-in network reads depth and normals from the colours of the views
-      (:mod:`mpsfm_core.testing.painted_views`);
-    * ``"prepared"``: ``tell`` is called with every example before the provider is asked about it, for
-      instance to write files;
-    * ``"image"``: the provider sees what is in a textured view, with real weights or without any;
-    * ``"none"``: answers cannot be compared with the truth, and checks that would are skipped;
-      ``tell``, where it is given, writes what the provider reads beside the view.
-
-    ``expected_failures``: ids of checks that are known to fail, each with the reason; a check that
-    then passes is a failure.
+    * ``"painted"``: a stand-in network reads depth and normals from the colors of the views, see
+      :mod:`mpsfm_core.testing.painted_views`.
+    * ``"prepared"``: ``prepare`` writes the correct answer, for providers that read files.
+    * ``"image"``: the answer follows from a textured view; with or without real weights.
+    * ``"none"``: the correct answer is unknown, and checks that need it are skipped.
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
+    """Options of the provider. They usually name the weights of a stand-in network that the
+    contract function wrote to ``folder``."""
     truth_source: TruthSource | None = None
+    """None means ``"image"`` for features, matchers and retrieval, and ``"none"`` otherwise."""
     prepare: Callable[[Example], None] | None = None
+    """Called with each example before the provider runs on it, for instance to write a file."""
     expected_failures: Mapping[str, str] = field(default_factory=dict)
+    """Reason by id of the checks that are known to fail. Such a check fails if it passes."""
 
     def __post_init__(self) -> None:
         if self.truth_source == "prepared" and self.prepare is None:
@@ -74,11 +74,11 @@ class ContractSetup:
 
 
 class ContractCase:
-    """One provider under test.
+    """One provider under test, the argument of every check.
 
-    ``kind`` is that of its answers: a wrapper is tested once for each kind it wraps, around an
-    oracle of that kind (``behaves_as``). The provider and the views are made when they are first
-    needed, and kept. ``folder``: for the stand-ins of other providers that it works with.
+    ``kind`` is the kind of the answers. A wrapper is tested once for each kind that it wraps,
+    around a provider that knows the ground truth. The provider and the views are created on first
+    use and reused by later checks.
     """
 
     def __init__(
@@ -91,6 +91,16 @@ class ContractCase:
         behaves_as: Kind | None = None,
         device: str = "cpu",
     ) -> None:
+        """Create the case without creating the provider.
+
+        Args:
+            registry: Registry that contains the provider.
+            spec: Specification of the provider.
+            setup: Setup of the provider.
+            folder: Folder for stand-ins of other providers, such as a detector for a matcher.
+            behaves_as: Kind that a wrapper wraps; None for every other provider.
+            device: ``"cpu"`` or ``"cuda"``.
+        """
         self.registry = registry
         self.spec = spec
         self.kind: Kind = behaves_as or spec.kind
@@ -101,110 +111,128 @@ class ContractCase:
         self._provider: Any = None
         self._prepared: WeakSet[Example] = WeakSet()
         self._detector: Any = None
-        self._detected: WeakKeyDictionary[View, Features] = WeakKeyDictionary()
-        self._main: Example | None = None
+        self._features: WeakKeyDictionary[View, Features] = WeakKeyDictionary()
+        self._example: Example | None = None
 
     @property
     def truth_source(self) -> TruthSource:
-        """Where the provider can know the right answer from."""
+        """Source from which the provider can derive the correct answer."""
         if self._ground_truth is not None:
             return "prepared"
-        by_itself = self.kind in ("features", "matcher", "retrieval")
-        return self.setup.truth_source or ("image" if by_itself else "none")
+        from_image = self.kind in ("features", "matcher", "retrieval")
+        return self.setup.truth_source or ("image" if from_image else "none")
 
     def declares(self, capability: Capability) -> bool:
-        """Whether the provider declares a capability."""
+        """Return whether the specification declares a capability."""
         return capability in self.spec.capabilities
 
     def require_truth(self, *sources: TruthSource) -> None:
-        """Skip unless the provider knows the right answer from one of these sources."""
+        """Skip the check unless the correct answer comes from one of these sources.
+
+        Raises:
+            CheckSkipped: The source is another one, or there is none.
+        """
         if self.truth_source == "none":
             raise CheckSkipped(
-                "no known answer: the provider has no stand-in that reads painted views, is not "
-                "told the truth and is not said to see it (docs/contract.md)"
+                "the correct answer is unknown: declare a truth_source in the contract setup "
+                "(docs/contract.md)"
             )
         if self.truth_source not in sources:
-            raise CheckSkipped(f"says nothing about a provider whose truth is {self.truth_source}")
+            raise CheckSkipped(f"does not apply to truth_source={self.truth_source!r}")
 
     @property
     def example(self) -> Example:
-        """The example that most checks ask about."""
-        if self._main is None:
-            look: Appearance = (
-                "painted" if self.truth_source == "painted" or self._ground_truth else "textured"
-            )
+        """Example that most checks use: 192 x 144 pixels, painted or textured."""
+        if self._example is None:
+            is_painted = self.truth_source == "painted" or self._ground_truth is not None
+            appearance: Appearance = "painted" if is_painted else "textured"
             outdoor = self.kind in ("depth", "normals", "multiview", "mask")
-            self._main = outdoor_example(look) if outdoor else indoor_example(look)
-        return self._main
+            self._example = outdoor_example(appearance) if outdoor else indoor_example(appearance)
+        return self._example
 
-    def create_provider(self, **inner: Any) -> Any:
-        """A new instance of the provider; ``inner``: options of the oracle in a wrapper."""
+    def create_provider(self, **inner_options: Any) -> Any:
+        """Create a new instance of the provider.
+
+        Args:
+            inner_options: Options of the ground-truth provider inside a wrapper, see
+                :class:`~mpsfm_core.testing.ground_truth_provider.GroundTruthOptions`.
+        """
         if self._ground_truth is None:
             return self._create(self.registry, self.kind, self.spec.name, self.setup.options)
         registry = Registry()
-        oracle = GROUND_TRUTH_SPECS[self.kind]
-        registry.add(self.spec, replace(oracle, factory=self._ground_truth.factory(self.kind)))
+        inner = GROUND_TRUTH_SPECS[self.kind]
+        registry.add(self.spec, replace(inner, factory=self._ground_truth.factory(self.kind)))
         wrapper = ProviderConfig(use=self.spec.name, options=dict(self.setup.options))
-        return self._create(registry, self.kind, oracle.name, inner, (wrapper,))
+        return self._create(registry, self.kind, inner.name, inner_options, (wrapper,))
 
     @property
     def provider(self) -> Any:
-        """The instance that most checks ask."""
+        """Instance that the checks share."""
         if self._provider is None:
             self._provider = self.create_provider()
         return self._provider
 
     def run(self, example: Example, provider: Any = None) -> Any:
-        """The provider's answer, validated; a matcher and a multi-view network are asked for the
-        view and its partner."""
-        self.prepare(example, *([example.partner] if self.kind in ("matcher", "multiview") else []))
+        """Run the provider on an example and validate the answer.
+
+        Args:
+            example: The example. Matchers and multi-view providers also get ``example.partner``.
+            provider: Instance to use instead of the shared one.
+        """
+        uses_pair = self.kind in ("matcher", "multiview")
+        self.prepare(example, *([example.partner] if uses_pair else []))
         return self.run_on_view(example.view, example, provider)
 
     def run_on_view(
-        self, view: View, example: Example, provider: Any = None, extra: Any = None
+        self, view: View, example: Example, provider: Any = None, auxiliary: Any = None
     ) -> Any:
-        """The answer about a changed view of an example; everything else is the example's.
+        """Run the provider on a modified view of an example and validate the answer.
 
-        ``extra``: what is handed in besides the view, by default what :meth:`extra` makes.
+        Args:
+            view: View that replaces ``example.view``.
+            example: Example that supplies everything else.
+            provider: Instance to use instead of the shared one.
+            auxiliary: Depth or features for the provider, by default
+                :meth:`make_auxiliary_input`.
         """
         provider = self.provider if provider is None else provider
-        extra = self.make_auxiliary_input(view, example) if extra is None else extra
+        auxiliary = self.make_auxiliary_input(view, example) if auxiliary is None else auxiliary
         if self.kind == "matcher":
             views = (view, example.partner.view)
-            return validation.run_matcher(self._rules, provider, views, extra)
+            return validation.run_matcher(self._validated_spec, provider, views, auxiliary)
         if self.kind == "multiview":
             views = (view, example.partner.view)
-            return validation.run_multiview(self._rules, provider, views)
+            return validation.run_multiview(self._validated_spec, provider, views)
         if self.kind == "normals":
-            return validation.run_normals(self._rules, provider, view, extra)
+            return validation.run_normals(self._validated_spec, provider, view, auxiliary)
         run: Callable[[ProviderSpec, Any, View], Any] = _RUN[self.kind]
-        return run(self._rules, provider, view)
+        return run(self._validated_spec, provider, view)
 
     def make_auxiliary_input(self, view: View, example: Example) -> Any:
-        """Depth for normals providers that need it, features for sparse matchers, else None."""
+        """Return depth for a normals provider, features for a sparse matcher, else None."""
         if self.kind == "matcher":
-            return self.features_of(view, example.partner.view)
+            return self.extract_features(view, example.partner.view)
         if self.kind != "normals" or not (self.declares("needs-depth") or self._ground_truth):
             return None
         truth = example.truth()
-        variance = (GIVEN_RELATIVE_STD * truth.depth) ** 2
+        variance = (AUXILIARY_RELATIVE_STD * truth.depth) ** 2
         return DepthPrior.from_arrays(truth.depth, variance, truth.valid)
 
     def run_on_pair(self, a: Example, b: Example) -> Any:
-        """A matcher's answer about two examples."""
+        """Match two examples and validate the answer."""
         self.prepare(a, b)
         views = (a.view, b.view)
-        features = self.features_of(*views)
-        return validation.run_matcher(self._rules, self.provider, views, features)
+        features = self.extract_features(*views)
+        return validation.run_matcher(self._validated_spec, self.provider, views, features)
 
-    def run_on_group(self, *examples: Example) -> GroupPrior:
-        """A multi-view network's answer about several examples."""
+    def run_on_group(self, *examples: Example) -> MultiViewPrior:
+        """Run a multi-view provider on several examples and validate the answer."""
         self.prepare(*examples)
         views = [example.view for example in examples]
-        return validation.run_multiview(self._rules, self.provider, views)
+        return validation.run_multiview(self._validated_spec, self.provider, views)
 
     def prepare(self, *examples: Example) -> None:
-        """Let the provider know the truth, if that is where it knows it from."""
+        """Give the setup and the ground truth access to examples; each example only once."""
         for example in examples:
             if example in self._prepared:
                 continue
@@ -214,18 +242,18 @@ class ContractCase:
             if self.setup.prepare is not None:
                 self.setup.prepare(example)
 
-    def features_of(self, *views: View) -> Any:
-        """Features for a sparse matcher, from the first detector of its family; else None."""
+    def extract_features(self, *views: View) -> Any:
+        """Return features for a sparse matcher from a detector of its family, else None."""
         if not self.declares("sparse"):
             return None
         return tuple(self._detect(view) for view in views)
 
     def received_depth(self) -> list[DepthPrior | None]:
-        """The depth that a wrapper handed to the normals provider inside, at each question."""
-        return [] if self._ground_truth is None else self._ground_truth.given_depth
+        """Return the depth that a wrapper passed to its normals provider, one entry per call."""
+        return [] if self._ground_truth is None else self._ground_truth.received_depth
 
     def calibration(self) -> Any:
-        """The uncertainty model that a run would apply to the provider's answers."""
+        """Return the uncertainty model that a run would apply to the answers."""
         options = dict(self.setup.options)
         if self._ground_truth is None:
             return self.registry.calibration(
@@ -238,36 +266,39 @@ class ContractCase:
         return registry.calibration(self.kind, inner)
 
     @property
-    def _rules(self) -> ProviderSpec:
-        """The specification that answers are validated against. A wrapper promises nothing of
-        its own (what it has to keep is checked by name), and is given depth to hand on."""
+    def _validated_spec(self) -> ProviderSpec:
+        """Specification for the validator.
+
+        Wrappers promise no capability of the inner provider; separate checks cover these.
+        """
         if self._ground_truth is None:
             return self.spec
         return replace(self.spec, capabilities=frozenset({"needs-depth"}))
 
     def _detect(self, view: View) -> Features:
-        if view not in self._detected:
-            spec = self._detector_spec()
+        if view not in self._features:
+            spec = self._choose_detector()
             if self._detector is None:
                 options = load_setup(spec, self._folder).options
                 self._detector = self._create(self.registry, "features", spec.name, options)
-            self._detected[view] = validation.run_features(spec, self._detector, view)
-        return self._detected[view]
+            self._features[view] = validation.run_features(spec, self._detector, view)
+        return self._features[view]
 
-    def _detector_spec(self) -> ProviderSpec:
-        """Of the matcher's family, if it has one, and then of its own plugin rather; else SIFT."""
+    def _choose_detector(self) -> ProviderSpec:
+        """Prefer a detector of the matcher's family and plugin; without a family use SIFT."""
         family = set(self.spec.tags)
-        home = self.registry.version(self.spec.kind, self.spec.name)
+        plugin = self.registry.version(self.spec.kind, self.spec.name)
 
-        def less_fitting(name: str) -> bool:
-            return self.registry.version("features", name) != home if family else name != "sift"
+        def is_second_choice(name: str) -> bool:
+            version = self.registry.version("features", name)
+            return version != plugin if family else name != "sift"
 
-        for name in sorted(self.registry.names("features"), key=less_fitting):
+        for name in sorted(self.registry.names("features"), key=is_second_choice):
             spec = self.registry.spec("features", name)
             if not family or family & set(spec.tags):
                 return spec
-        wanted = ", ".join(sorted(family)) or "any"
-        raise ProviderError(f"no features provider of the family {wanted} is installed")
+        families = ", ".join(sorted(family)) or "any"
+        raise ProviderError(f"no features provider of the family {families} is installed")
 
     def _create(
         self,
@@ -282,9 +313,17 @@ class ContractCase:
 
 
 def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:
-    """The setup that the plugin gives for the contract kit, or one of defaults.
+    """Return the setup that a plugin declares for its provider, or the default setup.
 
-    Raises :class:`~mpsfm_core.data.errors.ProviderError` when there is one and it cannot be made.
+    Args:
+        spec: Specification of the provider.
+        folder: Folder for the files of stand-ins.
+
+    Returns:
+        The setup.
+
+    Raises:
+        ProviderError: The contract function fails or returns something else.
     """
     if spec.contract is None:
         return ContractSetup()
@@ -297,11 +336,10 @@ def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:
     except Exception as error:
         text = f"{spec.kind} provider {spec.name!r}: its contract {spec.contract!r} fails"
         raise ProviderError(f"{text}: {type(error).__name__}: {error}") from error
-    if isinstance(setup, Mapping) and {part.name for part in fields(ContractSetup)}.issuperset(
-        setup
-    ):
-        # from another environment
-        setup = ContractSetup(**setup)
+    if isinstance(setup, Mapping):
+        # A provider of another environment sends the fields of its setup as a mapping.
+        names = {part.name for part in fields(ContractSetup)}
+        setup = ContractSetup(**setup) if names.issuperset(setup) else setup
     if not isinstance(setup, ContractSetup):
         raise ProviderError(
             f"{spec.contract!r} returns a {type(setup).__name__}, not a ContractSetup"
@@ -309,30 +347,29 @@ def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:
     return setup
 
 
-def depth_in(answer: Any) -> DepthPrior:
-    """The depth of the view that was asked about; in a group's answer the first."""
-    prior: DepthPrior = answer.depth[0] if isinstance(answer, GroupPrior) else answer
+def first_depth(answer: Any) -> DepthPrior:
+    """Return the depth prior of an answer; the one of the first view if it is a group."""
+    prior: DepthPrior = answer.depth[0] if isinstance(answer, MultiViewPrior) else answer
     return prior
 
 
 def collect_arrays(answer: object, name: str = "answer") -> dict[str, NDArray[Any]]:
-    """All arrays and numbers in an answer by their path, to compare answers."""
+    """Collect all arrays and numbers of an answer by their path, such as ``answer.depth``."""
     if isinstance(answer, np.ndarray):
         return {name: answer}
     if is_dataclass(answer) and not isinstance(answer, type):
-        found: dict[str, NDArray[Any]] = {}
+        arrays: dict[str, NDArray[Any]] = {}
         for part in fields(answer):
-            found |= collect_arrays(getattr(answer, part.name), f"{name}.{part.name}")
-        return found
+            arrays |= collect_arrays(getattr(answer, part.name), f"{name}.{part.name}")
+        return arrays
     if isinstance(answer, tuple):
-        return {
-            k: v for i, a in enumerate(answer) for k, v in collect_arrays(a, f"{name}[{i}]").items()
-        }
+        entries = enumerate(answer)
+        return {k: v for i, a in entries for k, v in collect_arrays(a, f"{name}[{i}]").items()}
     return {} if answer is None else {name: np.asarray(answer)}
 
 
 def describe_difference(first: object, second: object) -> str:
-    """Where two answers differ, or an empty text."""
+    """Describe the first difference between two answers, or return an empty text."""
     a, b = collect_arrays(first), collect_arrays(second)
     if a.keys() != b.keys():
         return f"one has {sorted(a)}, the other {sorted(b)}"

@@ -19,7 +19,7 @@ from mpsfm_core.pipeline.provider_resolution import resolve_providers
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
-from mpsfm_core.support.threads import limited
+from mpsfm_core.support.threads import limit_threads
 
 pytest.importorskip("mpsfm_onnx")
 pytest.importorskip("mpsfm_kornia")
@@ -102,7 +102,7 @@ def test_so_do_the_points_of_a_model_by_colmap(
     images = load_images(photos.folder, photos.intrinsics, photos.image_list, config.inputs)
     problem = extract(images, config, registry, Stages(registry)).problem
     write_database(problem, tmp_path / "database.db")
-    with limited(1):  # the same model every time
+    with limit_threads(1):  # the same model every time
         models = PEERS["colmap"](tmp_path / "database.db", tmp_path)
     largest = max(models, key=lambda number: models[number].num_reg_images())
     found = calibrate(photos, room.config, model=tmp_path / str(largest))

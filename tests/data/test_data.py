@@ -18,9 +18,9 @@ def test_sparse_matches_from_arrays_converts_dtypes_and_clips_scores() -> None:
     assert found.scores.dtype == np.float32 and found.scores.tolist() == [1.0, 0.0]
 
 
-def test_best_first_keeps_highest_score_per_feature() -> None:
+def test_from_best_scores_keeps_highest_score_per_feature() -> None:
     indices = np.array([[0, 5], [1, 5], [1, 6], [2, 7], [3, 6]])
-    found = SparseMatches.best_first(indices, np.array([0.2, 0.9, 0.8, 0.3, 0.5]))
+    found = SparseMatches.from_best_scores(indices, np.array([0.2, 0.9, 0.8, 0.3, 0.5]))
     # (1, 6) loses to (1, 5), so feature 6 stays available for (3, 6)
     assert found.indices.tolist() == [[1, 5], [3, 6], [2, 7]]
     np.testing.assert_allclose(found.scores, [0.9, 0.5, 0.3])

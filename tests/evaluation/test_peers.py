@@ -9,7 +9,7 @@ import pytest
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.evaluation import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.peers import PEERS, run_peer, write_database
-from mpsfm_core.support.threads import limited
+from mpsfm_core.support.threads import limit_threads
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -48,7 +48,7 @@ def test_the_database_holds_the_problem(problem: MappingProblem, tmp_path) -> No
 
 @pytest.mark.parametrize("name", PEERS)
 def test_every_peer_reconstructs_an_easy_scene(name: str, problem: MappingProblem) -> None:
-    with limited(1):  # the same model every time
+    with limit_threads(1):  # the same model every time
         (estimated,) = run_peer(name, problem)
     truth = {f"view_{i}.png": (pose[:, :3], pose[:, 3]) for i, pose in enumerate(POSES)}
     errors = pose_errors_deg(estimated, truth, CONVENTIONS["paper"])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mpsfm_core import DepthPrior, GroupPrior, View
+from mpsfm_core import DepthPrior, MultiViewPrior, View
 from mpsfm_core.data import DataError
 from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.extraction.cache import Cache, pack, unpack
@@ -46,21 +46,21 @@ def test_groups_in_turn() -> None:
 
 def test_the_cache_keeps_a_group(tmp_path: Path) -> None:
     depth = tuple(DepthPrior.from_arrays(np.full((2, 3), 1.0 + i)) for i in range(11))
-    group = GroupPrior(depth, np.tile(np.eye(3, 4), (11, 1, 1)))
+    group = MultiViewPrior(depth, np.tile(np.eye(3, 4), (11, 1, 1)))
     cache = Cache(tmp_path)
     cache.store("multiview", "ab", group)
-    found = cache.load("multiview", "ab", GroupPrior)
+    found = cache.load("multiview", "ab", MultiViewPrior)
     assert found is not None and found.intrinsics is None
     assert [float(prior.depth[0, 0]) for prior in found.depth] == [1.0 + i for i in range(11)]
-    assert unpack(GroupPrior, pack(GroupPrior(()))).depth == ()
+    assert unpack(MultiViewPrior, pack(MultiViewPrior(()))).depth == ()
 
 
 def test_a_group_checks_itself() -> None:
     depth = (DepthPrior.from_arrays(np.ones((2, 2))),)
     with pytest.raises(DataError, match=r"poses: must have shape \(1, 3, 4\)"):
-        GroupPrior(depth, np.zeros((2, 3, 4)))
+        MultiViewPrior(depth, np.zeros((2, 3, 4)))
     with pytest.raises(DataError, match="positive focal lengths"):
-        GroupPrior(depth, intrinsics=np.zeros((1, 4)))
+        MultiViewPrior(depth, intrinsics=np.zeros((1, 4)))
 
 
 @pytest.fixture
@@ -69,13 +69,13 @@ def shown(world: World) -> list[list[str]]:
     asked: list[list[str]] = []
 
     class TrueGroup:
-        def predict_group(self, views: Sequence[View]) -> GroupPrior:
+        def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
             asked.append([view.name for view in views])
             depth = [world.truth.renderings[view.name].depth * 2 for view in views]
             poses = np.array([world.poses[view.name] for view in views])
             poses[:, :, 3] *= 2
             maps = tuple(DepthPrior.from_arrays(d, (0.05 * d) ** 2, metric=False) for d in depth)
-            return GroupPrior(maps, poses)
+            return MultiViewPrior(maps, poses)
 
     world.registry.add(
         ProviderSpec(
@@ -138,7 +138,7 @@ def test_a_provider_that_fails_leaves_depth_unknown(
 ) -> None:
     def fail(options: object, context: object) -> object:
         class Failing:
-            def predict_group(self, views: Sequence[View]) -> GroupPrior:
+            def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
                 raise RuntimeError("CUDA error")
 
         return Failing()

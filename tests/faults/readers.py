@@ -37,7 +37,7 @@ from mpsfm_core.report.page import write_report
 from mpsfm_core.report.viewing import read_scene as read_view
 from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.exports.formats import export
-from mpsfm_core.support.files import claimed
+from mpsfm_core.support.files import lock_output_folder
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "0.1.0"
 _PHOTOS = ("0.png", "1.png")
@@ -146,7 +146,7 @@ def results() -> Table:
         TimeLeft(folder / "cache")
 
     def exchanged(folder: Path) -> None:
-        with claimed(folder / "exchange"):
+        with lock_output_folder(folder / "exchange"):
             pass
 
     def described(folder: Path) -> None:

@@ -47,7 +47,7 @@ from mpsfm_core.providers.registry import Registry, core_version
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 from mpsfm_core.providers.uncertainty.calibration_file import CalibrationFile, Provenance
 from mpsfm_core.providers.weights import WeightStore
-from mpsfm_core.support.files import replacing
+from mpsfm_core.support.files import replace_entries
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 from tests.support.file_server import serving
 
@@ -187,7 +187,7 @@ def write_others(output: Path) -> None:
     child = os.fork()
     if child == 0:
         Path.rename = lambda *_: os.kill(os.getpid(), signal.SIGKILL)  # type: ignore[method-assign]
-        with replacing(exchange, ("old.txt",)) as fresh:
+        with replace_entries(exchange, ("old.txt",)) as fresh:
             (exchange / "old.txt").write_text("old")
             (fresh / "new.txt").write_text("new")
     os.waitpid(child, 0)

@@ -20,7 +20,7 @@ from mpsfm_core.data import (
     Features,
     Float32,
     Float64,
-    GroupPrior,
+    MultiViewPrior,
     NormalPrior,
     PairDepth,
     PairMatches,
@@ -164,10 +164,10 @@ class ToldGroup:
     def __init__(self, options: ToldOptions, context: ProviderContext) -> None:
         self.options = options
 
-    def predict_group(self, views: Sequence[View]) -> GroupPrior:
+    def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
         """The truth; a plane one metre before the origin for views it was not told of."""
         depth, poses, intrinsics = zip(*(self.recall(view) for view in views), strict=True)
-        return GroupPrior(
+        return MultiViewPrior(
             tuple(depth_prior(values) for values in depth), np.array(poses), np.array(intrinsics)
         )
 

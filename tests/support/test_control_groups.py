@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mpsfm_core.support.control_groups import ControlGroups, MemoryLimit
-from mpsfm_core.support.threads import cores
+from mpsfm_core.support.threads import count_cores
 
 
 def make_groups(root: Path, membership: str, files: dict[str, str]) -> ControlGroups:
@@ -49,13 +49,13 @@ def test_cpu_quota_of_version_1_is_read_from_its_controller(tmp_path: Path) -> N
 
 def test_cores_with_quota_of_half_a_core_is_one(tmp_path: Path) -> None:
     groups = make_groups(tmp_path, "0::/\n", {"cpu.max": "50000 100000\n"})
-    assert cores(groups) == 1
+    assert count_cores(groups) == 1
 
 
 def test_cores_with_large_quota_is_number_of_available_processors(tmp_path: Path) -> None:
     groups = make_groups(tmp_path, "0::/\n", {"cpu.max": "99900000 100000\n"})
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    assert cores(groups) == available
+    assert count_cores(groups) == available
 
 
 def test_memory_limit_counts_file_cache_as_free(tmp_path: Path) -> None:

@@ -15,7 +15,12 @@ import pytest
 
 import mpsfm_core
 from mpsfm_core.data.errors import InputError, OutputError
-from mpsfm_core.support.files import claimed, remove_unfinished, replacing, write_file
+from mpsfm_core.support.files import (
+    lock_output_folder,
+    remove_temporary_files,
+    replace_entries,
+    write_file,
+)
 
 ENTRIES = ("sparse", "points.ply", "summary.json")
 
@@ -40,7 +45,7 @@ def content(folder: Path) -> dict[str, str]:
 
 
 def test_success_replaces_ours_and_leaves_the_rest(output: Path) -> None:
-    with replacing(output, ENTRIES) as fresh:
+    with replace_entries(output, ENTRIES) as fresh:
         (fresh / "points.ply").write_text("new points")
         (fresh / "summary.json").write_text("new summary")
         assert content(output)["summary.json"] == "old summary"
@@ -54,7 +59,7 @@ def test_success_replaces_ours_and_leaves_the_rest(output: Path) -> None:
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
 def test_failure_and_interruption_change_nothing(output: Path, error: type) -> None:
     before = content(output)
-    with pytest.raises(error), replacing(output, ENTRIES) as fresh:
+    with pytest.raises(error), replace_entries(output, ENTRIES) as fresh:
         (fresh / "points.ply").write_text("half of the points")
         raise error
     assert content(output) == before
@@ -70,7 +75,7 @@ def test_a_failure_while_swapping_is_undone(output: Path, monkeypatch) -> None:
         return rename(self, target)
 
     monkeypatch.setattr(Path, "rename", fails_on_points)
-    with pytest.raises(OutputError, match="broken disk"), replacing(output, ENTRIES) as fresh:
+    with pytest.raises(OutputError, match="broken disk"), replace_entries(output, ENTRIES) as fresh:
         (fresh / "a_first.txt").write_text("renamed before it fails")
         (fresh / "points.ply").write_text("new points")
     assert content(output) == before
@@ -83,7 +88,7 @@ def test_a_full_disk_is_one_clear_error(output: Path) -> None:
     try:
         with (
             pytest.raises(OutputError, match=r"out: the disk is full .*earlier results"),
-            replacing(output, ENTRIES) as fresh,
+            replace_entries(output, ENTRIES) as fresh,
         ):
             (fresh / "points.ply").write_bytes(bytes(1 << 20))
     finally:
@@ -92,7 +97,7 @@ def test_a_full_disk_is_one_clear_error(output: Path) -> None:
 
 
 def test_a_new_folder_that_fails_is_gone_again(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), replacing(tmp_path / "a" / "b", ENTRIES) as fresh:
+    with pytest.raises(RuntimeError), replace_entries(tmp_path / "a" / "b", ENTRIES) as fresh:
         (fresh / "points.ply").write_text("x")
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
@@ -100,10 +105,10 @@ def test_a_new_folder_that_fails_is_gone_again(tmp_path: Path) -> None:
 
 def test_checking_leaves_nothing_behind(tmp_path: Path, output: Path) -> None:
     before = content(output)
-    with claimed(output):
+    with lock_output_folder(output):
         pass
     assert content(output) == before
-    with claimed(tmp_path / "new" / "below"):
+    with lock_output_folder(tmp_path / "new" / "below"):
         assert (tmp_path / "new" / "below").is_dir()
     assert not (tmp_path / "new").exists()
 
@@ -111,14 +116,14 @@ def test_checking_leaves_nothing_behind(tmp_path: Path, output: Path) -> None:
 def test_a_file_in_the_way_is_wrong_input(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(InputError, match="cannot be the output folder"), claimed(folder):
+        with pytest.raises(InputError, match="cannot be the output folder"), lock_output_folder(folder):
             pass
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_folder_without_permission_is_wrong_input(output: Path) -> None:
     output.chmod(0o500)
-    with pytest.raises(InputError, match="cannot be written"), claimed(output):
+    with pytest.raises(InputError, match="cannot be written"), lock_output_folder(output):
         pass
 
 
@@ -138,7 +143,7 @@ def killed_while(output: Path, step: int) -> bool:
         return rename(self, target)
 
     Path.rename = counted  # type: ignore[method-assign]
-    with replacing(output, ENTRIES) as fresh:
+    with replace_entries(output, ENTRIES) as fresh:
         (fresh / "sparse").mkdir()
         (fresh / "sparse" / "images.bin").write_text("new model")
         (fresh / "points.ply").write_text("new points")
@@ -152,7 +157,7 @@ def test_what_a_killed_run_was_about_to_do_is_finished(output: Path) -> None:
         if not killed_while(output, step):
             break
         assert list(output.glob(".mpsfm-*"))
-        with claimed(output):
+        with lock_output_folder(output):
             pass
         assert content(output) != before
         assert content(output) == {
@@ -171,17 +176,17 @@ def test_scratch_of_a_killed_run_is_taken_away(output: Path) -> None:
     before = content(output)
     (output / ".mpsfm-dead" / "new" / "depth").mkdir(parents=True)
     (output / ".mpsfm-dead" / "new" / "depth" / "a.npz").write_text("half")
-    with claimed(output):
+    with lock_output_folder(output):
         assert content(output) == before
     assert not list(output.glob(".mpsfm-*"))
 
 
 def test_only_one_run_has_a_folder(output: Path) -> None:
-    with claimed(output):
-        with pytest.raises(InputError, match="another run is writing"), claimed(output):
+    with lock_output_folder(output):
+        with pytest.raises(InputError, match="another run is writing"), lock_output_folder(output):
             pass
         assert (output / "notes.txt").exists()
-    with claimed(output):
+    with lock_output_folder(output):
         pass
 
 
@@ -210,7 +215,7 @@ def test_unfinished_files_of_the_dead_are_taken_away(tmp_path: Path) -> None:
         os.utime(path, (0, 0))
     with alive.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        remove_unfinished(tmp_path)
+        remove_temporary_files(tmp_path)
     assert {*tmp_path.iterdir()} == {young, alive}
 
 

@@ -20,7 +20,7 @@ from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.providers import ProviderContext
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.support.threads import allowed, cores, each, limited
+from mpsfm_core.support.threads import count_cores, limit_threads, parallel_map, thread_limit
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
@@ -113,13 +113,13 @@ def test_the_limit_is_that_of_all_libraries_and_goes_again() -> None:
         return {pool["num_threads"] for pool in threadpool_info()}
 
     before = pools(), cv2.getNumThreads()
-    with limited(1):
-        assert (allowed(), cv2.getNumThreads(), pools()) == (1, 1, {1})
-        with limited(3):
-            assert allowed() == 3
-        assert allowed() == 1
+    with limit_threads(1):
+        assert (thread_limit(), cv2.getNumThreads(), pools()) == (1, 1, {1})
+        with limit_threads(3):
+            assert thread_limit() == 3
+        assert thread_limit() == 1
     assert (pools(), cv2.getNumThreads()) == before
-    assert allowed() == cores()
+    assert thread_limit() == count_cores()
 
 
 def test_each_gives_results_in_order_from_as_many_threads_as_are_allowed() -> None:
@@ -129,12 +129,12 @@ def test_each_gives_results_in_order_from_as_many_threads_as_are_allowed() -> No
         together.wait()  # passes only when both are at work
         return number / 2, threading.get_ident()
 
-    with limited(2):
-        found = each(halved, range(4))
+    with limit_threads(2):
+        found = parallel_map(halved, range(4))
     assert [half for half, _ in found] == [0, 0.5, 1, 1.5]
     assert len({thread for _, thread in found} - {threading.get_ident()}) == 2
     with pytest.raises(ZeroDivisionError):
-        each(lambda number: 1 / number, [1, 0, 2])
+        parallel_map(lambda number: 1 / number, [1, 0, 2])
 
 
 def test_torch_computes_with_the_threads_of_the_context_in_every_thread() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mpsfm_core.support.files import claimed
+from mpsfm_core.support.files import lock_output_folder
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def test_results_among_the_photos(photo_scene, mpsfm) -> None:
 
 
 def test_a_folder_that_another_run_has(photo_scene, mpsfm, output: Path) -> None:
-    with claimed(output):
+    with lock_output_folder(output):
         check(mpsfm(*photo_scene.arguments, "--output", output), 2, "another run is writing")
 
 

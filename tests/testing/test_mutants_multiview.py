@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mpsfm_core import DepthPrior, GroupPrior, View
+from mpsfm_core import DepthPrior, MultiViewPrior, View
 from mpsfm_core.geometry import invert, pixel_centers, rays
 from mpsfm_core.testing import ContractSetup
 from mpsfm_core.testing.checks.depth import OF_MAPS
@@ -32,10 +32,10 @@ def told(folder: Path) -> ContractSetup:
 class Changed(ToldGroup):
     """The truth, changed in one way."""
 
-    def predict_group(self, views: Sequence[View]) -> GroupPrior:
+    def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
         return self.change(super().predict_group(views), views)
 
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         raise NotImplementedError
 
 
@@ -44,7 +44,7 @@ def scaled(prior: DepthPrior, factor: Any) -> DepthPrior:
 
 
 class RayLength(Changed):
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         lengths = [
             np.linalg.norm(rays(v.camera, pixel_centers(*v.camera.size)), axis=-1) for v in views
         ]
@@ -52,20 +52,20 @@ class RayLength(Changed):
 
 
 class Std(Changed):
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         depth = tuple(replace(p, variance=np.sqrt(p.variance)) for p in group.depth)
         return replace(group, depth=depth)
 
 
 class LastFirst(Changed):
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         return replace(group, depth=group.depth[::-1])
 
 
 class EachItsOwn(Changed):
     """Normalises each map by itself."""
 
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         means = [3 / max(float(np.median(p.depth[p.valid])), 1e-6) for p in group.depth]
         growing = [mean * 1.1**i for i, mean in enumerate(means)]
         return replace(group, depth=tuple(map(scaled, group.depth, growing)))
@@ -74,7 +74,7 @@ class EachItsOwn(Changed):
 class AlongTheFirst(Changed):
     """Hands on the z of point maps, which are in the frame of the first view."""
 
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         first, depth = group.poses[0], []
         for prior, pose, view in zip(group.depth, group.poses, views, strict=True):
             rotation, translation = invert(pose[:, :3], pose[:, 3])
@@ -85,7 +85,7 @@ class AlongTheFirst(Changed):
 
 
 class GroupFromCamera(Changed):
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         poses = [np.column_stack(invert(p[:, :3], p[:, 3])) for p in group.poses]
         return replace(group, poses=np.array(poses))
 
@@ -93,12 +93,12 @@ class GroupFromCamera(Changed):
 class OpenGL(Changed):
     """Cameras that look along -z with y up."""
 
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         return replace(group, poses=np.diag([1.0, -1.0, -1.0]) @ group.poses)
 
 
 class CentersForTranslations(Changed):
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         poses = group.poses.copy()
         poses[:, :, 3] = [invert(p[:, :3], p[:, 3])[1] for p in poses]
         return replace(group, poses=poses)
@@ -107,14 +107,14 @@ class CentersForTranslations(Changed):
 class UnitSteps(Changed):
     """Poses normalised by themselves, depth left in metres."""
 
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         return replace(group, poses=group.poses * (1, 1, 1, 5))
 
 
 class OwnGrid(Changed):
     """The focal length on the network's grid of 518 pixels."""
 
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         widths = np.array([[view.camera.width] for view in views])
         return replace(group, intrinsics=group.intrinsics * 518 / widths)
 
@@ -122,12 +122,12 @@ class OwnGrid(Changed):
 class RowsFirst(Changed):
     """The principal point as row and column."""
 
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         return replace(group, intrinsics=group.intrinsics[:, [0, 1, 3, 2]])
 
 
 class NeedsTwo(Changed):
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         if len(views) < 2:
             raise IndexError("index 1 is out of bounds for dimension 1 with size 1")
         return group
@@ -136,7 +136,7 @@ class NeedsTwo(Changed):
 class OneSize(Changed):
     """Stacks the images."""
 
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         np.stack([view.image for view in views])
         return group
 
@@ -144,7 +144,7 @@ class OneSize(Changed):
 class CropsToTheSmallest(Changed):
     """As the authors' own loaders do: the borders of larger views are lost."""
 
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         rows = min(view.camera.height for view in views)
         columns = min(view.camera.width for view in views)
         depth = []
@@ -157,29 +157,29 @@ class CropsToTheSmallest(Changed):
 
 
 class Fewer(Changed):
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
-        return GroupPrior(group.depth[1:])
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
+        return MultiViewPrior(group.depth[1:])
 
 
 class NoPoses(Changed):
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         return replace(group, poses=None)
 
 
 class Sheared(Changed):
     """A matrix as a network gives it, which nobody made a rotation."""
 
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         return replace(group, poses=1.1 * group.poses)
 
 
 class Mirrored(Changed):
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         return replace(group, poses=np.diag([-1.0, 1.0, 1.0]) @ group.poses)
 
 
 class SomeInMetres(Changed):
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         first, *others = group.depth
         return replace(group, depth=(replace(first, metric=False), *others))
 
@@ -189,7 +189,7 @@ class Chains(Changed):
 
     seen = 0
 
-    def change(self, group: GroupPrior, views: Sequence[View]) -> GroupPrior:
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         self.seen += 1
         return replace(group, poses=group.poses + np.array([0, 0, 0, self.seen]))
 

@@ -34,7 +34,7 @@ def snap_to_keypoints(
     distance_b, row_b = _nearest(keypoints_b, dense.points_b)
     near = (distance_a <= radius_px) & (distance_b <= radius_px)
     rows = np.stack([row_a[near], row_b[near]], axis=1)
-    return SparseMatches.best_first(rows, dense.scores[near])
+    return SparseMatches.from_best_scores(rows, dense.scores[near])
 
 
 def sample_dense_matches(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.data import DepthPrior, Float64, GroupPrior, Int64, Pose
+from mpsfm_core.data import DepthPrior, Float64, Int64, MultiViewPrior, Pose
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.empty_results import EMPTY_RESULTS
 from mpsfm_core.extraction.pairs.pairing import Pair
@@ -71,16 +71,16 @@ class GroupPriors:
         shown = [group for group, _ in self.groups]
         self._poses = self._context.each("multiview", shown, self._see, self.provider)
 
-    def predict(self, group: Group) -> GroupPrior:
+    def predict(self, group: Group) -> MultiViewPrior:
         """What the network says of a group."""
         context, provider = self._context, self.provider
 
-        def compute(instance: Any) -> GroupPrior:
+        def compute(instance: Any) -> MultiViewPrior:
             views = [context.view(index) for index in group]
             return validation.run_multiview(provider.spec, instance, views)
 
         inputs = [context.view_inputs(index, provider) for index in group]
-        return context.result(provider, GroupPrior, inputs, compute, group)
+        return context.result(provider, MultiViewPrior, inputs, compute, group)
 
     def depth(self, image: int) -> DepthPrior:
         """Depth of an image, of the group that it belongs to."""

@@ -29,7 +29,7 @@ from mpsfm_core.optimize.subsampling import (
     subsample_pixels,
     subsample_prior,
 )
-from mpsfm_core.support.threads import each
+from mpsfm_core.support.threads import parallel_map
 
 LOCAL_MAX_TRACK_LENGTH = 15
 """Longer tracks stay fixed in local bundle adjustment (COLMAP, reference)."""
@@ -59,7 +59,7 @@ class Refiner:
         self._shares_scale: Bool = np.bincount(groups, minlength=1)[groups] > 1
         self.noise = DepthNoise()
         self.loss_scale = options.refinement.bundle.reprojection_scale
-        self.clean_matches = False
+        self.adapts_reprojection_loss = False
         self._assumed = DepthNoise()
         self._integrators: dict[int, DepthIntegrator] = {}
 
@@ -101,7 +101,7 @@ class Refiner:
         if len(log_scales):
             depth_map.set_scale(float(np.exp(np.median(log_scales))))
 
-    def scale_together(self, images: list[int]) -> None:
+    def estimate_scales(self, images: list[int]) -> None:
         """Scale the priors of posed images to their triangulated points.
 
         An image that sees none takes the median scale of the others.
@@ -113,7 +113,7 @@ class Refiner:
             if scales and not self.scene.maps[image].active:
                 self.scene.maps[image].set_scale(float(np.median(scales)))
 
-    def rescale_groups(self) -> None:
+    def estimate_shared_scales(self) -> None:
         """Estimate scales that several images share anew, from points that rays determine.
 
         Those of single images are unknowns of bundle adjustment.
@@ -149,7 +149,7 @@ class Refiner:
             return
         images = [image for image in images if self.scene.maps[image].active]
         covariances = self._covariances(images)
-        each(lambda image: self._integrate(image, *covariances), images)
+        parallel_map(lambda image: self._integrate(image, *covariances), images)
 
     def adjust(
         self,
@@ -256,7 +256,7 @@ class Refiner:
         if self.focal_is_stable():
             self.adjust(images, focal=True)
         for _ in range(options.global_iterations):
-            self.rescale_groups()
+            self.estimate_shared_scales()
             self._measure_keypoint_noise()
             self._measure_noise()
             if self._alternates:
@@ -268,16 +268,16 @@ class Refiner:
                 break
         self.integrate(images)
 
-    def forget(self, image: int) -> None:
+    def discard_integrator(self, image: int) -> None:
         """Drop what is remembered of an image that left the scene."""
         self._integrators.pop(image, None)
 
-    def forget_all(self) -> None:
+    def reset(self) -> None:
         """Drop what is remembered of the scene, which starts anew."""
         self._integrators.clear()
         self.noise = self._assumed = DepthNoise()
         self.loss_scale = self.options.bundle.reprojection_scale
-        self.clean_matches = False
+        self.adapts_reprojection_loss = False
 
     def _integrate(self, image: int, covariances: Float64, angles: Float64) -> None:
         scene, tracks = self.scene, self.scene.tracks
@@ -327,7 +327,7 @@ class Refiner:
     def _measure_keypoint_noise(self) -> None:
         """Let the reprojection loss suit the keypoints, whose tails Cauchy's loss knows."""
         bundle = self.options.bundle
-        measure = self.options.measure_keypoint_noise and self.clean_matches
+        measure = self.options.measure_keypoint_noise and self.adapts_reprojection_loss
         if measure and bundle.reprojection_loss == Loss.CAUCHY:
             self.loss_scale = measure_loss_scale(self.scene, bundle.reprojection_scale)
 

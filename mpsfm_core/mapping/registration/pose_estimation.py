@@ -1,7 +1,7 @@
-"""Pose of the next image from triangulated and depth-lifted points (paper section 3.2).
+"""Absolute pose estimation of an image (paper section 3.2).
 
-Of many hypotheses the one that most matches support wins, after the best have been moved to where
-matches support them most.
+Many hypotheses are generated and scored by their support. The best distinct ones are refined to
+maximize their support, and the best of those are refined by local bundle adjustment.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from mpsfm_core.mapping.registration.pose_hypotheses import (
 from mpsfm_core.mapping.registration.pose_support import ScoredPose, maximize_support, score_pose
 from mpsfm_core.mapping.scene.scene import Scene, Snapshot
 from mpsfm_core.mapping.triangulation import triangulate_image
-from mpsfm_core.support.threads import allowed
+from mpsfm_core.support.threads import thread_limit
 
 MIN_POSE_DISTANCE_DEG = 3.0
-"""PoseHypothesisGenerator that differ less are refined to the same pose (ours)."""
+"""Smallest angle between distinct poses; closer ones converge to the same pose. [ours]"""
 
 
 class AbsolutePoseEstimator:
-    """Finds poses of images beside the registered ones; leaves the scene as it is."""
+    """Estimator of absolute poses; it leaves the scene unchanged."""
 
     def __init__(self, scene: Scene, refiner: Refiner, options: MapperOptions) -> None:
         self.scene = scene
@@ -40,37 +40,42 @@ class AbsolutePoseEstimator:
         self._options = options
 
     def estimate_poses(
-        self, image: int, found: PoseCorrespondences, *, attempt: int
+        self, image: int, correspondences: PoseCorrespondences, *, attempt: int
     ) -> list[ScoredPose]:
-        """A few select_distinct_poses poses, bundle-adjusted beside their neighbours if that finds more support.
+        """Estimate a few distinct poses of an image and refine them by bundle adjustment.
 
-        A lone one that nearly all matches support needs none: it is adjusted once registered.
-        ``attempt`` counts how often the image was tried: see :func:`estimate_candidate_poses`.
+        A single pose with a high inlier ratio is returned without bundle adjustment, because its
+        registration adjusts it anyway.
+
+        Args:
+            image: The image to register.
+            correspondences: Its 2D-3D correspondences.
+            attempt: Number of earlier attempts at the image; see :func:`estimate_candidate_poses`.
         """
         options = self._options.registration
-        poses = self.estimate_unrefined_poses(image, found, attempt=attempt)
+        poses = self.estimate_unrefined_poses(image, correspondences, attempt=attempt)
         if len(poses) == 1 and poses[0].inlier_ratio >= options.confident_share:
             return poses
-        return self.refine_poses(image, poses, found)
+        return self.refine_poses(image, poses, correspondences)
 
     def estimate_unrefined_poses(
-        self, image: int, found: PoseCorrespondences, *, attempt: int
+        self, image: int, correspondences: PoseCorrespondences, *, attempt: int
     ) -> list[ScoredPose]:
-        """The same without bundle adjustment, in half the time."""
+        """Estimate a few distinct poses of an image without bundle adjustment."""
         options, seed = self._options.registration, self._options.seed
         return estimate_candidate_poses(
-            self.scene, image, found, options, seed=seed, attempt=attempt
+            self.scene, image, correspondences, options, seed=seed, attempt=attempt
         )
 
     def refine_poses(
-        self, image: int, poses: Sequence[ScoredPose], found: PoseCorrespondences
+        self, image: int, poses: Sequence[ScoredPose], correspondences: PoseCorrespondences
     ) -> list[ScoredPose]:
-        """Poses bundle-adjusted beside the image's neighbours, each if that finds more support."""
+        """Refine poses by bundle adjustment; a pose that loses support stays unrefined."""
         snapshot = self.scene.snapshot()
-        return [self._refine_pose(image, pose, found, snapshot) for pose in poses]
+        return [self._refine_pose(image, pose, correspondences, snapshot) for pose in poses]
 
     def _refine_pose(
-        self, image: int, pose: ScoredPose, found: PoseCorrespondences, snapshot: Snapshot
+        self, image: int, pose: ScoredPose, correspondences: PoseCorrespondences, snapshot: Snapshot
     ) -> ScoredPose:
         scene, options = self.scene, self._options
         scene.register(image, pose.rotation, pose.translation)
@@ -79,53 +84,61 @@ class AbsolutePoseEstimator:
         rotation, translation = scene.rotations[image].copy(), scene.translations[image].copy()
         scene.restore(snapshot)
         adjusted = PoseHypothesis(rotation, translation, pose.source)
-        polished = score_pose(scene, found, adjusted, options.registration)
-        return max(pose, polished, key=lambda candidate: candidate.support)
+        refined = score_pose(scene, correspondences, adjusted, options.registration)
+        return max(pose, refined, key=lambda candidate: candidate.support)
 
 
 def estimate_candidate_poses(
     scene: Scene,
     image: int,
-    found: PoseCorrespondences,
+    correspondences: PoseCorrespondences,
     options: RegistrationOptions,
     *,
     seed: int,
     attempt: int,
 ) -> list[ScoredPose]:
-    """A few select_distinct_poses poses of an image from its correspondences, best support first.
+    """Estimate a few distinct poses of an image, best support first.
 
-    While no pose is supported by nearly all matches, more are made from random halves of the
-    matches: one wrong match or one bad minimum of few matches does not decide then. ``attempt``
-    counts how often the image was tried; each takes other halves, for a few history.
+    If no pose has a high inlier ratio, random halves of the matches give further hypotheses. They
+    escape a single wrong match and poor local minima of few matches.
+
+    Args:
+        scene: The scene with the registered images.
+        image: The image to register.
+        correspondences: Its 2D-3D correspondences.
+        options: Thresholds and numbers of hypotheses.
+        seed: Seed of RANSAC.
+        attempt: Number of earlier attempts at the image. Each of the first attempts draws other
+            halves; from ``resampled_attempts`` on none are drawn.
     """
     poses: list[ScoredPose] = []
-    hypotheses = PoseHypothesisGenerator(scene, image, found, options, seed)
-    with ThreadPoolExecutor(allowed()) as pool:
+    generator = PoseHypothesisGenerator(scene, image, correspondences, options, seed)
+    with ThreadPoolExecutor(thread_limit()) as pool:
 
-        def add(estimates: Iterator[HypothesisEstimator]) -> None:
-            made = pool.map(lambda estimate: estimate(), estimates)
-            rated = [score_pose(scene, found, pose, options) for pose in made if pose]
-            chosen = select_distinct_poses(rated, options.num_improved)
-            improved = pool.map(partial(maximize_support, scene, found, options=options), chosen)
-            poses.extend([*rated, *improved])
+        def add_poses(estimators: Iterator[HypothesisEstimator]) -> None:
+            hypotheses = pool.map(lambda estimate: estimate(), estimators)
+            scored = [score_pose(scene, correspondences, h, options) for h in hypotheses if h]
+            distinct = select_distinct_poses(scored, options.num_improved)
+            maximize = partial(maximize_support, scene, correspondences, options=options)
+            poses.extend([*scored, *pool.map(maximize, distinct)])
 
-        add(hypotheses.generate_from_all())
+        add_poses(generator.generate_from_all())
         best = max(poses, key=lambda pose: pose.support, default=None)
-        confident = best is not None and best.inlier_ratio >= options.confident_share
-        if options.lifting and not confident and attempt < options.resampled_attempts:
-            add(replace(hypotheses, seed=seed + attempt).generate_from_halves())
+        is_confident = best is not None and best.inlier_ratio >= options.confident_share
+        if options.lifting and not is_confident and attempt < options.resampled_attempts:
+            add_poses(replace(generator, seed=seed + attempt).generate_from_halves())
     return select_distinct_poses(poses, options.num_polished)
 
 
 def select_distinct_poses(
-    poses: Sequence[ScoredPose], count: int | None = None
+    poses: Sequence[ScoredPose], max_poses: int | None = None
 ) -> list[ScoredPose]:
-    """The best supported poses, at most ``count``, none turned little from a better one."""
+    """Return the best supported poses whose rotations differ from those of all better poses."""
     poses = sorted(poses, key=lambda pose: -pose.support)
     rotations = np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3)
-    turns = rotation_angle_deg(rotations[:, None] @ rotations.transpose(0, 2, 1))
-    kept: list[int] = []
+    angles_deg = rotation_angle_deg(rotations[:, None] @ rotations.transpose(0, 2, 1))
+    distinct: list[int] = []
     for row in range(len(poses)):
-        if (turns[row, kept] > MIN_POSE_DISTANCE_DEG).all():
-            kept.append(row)
-    return [poses[row] for row in kept[:count]]
+        if (angles_deg[row, distinct] > MIN_POSE_DISTANCE_DEG).all():
+            distinct.append(row)
+    return [poses[row] for row in distinct[:max_poses]]

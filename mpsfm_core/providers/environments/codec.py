@@ -34,7 +34,7 @@ _TYPES: Mapping[str, type] = MappingProxyType(
             data.View,
             data.DepthPrior,
             data.NormalPrior,
-            data.GroupPrior,
+            data.MultiViewPrior,
             data.Features,
             data.SparseMatches,
             data.DenseMatches,

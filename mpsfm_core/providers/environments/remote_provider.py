@@ -14,7 +14,7 @@ from mpsfm_core.data import (
     DepthPrior,
     Features,
     Float32,
-    GroupPrior,
+    MultiViewPrior,
     NormalPrior,
     PairMatches,
     View,
@@ -116,9 +116,9 @@ class RemoteProvider:
         focal: float | None = self._call("estimate_focal", view)
         return focal
 
-    def predict_group(self, views: Sequence[View]) -> GroupPrior:
+    def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
         """Depth of a group of views."""
-        group: GroupPrior = self._call("predict_group", tuple(views))
+        group: MultiViewPrior = self._call("predict_group", tuple(views))
         return group
 
     def extract(self, view: View) -> Features:

@@ -18,7 +18,7 @@ from mpsfm_core.providers.environments.channel import Channel, ChannelClosed
 from mpsfm_core.providers.environments.worker_process import PROTOCOL, decode_error, encode_error
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import CORE, Registry, core_version
-from mpsfm_core.support.threads import limited
+from mpsfm_core.support.threads import limit_threads
 
 
 class ProviderServer:
@@ -88,7 +88,7 @@ class ProviderServer:
         """To be done again, which takes a millisecond, when libraries may have come since."""
         if self._limited_with != len(sys.modules):
             self._limit.close()
-            self._limit.enter_context(limited(self._threads))
+            self._limit.enter_context(limit_threads(self._threads))
             self._limited_with = len(sys.modules)
 
     def _resolve(self, uri: str, sha256: str | None) -> Path:

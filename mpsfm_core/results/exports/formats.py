@@ -22,7 +22,7 @@ from mpsfm_core.results.exports import (
     nvm,
 )
 from mpsfm_core.results.exports.source import ExportSource
-from mpsfm_core.support.files import replacing
+from mpsfm_core.support.files import replace_entries
 from mpsfm_core.support.format_versions import VERSION
 
 DESCRIPTION = "export.json"
@@ -119,7 +119,7 @@ def export(
         source = source.turned()
     output = output or folder / "exports" / format_name
     described = _describe(source, format_name)
-    with replacing(output, (*chosen.entries, DESCRIPTION)) as fresh:
+    with replace_entries(output, (*chosen.entries, DESCRIPTION)) as fresh:
         _writer_of(chosen)(source, fresh)
         text = json.dumps(described, indent=2) + "\n"
         (fresh / DESCRIPTION).write_text(text, encoding="utf-8")

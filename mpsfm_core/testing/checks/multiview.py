@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpsfm_core.data import DepthPrior, Float64, GroupPrior
+from mpsfm_core.data import DepthPrior, Float64, MultiViewPrior
 from mpsfm_core.geometry import (
     angle_between_deg,
     compose,
@@ -167,7 +167,7 @@ def _group(case: ContractCase) -> tuple[Example, ...]:
     return case.example, case.example.partner, case.example.partner.partner
 
 
-def _pairs(group: GroupPrior, examples: tuple[Example, ...]) -> list[tuple[DepthPrior, Example]]:
+def _pairs(group: MultiViewPrior, examples: tuple[Example, ...]) -> list[tuple[DepthPrior, Example]]:
     return list(zip(group.depth, examples, strict=True))
 
 
@@ -192,7 +192,7 @@ def _z_of_first(example: Example, first: Example, shape: tuple[int, int]) -> Flo
     return z
 
 
-def _log_factors(group: GroupPrior, examples: tuple[Example, ...]) -> list[float]:
+def _log_factors(group: MultiViewPrior, examples: tuple[Example, ...]) -> list[float]:
     errors = [map_errors.log_errors(p, e, any_scale=False) for p, e in _pairs(group, examples)]
     return [float(np.median(error)) for error in errors]
 

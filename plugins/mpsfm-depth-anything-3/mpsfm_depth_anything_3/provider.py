@@ -11,7 +11,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_model
 
-from mpsfm_core import DepthPrior, GroupPrior, ProviderContext, View
+from mpsfm_core import DepthPrior, MultiViewPrior, ProviderContext, View
 from mpsfm_core.data import Float64
 from mpsfm_core.data.errors import WeightsError
 from mpsfm_core.geometry import resize_map
@@ -47,7 +47,7 @@ class DepthAnything3:
             raise WeightsError(f"{path} is not of {options.network}: {reason}") from error
         self._network.to(self._device)
 
-    def predict_group(self, views: Sequence[View]) -> GroupPrior:
+    def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
         """Depth in one unit (metres of the nested network), with its std by the confidence."""
         sizes = [_network_size(view, self._options.resize) for view in views]
         width, height = np.max(sizes, axis=0).tolist()
@@ -67,7 +67,7 @@ class DepthAnything3:
             inside = slice(top, top + h), slice(left, left + w)
             std = self._options.relative_std * mean / sure[inside]
             priors.append(DepthPrior.from_arrays(z[inside], std**2, metric=metric))
-        return GroupPrior(
+        return MultiViewPrior(
             tuple(priors),
             found["extrinsics"][0, :, :3].double().cpu().numpy(),
             _intrinsics(found["intrinsics"][0].double().cpu().numpy(), views, starts, sizes),

@@ -90,4 +90,4 @@ class AdalamMatcher:
 
 def _matches(indices: Any, scores: Any) -> PairMatches:
     """The best match of each feature; kornia may match one of the second view several times."""
-    return PairMatches(sparse=SparseMatches.best_first(indices, scores))
+    return PairMatches(sparse=SparseMatches.from_best_scores(indices, scores))

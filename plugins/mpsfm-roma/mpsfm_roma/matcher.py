@@ -83,7 +83,7 @@ class SparseMatcher:
             more, certain = self._snapped(back, xy_b, xy_a)
             pairs = np.concatenate([pairs, more[:, ::-1]])
             scores = np.concatenate([scores, certain])
-        return PairMatches(sparse=SparseMatches.best_first(pairs, scores))
+        return PairMatches(sparse=SparseMatches.from_best_scores(pairs, scores))
 
     def _snapped(self, warp: Warp, xy: Float64, others: Float64) -> tuple[Int64, Float32]:
         """Pairs (m, 2) of a keypoint and the other view's nearest to where the warp sends it, if

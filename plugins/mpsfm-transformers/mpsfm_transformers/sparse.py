@@ -137,4 +137,4 @@ def _as_in(xy: Float64, view: View, first: View) -> Float64:
 
 
 def _matches(indices: Any, scores: Any) -> PairMatches:
-    return PairMatches(sparse=SparseMatches.best_first(indices, scores))
+    return PairMatches(sparse=SparseMatches.from_best_scores(indices, scores))

@@ -118,4 +118,4 @@ class SparseMatcher(DenseMatcher):
                 continue
             distance, nearest[:, side] = cKDTree(features.keypoints).query(xy)
             near &= distance <= self._snap_px
-        return PairMatches(sparse=SparseMatches.best_first(nearest[near], found.scores[near]))
+        return PairMatches(sparse=SparseMatches.from_best_scores(nearest[near], found.scores[near]))

@@ -1,6 +1,6 @@
 import numpy as np
 
-from mpsfm_core import DepthPrior, GroupPrior, Options
+from mpsfm_core import DepthPrior, MultiViewPrior, Options
 
 
 class ${Class}Options(Options):
@@ -16,7 +16,7 @@ class $Class:
         depth = self._network([view.image / np.float32(255) for view in views])
         # If the network says how the views lie to each other: poses=, (n, 3, 4) cam_from_group,
         # and the capability proposes-poses; if it says their intrinsics: intrinsics=, (n, 4).
-        return GroupPrior(tuple(DepthPrior.from_arrays(map) for map in depth))
+        return MultiViewPrior(tuple(DepthPrior.from_arrays(map) for map in depth))
 
 
 class Network:  # put yours here: this one is an affine function of each pixel's colour
