@@ -1,1 +1,1 @@
-"""From a folder of photos to undistorted views with known cameras."""
+"""Reads images, cameras, masks, poses, matches and videos; one module for each source."""

@@ -1,4 +1,4 @@
-"""Photos that need a library of their own: HEIC of phones, raw files of cameras."""
+"""Decoders of optional libraries: HEIF images of phones, raw files of cameras."""
 
 from __future__ import annotations
 
@@ -15,14 +15,19 @@ from mpsfm_core.data.errors import InputError
 
 HEIF = frozenset((".heic", ".heif", ".hif"))
 RAW = frozenset((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef"))
-"""File names; a raw file's content tells no more than its name, most are TIFF files too."""
+"""Extensions of raw files. The content does not identify them: most are TIFF files."""
 
 
 def find_decoder(data: bytes, path: Path) -> Callable[[bytes, Path], UInt8] | None:
-    """What decodes this content of a file called so, None if OpenCV does.
+    """Return the decoder of an image that OpenCV does not read, else None.
 
-    It gives (H, W, 3) uint8 RGB, upright, and raises :class:`InputError` when the file is damaged
-    or the library is not installed.
+    Args:
+        data: content of the file.
+        path: its extension identifies raw files.
+
+    Returns:
+        A function of ``data`` and ``path`` that returns the upright image, (H, W, 3) uint8 RGB. It
+        raises :class:`InputError` for a damaged file and for a missing library.
     """
     if is_heif(data):
         return _decode_heif
@@ -31,16 +36,16 @@ def find_decoder(data: bytes, path: Path) -> Callable[[bytes, Path], UInt8] | No
 
 
 def is_heif(data: bytes) -> bool:
-    """Whether the content is HEIF; AVIF is not, which nobody's photos are."""
+    """Return whether the content is HEIF (AVIF is not included)."""
     return data[4:8] == b"ftyp" and data[8:12] in (b"heic", b"heix", b"hevc", b"mif1", b"msf1")
 
 
 def heif_exif(data: bytes) -> bytes | None:
-    """The EXIF block of an HEIF file; None if there is none, or nobody to read it."""
+    """Return the EXIF block of a HEIF file, None if there is none or ``pillow_heif`` is missing."""
     try:
         opened = importlib.import_module("pillow_heif").open_heif(data)
         block = opened.info.get("exif")
-    except Exception:  # what cannot be read says nothing; decoding it tells why
+    except Exception:  # decoding the pixels reports the reason
         return None
     return None if block is None else bytes(block).removeprefix(b"Exif\x00\x00")
 
@@ -48,9 +53,9 @@ def heif_exif(data: bytes) -> bytes | None:
 def _decode_heif(data: bytes, path: Path) -> UInt8:
     library = _library("pillow_heif", "heic", path)
     try:
-        image = library.read_heif(data)  # applies the rotation that the file asks for
+        image = library.read_heif(data)  # applies the rotation in the file
         pixels = np.asarray(image.to_pillow().convert("RGB"))
-    except Exception as error:  # the library raises what its parts raise
+    except Exception as error:  # the library documents no exception types
         raise InputError(f"image {path} cannot be decoded: {error}") from error
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
@@ -60,7 +65,7 @@ def _decode_raw(data: bytes, path: Path) -> UInt8:
     try:
         with library.imread(BytesIO(data)) as raw:
             pixels = raw.postprocess(use_camera_wb=True, output_bps=8)
-    except Exception as error:  # the library raises what its parts raise
+    except Exception as error:  # the library documents no exception types
         raise InputError(f"image {path} cannot be decoded: {error!r}") from error
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 

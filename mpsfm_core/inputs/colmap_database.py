@@ -1,6 +1,6 @@
-"""COLMAP's database of keypoints and matches, read as the SQLite file that it is.
+"""Reader of COLMAP's database of cameras, keypoints and matches.
 
-Not through pycolmap, which ends the process over a damaged one.
+Reads the SQLite file directly because pycolmap aborts the process on a damaged database.
 """
 
 from __future__ import annotations
@@ -20,40 +20,44 @@ from mpsfm_core.data import Float64, Int64
 from mpsfm_core.data.errors import InputError
 
 _MAX_IMAGES = 2**31 - 1
-"""Factor between the two image ids of a pair id (COLMAP: kMaxNumImages)."""
+"""Factor between the two image ids of a pair id [COLMAP kMaxNumImages]."""
 
 
 @dataclass(frozen=True, eq=False)
 class ColmapDatabase:
-    """What a database holds.
-
-    ``cameras``: by their number. ``images``: name -> number. ``camera_of``: image -> camera.
-    ``keypoints``: image -> (n, 2) float64, pixels as stored (EXIF orientation not applied).
-    ``matches``: (smaller image, larger image) -> (m, 2) int64 rows of keypoints; the raw matches
-    where there are some, else the verified ones.
-    """
+    """Cameras, images, keypoints and matches of a COLMAP database."""
 
     path: Path
+    """File of the database, for messages."""
     cameras: dict[int, pycolmap.Camera]
+    """Camera id -> camera."""
     images: dict[str, int]
+    """Image name -> image id."""
     camera_of: dict[int, int]
+    """Image id -> camera id."""
     keypoints: dict[int, Float64]
+    """Image id -> (n, 2) float64, pixels of the stored image (EXIF orientation not applied)."""
     matches: dict[tuple[int, int], Int64]
+    """(smaller, larger image id) -> (m, 2) int64 rows of keypoints.
+
+    The raw matches if the database has them for the pair, else the verified matches.
+    """
 
 
 def read_database(path: Path) -> ColmapDatabase:
-    """Read a database; it is not changed.
+    """Read a COLMAP database without changing it.
 
-    Raises :class:`InputError` that names what is missing or damaged.
+    Raises:
+        InputError: the file is missing or damaged; the message names the record.
     """
     if not path.is_file():
-        raise InputError(f"COLMAP database {path} does not exist")
+        raise InputError(f"COLMAP database {path} does not exist; check the path")
     uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
     try:
         with closing(sqlite3.connect(uri, uri=True)) as database:
             return _read(path, database)
     except sqlite3.Error as error:
-        raise InputError(f"{path}: is no COLMAP database, or damaged: {error}") from error
+        raise InputError(f"{path} is not a COLMAP database, or is damaged: {error}") from error
 
 
 def _read(path: Path, database: sqlite3.Connection) -> ColmapDatabase:
@@ -64,7 +68,7 @@ def _read(path: Path, database: sqlite3.Connection) -> ColmapDatabase:
     images, camera_of = {}, {}
     for number, name, camera_id in database.execute("SELECT image_id, name, camera_id FROM images"):
         if not isinstance(name, str) or camera_id not in cameras:
-            raise InputError(f"{path}, image {number}: has no name, or no camera")
+            raise InputError(f"{path}, image {number} has no name or no camera")
         images[name.replace("\\", "/")] = number
         camera_of[number] = camera_id
     keypoints = {}
@@ -74,10 +78,10 @@ def _read(path: Path, database: sqlite3.Connection) -> ColmapDatabase:
         where = f"{path}, keypoints of image {number}"
         values = _array(where, count, columns, data, np.dtype("<f4"))
         if values.shape[1] < 2 or not np.isfinite(values[:, :2]).all():
-            raise InputError(f"{where}: have no x and y, or they are not finite")
+            raise InputError(f"{where}: x and y are missing or not finite")
         keypoints[number] = values[:, :2].astype(np.float64)
     matches = dict(_matches(path, database, "two_view_geometries"))
-    matches |= {pair: found for pair, found in _matches(path, database, "matches") if len(found)}
+    matches |= {pair: rows for pair, rows in _matches(path, database, "matches") if len(rows)}
     return ColmapDatabase(path, cameras, images, camera_of, keypoints, matches)
 
 
@@ -88,13 +92,13 @@ def _matches(
         f"SELECT pair_id, rows, cols, data FROM {table}"
     ):
         if not isinstance(pair_id, int):
-            raise InputError(f"{path}, {table}: {pair_id!r} is no pair of images")
+            raise InputError(f"{path}, {table}: {pair_id!r} is not a pair id")
         second = pair_id % _MAX_IMAGES
         pair = (pair_id - second) // _MAX_IMAGES, second
         where = f"{path}, {table} of images {pair[0]} and {pair[1]}"
         values = _array(where, count, columns, data, np.dtype("<u4"))
         if len(values) and values.shape[1] != 2:
-            raise InputError(f"{where}: a match is two numbers")
+            raise InputError(f"{where}: a match must be two keypoint indices")
         yield pair, values.reshape(-1, 2).astype(np.int64)
 
 
@@ -102,10 +106,10 @@ def _array(
     where: str, rows: object, columns: object, data: object, dtype: np.dtype[Any]
 ) -> NDArray[Any]:
     if not isinstance(rows, int) or not isinstance(columns, int) or min(rows, columns) < 0:
-        raise InputError(f"{where}: have no size")
+        raise InputError(f"{where}: rows and columns are missing")
     content = data if isinstance(data, bytes) else b""
     if rows * columns * dtype.itemsize != len(content):
-        raise InputError(f"{where}: are cut off: {len(content)} bytes for {rows} x {columns}")
+        raise InputError(f"{where} are cut off: {len(content)} bytes for {rows} x {columns} values")
     return np.frombuffer(content, dtype).reshape(rows, columns)
 
 
@@ -115,9 +119,11 @@ def _camera(
     known = {int(value): name for name, value in pycolmap.CameraModelId.__members__.items()}
     sized = isinstance(width, int) and isinstance(height, int) and min(width, height) > 0
     if model not in known or model == -1 or not sized or not isinstance(params, bytes):
-        raise InputError(f"{where}: has an unknown model ({model}), no size or no parameters")
+        raise InputError(
+            f"{where}: the model ({model}) is unknown, or size or parameters are missing"
+        )
     values = np.frombuffer(params, "<f8") if len(params) % 8 == 0 else np.zeros(0)
     camera = pycolmap.Camera(model=known[model], width=width, height=height, params=values)
     if not camera.verify_params() or not np.isfinite(values).all():
-        raise InputError(f"{where}: these are no parameters of {known[model]}: {values.tolist()}")
+        raise InputError(f"{where}: invalid parameters for {known[model]}: {values.tolist()}")
     return camera

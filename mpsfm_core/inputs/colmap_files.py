@@ -1,7 +1,7 @@
-"""COLMAP's binary files, checked before COLMAP reads them.
+"""Validation of COLMAP's binary model files before pycolmap reads them.
 
-Its reader believes every count in a file: a damaged or hostile one keeps it busy, and takes memory,
-without end. Here each count is held against the size of the file.
+COLMAP's reader does not check record counts: a damaged file can take unlimited time and memory.
+The functions here compare every count with the size of the file.
 """
 
 from __future__ import annotations
@@ -20,14 +20,18 @@ _RIG_START, _SENSOR = 4, 4 + 4
 
 
 def check_binary_model(folder: Path) -> None:
-    """Raise :class:`ValueError` when a file of a binary model cannot hold what it says it holds."""
+    """Check that the record counts in a binary model fit the sizes of its files.
+
+    Raises:
+        ValueError: a file ends before its last record.
+    """
     for name, record_end in _RECORDS.items():
         path = folder / f"{name}.bin"
         if path.is_file():
             try:
                 _check(path.read_bytes(), record_end)
             except (struct.error, ValueError) as error:
-                text = f"{path.name} is damaged: it ends before what it announces ({error})"
+                text = f"{path.name} is damaged: it ends before its last record ({error})"
                 raise ValueError(text) from error
 
 
@@ -41,7 +45,7 @@ def _check(data: bytes, record_end: Callable[[bytes, int], int]) -> None:
 
 
 def _camera_end(data: bytes, start: int) -> int:
-    return start + _CAMERA_START + 8  # one parameter at least; COLMAP knows the rest
+    return start + _CAMERA_START + 8  # at least one parameter; COLMAP checks the number
 
 
 def _image_end(data: bytes, start: int) -> int:
@@ -71,4 +75,4 @@ _RECORDS = {
     "frames": _frame_end,
     "rigs": _rig_end,
 }
-"""File -> where a record that starts at a byte ends, at least."""
+"""File stem -> function that returns the end (at least) of the record that starts at a byte."""

@@ -1,4 +1,4 @@
-"""Where photos were taken, as their EXIF data say."""
+"""GPS positions in EXIF data, and their conversion to east, north, up."""
 
 from __future__ import annotations
 
@@ -17,25 +17,28 @@ _GPS_IFD = 0x8825
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE = 1, 2, 3, 4
 _ALTITUDE_REF, _ALTITUDE, _ERROR_M = 5, 6, 31
 DEFAULT_STD_M = 5.0
-"""Horizontal noise of a phone under the open sky (GPS.gov: 4.9 m), where the photo says none."""
+"""Horizontal std in meters if EXIF has none: a phone under open sky [GPS.gov: 4.9 m]."""
 
 
 @dataclass(frozen=True)
 class GpsPosition:
-    """WGS84: ``latitude`` in [-90, 90] and ``longitude`` in [-180, 180] degrees, ``altitude`` in
-    metres or None. ``std_m``: horizontal noise."""
+    """Position in WGS84."""
 
     latitude: float
+    """Degrees, [-90, 90]."""
     longitude: float
+    """Degrees, [-180, 180]."""
     altitude: float | None = None
+    """Meters, None if unknown."""
     std_m: float = DEFAULT_STD_M
+    """Horizontal standard deviation in meters."""
 
 
 def read_gps(data: bytes) -> GpsPosition | None:
-    """The position in the EXIF data of an encoded photo.
+    """Read the GPS position from the EXIF data of an encoded image.
 
-    None where there is none, and where it is damaged: (0, 0), out of range, or not a number. Wrong
-    positions are worse than none.
+    Returns:
+        The position. None if it is missing, (0, 0), out of range or not a number.
     """
     block = exif_block(data)
     if block is None:
@@ -59,7 +62,11 @@ def read_gps(data: bytes) -> GpsPosition | None:
 
 
 def convert_to_enu(positions: Sequence[GpsPosition], origin: GpsPosition) -> Float64:
-    """Metres east, north and up (n, 3) of the origin; up is NaN without an altitude."""
+    """Convert positions to meters east, north, up of an origin.
+
+    Returns:
+        (n, 3) float64; up is NaN for a position without altitude.
+    """
     reference = origin.altitude or 0.0
     geographic = [
         (p.latitude, p.longitude, reference if p.altitude is None else p.altitude)
@@ -75,7 +82,7 @@ def convert_to_enu(positions: Sequence[GpsPosition], origin: GpsPosition) -> Flo
 
 
 def _values(block: bytes) -> dict[int, object]:
-    """Entries of the GPS directory: texts as bytes, numbers as lists."""
+    """Read the entries of the GPS directory: texts as bytes, numbers as lists."""
     for tag, kind, count, place in tiff_entries(block):
         if tag == _GPS_IFD and kind in (4, 13) and count == 1:
             order = "<" if block[:2] == b"II" else ">"
@@ -99,7 +106,7 @@ def _values(block: bytes) -> dict[int, object]:
 def _degrees(values: dict[int, object], tag: int, reference: int, negative: bytes) -> float:
     parts = values.get(tag)
     if not isinstance(parts, list) or len(parts) != 3 or not all(map(math.isfinite, parts)):
-        raise ValueError("no angle")
+        raise ValueError("not an angle")
     angle: float = parts[0] + parts[1] / 60 + parts[2] / 3600
     sign = values.get(reference)
     return -angle if isinstance(sign, bytes) and sign[:1].upper() == negative else angle

@@ -1,4 +1,4 @@
-"""Features and matches in hloc's HDF5 files; needs h5py."""
+"""Reader of hloc's HDF5 files of features and matches; needs h5py."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from mpsfm_core.data import Float32, Float64, Int64
 from mpsfm_core.data.errors import InputError
 
 _TO_COLMAP = 0.5
-"""hloc's first pixel has its centre at (0, 0)."""
+"""Offset to COLMAP's pixels: the center of hloc's first pixel is (0, 0)."""
 
 
 class HlocFiles:
-    """The features file and the matches file of one set of photos.
+    """Features file and matches file of one set of images.
 
-    Raises :class:`InputError` here and in all methods, with what is missing or damaged.
+    All methods raise :class:`InputError` that names what is missing or damaged.
     """
 
     def __init__(self, features: Path, matches: Path) -> None:
@@ -27,44 +27,48 @@ class HlocFiles:
         self.matches = _Hdf5(matches)
 
     def names(self) -> list[str]:
-        """Names of the photos that have keypoints."""
+        """Return the names of the images that have keypoints."""
         suffix = "/keypoints"
         return [n.removesuffix(suffix) for n in self.features.datasets() if n.endswith(suffix)]
 
     def keypoints(self, name: str) -> tuple[Float64, float]:
-        """Keypoints (n, 2) in COLMAP pixels as stored (EXIF orientation not applied), and their
-        std in pixels."""
+        """Read the keypoints of an image and their noise.
+
+        Returns:
+            (n, 2) float64, COLMAP pixels of the stored image (EXIF orientation not applied), and
+            their standard deviation in pixels.
+        """
         values, attributes = self.features.read(f"{name}/keypoints")
         where = f"{self.features.path}, keypoints of {name!r}"
         if values.ndim != 2 or values.shape[1] != 2 or not _finite(values):
-            raise InputError(f"{where}: must be finite x and y, shape is {values.shape}")
+            raise InputError(f"{where} must be finite x and y, their shape is {values.shape}")
         std = attributes.get("uncertainty", 1.0)
         if not isinstance(std, (int, float, np.number)) or not 0 < float(std) < np.inf:
-            raise InputError(f"{where}: their uncertainty is {std!r}, not a number of pixels")
+            raise InputError(f"{where}: the uncertainty {std!r} is not a number of pixels")
         return values.astype(np.float64) + _TO_COLMAP, float(std)
 
     def size(self, name: str) -> tuple[int, int] | None:
-        """(width, height) of the photo as stored, None if the file does not say."""
+        """Return (width, height) of the stored image, None if the file does not have it."""
         if not self.features.has(f"{name}/image_size"):
             return None
         values = self.features.read(f"{name}/image_size")[0].ravel()
         if values.shape != (2,) or not _finite(values):
-            raise InputError(f"{self.features.path}, {name!r}: its image_size is no width, height")
+            raise InputError(f"{self.features.path}, {name!r}: image_size is not width, height")
         return int(values[0]), int(values[1])
 
     def pairs(self, names: list[str]) -> Iterator[tuple[str, str, Int64, Float32]]:
-        """For each pair of these photos rows of keypoints (m, 2), and scores (m,) in [0, 1]."""
+        """Yield the matches of each pair: names, keypoint rows (m, 2), scores (m,) in [0, 1]."""
         written = {name.replace("/", "-"): name for name in names}
         suffix = "/matches0"
         for dataset in self.matches.datasets():
             pair = dataset.removesuffix(suffix)
             if pair == dataset:
                 continue
-            found = _split(pair, written)
-            if found is None:
+            images = _split_pair_name(pair, written)
+            if images is None:
                 continue
             indices, scores = self._matches(pair)
-            yield (*found, indices, scores)
+            yield (*images, indices, scores)
 
     def _matches(self, pair: str) -> tuple[Int64, Float32]:
         where = f"{self.matches.path}, pair {pair!r}"
@@ -75,14 +79,14 @@ class HlocFiles:
         if self.matches.has(f"{pair}/matching_scores0"):
             scores = self.matches.read(f"{pair}/matching_scores0")[0]
         if scores.shape != target.shape or not _finite(scores):
-            raise InputError(f"{where}: matching_scores0 do not fit matches0")
+            raise InputError(f"{where}: matching_scores0 and matches0 differ in length")
         rows = np.flatnonzero(target >= 0)
         indices = np.stack([rows, target[rows]], axis=1).astype(np.int64)
         return indices, np.clip(scores[rows], 0, 1).astype(np.float32)
 
 
 class _Hdf5:
-    """A file that is opened anew for each read, so that it is never left open."""
+    """HDF5 file that is opened for each read and closed again."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -93,27 +97,27 @@ class _Hdf5:
                 f"{path}: reading HDF5 needs h5py: pip install 'mpsfm-core[hloc]'"
             ) from error
         if not path.is_file():
-            raise InputError(f"{path} does not exist")
+            raise InputError(f"{path} does not exist; check the path")
 
     def datasets(self) -> list[str]:
-        """Full names of all datasets."""
-        found: list[str] = []
+        """Return the full names of all datasets."""
+        names: list[str] = []
 
         def visit(name: str, item: object) -> None:
             if isinstance(item, self._h5py.Dataset):
-                found.append(name)
+                names.append(name)
 
         with self._open() as file:
             self._guarded("the file", lambda: file.visititems(visit))
-        return found
+        return names
 
     def has(self, name: str) -> bool:
-        """Whether there is a dataset or group of this name."""
+        """Return whether there is a dataset or group of this name."""
         with self._open() as file:
             return bool(self._guarded(name, lambda: name in file))
 
     def read(self, name: str) -> tuple[Any, dict[str, Any]]:
-        """Values and attributes of a dataset."""
+        """Read values and attributes of a dataset."""
         with self._open() as file:
             return (
                 np.asarray(self._guarded(name, lambda: file[name][()])),
@@ -127,11 +131,11 @@ class _Hdf5:
         try:
             return act()
         except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-            raise InputError(f"{self.path}: {what} is damaged, or no HDF5: {error}") from error
+            raise InputError(f"{self.path}: {what} is damaged or not HDF5: {error}") from error
 
 
-def _split(pair: str, written: dict[str, str]) -> tuple[str, str] | None:
-    """The photos of a pair: hloc's names are ``A/B``, formerly ``A_B``; None if others."""
+def _split_pair_name(pair: str, written: dict[str, str]) -> tuple[str, str] | None:
+    """Return the images of a pair named ``A/B`` (or ``A_B``, old hloc), None if unknown."""
     for cut, letter in enumerate(pair):
         if letter in "/_" and pair[:cut] in written and pair[cut + 1 :] in written:
             return written[pair[:cut]], written[pair[cut + 1 :]]

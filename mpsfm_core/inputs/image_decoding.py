@@ -1,4 +1,4 @@
-"""Pixels of an image file: upright, RGB, 8 bit."""
+"""Decoding of image files to upright 8-bit RGB, and checks before it."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ EXTENSIONS = (
         (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".webp", ".bmp", ".jp2", ".ppm", ".pgm")
     )
 )
-"""File names that count as images; the content may be any of these formats."""
+"""Extensions of image files. The content decides the decoder, not the extension."""
 
 
 def read_bytes(path: Path) -> bytes:
-    """The file's content; raises :class:`InputError` when it cannot be read."""
+    """Read the content of an image file; raise :class:`InputError` if this fails."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -38,15 +38,15 @@ def read_bytes(path: Path) -> bytes:
 
 
 def check_decodable(data: bytes, path: Path) -> None:
-    """Decode an image once, coarsely; raises :class:`InputError` when it is damaged or none."""
+    """Decode an image at 1/8 size; raise :class:`InputError` if it is damaged or not an image."""
     if is_cut_jpeg(data):
-        raise InputError(f"image {path} is cut off: its end is missing; copy it again")
-    if find_decoder(data, path) is None:  # others are decoded whole, for their size
+        raise InputError(f"image {path} is cut off: its end is missing. Copy it again")
+    if find_decoder(data, path) is None:  # other formats are decoded in full to get their size
         _decode(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
 
 def check_size(data: bytes, path: Path, max_pixels: int) -> None:
-    """Raise :class:`InputError` for an image that would take too much memory to decode."""
+    """Raise :class:`InputError` for an image with more than ``max_pixels`` pixels."""
     pixels = read_declared_num_pixels(data)
     if pixels is not None and pixels > max_pixels:
         raise InputError(
@@ -56,9 +56,12 @@ def check_size(data: bytes, path: Path, max_pixels: int) -> None:
 
 
 def upright_size(data: bytes, header: ImageHeader, path: Path) -> tuple[int, int]:
-    """(width, height) with the EXIF orientation applied; decodes only where the header lacks it.
+    """Return (width, height) with the EXIF orientation applied.
 
-    Raises :class:`InputError` when the file is no image or damaged.
+    Decodes the pixels only if the header has no size.
+
+    Raises:
+        InputError: the file is damaged or not an image.
     """
     size = header.size
     if size is None or min(size) == 0:
@@ -68,10 +71,15 @@ def upright_size(data: bytes, header: ImageHeader, path: Path) -> tuple[int, int
 
 
 def decode_rgb(data: bytes, header: ImageHeader, path: Path) -> UInt8:
-    """(H, W, 3) uint8 RGB with the EXIF orientation applied.
+    """Decode an image and apply its EXIF orientation.
 
-    16-bit values are scaled by 1/257, floats in [0, 1] by 255; grayscale is repeated, alpha
-    dropped. Raises :class:`InputError` when the file is no image or damaged.
+    Scales 16-bit values by 1/257 and floats in [0, 1] by 255, repeats gray, drops alpha.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+
+    Raises:
+        InputError: the file is damaged or not an image.
     """
     decode = find_decoder(data, path)
     if decode is not None:
@@ -91,7 +99,7 @@ def decode_rgb(data: bytes, header: ImageHeader, path: Path) -> UInt8:
 
 
 def read_mask(path: Path, max_pixels: int) -> Bool:
-    """(H, W) bool from a mask image, upright: False where it is black."""
+    """Read an upright mask, (H, W) bool, False where the image is black."""
     data = read_bytes(path)
     check_size(data, path, max_pixels)
     rgb = decode_rgb(data, read_header(data), path)
@@ -99,7 +107,7 @@ def read_mask(path: Path, max_pixels: int) -> Bool:
 
 
 def orient(image: UInt8, orientation: int) -> UInt8:
-    """The stored image turned upright; ``orientation`` is EXIF's (1: already upright)."""
+    """Turn a stored image upright; ``orientation`` is the EXIF value, 1 for upright."""
     if orientation >= 5:
         image = np.swapaxes(image, 0, 1)
     if orientation in (3, 4, 7, 8):
@@ -110,7 +118,7 @@ def orient(image: UInt8, orientation: int) -> UInt8:
 
 
 def apply_orientation_to_pixels(xy: Float64, size: tuple[int, int], orientation: int) -> Float64:
-    """Pixels (n, 2) of a stored image of (width, height) as those of :func:`orient`'s."""
+    """Map pixels (n, 2) of a stored image of (width, height) to the image of :func:`orient`."""
     x, y = xy[:, 0], xy[:, 1]
     width, height = size
     if orientation >= 5:
@@ -126,12 +134,12 @@ def _decode(data: bytes, path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> NDArr
     if not data:
         raise InputError(f"image {path} is empty")
     try:
-        # Unchanged: OpenCV's own rotation and depth conversion differ between formats.
+        # IMREAD_UNCHANGED: OpenCV's rotation and depth conversion differ between formats.
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error as error:
         raise InputError(f"image {path} cannot be decoded: {error.err}") from error
     if pixels is None:
         raise InputError(
-            f"image {path} cannot be decoded: it is damaged or no image; replace or remove it"
+            f"image {path} cannot be decoded: it is damaged or not an image. Replace or remove it"
         )
     return np.asarray(pixels)

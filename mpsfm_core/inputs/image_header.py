@@ -1,4 +1,4 @@
-"""Size, orientation and focal length from an image file's first bytes, without decoding it."""
+"""Parser of image headers: size, orientation, EXIF tags; pixels are not decoded."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _TYPE_SIZES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MAX_ASPECT_DIFFERENCE = 0.02
-"""Pixel rounding of a resized photo stays far below; a crop to another format far above."""
+"""Difference of log aspect ratios above which an image counts as cropped since EXIF was written."""
 
 _TIFF_WIDTH, _TIFF_HEIGHT = 0x0100, 0x0101
 _ORIENTATION, _EXIF_IFD = 0x0112, 0x8769
@@ -31,23 +31,25 @@ _PLANE_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What a file says of its image.
-
-    ``size``: stored (width, height) before rotation, None where only decoding tells.
-    ``orientation``: EXIF's 1 to 8. ``tags``: numeric EXIF tags by number.
-    ``projection``: of a panorama, as ``equirectangular``.
-    """
+    """Header of an image file."""
 
     size: tuple[int, int] | None
+    """Stored (width, height) before rotation, None if only decoding the pixels gives it."""
     orientation: int
+    """EXIF orientation of the stored pixels, 1 to 8."""
     tags: dict[int, float]
+    """Numeric EXIF tags by number."""
     projection: str | None = None
+    """Projection of a panorama such as ``equirectangular``, None for other images."""
 
     def focal_px(self, width: int, height: int) -> float | None:
-        """Focal length in pixels of the image at this (stored) size, None when EXIF has none.
+        """Return the focal length in pixels of the image at a size, from EXIF.
 
-        The 35 mm equivalent is that of the diagonal (CIPA DCG-001); else focal length times
-        the resolution of the focal plane. None as well for an image that was cropped since.
+        Uses the 35 mm equivalent, defined by the diagonal (CIPA DCG-001). Without it, uses focal
+        length times focal-plane resolution.
+
+        Returns:
+            Focal length in pixels, None if EXIF has none or the image was cropped.
         """
         recorded = self.tags.get(_PIXELS_X, 0.0), self.tags.get(_PIXELS_Y, 0.0)
         if min(recorded) > 0:
@@ -67,7 +69,7 @@ class ImageHeader:
 
 
 def read_declared_num_pixels(data: bytes) -> int | None:
-    """Number of pixels that an encoded image says it has, None where it does not say so plainly."""
+    """Return the number of pixels in the header of an encoded image, None if unknown."""
     if data[:4] in (b"II*\x00", b"MM\x00*"):
         tags = _read_tags(data)
         size = tags.get(_TIFF_WIDTH), tags.get(_TIFF_HEIGHT)
@@ -78,7 +80,7 @@ def read_declared_num_pixels(data: bytes) -> int | None:
 
 
 def is_cut_jpeg(data: bytes) -> bool:
-    """Whether a JPEG ends before its pixels do; decoders fill the rest with grey."""
+    """Return whether a JPEG lacks its end marker; decoders fill missing pixels with gray."""
     if data[:2] != b"\xff\xd8":
         return False
     pixels = 2 + sum(4 + len(payload) for _, payload in _jpeg_segments(data))
@@ -93,7 +95,7 @@ def _bmp_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _webp_size(data: bytes) -> tuple[int, int] | None:
-    """Of the canvas, or of the first frame."""
+    """Return (width, height) of the canvas or the first frame of a WebP file."""
     if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
         return None
     if data[12:16] == b"VP8X":
@@ -111,12 +113,12 @@ def _three_bytes(data: bytes, place: int) -> int:
 
 def _pnm_size(data: bytes) -> tuple[int, int] | None:
     gap = rb"(?:\s|#[^\n]*\n)+"
-    found = re.match(rb"P[1-7]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s", data[:4096])
-    return None if found is None else (int(found[1]), int(found[2]))
+    match = re.match(rb"P[1-7]" + gap + rb"(\d{1,9})" + gap + rb"(\d{1,9})\s", data[:4096])
+    return None if match is None else (int(match[1]), int(match[2]))
 
 
 def _jp2_size(data: bytes) -> tuple[int, int] | None:
-    """Of the image header box, or of the SIZ marker of a bare codestream."""
+    """Return (width, height) from the image header box or the SIZ marker of JPEG 2000."""
     box = data.find(b"ihdr", 0, 4096)
     if data[4:8] == b"jP  " and box > 0 and len(data) >= box + 12:
         height, width = struct.unpack_from(">II", data, box + 4)
@@ -127,7 +129,7 @@ def _jp2_size(data: bytes) -> tuple[int, int] | None:
 
 
 def read_header(data: bytes) -> ImageHeader:
-    """ImageHeader of an encoded image; what is damaged or unknown is left out."""
+    """Parse the header of an encoded image; omit damaged and unknown parts."""
     size: tuple[int, int] | None = None
     if data[:2] == b"\xff\xd8":
         for marker, payload in _jpeg_segments(data):
@@ -140,16 +142,16 @@ def read_header(data: bytes) -> ImageHeader:
     tags = _read_tags(block) if block else {}
     orientation = int(tags.get(_ORIENTATION, 1))
     if block is data or is_heif(data) or not 1 <= orientation <= 8:
-        # Decoders turn TIFF and HEIF upright themselves; a TIFF's stored size then says nothing.
+        # Decoders apply the orientation of TIFF and HEIF themselves.
         orientation = 1
     return ImageHeader(size, orientation, tags, _projection(data))
 
 
 def exif_block(data: bytes) -> bytes | None:
-    """The TIFF structure with the EXIF data of an encoded image; a TIFF is one itself."""
+    """Return the TIFF structure with the EXIF data of an encoded image, None if there is none."""
     if data[:2] == b"\xff\xd8":
-        found = (p for m, p in _jpeg_segments(data) if m == 0xE1 and p.startswith(_EXIF_SIGNATURE))
-        block = next(found, None)
+        app1 = (p for m, p in _jpeg_segments(data) if m == 0xE1 and p.startswith(_EXIF_SIGNATURE))
+        block = next(app1, None)
         return None if block is None else block[len(_EXIF_SIGNATURE) :]
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return next((c for name, c in _chunks(data, 8, ">") if name == b"eXIf"), None)
@@ -162,19 +164,19 @@ def exif_block(data: bytes) -> bytes | None:
 
 
 def _projection(data: bytes) -> str | None:
-    """What a panorama's XMP data call its projection, None of other photos."""
+    """Return the projection in the XMP data of a panorama, None for other images."""
     if data[:2] != b"\xff\xd8":
         return None
     for marker, payload in _jpeg_segments(data):
         if marker == 0xE1 and payload.startswith(_XMP_SIGNATURE):
-            found = re.search(rb"GPano:ProjectionType\W{1,4}(\w{1,40})", payload)
-            if found is not None:
-                return found[1].decode("ascii", "replace")
+            match = re.search(rb"GPano:ProjectionType\W{1,4}(\w{1,40})", payload)
+            if match is not None:
+                return match[1].decode("ascii", "replace")
     return None
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Marker and payload of each segment before the pixels."""
+    """Yield marker and payload of each segment before the pixels."""
     position = 2
     while position + 4 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
@@ -189,7 +191,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _chunks(data: bytes, position: int, order: str) -> Iterator[tuple[bytes, bytes]]:
-    """Chunks of a PNG (big-endian, length first, CRC behind) or RIFF (name first, padded)."""
+    """Yield chunks of a PNG (big-endian, length first, CRC last) or RIFF (name first, padded)."""
     png = order == ">"
     while position + 8 <= len(data):
         first, second = data[position : position + 4], data[position + 4 : position + 8]
@@ -200,7 +202,7 @@ def _chunks(data: bytes, position: int, order: str) -> Iterator[tuple[bytes, byt
 
 
 def _read_tags(block: bytes) -> dict[int, float]:
-    """Numeric tags of the first directory and the EXIF directory of a TIFF structure."""
+    """Read numeric tags of the first directory and the EXIF directory of a TIFF structure."""
     order = {b"II": "<", b"MM": ">"}.get(block[:2])
     if order is None or len(block) < 8:
         return {}
@@ -211,9 +213,11 @@ def _read_tags(block: bytes) -> dict[int, float]:
 
 
 def tiff_entries(block: bytes, offset: int | None = None) -> Iterator[tuple[int, int, int, int]]:
-    """Tag, type, number of values and the place of the first one, of each entry of a directory.
+    """Yield tag, type, number of values and offset of the first value of each directory entry.
 
-    ``offset``: of the directory, by default the first one. Ends where the block is cut off.
+    Args:
+        block: TIFF structure. Iteration stops where it is cut off.
+        offset: position of the directory, by default the first one.
     """
     order = {b"II": "<", b"MM": ">"}.get(block[:2])
     if order is None or len(block) < 8:
@@ -232,7 +236,7 @@ def tiff_entries(block: bytes, offset: int | None = None) -> Iterator[tuple[int,
 
 def _read_directory(block: bytes, order: str, offset: int) -> dict[int, float]:
     tags = {}
-    with suppress(struct.error):  # the directory is cut off: what was read so far stands
+    with suppress(struct.error):  # a directory that is cut off keeps the entries before the cut
         for tag, kind, number, place in tiff_entries(block, offset):
             layout = _TYPE_FORMATS.get(kind)
             if layout is None or number != 1:

@@ -1,13 +1,13 @@
-"""Cameras from a file: ``intrinsics.yaml``, a COLMAP model or ``transforms.json``.
+"""Reader of cameras: ``intrinsics.yaml``, COLMAP model or database, ``transforms.json``.
 
-``intrinsics.yaml`` numbers its cameras::
+Format of ``intrinsics.yaml``, cameras by number::
 
     1:
       model: OPENCV            # any camera model of COLMAP; default PINHOLE (SIMPLE_PINHOLE for 3)
       params: [600, 600, 320, 240, 0.1, 0, 0, 0]
       width: 640               # optional, checked against the images
       height: 480
-      images: all              # or a list of names; "all" means those that no list names
+      images: all              # or a list of names; "all": images that no list names
 """
 
 from __future__ import annotations
@@ -27,25 +27,27 @@ from mpsfm_core.inputs.models import match_names, read_model
 _DEFAULT_MODELS = {3: "SIMPLE_PINHOLE", 4: "PINHOLE"}
 _KEYS = ("model", "params", "width", "height", "images")
 _MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = 0.1, 10.0
-"""Focal length over the longer side (COLMAP: min/max_focal_length_ratio)."""
+"""Bounds of focal length over longer side [COLMAP min/max_focal_length_ratio]."""
 _CENTRAL = (0.8, 1.25)
-"""Principal points of real cameras lie nearer to the image's centre than these ratios."""
+"""Bounds of the principal point over the image center of real cameras."""
 _SAME_SCALE = 0.1
+"""Relative difference of x and y ratios below which a principal point is for another image size."""
 
 
 @dataclass(frozen=True)
 class CameraEntry:
-    """One camera of an intrinsics file.
-
-    ``size`` is None when the file does not give it. ``images``: names, or None for all that no
-    other camera names.
-    """
+    """One camera of an intrinsics file."""
 
     camera_id: int
+    """Number of the camera in the file."""
     model: str
+    """Name of COLMAP's camera model."""
     params: tuple[float, ...]
+    """Parameters in COLMAP's order, pixels."""
     size: tuple[int, int] | None
+    """(width, height), None if the file does not have it."""
     images: frozenset[str] | None
+    """Names of its images, None for all images that no other camera lists."""
 
 
 @dataclass(frozen=True)
@@ -56,17 +58,19 @@ class Intrinsics:
     entries: tuple[CameraEntry, ...]
 
     def for_images(self, names: Iterable[str]) -> Intrinsics:
-        """With the given names where the file calls the images otherwise: see
-        :func:`~mpsfm_core.inputs.models.match_names`."""
+        """Return the same cameras, listed under these names of the images.
+
+        Matches names with :func:`~mpsfm_core.inputs.models.match_names`.
+        """
         listed = {image for entry in self.entries for image in entry.images or ()}
-        called: dict[str, set[str]] = {}
-        for name, found in match_names(names, listed).items():
-            called.setdefault(found, set()).add(name)
+        new_names: dict[str, set[str]] = {}
+        for name, listed_name in match_names(names, listed).items():
+            new_names.setdefault(listed_name, set()).add(name)
         entries = (
             entry
             if entry.images is None
             else replace(
-                entry, images=entry.images.union(*(called.get(i, ()) for i in entry.images))
+                entry, images=entry.images.union(*(new_names.get(i, ()) for i in entry.images))
             )
             for entry in self.entries
         )
@@ -74,13 +78,17 @@ class Intrinsics:
 
     @property
     def max_id(self) -> int:
-        """The largest number of a camera."""
+        """Return the largest camera number."""
         return max((entry.camera_id for entry in self.entries), default=0)
 
     def usual_camera(self, name: str, size: tuple[int, int]) -> pycolmap.Camera | None:
-        """The camera of an image if the file names it, else the only one of its size, if any.
+        """Return the camera that lists the image, else the only camera of its size.
 
-        Raises what :meth:`camera` raises.
+        Returns:
+            None if neither exists.
+
+        Raises:
+            InputError: as :meth:`camera`.
         """
         if any(name in (entry.images or ()) for entry in self.entries):
             return self.camera(name, size)
@@ -88,15 +96,15 @@ class Intrinsics:
         return self._checked(same[0], name, size) if len(same) == 1 else None
 
     def camera(self, name: str, size: tuple[int, int]) -> pycolmap.Camera:
-        """The camera of an image of (width, height) pixels.
+        """Return the camera of an image of (width, height) pixels.
 
-        Raises :class:`InputError` when the file has none for it, or when it is for images of
-        another size.
+        Raises:
+            InputError: the file has no camera for the image, or one for images of another size.
         """
         return self._checked(self._entry(name), name, size)
 
     def _checked(self, entry: CameraEntry, name: str, size: tuple[int, int]) -> pycolmap.Camera:
-        """The camera for an image that it fits."""
+        """Return the camera of an entry; raise :class:`InputError` if it does not fit the image."""
         width, height = entry.size or size
         camera = pycolmap.Camera(
             model=entry.model,
@@ -123,15 +131,19 @@ class Intrinsics:
         listed = [image for entry in self.entries for image in entry.images or ()]
         raise InputError(
             f"{self.source} has no camera for image {name!r}{did_you_mean(name, listed)}; "
-            f"add it, or say 'images: all' for one camera"
+            f"add it, or write 'images: all' for one camera of all images"
         )
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
-    """Read ``intrinsics.yaml``, a COLMAP model, its ``cameras.txt``, a COLMAP database
-    (``.db``), or ``transforms.json``.
+    """Read cameras from a file or folder.
 
-    Raises :class:`InputError` that names the file, the camera and what is wrong.
+    Args:
+        path: ``intrinsics.yaml``, a COLMAP model, its ``cameras.txt``, a COLMAP database (``.db``)
+            or ``transforms.json``.
+
+    Raises:
+        InputError: the file cannot be read; the message names file, camera and fault.
     """
     try:
         if path.is_dir():
@@ -156,18 +168,18 @@ def _from_yaml(path: Path) -> tuple[CameraEntry, ...]:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except UnicodeDecodeError as error:
         known = "a COLMAP model, database (.db) or transforms.json"
-        raise InputError(f"{path} is no text, so neither YAML nor {known}") from error
+        raise InputError(f"{path} is binary, and neither a YAML file nor {known}") from error
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise InputError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, Mapping) or not data:
-        raise InputError(f"{path}: expected numbered cameras, see the format in the documentation")
+        raise InputError(f"{path}: expected cameras by number; the documentation shows the format")
     return tuple(_yaml_entry(path, key, value) for key, value in data.items())
 
 
 def _yaml_entry(path: Path, key: object, value: object) -> CameraEntry:
     where = f"{path}, camera {key}"
     if not isinstance(key, int) or isinstance(key, bool):
-        raise InputError(f"{where}: cameras are numbered (1:, 2:, ...)")
+        raise InputError(f"{where}: the key of a camera must be a number (1:, 2:, ...)")
     if not isinstance(value, Mapping):
         raise InputError(f"{where}: expected a mapping with 'params' and 'images'")
     for name in value:
@@ -189,14 +201,14 @@ def _yaml_entry(path: Path, key: object, value: object) -> CameraEntry:
 
 
 def _from_text(path: Path) -> tuple[CameraEntry, ...]:
-    """COLMAP's ``cameras.txt``, with the image names of the ``images.txt`` beside it."""
+    """Read ``cameras.txt`` of COLMAP and the image names of ``images.txt`` in the same folder."""
     names: dict[int, list[str]] = {}
     listing = path.with_name("images.txt")
     if listing.is_file():
         for line in _lines(listing)[::2]:
             fields = line.split(maxsplit=9)
             if len(fields) != 10:
-                raise InputError(f"{listing}: {line!r} is no image line of a COLMAP model")
+                raise InputError(f"{listing}: {line!r} is not an image line of a COLMAP model")
             names.setdefault(int(fields[8]), []).append(fields[9])
     cameras = [line.split() for line in _lines(path) if line]
     entries = []
@@ -285,7 +297,7 @@ def _check_lists(path: Path, entries: Sequence[CameraEntry]) -> None:
 
 
 def _fault(camera: pycolmap.Camera, entry: CameraEntry, size: tuple[int, int]) -> str | None:
-    """Why the camera cannot belong to an image of this size, and what to do."""
+    """Return why the camera does not fit an image of this size and what to do, else None."""
     if entry.size is not None and entry.size != size:
         return (
             f"the intrinsics are for {entry.size[0]}x{entry.size[1]} pixels; give those of the "
@@ -297,13 +309,15 @@ def _fault(camera: pycolmap.Camera, entry: CameraEntry, size: tuple[int, int]) -
     ratio = [2 * c / s for c, s in zip(center, size, strict=True)]
     wanted = "give fx, fy, cx, cy in pixels of this image"
     if not all(0 < r < 2 for r in ratio):
-        return f"the principal point ({center[0]:g}, {center[1]:g}) lies outside; {wanted}"
+        return (
+            f"the principal point ({center[0]:g}, {center[1]:g}) is outside of the image; {wanted}"
+        )
     off_center = [not _CENTRAL[0] < r < _CENTRAL[1] for r in ratio]
     if entry.size is None and all(off_center) and abs(ratio[0] / ratio[1] - 1) < _SAME_SCALE:
         return (
             f"the principal point ({center[0]:g}, {center[1]:g}) belongs to an image of about "
             f"{2 * center[0]:.0f}x{2 * center[1]:.0f} pixels; {wanted} (or add width and height "
-            f"if it really is so far from the centre)"
+            f"if it really is so far from the center)"
         )
     focal_ratio = camera.mean_focal_length() / max(size)
     if not _MIN_FOCAL_RATIO < focal_ratio < _MAX_FOCAL_RATIO:

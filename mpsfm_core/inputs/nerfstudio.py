@@ -1,8 +1,7 @@
-"""``transforms.json``, the camera file of nerfstudio and of tools that share its format.
+"""Reader of ``transforms.json``, the camera file of nerfstudio and instant-ngp.
 
-It holds a camera and ``world_from_cam`` with OpenGL's axes (x right, y up, z backward) for each
-frame. Here it is read as a COLMAP model without points, and written from one; the world is the
-file's in both.
+Each frame has intrinsics and ``world_from_cam`` with OpenGL's camera axes (x right, y up, z
+backward). The result is a COLMAP model without points in the same world frame.
 """
 
 from __future__ import annotations
@@ -32,24 +31,26 @@ DISTORTION_KEYS: Mapping[str, tuple[str, ...]] = {
     "OPENCV": ("k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
-"""COLMAP models the format can hold, and its names for the parameters behind the intrinsics."""
+"""COLMAP camera model -> keys of its distortion parameters in ``transforms.json``."""
 _CAMERA_KEYS = (
     *("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x"),
     *("k1", "k2", "k3", "k4", "p1", "p2"),
 )
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Between the axes of OpenGL's cameras and ours."""
+"""Converts camera axes from OpenCV (x right, y down, z forward) to OpenGL; its own inverse."""
 _LARGEST = 1 << 20
-"""Pixels of a side, and more than any photo has."""
+"""Upper bound of width and height in pixels, above every camera."""
 _ROTATION_TOLERANCE = 1e-3
-"""Of an entry of R^T R: files are written with few digits."""
+"""Tolerance of the entries of ``R^T R - I``: files have few digits."""
 
 
 def read_transforms(path: Path) -> pycolmap.Reconstruction:
-    """Cameras and poses of all frames; images are called as their ``file_path``.
+    """Read cameras and poses of all frames; image names are the ``file_path`` values.
 
-    Intrinsics stand in the frames or beside them. Where no size is given, that of the picture is
-    taken. Raises :class:`InputError` that names the frame and what is wrong.
+    Intrinsics are per frame or shared. If the file has no image size, the image file is read.
+
+    Raises:
+        InputError: the file is damaged or a frame is invalid; the message names the frame.
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
@@ -57,7 +58,7 @@ def read_transforms(path: Path) -> pycolmap.Reconstruction:
         raise InputError(f"{path} cannot be read: {error}") from error
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise InputError(f"{path}: no 'frames' in it, is it a transforms.json?")
+        raise InputError(f"{path}: it has no 'frames', so it is not a transforms.json")
     shared = {key: value for key, value in data.items() if key != "frames"}
     model = pycolmap.Reconstruction()
     cameras: dict[str, int] = {}
@@ -69,7 +70,7 @@ def read_transforms(path: Path) -> pycolmap.Reconstruction:
         name = posixpath.normpath(frame["file_path"].replace("\\", "/"))
         where += f" ({name})"
         if name in names:
-            raise InputError(f"{where}: the same picture has a frame before")
+            raise InputError(f"{where}: an earlier frame has the same file_path")
         names.add(name)
         camera = _camera(where, {**shared, **frame}, path.parent / name)
         key = camera_key(camera)
@@ -83,7 +84,7 @@ def read_transforms(path: Path) -> pycolmap.Reconstruction:
 
 
 def _world_from_camera(where: str, value: object) -> Float64:
-    """(4, 4), of a camera with our axes."""
+    """Return ``world_from_cam`` (4, 4) for OpenCV camera axes."""
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -96,7 +97,7 @@ def _world_from_camera(where: str, value: object) -> Float64:
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if not off <= _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise InputError(f"{where}: the left 3x3 block of 'transform_matrix' is no rotation")
+        raise InputError(f"{where}: the left 3x3 block of 'transform_matrix' is not a rotation")
     left, _, right = np.linalg.svd(rotation)
     pose[:3, :3] = left @ right
     return pose @ OPENGL_FROM_OPENCV
@@ -107,7 +108,7 @@ def _camera(where: str, values: Mapping[str, Any], picture: Path) -> pycolmap.Ca
     if "w" not in numbers or "h" not in numbers:
         numbers.update(_picture_size(where, picture))
     if not 1 <= min(numbers["w"], numbers["h"]) <= max(numbers["w"], numbers["h"]) < _LARGEST:
-        raise InputError(f"{where}: no picture has 'w' {numbers['w']:g} and 'h' {numbers['h']:g}")
+        raise InputError(f"{where}: no image has 'w' {numbers['w']:g} and 'h' {numbers['h']:g}")
     width, height = int(numbers["w"]), int(numbers["h"])
     focal = numbers.get("fl_x")
     if focal is None and 0 < numbers.get("camera_angle_x", 0) < math.pi:
@@ -135,23 +136,8 @@ def _camera(where: str, values: Mapping[str, Any], picture: Path) -> pycolmap.Ca
 
 
 def _numbers(where: str, values: Mapping[str, Any]) -> dict[str, float]:
-    """The values that describe a camera."""
-    names = [
-        "w",
-        "h",
-        "fl_x",
-        "fl_y",
-        "cx",
-        "cy",
-        "k1",
-        "k2",
-        "k3",
-        "k4",
-        "p1",
-        "p2",
-        "camera_angle_x",
-    ]
-    numbers = {name: values[name] for name in names if values.get(name) is not None}
+    """Return the camera parameters; raise :class:`InputError` for one that is not a number."""
+    numbers = {key: values[key] for key in _CAMERA_KEYS if values.get(key) is not None}
     for name, value in numbers.items():
         if not isinstance(value, (int, float)) or not math.isfinite(value):
             raise InputError(f"{where}: {name!r} must be a number, it is {value!r}")
@@ -159,13 +145,13 @@ def _numbers(where: str, values: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _picture_size(where: str, picture: Path) -> dict[str, float]:
-    """Width and height of the picture; its extension may be missing."""
+    """Return width and height of the image file; its extension may be missing."""
     named = (picture.with_name(picture.name + ending) for ending in sorted(EXTENSIONS))
     candidates = [picture, *named]
-    found = next((path for path in candidates if path.is_file()), None)
-    if found is None:
-        raise InputError(f"{where}: neither 'w' and 'h' nor the picture is there")
-    data = read_bytes(found)
-    check_size(data, found, InputOptions().max_pixels)
-    width, height = upright_size(data, read_header(data), found)
+    file = next((path for path in candidates if path.is_file()), None)
+    if file is None:
+        raise InputError(f"{where}: 'w' and 'h' are missing, and so is the image file")
+    data = read_bytes(file)
+    check_size(data, file, InputOptions().max_pixels)
+    width, height = upright_size(data, read_header(data), file)
     return {"w": width, "h": height}

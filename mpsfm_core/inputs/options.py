@@ -1,4 +1,4 @@
-"""Settings of the inputs room."""
+"""Options of reading images and videos."""
 
 from __future__ import annotations
 
@@ -10,37 +10,38 @@ from mpsfm_core.data.options import Options
 
 
 class VideoOptions(Options):
-    """Which frames of a video become photos."""
+    """Options of choosing frames of a video."""
 
     motion: float = Field(0.08, gt=0, lt=1)
-    """The next frame is taken when points have moved by this share of the diagonal (ours: about
-    what 3 to 5 degrees of a phone's turn move them)."""
+    """Median motion of tracked points to the next frame, as a share of the diagonal. Larger values
+    give fewer frames [3 to 5 degrees of rotation of a phone]."""
     overlap: float = Field(0.7, gt=0, lt=1)
-    """... or when only this share of them is still seen."""
+    """Share of tracked points below which the next frame is chosen. Larger values give more
+    frames."""
     max_frames: int = Field(300, ge=2)
-    """Of more frames evenly spread ones are taken."""
+    """Maximum number of frames. Above it, evenly spaced frames are chosen."""
 
 
 class InputOptions(Options):
-    """How photos become views."""
+    """Options of reading and undistorting images."""
 
     max_image_size: int | None = Field(None, ge=32)
-    """Longer side in pixels to which larger images are reduced, null keeps their size (the paper's
-    evaluation; the published command reduces to 1200)."""
+    """Longer side in pixels to which larger images are reduced; null keeps the size [paper 4]. The
+    reference command uses 1200. Larger values give more accurate keypoints and take more time."""
     max_pixels: int = Field(250_000_000, ge=1024)
-    """Larger photos and masks are refused before they are decoded: a file of a few kilobytes can
-    stand for gigabytes (ours: above every camera, 0.75 GB decoded)."""
+    """Maximum number of pixels of an image or mask. Larger files are refused before decoding,
+    because a small file can decode to gigabytes [above all cameras on the market]."""
     strict: bool = False
-    """A damaged photo ends the run; else it is left out, with a warning and the reason in the
-    summary, as long as no more than half of the photos are damaged."""
+    """True: a damaged image ends the run. False: damaged images are left out with a warning, unless
+    more than half are damaged."""
     masks: Path | None = None
-    """Folder of masks of the original images, ``NAME.png`` or the name with ``.png`` for its own
-    extension; black pixels are not used (COLMAP's convention)."""
+    """Folder of masks of the original images, ``NAME.png`` or the name with ``.png`` instead of its
+    extension. Black pixels are not used [COLMAP mask_path]."""
     default_focal_ratio: float = Field(1.2, gt=0)
-    """Focal length over the longer side when nothing is known (COLMAP:
-    default_focal_length_factor)."""
+    """Ratio of focal length to longer side for images without a known focal length [COLMAP
+    default_focal_length_factor]."""
     blank_pixels: float = Field(0.0, ge=0, le=1)
-    """Undistortion: 0 keeps only the area that is seen everywhere, 1 keeps every original pixel
-    with empty (masked) corners (COLMAP's option and default)."""
+    """Share of blank pixels after undistortion: 0 crops to valid pixels, 1 keeps all original
+    pixels and masks blank corners [COLMAP blank_pixels]."""
     video: VideoOptions = Field(default_factory=VideoOptions)
-    """Of a video instead of photos."""
+    """Options for a video as input."""

@@ -1,4 +1,4 @@
-"""From the original camera to the pinhole camera of the whole pipeline, and back."""
+"""Undistortion of images, masks and pixels to pinhole cameras."""
 
 from __future__ import annotations
 
@@ -11,23 +11,28 @@ from mpsfm_core.geometry import inside, pixel_centers, project, rays, scale_pixe
 from mpsfm_core.geometry.pycolmap_conversion import pinhole_from_colmap
 
 _ROWS = 256
-"""Rows of a warp that are computed at once: bounds the memory for large images."""
+"""Rows of a map that are computed together: bounds the memory for large images."""
 
 
 def is_pinhole(camera: pycolmap.Camera) -> bool:
-    """Whether pixels of the camera are those of a pinhole camera already."""
+    """Return whether the camera has no distortion."""
     return bool(camera.is_perspective_pinhole() and camera.is_undistorted())
 
 
 def resize_camera(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:
-    """The same camera for an image resized to (width, height)."""
+    """Return the camera of the image after resizing to (width, height)."""
     resized = pycolmap.Camera(camera.todict())
     resized.rescale(*size)
     return resized
 
 
 def undistort_camera(camera: pycolmap.Camera, blank_pixels: float) -> PinholeCamera:
-    """The undistorted camera: COLMAP's choice of field of view, or the camera itself."""
+    """Return the pinhole camera of the undistorted image.
+
+    Args:
+        camera: original camera. A pinhole camera is returned unchanged.
+        blank_pixels: COLMAP's ``blank_pixels``, 0 for no empty pixels, 1 for all original pixels.
+    """
     if not is_pinhole(camera):
         options = pycolmap.UndistortCameraOptions()
         options.blank_pixels = blank_pixels
@@ -36,7 +41,7 @@ def undistort_camera(camera: pycolmap.Camera, blank_pixels: float) -> PinholeCam
 
 
 def distort_pixels(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64) -> Float64:
-    """Pixels (n, 2) of the undistorted view as pixels of the original camera."""
+    """Map pixels (n, 2) of the undistorted view to pixels of the original camera."""
     if is_pinhole(camera):
         return scale_pixels(xy, pinhole.size, (camera.width, camera.height))
     original: Float64 = camera.img_from_cam(rays(pinhole, xy))
@@ -44,8 +49,11 @@ def distort_pixels(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64)
 
 
 def undistort_pixels(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float64) -> Float64:
-    """Pixels (n, 2) of the original camera as pixels of the undistorted view; NaN where a
-    distortion has no inverse."""
+    """Map pixels (n, 2) of the original camera to pixels of the undistorted view.
+
+    Returns:
+        (n, 2) float64, NaN where the distortion has no inverse.
+    """
     if is_pinhole(camera):
         return scale_pixels(xy, (camera.width, camera.height), pinhole.size)
     direction: Float64 = camera.cam_from_img(xy)
@@ -53,9 +61,9 @@ def undistort_pixels(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float6
 
 
 class UndistortionMap:
-    """Resampling from a distorted image to its pinhole view; made once for each camera.
+    """Precomputed resampling from a distorted image to its pinhole view.
 
-    ``valid``: (h, w) bool, False where the view looks past the border of the original image.
+    ``valid``: (h, w) bool, False where the pixel is outside of the original image.
     """
 
     def __init__(self, camera: pycolmap.Camera, pinhole: PinholeCamera) -> None:
@@ -69,7 +77,7 @@ class UndistortionMap:
         self._source: Float32 = source - np.float32(0.5)
 
     def image(self, image: UInt8) -> UInt8:
-        """The undistorted image, bilinear, black where nothing was seen."""
+        """Undistort an image with bilinear interpolation; pixels outside of it are black."""
         warped = cv2.remap(
             image, self._source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
@@ -78,7 +86,7 @@ class UndistortionMap:
         return result
 
     def mask(self, mask: Bool) -> Bool:
-        """A mask of the original image on the view, nearest pixel, False where nothing was seen."""
+        """Undistort a mask with nearest-neighbor sampling; pixels outside of it are False."""
         warped = cv2.remap(
             mask.astype(np.uint8), self._source, None, cv2.INTER_NEAREST, borderValue=0
         )

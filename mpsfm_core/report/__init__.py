@@ -1,5 +1,5 @@
-"""The page that shows a finished result folder.
+"""Report page of a finished result folder, and scenes for viewers.
 
-It reads that folder and nothing else, so that it can be made anew at any time
-(``mpsfm report DIR``), and it is one file that opens without a server or a network.
+The report reads only the result folder, so ``mpsfm report DIR`` can write it again at any time. It
+is one HTML file that opens without a server or network.
 """

@@ -19,7 +19,7 @@ from mpsfm_core.data import Float64
 from mpsfm_core.data.errors import InputError, MpsfmError
 from mpsfm_core.data.result_layout import REPORT
 from mpsfm_core.report import pictures
-from mpsfm_core.report.findings import findings, partner_counts, verdict
+from mpsfm_core.report.findings import findings, partner_counts
 from mpsfm_core.report.points import PointSet, dense_points, sparse_points
 from mpsfm_core.report.reasons import explain_image, explain_pair
 from mpsfm_core.report.result_folder import PairMatches, PriorMaps, RefinedMap, ResultFolder
@@ -102,7 +102,7 @@ def _payload(result: ResultFolder) -> dict[str, Any]:
     ids = {name: row for row, name in enumerate(result.names)}
     return {
         "folder": result.path.resolve().name,
-        "verdict": asdict(verdict(summary)),
+        "verdict": {"level": verdict.level, "text": verdict.text},
         "findings": [asdict(finding) for finding in findings(summary)],
         "photos": parallel_map(photos.describe, result.names),
         "pairs": _pairs(summary, ids),

@@ -1,4 +1,4 @@
-"""Photos and maps as small pictures for a page."""
+"""Images and maps as small pictures (data URIs) for the report page."""
 
 from __future__ import annotations
 
@@ -12,30 +12,31 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Bool, Float32, UInt8
 
 _QUALITY = 76
+"""WebP quality."""
 _EMPTY_BGR = (40, 36, 34)
-"""Of pixels that have no value."""
+"""Color of pixels without a value."""
 
 
 def photo(picture: UInt8, side: int) -> str:
-    """A BGR picture, its longer side at most so many pixels, as a data URI."""
+    """Encode a BGR image as a data URI, its longer side at most ``side`` pixels."""
     return _encode(_reduced(picture, side, cv2.INTER_AREA))
 
 
 def depth_map(depth: Float32, valid: Bool, near_far: tuple[float, float], side: int) -> str:
-    """Near is red, far is blue, even in inverse depth as the eye sees it."""
+    """Encode a depth map: near is red, far is blue, linear in inverse depth."""
     near, far = near_far
     inverse = 1 / np.where(valid, depth, 1)
     share = (inverse - 1 / far) / max(1 / near - 1 / far, 1e-12)
     return _coloured(share, valid, cv2.COLORMAP_TURBO, side)
 
 
-def std_map(relative_std: Float32, valid: Bool, most: float, side: int) -> str:
-    """Dark is certain, bright is not; ``most``: the relative std that is brightest."""
-    return _coloured(relative_std / max(most, 1e-12), valid, cv2.COLORMAP_INFERNO, side)
+def std_map(relative_std: Float32, valid: Bool, max_std: float, side: int) -> str:
+    """Encode a map of relative std: 0 is dark, ``max_std`` is brightest."""
+    return _coloured(relative_std / max(max_std, 1e-12), valid, cv2.COLORMAP_INFERNO, side)
 
 
 def normal_map(normals: Float32, valid: Bool, side: int) -> str:
-    """Right is red, up is green, towards the camera is blue."""
+    """Encode a normal map: right is red, up is green, toward the camera is blue."""
     rgb = (normals * np.array([1, -1, -1], np.float32) + 1) * 127.5
     bgr = np.clip(rgb[..., ::-1], 0, 255).astype(np.uint8)
     bgr[~valid] = _EMPTY_BGR
@@ -43,7 +44,7 @@ def normal_map(normals: Float32, valid: Bool, side: int) -> str:
 
 
 def range_of(depth: Float32, valid: Bool) -> tuple[float, float]:
-    """Near and far for :func:`depth_map`, without the outermost 2 %; of no pixels (1, 1)."""
+    """Return the 2nd and 98th percentile of valid depth, (1, 1) without valid pixels."""
     if not valid.any():
         return 1.0, 1.0
     near, far = np.percentile(depth[valid], [2, 98])

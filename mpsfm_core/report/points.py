@@ -1,4 +1,4 @@
-"""The points of the page: thinned, and with what they can be coloured by."""
+"""Points of the report page: subsampled, with error, std and number of images."""
 
 from __future__ import annotations
 
@@ -13,71 +13,81 @@ from mpsfm_core.geometry import inside, project, sample_nearest, transform
 from mpsfm_core.report.result_folder import RefinedMap
 
 _SIGMAS = 3.0
-"""A map sees a point when its depth there agrees within so many standard deviations, as the fused
-cloud is made."""
+"""Maximum depth difference in standard deviations for a map to count as observing a point."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointSet:
-    """``xyz`` (n, 3) float64, ``rgb`` (n, 3) uint8. ``error``: (n,) float32, reprojection error in
-    pixels or relative disagreement of depth maps (``error_unit``: px or %). ``std``: (n,) float32,
-    least relative std of a map that sees it, in percent, NaN where none does. ``views``: (n,)
-    float32, images that see it."""
+    """Points with the values by which the page can color them."""
 
     xyz: Float64
+    """(n, 3) float64, world coordinates."""
     rgb: UInt8
+    """(n, 3) uint8."""
     error: Float32
+    """(n,) float32, reprojection error or relative depth difference, in :attr:`error_unit`."""
     std: Float32
+    """(n,) float32, minimum relative std of the observing maps in percent, NaN without one."""
     views: Float32
+    """(n,) float32, number of images that observe the point."""
     error_unit: str
+    """``px`` or ``%``."""
 
 
 def sparse_points(
-    model: pycolmap.Reconstruction, maps: Sequence[RefinedMap], most: int
+    model: pycolmap.Reconstruction, maps: Sequence[RefinedMap], max_points: int
 ) -> PointSet:
-    """The triangulated points, at most so many."""
+    """Return at most ``max_points`` triangulated points."""
     points = [model.points3D[key] for key in sorted(model.points3D)]
-    points = [points[row] for row in _some(len(points), most)]
+    points = [points[row] for row in _sample_rows(len(points), max_points)]
     xyz = np.array([p.xyz for p in points], np.float64).reshape(-1, 3)
     rgb = np.array([p.color for p in points], np.uint8).reshape(-1, 3)
     error = np.array([p.error for p in points], np.float32)
     views = np.array([p.track.length() for p in points], np.float32)
-    std = _seen(xyz, maps)[1]
+    std = _measure_observations(xyz, maps)[1]
     return PointSet(xyz, rgb, error, std, views, "px")
 
 
-def dense_points(cloud: tuple[Float64, UInt8], maps: Sequence[RefinedMap], most: int) -> PointSet:
-    """The fused depth maps, at most so many points."""
-    chosen = _some(len(cloud[0]), most)
-    xyz, rgb = cloud[0][chosen], cloud[1][chosen]
-    error, std, views = _seen(xyz, maps)
+def dense_points(
+    cloud: tuple[Float64, UInt8], maps: Sequence[RefinedMap], max_points: int
+) -> PointSet:
+    """Return at most ``max_points`` points of the fused depth maps."""
+    rows = _sample_rows(len(cloud[0]), max_points)
+    xyz, rgb = cloud[0][rows], cloud[1][rows]
+    error, std, views = _measure_observations(xyz, maps)
     return PointSet(xyz, rgb, error, std, views, "%")
 
 
-def _some(count: int, most: int) -> Int64:
-    """Rows of at most ``most``, drawn evenly and always the same."""
-    if count <= most:
+def _sample_rows(count: int, max_rows: int) -> Int64:
+    """Return at most ``max_rows`` of ``count`` rows, drawn with a fixed seed."""
+    if count <= max_rows:
         return np.arange(count)
-    return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
+    return np.sort(np.random.default_rng(0).choice(count, max_rows, replace=False))
 
 
-def _seen(xyz: Float64, maps: Sequence[RefinedMap]) -> tuple[Float32, Float32, Float32]:
-    """Of each point the mean relative disagreement of the maps that see it and their least
-    relative std, both in percent, and their number."""
+def _measure_observations(
+    xyz: Float64, maps: Sequence[RefinedMap]
+) -> tuple[Float32, Float32, Float32]:
+    """Compare points with the depth maps that observe them.
+
+    Returns:
+        Mean relative depth difference in percent, minimum relative std in percent, and number of
+        observing maps of each point.
+    """
     total = np.zeros(len(xyz))
     views = np.zeros(len(xyz), np.float32)
-    least = np.full(len(xyz), np.nan, np.float32)
+    min_std = np.full(len(xyz), np.nan, np.float32)
     for refined in maps:
         local = transform(refined.rotation, refined.translation, xyz)
         pixels = project(refined.camera, local)
         rows = np.flatnonzero(inside(pixels, refined.camera.size) & (local[:, 2] > 0))
         rows = rows[sample_nearest(refined.valid, pixels[rows])]
         std = sample_nearest(refined.relative_std, pixels[rows])
-        off = np.abs(sample_nearest(refined.depth, pixels[rows]) / local[rows, 2] - 1)
-        agrees = off <= _SIGMAS * std
-        rows, std, off = rows[agrees], std[agrees], off[agrees]
-        total[rows] += off
+        difference = np.abs(sample_nearest(refined.depth, pixels[rows]) / local[rows, 2] - 1)
+        agrees = difference <= _SIGMAS * std
+        rows, std, difference = rows[agrees], std[agrees], difference[agrees]
+        total[rows] += difference
         views[rows] += 1
-        least[rows] = np.fmin(least[rows], std)
+        min_std[rows] = np.fmin(min_std[rows], std)
     error = (100 * total / np.maximum(views, 1)).astype(np.float32)
-    return error, 100 * least, views
+    return error, 100 * min_std, views

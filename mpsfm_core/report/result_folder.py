@@ -1,4 +1,4 @@
-"""A finished result folder, read back."""
+"""Reader of a finished result folder."""
 
 from __future__ import annotations
 
@@ -27,38 +27,41 @@ _UNREADABLE = (ValueError, KeyError, TypeError, IndexError)
 
 @dataclass(frozen=True, eq=False)
 class RefinedMap:
-    """Refined depth of a registered image.
-
-    ``depth``, ``relative_std``: (h, w) float32, z in units of the model and the std in shares of
-    it. ``valid``: (h, w) bool. ``rotation`` (3, 3), ``translation`` (3,): ``cam_from_world``.
-    """
+    """Refined depth of a registered image."""
 
     depth: Float32
+    """(h, w) float32, z in units of the model."""
     relative_std: Float32
+    """(h, w) float32, std of the depth over the depth."""
     valid: Bool
+    """(h, w) bool."""
     camera: PinholeCamera
+    """Camera of the depth grid."""
     rotation: Float64
+    """(3, 3), of ``cam_from_world``."""
     translation: Float64
+    """(3,), of ``cam_from_world``."""
 
 
 @dataclass(frozen=True, eq=False)
 class PriorMaps:
-    """What the mapper was given for an image.
-
-    ``depth``, ``relative_std``: (h, w) float32, the prior in its own units and its std in shares
-    of it. ``normals``: (h, w, 3) float32. ``valid``: (h, w) bool. ``camera``: of the whole view.
-    """
+    """Depth and normal prior of an image."""
 
     depth: Float32
+    """(h, w) float32, z in the units of the prior."""
     relative_std: Float32
+    """(h, w) float32, std of the depth over the depth."""
     normals: Float32
+    """(h, w, 3) float32, unit, camera frame."""
     valid: Bool
+    """(h, w) bool."""
     camera: PinholeCamera
+    """Camera of the view (full resolution, not the grid of the prior)."""
 
 
 @dataclass(frozen=True, eq=False)
 class PairMatches:
-    """Some of the verified matches of two images: (m, 2) float32 each, pixels of the views."""
+    """Sample of the verified matches of two images, (m, 2) float32 each, pixels of the views."""
 
     image_a: str
     image_b: str
@@ -68,49 +71,48 @@ class PairMatches:
 
 @dataclass(frozen=True, eq=False)
 class ResultFolder:
-    """What a run left in a folder; arrays are read when asked for.
-
-    ``summary``: of ``summary.json``.
-    """
+    """Results of a run; arrays are read on demand."""
 
     path: Path
+    """Result folder."""
     summary: Mapping[str, Any] = field(repr=False)
+    """Content of ``summary.json``."""
 
     @classmethod
     def open(cls, path: Path) -> ResultFolder:
-        """Raises :class:`InputError` when there is no summary that can be read."""
+        """Open a result folder; raise :class:`InputError` if its summary cannot be read."""
         summary = read_summary(path / SUMMARY)
-        wanted = {"images", "pairs", "reconstructions", "stages", "providers"}
-        if not wanted <= summary.keys():
-            raise InputError(f"{path / SUMMARY}: is not the summary of a run")
+        required = {"images", "pairs", "reconstructions", "stages", "providers"}
+        if not required <= summary.keys():
+            raise InputError(f"{path / SUMMARY} is not the summary of a run")
         return cls(path, summary)
 
     @property
     def failed(self) -> bool:
-        """Whether nothing was reconstructed; what else lies in the folder is an earlier run's."""
+        """True if the run failed; models in the folder are then from an earlier run."""
         return bool(self.summary["status"] != "success")
 
     @property
     def names(self) -> list[str]:
-        """Of all images of the run."""
+        """Names of all images of the run."""
         return list(self.summary["images"]["details"])
 
     @cached_property
     def model(self) -> pycolmap.Reconstruction:
-        """Of the original photos; empty after a failed run."""
+        """COLMAP model of the original images, empty after a failed run."""
         if self.failed:
             return pycolmap.Reconstruction()
         return read_model(self.path / "sparse")
 
     def dense_cloud(self) -> tuple[Float64, UInt8]:
-        """World points (n, 3) and RGB colours (n, 3) of ``dense.ply``, empty if it is not there."""
+        """Read points (n, 3) and RGB colors (n, 3) of ``dense.ply``, empty if it does not exist."""
         file = self.path / DENSE
         if self.failed or not file.is_file():
             return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
         return read_ply(file)
 
     def refined(self, name: str) -> RefinedMap | None:
-        """Refined depth of an image, None if it was not written."""
+        """Read the refined depth of an image, None if it was not written."""
         file = self.path / DEPTH / f"{name}.npz"
         if self.failed or not file.is_file():
             return None
@@ -123,10 +125,10 @@ class ResultFolder:
             camera = PinholeCamera(width, height, *map(float, data["camera"]))
             return RefinedMap(depth, std, valid, camera, pose[:, :3], pose[:, 3])
         except _UNREADABLE as error:
-            raise InputError(f"{file}: is damaged: {error}") from error
+            raise InputError(f"{file} is damaged: {error}") from error
 
     def prior(self, name: str) -> PriorMaps | None:
-        """Priors of an image, None if they were not written."""
+        """Read the priors of an image, None if they were not written."""
         file = self.path / VIEWS / f"{name}.npz"
         if not file.is_file():
             return None
@@ -141,20 +143,20 @@ class ResultFolder:
                 PinholeCamera(int(width), int(height), *params),
             )
         except _UNREADABLE as error:
-            raise InputError(f"{file}: is damaged: {error}") from error
+            raise InputError(f"{file} is damaged: {error}") from error
 
     def picture(self, name: str) -> UInt8 | None:
-        """The small undistorted view, (h, w, 3) BGR, None if it was not written."""
+        """Read the reduced undistorted view, (h, w, 3) BGR, None if it was not written."""
         file = self.path / VIEWS / f"{name}.webp"
         if not file.is_file():
             return None
         picture = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
         if picture is None:
-            raise InputError(f"{file}: is damaged")
+            raise InputError(f"{file} is damaged")
         return np.asarray(picture, np.uint8)
 
-    def lines(self) -> list[PairMatches]:
-        """Verified matches, none if they were not written."""
+    def matches(self) -> list[PairMatches]:
+        """Read the sampled verified matches of all pairs, empty if they were not written."""
         file = self.path / VIEWS / MATCHES
         if not file.is_file():
             return []
@@ -171,11 +173,11 @@ class ResultFolder:
                 for row, (a, b) in enumerate(data["pairs"])
             ]
         except _UNREADABLE as error:
-            raise InputError(f"{file}: is damaged: {error}") from error
+            raise InputError(f"{file} is damaged: {error}") from error
 
 
 def _load(file: Path) -> dict[str, Any]:
     try:
         return read_npz(file)
     except (OSError, ValueError) as error:
-        raise InputError(f"{file}: is damaged: {error}") from error
+        raise InputError(f"{file} is damaged: {error}") from error

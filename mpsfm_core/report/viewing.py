@@ -1,8 +1,8 @@
-"""What viewers show: posed images with pictures and points, from a run or from a folder.
+"""Scenes for viewers: posed images with pictures and points, from a run or a folder.
 
-A viewer is a plugin. It names itself in the hook ``mpsfm_viewers``; what it names is called as
-``factory(output, pictures)`` and gives an object with the methods of :class:`Viewer`. During a run
-that object is registered as a plugin, so that every event hook it implements is called.
+A viewer is a plugin that implements the hook ``mpsfm_viewers``. The hook returns factories, which
+are called as ``factory(output, pictures)`` and return a :class:`Viewer`. During a run the viewer is
+registered as a plugin, so its event hooks are called.
 """
 
 from __future__ import annotations
@@ -35,57 +35,59 @@ from mpsfm_core.results.ply import read_ply
 PICTURE_SIDE = 320
 """Longer side of pictures in viewers, in pixels."""
 MAX_RELATIVE_STD = 0.3
-"""Depth that is less certain is not shown: it hides the rest (ours)."""
-_SHOWN_PIXELS = 8000
-"""Of a depth map."""
+"""Maximum relative std of shown depth; less certain depth would occlude the rest."""
+_MAX_PIXELS = 8000
+"""Maximum number of shown pixels of a depth map."""
 
 
 class Viewer(Protocol):
-    """Shows scenes."""
+    """Viewer of scenes."""
 
     def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
-        """Show a scene in the place of what was shown before."""
+        """Show a scene instead of the previous one."""
         ...
 
     def finish(self) -> str:
-        """No more scenes come; returns a line that says where to look."""
+        """Finish after the last scene; return a line that says where to look."""
         ...
 
     def wait(self) -> None:
-        """Stay until the user has seen enough; returns at once where there is a file to open."""
+        """Block until the user closes the viewer; return immediately if it writes a file."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class ColoredPoints:
-    """``xyz``: (n, 3) float64, world units. ``rgb``: (n, 3) uint8."""
+    """Points with colors."""
 
     xyz: Float64
+    """(n, 3) float64, world coordinates."""
     rgb: UInt8
+    """(n, 3) uint8."""
 
 
 Pictures = Callable[[str], UInt8 | None]
-"""Small RGB picture (h, w, 3) uint8 of an image by its name, None where there is none."""
+"""Returns the reduced RGB image (h, w, 3) uint8 of an image name, None if there is none."""
 
 
 def pictures_from_photos(folder: Path) -> Pictures:
-    """Pictures from a folder of photos; a photo that cannot be read has none."""
-    return lambda name: _decoded(folder / name)
+    """Return pictures from a folder of images, None for images that cannot be read."""
+    return lambda name: _read_picture(folder / name)
 
 
 def pictures_from_results(folder: Path) -> Pictures:
-    """Pictures from a result folder."""
-    return lambda name: _decoded(folder / VIEWS / f"{name}.webp")
+    """Return pictures from a result folder."""
+    return lambda name: _read_picture(folder / VIEWS / f"{name}.webp")
 
 
-def lifted(image: PosedImage, picture: UInt8 | None) -> ColoredPoints:
-    """The depth map of an image as thinned points, grey without a picture, none without depth."""
+def unproject_depth_map(image: PosedImage, picture: UInt8 | None) -> ColoredPoints:
+    """Unproject a subsampled depth map; points are gray without a picture."""
     depth = image.depth
     if depth is None:
         return ColoredPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     height, width = depth.shape
-    pixels = np.flatnonzero(certain(depth))
-    pixels = pixels[:: max(1, -(-len(pixels) // _SHOWN_PIXELS))]
+    pixels = np.flatnonzero(select_certain_pixels(depth))
+    pixels = pixels[:: max(1, -(-len(pixels) // _MAX_PIXELS))]
     xy = pixel_centers(width, height).reshape(-1, 2)[pixels]
     local = unproject(image.camera.resized(width, height), xy, depth.depth.ravel()[pixels])
     world = local @ image.rotation + camera_center(image.rotation, image.translation)
@@ -95,9 +97,8 @@ def lifted(image: PosedImage, picture: UInt8 | None) -> ColoredPoints:
     return ColoredPoints(world, rgb)
 
 
-def certain(depth: DepthPrior) -> Bool:
-    """Which pixels (h, w) are worth showing: valid, and not less certain than
-    :data:`MAX_RELATIVE_STD`."""
+def select_certain_pixels(depth: DepthPrior) -> Bool:
+    """Return the mask (h, w) of valid pixels with relative std up to :data:`MAX_RELATIVE_STD`."""
     if depth.variance is None:
         return depth.valid
     shown: Bool = depth.valid & (depth.variance <= (MAX_RELATIVE_STD * depth.depth) ** 2)
@@ -105,14 +106,15 @@ def certain(depth: DepthPrior) -> Bool:
 
 
 def read_scene(folder: Path) -> tuple[SceneState, ColoredPoints, Pictures]:
-    """A result folder, any COLMAP model, or a ``transforms.json``; its photos lie in ``images/``.
+    """Read a result folder, a COLMAP model or a ``transforms.json`` with ``images/``.
 
-    Raises :class:`InputError` when the folder is none of them.
+    Raises:
+        InputError: the folder is none of them.
     """
     if (folder / SUMMARY).is_file():
         result = ResultFolder.open(folder)
         if result.failed:
-            raise InputError(f"{folder}: the run failed, open {folder}/report.html instead")
+            raise InputError(f"{folder}: the run failed; open {folder}/report.html for the reasons")
         scene, cloud = scene_from_model(result.model)
         if (folder / DENSE).is_file():
             cloud = ColoredPoints(*read_ply(folder / DENSE))
@@ -121,7 +123,7 @@ def read_scene(folder: Path) -> tuple[SceneState, ColoredPoints, Pictures]:
 
 
 def scene_from_model(model: pycolmap.Reconstruction) -> tuple[SceneState, ColoredPoints]:
-    """The images of a COLMAP model that have a pose, sorted by name, and its points."""
+    """Return the registered images of a COLMAP model, sorted by name, and its points."""
     images = []
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.has_pose:
@@ -134,8 +136,8 @@ def scene_from_model(model: pycolmap.Reconstruction) -> tuple[SceneState, Colore
     return SceneState(tuple(images), xyz), ColoredPoints(xyz, rgb)
 
 
-def _decoded(file: Path) -> UInt8 | None:
-    """Reduced and upright; None if it is not there or no picture."""
+def _read_picture(file: Path) -> UInt8 | None:
+    """Read an image reduced and upright, None if it cannot be read."""
     try:
         data = np.frombuffer(file.read_bytes(), np.uint8)
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)

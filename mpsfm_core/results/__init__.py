@@ -1,1 +1,1 @@
-"""Writes reconstructions in the formats other tools read, and the report."""
+"""Writes result folders, COLMAP models and exports to the formats of other programs."""

@@ -1,4 +1,4 @@
-"""A reconstruction in metres east, north and up, from where its photos were taken."""
+"""Georeferencing: alignment of a reconstruction with GPS positions of its images."""
 
 from __future__ import annotations
 
@@ -9,85 +9,110 @@ import cv2
 import numpy as np
 import pycolmap
 
+from mpsfm_core.data.decisions import GpsReason, Reason
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.inputs.gps import GpsPosition, convert_to_enu
-from mpsfm_core.mapping.scene.reconstruction import MetricScale, Reconstruction, transformed
+from mpsfm_core.mapping.scene.reconstruction import (
+    MetricScale,
+    Reconstruction,
+    transform_reconstruction,
+)
 from mpsfm_core.results.gravity import estimate_gravity, rotation_to_z
 
-_FEWEST = 4
-"""Positions: three fix a similarity, one more can deny it."""
-_SPREAD = 5.0
-"""Standard deviations of the noise over which the positions have to spread."""
-_TILT_DEG = 2.0
-"""Altitudes that fix gravity less well than this leave it to cameras and surfaces."""
-_ALTITUDE = 2.0
-"""Noise of altitudes over that of positions (GPS.gov's user ranges: 1.5 to 3)."""
-_OUTLIER = 3.0
-"""Standard deviations."""
+_MIN_POSITIONS = 4
+"""Minimum number of positions: three determine a similarity, a fourth validates it."""
+_MIN_SPREAD_STDS = 5.0
+"""Minimum spread of the positions in standard deviations of their noise."""
+_MAX_TILT_STD_DEG = 2.0
+"""Maximum std of gravity from altitudes; above it gravity comes from camera orientations."""
+_ALTITUDE_STD_RATIO = 2.0
+"""Vertical over horizontal GPS noise [GPS.gov: 1.5 to 3]."""
+_MAX_ERROR_STDS = 3.0
+"""Maximum error of an inlier in standard deviations."""
 
 
 @dataclass(frozen=True)
 class Georeference:
-    """How a reconstruction was laid over the positions of its photos.
-
-    ``origin``: of east, north, up. ``images``: photos with a position, ``inliers`` of which fit.
-    ``rms_m``: horizontal distance of those. ``metres_per_unit``: what was applied. ``up``: what
-    fixed gravity.
-    """
+    """Alignment of a reconstruction with GPS positions."""
 
     origin: GpsPosition
+    """Origin of east, north, up."""
     images: int
+    """Number of registered images with a position."""
     inliers: int
+    """Number of positions that agree with the alignment."""
     rms_m: float
+    """Root mean square horizontal error of the inliers in meters."""
     metres_per_unit: float
+    """Scale that was applied."""
     up: str
+    """Source of the gravity direction."""
 
     def describe(self) -> dict[str, object]:
-        """Plain data for the summary."""
+        """Return plain data for the summary."""
         return asdict(self)
 
 
 def georeference(
     reconstruction: Reconstruction, positions: Mapping[str, GpsPosition]
-) -> tuple[Reconstruction, Georeference] | str:
-    """The reconstruction in metres east, north and up of the photos' middle.
+) -> tuple[Reconstruction, Georeference] | Reason:
+    """Align a reconstruction with the GPS positions of its images.
 
-    ``positions``: by image name. Returns why not, in words, where too few photos have one, they
-    spread too little for their noise, or most of them deny each other.
+    Estimates a similarity with RANSAC. If altitudes do not determine gravity, gravity comes from
+    the camera orientations, and the positions determine heading, scale and translation.
+
+    Args:
+        reconstruction: reconstruction in any frame.
+        positions: GPS positions by image name.
+
+    Returns:
+        The reconstruction in meters east, north, up of the median position, and the alignment. A
+        reason instead if there are too few positions, they spread too little for their noise, or
+        most of them disagree.
     """
-    named = {image.name: image for image in reconstruction.confirmed_images}
-    known = [name for name in named if name in positions]
-    if len(known) < _FEWEST:
-        return f"{len(known)} registered photos have a GPS position, {_FEWEST} are needed"
-    origin = _middle([positions[name] for name in known])
-    enu = convert_to_enu([positions[name] for name in known], origin)
-    std_m = float(np.median([positions[name].std_m for name in known]))
+    by_name = {image.name: image for image in reconstruction.confirmed_images}
+    located = [name for name in by_name if name in positions]
+    if len(located) < _MIN_POSITIONS:
+        return GpsReason.TOO_FEW_POSITIONS.because(
+            num_positions=len(located), min_positions=_MIN_POSITIONS
+        )
+    origin = _median_position([positions[name] for name in located])
+    enu = convert_to_enu([positions[name] for name in located], origin)
+    std_m = float(np.median([positions[name].std_m for name in located]))
     deviations = enu[:, :2] - np.median(enu[:, :2], axis=0)
     spread = float(np.sqrt((deviations**2).sum(axis=1).mean()))
-    if spread < _SPREAD * std_m:
-        return f"GPS positions spread over {spread:.1f} m, their noise is {std_m:.1f} m"
-    centers = np.stack([camera_center(named[n].rotation, named[n].translation) for n in known])
+    if spread < _MIN_SPREAD_STDS * std_m:
+        return GpsReason.TOO_LITTLE_SPREAD.because(spread_m=round(spread, 2), std_m=round(std_m, 2))
+    images = [by_name[name] for name in located]
+    centers = np.stack([camera_center(image.rotation, image.translation) for image in images])
     tilt = _tilt_deg(enu, std_m)
-    if tilt < _TILT_DEG:
-        fitted, up = _fit_all(centers, enu, std_m), "GPS altitudes"
+    if tilt < _MAX_TILT_STD_DEG:
+        enu_from_world, up = _fit_similarity(centers, enu, std_m), "GPS altitudes"
     else:
-        poses = [(image.rotation, image.translation) for image in named.values()]
-        fitted, up = _fit_level(poses, centers, enu, std_m), "gravity from how cameras are held"
-    if fitted is None:
-        return "GPS positions deny each other"
-    off = np.linalg.norm((fitted * centers)[:, :2] - enu[:, :2], axis=1)
-    inliers = off < _OUTLIER * std_m
-    if 2 * inliers.sum() <= len(known):
-        return f"only {inliers.sum()} of {len(known)} GPS positions fit the reconstruction"
-    scale = float(fitted.scale)
-    rms = float(np.sqrt((off[inliers] ** 2).mean()))
+        poses = [(image.rotation, image.translation) for image in by_name.values()]
+        enu_from_world, up = (
+            _fit_level_similarity(poses, centers, enu, std_m),
+            "gravity from how cameras are held",
+        )
+    if enu_from_world is None:
+        return GpsReason.INCONSISTENT.because()
+    error_m = np.linalg.norm((enu_from_world * centers)[:, :2] - enu[:, :2], axis=1)
+    inliers = error_m < _MAX_ERROR_STDS * std_m
+    if 2 * inliers.sum() <= len(located):
+        return GpsReason.FEW_INLIERS.because(
+            num_inliers=int(inliers.sum()), num_positions=len(located)
+        )
+    scale = float(enu_from_world.scale)
+    rms = float(np.sqrt((error_m[inliers] ** 2).mean()))
     metric = MetricScale(1.0, rms / spread, int(inliers.sum()), True, "GPS positions")
-    moved = transformed(reconstruction, scale, fitted.rotation.matrix(), fitted.translation, metric)
-    return moved, Georeference(origin, len(known), int(inliers.sum()), rms, scale, up)
+    moved = transform_reconstruction(
+        reconstruction, scale, enu_from_world.rotation.matrix(), enu_from_world.translation, metric
+    )
+    return moved, Georeference(origin, len(located), int(inliers.sum()), rms, scale, up)
 
 
-def _middle(positions: list[GpsPosition]) -> GpsPosition:
+def _median_position(positions: list[GpsPosition]) -> GpsPosition:
     altitudes = [p.altitude for p in positions if p.altitude is not None]
     return GpsPosition(
         float(np.median([p.latitude for p in positions])),
@@ -97,41 +122,45 @@ def _middle(positions: list[GpsPosition]) -> GpsPosition:
 
 
 def _tilt_deg(enu: Float64, std_m: float) -> float:
-    """How well altitudes fix the vertical: across the direction in which positions spread less."""
-    whole = enu[np.isfinite(enu).all(axis=1)]
-    if len(whole) < _FEWEST:
+    """Return the std in degrees of gravity from altitudes, about the axis of least spread."""
+    with_altitude = enu[np.isfinite(enu).all(axis=1)]
+    if len(with_altitude) < _MIN_POSITIONS:
         return 90.0
-    width = np.linalg.svd(whole[:, :2] - whole[:, :2].mean(axis=0), compute_uv=False)[1]
-    return float(np.degrees(np.arctan2(_ALTITUDE * std_m, width)))
+    horizontal = with_altitude[:, :2]
+    width = np.linalg.svd(horizontal - horizontal.mean(axis=0), compute_uv=False)[1]
+    return float(np.degrees(np.arctan2(_ALTITUDE_STD_RATIO * std_m, width)))
 
 
-def _fit_all(centers: Float64, enu: Float64, std_m: float) -> pycolmap.Sim3d | None:
-    whole = np.isfinite(enu).all(axis=1)
-    options = pycolmap.RANSACOptions(max_error=_OUTLIER * _ALTITUDE * std_m, random_seed=0)
-    fitted = pycolmap.estimate_sim3d_robust(centers[whole], enu[whole], options)
-    return (
-        None if fitted is None else fitted["tgt_from_src"] if isinstance(fitted, dict) else fitted
+def _fit_similarity(centers: Float64, enu: Float64, std_m: float) -> pycolmap.Sim3d | None:
+    """Estimate ``enu_from_world`` from all coordinates with RANSAC."""
+    with_altitude = np.isfinite(enu).all(axis=1)
+    options = pycolmap.RANSACOptions(
+        max_error=_MAX_ERROR_STDS * _ALTITUDE_STD_RATIO * std_m, random_seed=0
     )
+    result = pycolmap.estimate_sim3d_robust(centers[with_altitude], enu[with_altitude], options)
+    return result["tgt_from_src"] if isinstance(result, dict) else result
 
 
-def _fit_level(
+def _fit_level_similarity(
     poses: list[Pose], centers: Float64, enu: Float64, std_m: float
 ) -> pycolmap.Sim3d | None:
-    """Gravity from the cameras; heading, scale and place from positions; height from altitudes."""
+    """Estimate ``enu_from_world`` with gravity from the cameras and the rest from positions."""
     rotations = np.stack([rotation for rotation, _ in poses])
     gravity = estimate_gravity(rotations, np.zeros((0, 3)))
     level = rotation_to_z(gravity.up, rotations[0, 0])
-    turned = centers @ level.T
+    leveled = centers @ level.T
     cv2.setRNGSeed(0)
-    source, target = (np.ascontiguousarray(places[:, :2]) for places in (turned, enu))
-    found, _ = cv2.estimateAffinePartial2D(
-        source, target, ransacReprojThreshold=_OUTLIER * std_m, maxIters=5000
+    source, target = (np.ascontiguousarray(places[:, :2]) for places in (leveled, enu))
+    affine, _ = cv2.estimateAffinePartial2D(
+        source, target, ransacReprojThreshold=_MAX_ERROR_STDS * std_m, maxIters=5000
     )
-    if found is None:
+    if affine is None:
         return None
-    scale = float(np.hypot(found[0, 0], found[1, 0]))
+    scale = float(np.hypot(affine[0, 0], affine[1, 0]))
     heading = np.eye(3)
-    heading[:2, :2] = found[:, :2] / scale
-    height = np.nanmedian(enu[:, 2] - scale * turned[:, 2]) if np.isfinite(enu[:, 2]).any() else 0.0
-    translation = np.array([found[0, 2], found[1, 2], height])
+    heading[:2, :2] = affine[:, :2] / scale
+    height = (
+        np.nanmedian(enu[:, 2] - scale * leveled[:, 2]) if np.isfinite(enu[:, 2]).any() else 0.0
+    )
+    translation = np.array([affine[0, 2], affine[1, 2], height])
     return pycolmap.Sim3d(scale, pycolmap.Rotation3d(heading @ level), translation)

@@ -1,4 +1,4 @@
-"""Binary glTF 2.0 files. glTF has y up and metres."""
+"""Writer of binary glTF 2.0 files (y up, meters)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Float64, Int64, UInt8
 
 POINTS, LINES, TRIANGLES = 0, 1, 4
-"""Kinds of meshes."""
+"""Modes of glTF primitives."""
 Y_UP_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 FLIP = np.diag([1.0, -1.0, -1.0])
-"""Between our axes of cameras and glTF's; of the world too, if it is as COLMAP leaves it."""
+"""Converts camera axes from OpenCV to glTF; also for a world without known gravity."""
 _FLOAT, _BYTE, _UINT = 5126, 5121, 5125
 _LISTS = ("nodes", "meshes", "cameras", "accessors", "bufferViews")
 
 
 class GltfScene:
-    """Collects nodes and their numbers."""
+    """Scene to which nodes, meshes and cameras are added by number."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -33,7 +33,7 @@ class GltfScene:
         }
 
     def add(self, node: dict[str, Any], root: bool = True) -> int:
-        """A node, of the scene itself or of another node; its number."""
+        """Add a node to the scene, or a child node if ``root`` is False; return its number."""
         number = len(self._json["nodes"])
         self._json["nodes"].append(node)
         if root:
@@ -48,8 +48,15 @@ class GltfScene:
         colors: UInt8 | None,
         triangles: Int64 | None = None,
     ) -> int:
-        """Points (n, 3), ends of lines, or corners of triangles (m, 3), which are rows of the
-        points; maybe with RGB colours (n, 3). Its number."""
+        """Add a mesh; return its number.
+
+        Args:
+            name: name of the mesh.
+            mode: :data:`POINTS`, :data:`LINES` or :data:`TRIANGLES`.
+            points: (n, 3) vertices; two per line.
+            colors: (n, 3) RGB, or None.
+            triangles: (m, 3) rows of the points.
+        """
         positions = points.astype("<f4")
         bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
         attributes = {"POSITION": self._accessor(positions, "VEC3", _FLOAT, bounds)}
@@ -61,12 +68,12 @@ class GltfScene:
         if triangles is not None:
             indices = triangles.astype("<u4").ravel()
             primitive["indices"] = self._accessor(indices, "SCALAR", _UINT, {})
-            primitive["material"] = self._photographed()
+            primitive["material"] = self._unlit_material()
         self._json["meshes"].append({"name": name, "primitives": [primitive]})
         return len(self._json["meshes"]) - 1
 
-    def _photographed(self) -> int:
-        """A material that is seen from both sides and has its light in its colours."""
+    def _unlit_material(self) -> int:
+        """Return the unlit, double-sided material; add it on first use."""
         if not self._json["materials"]:
             unlit = "KHR_materials_unlit"
             self._json["extensionsUsed"].append(unlit)
@@ -74,7 +81,7 @@ class GltfScene:
         return 0
 
     def camera(self, name: str, half: Float64) -> int:
-        """A camera that sees so far to the sides and up at z = -1; its number."""
+        """Add a camera with half width and half height ``half`` at z = -1; return its number."""
         described = {
             "aspectRatio": float(half[0] / half[1]),
             "yfov": float(2 * np.arctan(half[1])),
@@ -85,7 +92,7 @@ class GltfScene:
         return len(self._json["cameras"]) - 1
 
     def encode(self) -> bytes:
-        """The file."""
+        """Return the content of the file."""
         self._json["buffers"] = [{"byteLength": len(self._data)}]
         parts = {name: value for name, value in self._json.items() if value != []}
         text = json.dumps(parts, separators=(",", ":")).encode("utf-8")

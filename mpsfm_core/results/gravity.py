@@ -1,4 +1,4 @@
-"""Which way is up in a reconstruction, from how cameras are held and how surfaces lie."""
+"""Estimation of the gravity direction from camera orientations and surface normals."""
 
 from __future__ import annotations
 
@@ -10,27 +10,29 @@ from mpsfm_core.data import Float64
 from mpsfm_core.geometry import angle_between_deg
 
 _ROLL_DEG = 10.0
-"""How far from level people hold a camera."""
+"""Std of the roll of hand-held cameras in degrees."""
 _PITCH_DEG = 30.0
-"""How far from level they point it, on average over the photos; up to twice that far surfaces are
-believed against the cameras."""
+"""Std of the mean pitch of hand-held cameras in degrees. Candidates from surfaces may differ from
+the cameras by twice this angle."""
 _SURFACE_DEG = 5.0
-"""Within this angle floors and walls count as level and upright: the std of a normal of the better
-networks of the paper's appendix C is about twice that, averaged over many it is far smaller."""
+"""Angle in degrees within which a surface counts as horizontal or vertical."""
 _CANDIDATES = 500
+"""Number of normals that are tested as gravity direction."""
 _REFINEMENTS = 5
+"""Number of least-squares iterations."""
 
 
 @dataclass(frozen=True, eq=False)
 class Gravity:
-    """``up``: (3,) float64, unit, away from the ground, in world coordinates. ``surfaces``: share
-    of surface normals that lie along it or across it, None if there were none to ask."""
+    """Gravity direction of a reconstruction."""
 
     up: Float64
+    """(3,) float64, unit vector away from the ground in world coordinates."""
     surfaces: float | None
+    """Share of normals that are parallel or perpendicular to ``up``, None without normals."""
 
     def __str__(self) -> str:
-        """For people."""
+        """Describe the source for users."""
         if self.surfaces is None:
             return "gravity from how the cameras are held"
         return (
@@ -39,12 +41,17 @@ class Gravity:
 
 
 def estimate_gravity(rotations: Float64, normals: Float64) -> Gravity:
-    """Up, from cameras that are held about level and surfaces that are level or upright.
+    """Estimate gravity: cameras are about level, surfaces are horizontal or vertical.
 
-    ``rotations``: (n, 3, 3) ``cam_from_world``. ``normals``: (m, 3) unit vectors in the world, may
-    be none. Photos that all look steeply down or up need surfaces.
+    Scores candidate directions by a Gaussian prior on roll and pitch and by the support of the
+    normals, then refines the best one by least squares. Without normals, images that all look
+    steeply down or up give a wrong direction.
+
+    Args:
+        rotations: (n, 3, 3) ``cam_from_world``.
+        normals: (m, 3) unit normals in the world, may be empty.
     """
-    level = _up_of_cameras(rotations)
+    level = _estimate_up_from_cameras(rotations)
     if not len(normals):
         return Gravity(level, None)
     rights = rotations[:, 0]
@@ -52,13 +59,13 @@ def estimate_gravity(rotations: Float64, normals: Float64) -> Gravity:
     candidates = np.vstack([level, normals[::step], -normals[::step]])
     candidates = candidates[angle_between_deg(candidates, level) < 2 * _PITCH_DEG]
     roll = np.sin(np.radians(_ROLL_DEG))
-    doubt = 0.5 * (angle_between_deg(candidates, level) / _PITCH_DEG) ** 2
-    doubt += 0.5 * ((candidates @ rights.T / roll) ** 2).mean(axis=1)
+    cost = 0.5 * (angle_between_deg(candidates, level) / _PITCH_DEG) ** 2
+    cost += 0.5 * ((candidates @ rights.T / roll) ** 2).mean(axis=1)
     cosines = np.abs(normals[::step] @ candidates.T)
-    support = (_near_level(cosines) + _near_upright(cosines)).mean(axis=0)
-    up = candidates[np.argmax(np.log(support + 1e-6) - doubt)]
+    support = (_weigh_horizontal(cosines) + _weigh_vertical(cosines)).mean(axis=0)
+    up = candidates[np.argmax(np.log(support + 1e-6) - cost)]
     for _ in range(_REFINEMENTS):
-        up = _refined(up, normals)
+        up = _refine_up(up, normals)
     cosines = np.abs(normals @ up)
     limit = np.radians(_SURFACE_DEG)
     agreeing = (cosines > np.cos(limit)) | (cosines < np.sin(limit))
@@ -66,8 +73,7 @@ def estimate_gravity(rotations: Float64, normals: Float64) -> Gravity:
 
 
 def rotation_to_z(up: Float64, right: Float64) -> Float64:
-    """Rotation (3, 3) float64 of the world that turns ``up`` to +z, and ``right``, as far as it is
-    level, to +x."""
+    """Return the rotation (3, 3) of ``up`` to +z and of the level part of ``right`` to +x."""
     x = right - (right @ up) * up
     if np.linalg.norm(x) < 1e-6:
         x = np.eye(3)[np.argmin(np.abs(up))]
@@ -76,8 +82,8 @@ def rotation_to_z(up: Float64, right: Float64) -> Float64:
     return np.stack([x, np.cross(up, x), up])
 
 
-def _up_of_cameras(rotations: Float64) -> Float64:
-    """Across the right axes of all cameras; where these say too little, the mean of their ups."""
+def _estimate_up_from_cameras(rotations: Float64) -> Float64:
+    """Return the direction most perpendicular to all right axes; the mean up axis regularizes."""
     rights, ups = rotations[:, 0], -rotations[:, 1]
     mean = ups.mean(axis=0)
     mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
@@ -87,23 +93,25 @@ def _up_of_cameras(rotations: Float64) -> Float64:
     return up if up @ mean >= 0 else -up
 
 
-def _refined(up: Float64, normals: Float64) -> Float64:
-    """The direction that level normals lie along and upright ones across, by least squares."""
+def _refine_up(up: Float64, normals: Float64) -> Float64:
+    """Refine ``up`` by least squares over normals of horizontal and vertical surfaces."""
     cosines = np.abs(normals @ up)
-    along, across = _near_level(cosines), _near_upright(cosines)
+    along, across = _weigh_horizontal(cosines), _weigh_vertical(cosines)
     scatter = (normals * (across - along)[:, None]).T @ normals
-    better: Float64 = np.linalg.eigh(scatter)[1][:, 0]
-    better = better if better @ up >= 0 else -better
-    return better if angle_between_deg(better, up) < 2 * _SURFACE_DEG else up
+    refined: Float64 = np.linalg.eigh(scatter)[1][:, 0]
+    refined = refined if refined @ up >= 0 else -refined
+    return refined if angle_between_deg(refined, up) < 2 * _SURFACE_DEG else up
 
 
-def _near_level(cosines: Float64) -> Float64:
+def _weigh_horizontal(cosines: Float64) -> Float64:
+    """Return Gaussian weights of normals that are parallel to a direction."""
     angle = np.degrees(np.arccos(np.clip(cosines, 0, 1)))
     weight: Float64 = np.exp(-0.5 * (angle / _SURFACE_DEG) ** 2)
     return weight
 
 
-def _near_upright(cosines: Float64) -> Float64:
+def _weigh_vertical(cosines: Float64) -> Float64:
+    """Return Gaussian weights of normals that are perpendicular to a direction."""
     angle = np.degrees(np.arcsin(np.clip(cosines, 0, 1)))
     weight: Float64 = np.exp(-0.5 * (angle / _SURFACE_DEG) ** 2)
     return weight

@@ -1,4 +1,4 @@
-"""Settings of the results room."""
+"""Options of the result folder."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mpsfm_core.data.options import Options
 
 
 class ResultOptions(Options):
-    """What is written beside the COLMAP model, and how much of it."""
+    """Options of the files that are written in addition to the COLMAP model."""
 
     text_model: bool = False
     """Also write the COLMAP model as text, into ``sparse_text/``."""
@@ -17,17 +17,17 @@ class ResultOptions(Options):
     depth_maps: bool = True
     """Write the refined depth maps into ``depth/``."""
     report: bool = True
-    """Write ``report.html``, and into ``views/`` what it shows: small photos, priors, matches."""
+    """Write ``report.html``, and small images, priors and matches into ``views/``."""
     dense_cloud: bool = True
     """Write ``dense.ply``."""
     dense_max_points: int = Field(2_000_000, ge=1)
-    """Size limit of ``dense.ply`` (32 bytes a point: 64 MB); random pixels are left out above."""
+    """Maximum number of points in ``dense.ply``, 32 bytes each; random pixels are dropped."""
     dense_max_relative_std: float = Field(0.1, gt=0)
-    """Pixels whose depth has a larger relative std are left out of ``dense.ply``. Twice the
-    relative std of the weaker networks of the paper's appendix C, so it takes the worst pixels.
-    Where more than three quarters are worse, the surest quarter stays."""
+    """Maximum relative depth std of pixels in ``dense.ply``. Larger values give more and less
+    accurate points. If more than three quarters exceed it, the best quarter is used [twice the std
+    of the weaker networks in paper C]."""
     dense_consistency_sigmas: float = Field(3.0, gt=0)
-    """A pixel that another image sees through, by more than this many standard deviations, is left
-    out of ``dense.ply`` unless more images confirm than contradict it."""
+    """Depth difference in standard deviations from which another image contradicts a pixel. Pixels
+    with more contradicting than confirming images are dropped from ``dense.ply``."""
     georeference: bool = True
-    """Where the photos have GPS positions that spread enough: metres east, north and up."""
+    """Transform the result to meters east, north, up if GPS positions spread enough."""

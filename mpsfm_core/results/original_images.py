@@ -1,4 +1,4 @@
-"""From the mapper's undistorted views back to the photos of the user."""
+"""Access from the mapper's undistorted views to the original images, and export of views."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from mpsfm_core.inputs.undistortion import is_pinhole
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 _PORTABLE = frozenset((".jpg", ".jpeg", ".png"))
+"""Extensions of formats that all programs read."""
 
 
 class OriginalImages:
-    """The photos of the images of a problem, found by name."""
+    """Original images of a mapping problem, by name."""
 
     def __init__(self, images: ImageSet, problem: MappingProblem) -> None:
         self.problem = problem
@@ -26,51 +27,50 @@ class OriginalImages:
         self._rows = {name: row for row, name in enumerate(images.names)}
 
     def source(self, image: RegisteredImage) -> SourceImage:
-        """The photo of a registered image."""
+        """Return the image file of a registered image."""
         return self._images[self._rows[image.name]]
 
     def key(self, image: RegisteredImage) -> str:
-        """Names the content of its view."""
+        """Return the cache key of the view of a registered image."""
         return self._images.pixel_key(self._rows[image.name])
 
     def view(self, name: str) -> View:
-        """The undistorted view."""
+        """Return the undistorted view of an image."""
         return self._images.view(self._rows[name])
 
     def keypoints(self, reconstruction: Reconstruction) -> list[Float64]:
-        """For each registered image its keypoints (n, 2), pixels of the view."""
+        """Return the keypoints (n, 2) of each registered image in pixels of its view."""
         return [self.problem.images[image.index].keypoints for image in reconstruction.images]
 
     def original_keypoints(self, reconstruction: Reconstruction) -> list[Float64]:
-        """For each registered image its keypoints (n, 2), pixels of the upright photo."""
+        """Return the keypoints (n, 2) of each registered image in pixels of the original."""
         return [
             self.source(image).original_pixels(xy)
             for image, xy in zip(reconstruction.images, self.keypoints(reconstruction), strict=True)
         ]
 
     def original_camera(self, image: RegisteredImage) -> pycolmap.Camera:
-        """The camera of the upright photo, with the focal length that the mapper refined."""
+        """Return the camera of the upright original with the refined focal length."""
         return self.source(image).refined_camera(image.camera)
 
     def any_distorted(self, reconstruction: Reconstruction) -> bool:
-        """Whether a photo of the reconstruction is not a pinhole image."""
+        """Return whether a registered image has lens distortion."""
         return any(not is_pinhole(self.source(image).camera) for image in reconstruction.images)
 
     def write_view(self, image: RegisteredImage, path: Path) -> None:
-        """Write the undistorted view as :func:`export_view` does."""
+        """Write the undistorted view with :func:`export_view`."""
         export_view(self._images, self._rows[image.name], path)
 
 
 def exported_image_name(name: str) -> str:
-    """What an undistorted view is called: as its photo, with ``.jpg`` behind what not every
-    program reads."""
+    """Return the file name of an undistorted view: ``.jpg`` is appended to uncommon formats."""
     return name if PurePosixPath(name).suffix.lower() in _PORTABLE else f"{name}.jpg"
 
 
 def export_view(images: ImageSet, index: int, path: Path) -> None:
-    """Write the undistorted view of a photo, upright, in the format that ``path`` ends in.
+    """Write the upright, undistorted view of an image; the extension sets the format.
 
-    A photo that is already so is copied as it is.
+    Copies the file if the image is already upright and undistorted and has this format.
     """
     image = images[index]
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""PLY files: point clouds and meshes."""
+"""Reader and writer of PLY files: point clouds and meshes."""
 
 from __future__ import annotations
 
@@ -29,19 +29,24 @@ def write_ply(
     points: Float64,
     colors: UInt8,
     normals: Float32 | None = None,
-    further: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+    extra: Mapping[str, NDArray[Any]] = MappingProxyType({}),
     triangles: Int64 | None = None,
 ) -> None:
-    """Write points (n, 3) with RGB colours (n, 3) as little-endian float32 and uint8.
+    """Write a point cloud or mesh as binary little-endian PLY.
 
-    ``normals``: (n, 3). ``further``: properties (n,) by name, float32 or uint8. ``triangles``:
-    (m, 3), rows of the points.
+    Args:
+        path: file to write.
+        points: (n, 3), written as float32.
+        colors: (n, 3) uint8 RGB.
+        normals: (n, 3), optional.
+        extra: further properties (n,) by name, float32 or uint8.
+        triangles: (m, 3) rows of the points, optional.
     """
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", points.T.astype("<f4"), strict=True))
     if normals is not None:
         columns |= zip(("nx", "ny", "nz"), normals.T.astype("<f4"), strict=True)
     columns |= zip(("red", "green", "blue"), colors.T, strict=True)
-    columns |= further
+    columns |= extra
     kinds = {name: "uchar" if x.dtype == np.uint8 else "float" for name, x in columns.items()}
     layout = [(name, "<" + _TYPES[kind]) for name, kind in kinds.items()]
     vertices = np.empty(len(points), dtype=layout)
@@ -62,15 +67,19 @@ def write_ply(
 
 
 def write_cloud(path: Path, cloud: FusedPointCloud) -> None:
-    """Write a fused cloud, with ``std`` and ``views`` as properties of that name."""
-    further: dict[str, NDArray[Any]] = {"std": cloud.std, "views": cloud.views}
-    write_ply(path, cloud.points, cloud.colors, cloud.normals, further)
+    """Write a fused point cloud with the properties ``std`` and ``views``."""
+    extra: dict[str, NDArray[Any]] = {"std": cloud.std, "views": cloud.views}
+    write_ply(path, cloud.points, cloud.colors, cloud.normals, extra)
 
 
 def read_ply(path: Path) -> tuple[Float64, UInt8]:
-    """Points (n, 3) and RGB colours (n, 3) of a PLY file, text or binary; grey without colours.
+    """Read the vertices of a text or binary PLY file.
 
-    Raises :class:`InputError` when it is another kind of file, or cut off.
+    Returns:
+        Points (n, 3) float64 and RGB colors (n, 3) uint8, gray if the file has none.
+
+    Raises:
+        InputError: the file is not PLY, is cut off, or has points that are not finite.
     """
     try:
         data = path.read_bytes()
@@ -83,17 +92,17 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
         case [["ply"], ["format", encoding, *_]] if encoding in _ORDERS and start:
             vertex, count = _layout(path, lines[2:], _ORDERS[encoding])
         case _:
-            raise InputError(f"{path}: is no PLY file")
+            raise InputError(f"{path} is not a PLY file")
     body = data[start:]
     if encoding == "ascii":
         vertices = _read_text(path, body, vertex, count)
     elif len(body) < count * vertex.itemsize:
-        raise InputError(f"{path}: is cut off, {count} points are announced")
+        raise InputError(f"{path} is cut off: the header has {count} points")
     else:
         vertices = np.frombuffer(body, vertex, count)
     points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
     if not np.isfinite(points).all():
-        raise InputError(f"{path}: has points that are not finite")
+        raise InputError(f"{path} has points that are not finite")
     rgb = ("red", "green", "blue")
     if not set(rgb) <= set(vertex.names or ()):
         return points, np.full((count, 3), 128, np.uint8)
@@ -101,7 +110,7 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
 
 
 def _layout(path: Path, header: list[str], order: str) -> tuple[np.dtype[Any], int]:
-    """What a vertex consists of, and how many there are."""
+    """Parse the header: dtype of a vertex and number of vertices."""
     layout: list[tuple[str, str]] = []
     count: int | None = None
     for line in header:
@@ -113,18 +122,18 @@ def _layout(path: Path, header: list[str], order: str) -> tuple[np.dtype[Any], i
             case ["property", kind, name] if kind in _TYPES:
                 layout.append((name, order + _TYPES[kind]))
             case ["property", *_]:
-                raise InputError(f"{path}: its points have a property of a strange type: {line}")
+                raise InputError(f"{path}: a vertex property has an unknown type: {line}")
     names = [name for name, _ in layout]
     if count is None or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
-        raise InputError(f"{path}: its points have no x, y and z, or have them twice")
+        raise InputError(f"{path}: the vertices need x, y and z once each")
     return np.dtype(layout), count
 
 
 def _read_text(path: Path, body: bytes, vertex: np.dtype[Any], count: int) -> NDArray[Any]:
     lines = body.decode("ascii", "replace").splitlines()[:count]
     if len(lines) < count:
-        raise InputError(f"{path}: is cut off, {count} points are announced")
+        raise InputError(f"{path} is cut off: the header has {count} points")
     try:
         return np.array([tuple(map(float, line.split())) for line in lines], dtype=vertex)
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{path}: has a point that cannot be read: {error}") from error
+        raise InputError(f"{path} has a point that cannot be read: {error}") from error

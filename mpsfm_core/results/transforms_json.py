@@ -14,14 +14,17 @@ from mpsfm_core.inputs.nerfstudio import DISTORTION_KEYS, OPENGL_FROM_OPENCV
 
 
 def supports_camera(camera: pycolmap.Camera) -> bool:
-    """Whether the format has this camera model; others have to be undistorted first."""
+    """Return whether the format has this camera model; images of others must be undistorted."""
     return camera.model_name in DISTORTION_KEYS
 
 
 def write_transforms(path: Path, model: pycolmap.Reconstruction, files: Mapping[str, str]) -> None:
     """Write poses and cameras of a model.
 
-    ``files``: image name -> path of its picture, relative to the folder of ``path``.
+    Args:
+        path: file to write.
+        model: all its images must have a pose.
+        files: image name -> path of the image file, relative to the folder of ``path``.
     """
     frames = []
     for image in sorted(model.images.values(), key=lambda image: str(image.name)):

@@ -1,4 +1,4 @@
-"""A bounded memory of what was used last."""
+"""Size-bounded cache with least-recently-used eviction."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ Value = TypeVar("Value")
 
 
 class LruCache(Generic[Key, Value]):
-    """Keeps values up to a total size, and forgets the ones that were not asked for longest.
+    """Thread-safe cache that evicts the least recently used values above a total size.
 
-    Threads may share it. Two that ask for the same missing value at once may both compute it.
+    Two threads that miss the same key at the same time may both compute its value.
     """
 
     def __init__(self, limit: int, size: Callable[[Value], int]) -> None:
@@ -25,7 +25,7 @@ class LruCache(Generic[Key, Value]):
         self._lock = threading.Lock()
 
     def get(self, key: Key, compute: Callable[[], Value]) -> Value:
-        """The value of a key, computed if it is not here; the newest one is always kept."""
+        """Return the value of a key; compute it on a miss. The newest value is never evicted."""
         with self._lock:
             if key in self._values:
                 self._values.move_to_end(key)

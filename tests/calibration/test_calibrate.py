@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 from mpsfm_core.calibration.report import write_report
 from mpsfm_core.cli import build_app
 from mpsfm_core.config import load_config
-from mpsfm_core.providers.uncertainty.calibration_file import load_calibration
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration_file import load_calibration
 from mpsfm_core.support.yaml_text import parse_yaml
 from tests.calibration.scene_model import write_model
 
@@ -186,7 +186,7 @@ def test_masked_pixels_and_images_without_truth_are_left_out(tmp_path: Path) -> 
     ("arguments", "message"),
     [
         ([*PRIOR, "--ground-truth", "nowhere"], "nowhere does not exist"),
-        ([*PRIOR, "--model", SCENE / "images"], "no COLMAP model here"),
+        ([*PRIOR, "--model", SCENE / "images"], "has no COLMAP model"),
         ([*PRIOR, "--model", SCENE / "gt"], "the model has no points"),
         ([*PRIOR, *DEPTH, "--model", SCENE / "gt"], "true maps or a model, not both"),
         ([*PRIOR, *DEPTH, "--kind", "depht"], "did you mean 'depth'"),

@@ -77,10 +77,10 @@ def test_declared_size_allows_an_odd_principal_point(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "hint"),
     [
-        ("", "expected numbered cameras"),
-        ("[1, 2]", "expected numbered cameras"),
+        ("", "expected cameras by number"),
+        ("[1, 2]", "expected cameras by number"),
         ("1: [", "not valid YAML"),
-        ("a: {params: [1, 2, 3]}", "numbered"),
+        ("a: {params: [1, 2, 3]}", "must be a number"),
         ("1: 5", "expected a mapping"),
         ("1: {parms: [1, 2, 3]}", "did you mean 'params'"),
         ("1: {params: 5}", "list of numbers"),

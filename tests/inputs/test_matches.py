@@ -13,10 +13,10 @@ import pytest
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.colmap_database import read_database
+from mpsfm_core.inputs.image_decoding import apply_orientation_to_pixels, orient
 from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.matches import matches_from_database, matches_from_hloc
-from mpsfm_core.inputs.image_decoding import orient, apply_orientation_to_pixels
 from mpsfm_core.testing.synthetic.scenes import arc_poses, project, room_scene
 
 SIZE = (160, 120)

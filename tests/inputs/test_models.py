@@ -33,7 +33,7 @@ def test_a_folder_without_a_model_or_with_a_broken_one_is_wrong_input(tmp_path: 
         read_poses(tmp_path)
     for name in ("cameras", "images", "points3D", "frames", "rigs"):
         (tmp_path / f"{name}.bin").write_bytes(b"\x01\x00")
-    with pytest.raises(InputError, match="not a readable COLMAP model"):
+    with pytest.raises(InputError, match="the COLMAP model cannot be read"):
         read_poses(tmp_path)
 
 

@@ -14,9 +14,9 @@ from PIL import Image
 
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.gps import read_gps
+from mpsfm_core.inputs.image_decoding import decode_rgb
 from mpsfm_core.inputs.image_header import read_header
 from mpsfm_core.inputs.images import load_images
-from mpsfm_core.inputs.image_decoding import decode_rgb
 
 
 def picture(width: int = 96, height: int = 64) -> np.ndarray:

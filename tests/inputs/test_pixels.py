@@ -12,8 +12,8 @@ import pytest
 
 from mpsfm_core.data import UInt8
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.image_header import read_header
 from mpsfm_core.inputs.image_decoding import decode_rgb, orient, read_bytes, read_mask
+from mpsfm_core.inputs.image_header import read_header
 
 ORIENTATION = 0x0112
 

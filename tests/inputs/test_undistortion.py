@@ -9,10 +9,10 @@ import pytest
 from mpsfm_core.geometry import pixel_centers, project
 from mpsfm_core.inputs.undistortion import (
     UndistortionMap,
-    is_pinhole,
-    undistort_camera,
-    resize_camera,
     distort_pixels,
+    is_pinhole,
+    resize_camera,
+    undistort_camera,
 )
 
 WIDTH, HEIGHT = 160, 120

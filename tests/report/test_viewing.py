@@ -19,7 +19,7 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers import hookimpl
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.report.viewing import lifted, pictures_from_photos, read_scene
+from mpsfm_core.report.viewing import pictures_from_photos, read_scene, unproject_depth_map
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -53,12 +53,12 @@ def test_a_depth_map_is_lifted_to_where_it_is() -> None:
     prior = DepthPrior.from_arrays(depth, np.full(depth.shape, 1e-4))
     image = PosedImage("a", camera, np.eye(3), np.array([0.0, 0, 1]), prior)
     red = np.full((30, 40, 3), (255, 0, 0), np.uint8)
-    cloud = lifted(image, red)
+    cloud = unproject_depth_map(image, red)
     assert len(cloud.xyz) == 600
     np.testing.assert_allclose(cloud.xyz[:, 2], 2)
     assert (cloud.xyz[:, 0] > 0).all()
     assert (cloud.rgb == (255, 0, 0)).all()
-    assert len(lifted(PosedImage("b", camera, np.eye(3), np.zeros(3)), red).xyz) == 0
+    assert len(unproject_depth_map(PosedImage("b", camera, np.eye(3), np.zeros(3)), red).xyz) == 0
 
 
 def test_any_colmap_model_can_be_seen(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
@@ -73,10 +73,10 @@ def test_any_colmap_model_can_be_seen(model: pycolmap.Reconstruction, tmp_path: 
 
 
 def test_what_is_no_model_is_said(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no COLMAP model here"):
+    with pytest.raises(InputError, match="has no COLMAP model"):
         read_scene(tmp_path)
     (tmp_path / "images.bin").write_bytes(b"\0\1")
-    with pytest.raises(InputError, match="not a readable COLMAP model"):
+    with pytest.raises(InputError, match="the COLMAP model cannot be read"):
         read_scene(tmp_path)
 
 

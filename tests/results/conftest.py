@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data import (
     DepthPrior,
     MappingImage,
@@ -16,6 +15,7 @@ from mpsfm_core.data import (
     PinholeCamera,
     View,
 )
+from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.mapping.scene.reconstruction import (
     MappingReport,
     MappingResult,

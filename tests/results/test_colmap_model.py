@@ -89,15 +89,15 @@ def test_points_have_the_colour_of_the_photos(solved, model) -> None:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_the_room_that_is_tried_is_enough(model, tmp_path: Path, text: bool, monkeypatch) -> None:
+def test_checked_free_space_covers_all_files(model, tmp_path: Path, text: bool, monkeypatch) -> None:
     sizes = []
-    monkeypatch.setattr(colmap_model, "_try_room", lambda path, size: sizes.append(size))
+    monkeypatch.setattr(colmap_model, "_check_free_space", lambda path, size: sizes.append(size))
     write_model(tmp_path, model, text=text)
     written = sum(path.stat().st_size for path in tmp_path.iterdir())
     assert written <= sizes[0] <= 20 * written
 
 
-def test_a_disk_without_room_is_noticed_and_left_clean(model, tmp_path: Path) -> None:
+def test_write_model_on_full_disk_raises_and_leaves_no_file(model, tmp_path: Path) -> None:
     _, limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limit))
     try:
@@ -111,7 +111,7 @@ def test_a_disk_without_room_is_noticed_and_left_clean(model, tmp_path: Path) ->
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("part", ["cameras", "images", "points3D", "frames", "rigs"])
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.98])
-def test_a_model_that_the_disk_did_not_take_is_no_result(
+def test_write_model_with_truncated_file_raises(
     model: pycolmap.Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     text: bool, part: str, kept: float,
 ) -> None:  # fmt: skip
@@ -125,5 +125,5 @@ def test_a_model_that_the_disk_did_not_take_is_no_result(
         path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
 
     monkeypatch.setattr(pycolmap.Reconstruction, name, cut)
-    with pytest.raises(OSError, match="did not take all"):
+    with pytest.raises(OSError, match="are incomplete"):
         write_model(tmp_path, model, text=text)

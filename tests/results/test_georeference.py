@@ -11,7 +11,11 @@ import pytest
 from mpsfm_core.data import DepthPrior, PinholeCamera
 from mpsfm_core.geometry import angle_between_deg, camera_center
 from mpsfm_core.inputs.gps import GpsPosition, convert_to_enu
-from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage, transformed
+from mpsfm_core.mapping.scene.reconstruction import (
+    Reconstruction,
+    RegisteredImage,
+    transform_reconstruction,
+)
 from mpsfm_core.results.georeference import georeference
 
 ORIGIN = GpsPosition(47.3764, 8.5476, 410.0)
@@ -41,7 +45,7 @@ def walk(centers: np.ndarray, pitch_deg: float = 0.0) -> Reconstruction:
 def scrambled(truth: Reconstruction) -> Reconstruction:
     quaternion = np.array([0.5, -0.1, 0.3, 0.8])
     rotation = pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion)).matrix()
-    return transformed(truth, 0.2, rotation, np.array([3.0, -1.0, 2.0]), None)
+    return transform_reconstruction(truth, 0.2, rotation, np.array([3.0, -1.0, 2.0]), None)
 
 
 def positions(centers: np.ndarray, noise_m: float, altitudes: bool) -> dict[str, GpsPosition]:

@@ -11,8 +11,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data import MappingProblem
+from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.geometry import project, transform
 from mpsfm_core.inputs.images import FocalSource, ImageSet, SourceImage
 from mpsfm_core.inputs.options import InputOptions

@@ -37,7 +37,7 @@ def test_formats_are_listed_and_mistakes_explained(mpsfm, tmp_path: Path) -> Non
     assert "gsplat" in listed.out
     wrong = mpsfm("export", tmp_path, "--to", "gsplat")
     assert wrong.code == 2
-    assert "no COLMAP model here" in wrong.err
+    assert "has no COLMAP model" in wrong.err
     assert len(wrong.err.strip().splitlines()) == 1
 
 

@@ -1,4 +1,4 @@
-"""Finished reconstructions in the formats of other programs: one file a format.
+"""Exports of reconstructions to the formats of other programs; one module for each format.
 
-A format is found by its name in :mod:`mpsfm_core.results.exports.formats`.
+:mod:`mpsfm_core.results.exports.formats` lists the formats.
 """

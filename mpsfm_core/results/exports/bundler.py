@@ -1,6 +1,6 @@
-"""Bundler's ``bundle.out`` (version 0.3) and ``list.txt``, with undistorted photos.
+"""Export to Bundler's ``bundle.out`` (version 0.3) and ``list.txt`` with undistorted images.
 
-Its cameras look along -z with y up; keypoints are relative to the principal point, y up.
+Bundler's cameras look along -z with y up; keypoints are relative to the principal point, y up.
 """
 
 from __future__ import annotations
@@ -10,16 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from mpsfm_core.results.exports.source import ExportSource
-from mpsfm_core.results.exports.tracks import describe_points, numbers, sort_images_by_name
+from mpsfm_core.results.exports.tracks import describe_points, format_numbers, sort_images_by_name
 
 ENTRIES = ("bundle.out", "list.txt", "images")
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the folder. Raises :class:`~mpsfm_core.data.errors.InputError` without the photos.
+    """Write the folder; the focal length is the mean of fx and fy.
 
-    The format has one focal length a camera: the mean of both, which differ by little.
+    Raises:
+        InputError: the image files are missing.
     """
     model = source.undistorted()
     source.write_photos(folder / "images")
@@ -28,8 +29,8 @@ def write(source: ExportSource, folder: Path) -> None:
     for image in images:
         pose = image.cam_from_world()
         focal = model.cameras[image.camera_id].mean_focal_length()
-        lines += [f"{focal:.12g} 0 0", *map(numbers, _FLIP @ pose.rotation.matrix())]
-        lines.append(numbers(_FLIP @ pose.translation))
+        lines += [f"{focal:.12g} 0 0", *map(format_numbers, _FLIP @ pose.rotation.matrix())]
+        lines.append(format_numbers(_FLIP @ pose.translation))
     for point in describe_points(model, y_sign=-1):
         lines += point
     (folder / "bundle.out").write_text("\n".join([*lines, ""]), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""COLMAP's database: cameras, images, keypoints, and matches with their two-view geometry."""
+"""Export to COLMAP's database: cameras, images, keypoints, matches and two-view geometry."""
 
 from __future__ import annotations
 
@@ -15,10 +15,7 @@ ENTRIES = ("database.db",)
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the database of the registered images.
-
-    The matches are those that the tracks of the points imply; they count as verified.
-    """
+    """Write a database of the registered images with matches from the tracks as verified."""
     folder.mkdir(parents=True, exist_ok=True)
     model = source.model
     with pycolmap.Database.open(str(folder / "database.db")) as database:
@@ -36,7 +33,7 @@ def write(source: ExportSource, folder: Path) -> None:
 
 
 def write_images(database: pycolmap.Database, model: pycolmap.Reconstruction) -> None:
-    """Write cameras, rigs, frames, and images with their keypoints, under their own numbers."""
+    """Write cameras, rigs, frames, and images with keypoints, with the ids of the model."""
     for camera in model.cameras.values():
         known = pycolmap.Camera({**camera.todict(), "has_prior_focal_length": True})
         database.write_camera(known, use_camera_id=True)
@@ -51,7 +48,7 @@ def write_images(database: pycolmap.Database, model: pycolmap.Reconstruction) ->
 
 
 def _matches(model: pycolmap.Reconstruction) -> dict[tuple[int, int], list[tuple[int, int]]]:
-    """Image ids (the smaller one first) -> keypoint rows that see the same point."""
+    """Return (smaller, larger image id) -> pairs of keypoint rows that observe the same point."""
     matches: dict[tuple[int, int], list[tuple[int, int]]] = defaultdict(list)
     for _, point in sorted(model.points3D.items()):
         views = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)

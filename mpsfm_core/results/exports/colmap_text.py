@@ -1,4 +1,4 @@
-"""COLMAP's model as text."""
+"""Export to COLMAP's text format."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ ENTRIES = ("cameras.txt", "images.txt", "points3D.txt", "rigs.txt", "frames.txt"
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the text files of the model of the original photos."""
+    """Write the text model of the original images."""
     write_model(folder, source.model, text=True)

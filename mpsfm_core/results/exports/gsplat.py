@@ -1,10 +1,10 @@
-"""A folder for Gaussian splatting, as gsplat, Inria's code and nerfstudio's splatfacto read it.
+"""Export for Gaussian splatting, as read by gsplat, Inria's code and splatfacto.
 
 ::
 
-    images/NAME          undistorted photos
-    sparse/0/            COLMAP model of them, pinhole cameras, points with colour
-    gaussians.ply        a Gaussian for each point: centre, colour and size
+    images/NAME          undistorted images
+    sparse/0/            their COLMAP model: pinhole cameras, colored points
+    gaussians.ply        one Gaussian for each point: center, color and size
     maps/NAME.npz        refined depth and normals with their std
 """
 
@@ -22,16 +22,17 @@ from mpsfm_core.support.npz import write_npz
 
 ENTRIES = ("images", "sparse", "gaussians.ply", "maps")
 _NEIGHBOURS = 3
-"""Size of a Gaussian: root mean square distance to so many neighbours (Kerbl et al. 2023)."""
+"""Number of neighbors whose root mean square distance is the size (Kerbl et al. 2023)."""
 _OPACITY = 0.1
-"""Of a Gaussian at first (Kerbl et al. 2023)."""
+"""Initial opacity of a Gaussian (Kerbl et al. 2023)."""
 _MAX_GAUSSIANS = 500_000
+"""Maximum number of Gaussians; above it, random points are used."""
 _SH_0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+"""Spherical harmonic of degree 0, ``1 / (2 sqrt(pi))``."""
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the folder. Raises :class:`~mpsfm_core.data.errors.InputError` without the photos."""
+    """Write the folder; raise ``InputError`` if the image files are missing."""
     source.write_photos(folder / "images")
     write_model(folder / "sparse" / "0", source.undistorted())
     write_maps(source, folder / "maps")
@@ -69,9 +70,12 @@ def write_maps(source: ExportSource, folder: Path) -> None:
 
 
 def write_gaussians(path: Path, points: Float64, colors: UInt8) -> None:
-    """Write isotropic Gaussians in the PLY layout of Kerbl et al. (2023), which viewers read.
+    """Write isotropic Gaussians in the PLY layout of Kerbl et al. (2023).
 
-    ``points``: (n, 3), more than three. ``colors``: (n, 3) RGB.
+    Args:
+        path: file to write.
+        points: (n, 3) centers, more than three.
+        colors: (n, 3) uint8 RGB.
     """
     distance = cKDTree(points).query(points, k=_NEIGHBOURS + 1)[0][:, 1:]
     size = np.sqrt((distance**2).mean(axis=1))

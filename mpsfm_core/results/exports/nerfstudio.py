@@ -1,12 +1,12 @@
-"""``transforms.json`` with what nerfstudio reads beside it.
+"""Export for nerfstudio: ``transforms.json`` with images, depth and points.
 
 ::
 
-    transforms.json      pinhole cameras, poses, and where the rest is
-    images/NAME          undistorted photos
+    transforms.json      pinhole cameras, poses, and paths of the other files
+    images/NAME          undistorted images
     depths/NAME.npy      refined depth, (h, w) float32, thousandths of a unit, 0 where unknown
-    maps/NAME.npz        depth and normals with their std, as for gsplat
-    sparse_pc.ply        points with colour
+    maps/NAME.npz        depth and normals with std, as for gsplat
+    sparse_pc.ply        colored points
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from mpsfm_core.results.transforms_json import write_transforms
 
 ENTRIES = ("transforms.json", "images", "depths", "maps", "sparse_pc.ply")
 _STORED_UNITS = 1000
-"""nerfstudio multiplies depth by its depth_unit_scale_factor, 0.001 by default."""
+"""Stored depth per unit: nerfstudio multiplies by ``depth_unit_scale_factor``, default 0.001."""
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the folder. Raises :class:`~mpsfm_core.data.errors.InputError` without the photos."""
+    """Write the folder; raise ``InputError`` if the image files are missing."""
     source.write_photos(folder / "images")
     write_maps(source, folder / "maps")
     write_ply(folder / "sparse_pc.ply", *source.points())
@@ -39,7 +39,7 @@ def write(source: ExportSource, folder: Path) -> None:
     write_transforms(path, source.undistorted(), {name: f"images/{name}" for name in names})
     transforms: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     for frame in transforms["frames"]:
-        if depths:  # all frames must have one, or none
+        if depths:  # nerfstudio requires depth for all frames or none
             frame["depth_file_path"] = depths[frame["file_path"]]
     transforms |= {"camera_model": "OPENCV", "ply_file_path": "sparse_pc.ply"}
     if source.z_is_up:
@@ -48,10 +48,10 @@ def write(source: ExportSource, folder: Path) -> None:
 
 
 def _write_depths(source: ExportSource, folder: Path) -> dict[str, str]:
-    """File of the photo -> file of its depth; empty unless all photos have depth."""
-    found = {name: source.maps(name) for name in source.names}
+    """Write depth files; return image file -> depth file, empty unless all images have depth."""
+    maps_of = {name: source.maps(name) for name in source.names}
     written = {}
-    for name, maps in found.items():
+    for name, maps in maps_of.items():
         if maps is None:
             return {}
         depth = np.where(maps.depth.valid, maps.depth.depth * _STORED_UNITS, 0)

@@ -9,28 +9,34 @@ from pathlib import Path
 
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.results.exports.source import ExportSource
-from mpsfm_core.results.exports.tracks import describe_points, numbers, sort_images_by_name
+from mpsfm_core.results.exports.tracks import describe_points, format_numbers, sort_images_by_name
 
 ENTRIES = ("reconstruction.nvm", "images")
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the folder. Raises :class:`InputError` without the photos, or when the name of one has
-    a space, which the format cannot hold.
+    """Write the folder; the focal length is the mean of fx and fy.
 
-    The format has one focal length a camera: the mean of both, which differ by little.
+    Raises:
+        InputError: the image files are missing, or a name has a space, which NVM does not allow.
     """
     model = source.undistorted()
     images = sort_images_by_name(model)
     for image in images:
         if len(str(image.name).split()) != 1:
-            raise InputError(f"NVM files cannot name {image.name!r}: a name must have no space")
+            raise InputError(
+                f"NVM does not allow spaces in names such as {image.name!r}; rename the photo"
+            )
     source.write_photos(folder / "images")
-    lines = ["NVM_V3 ", " ", str(len(images))]  # VisualSFM has the spaces, MeshLab needs them
+    lines = [
+        "NVM_V3 ",
+        " ",
+        str(len(images)),
+    ]  # VisualSFM writes the spaces, and MeshLab requires them
     for image in images:
         x, y, z, w = image.cam_from_world().rotation.quat
         focal = model.cameras[image.camera_id].mean_focal_length()
-        place = numbers([w, x, y, z, *image.projection_center()])
+        place = format_numbers([w, x, y, z, *image.projection_center()])
         lines.append(f"images/{image.name}\t{focal:.12g} {place} 0 0")
     lines += ["", str(model.num_points3D())]
     lines += [" ".join(point) for point in describe_points(model, y_sign=1)]

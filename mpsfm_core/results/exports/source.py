@@ -1,4 +1,4 @@
-"""What is exported: a result folder or a COLMAP model, read and checked."""
+"""Reader of the reconstruction to export: a result folder or a COLMAP model."""
 
 from __future__ import annotations
 
@@ -27,44 +27,50 @@ from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.summary import read_summary
 
 _NORMALS_AN_IMAGE = 2000
-"""Normals of an image that are asked for the direction of gravity."""
+"""Maximum number of normals of an image in the estimate of gravity."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExportMaps:
-    """Refined depth of an image and the normals of its surfaces, on one grid.
-
-    ``camera``: of that grid. Depth is in the units of the exported world.
-    """
+    """Refined depth and normals of an image on one grid."""
 
     camera: PinholeCamera
+    """Camera of the grid."""
     depth: DepthPrior
+    """Depth in units of the exported world."""
     normals: NormalPrior
+    """Normals of the depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExportSource:
-    """A reconstruction to be exported, and what lies beside it.
-
-    ``model``: of the original photos; images whose pose is only a guess are left out.
-    ``photos``: the folder of the photos, None if nobody knows. ``summary``: of the run, empty for a
-    COLMAP model. ``world_from_model``: what was applied to the model in the folder.
-    ``gravity``: None if the world is as it was.
-    """
+    """Reconstruction to export, with its images, depth maps and summary."""
 
     folder: Path
+    """Result folder or folder of a COLMAP model."""
     model: pycolmap.Reconstruction
+    """Model of the original images, without images that are registered tentatively."""
     photos: Path | None
+    """Folder of the original images, None if unknown."""
     summary: Mapping[str, Any]
+    """Summary of the run, empty for a COLMAP model."""
     left_out: tuple[str, ...] = ()
+    """Names of images that are registered tentatively."""
     world_from_model: pycolmap.Sim3d = field(default_factory=pycolmap.Sim3d)
+    """Transform that was applied to the model in the folder."""
     gravity: Gravity | None = None
+    """Gravity that was rotated to -z, None if the world was not rotated."""
 
     @classmethod
     def read(cls, folder: Path, photos: Path | None = None) -> ExportSource:
-        """Read a folder; ``photos`` if they are not where the run found them.
+        """Read a result folder or COLMAP model.
 
-        Raises :class:`InputError` when there is no model, or what is there is damaged.
+        Args:
+            folder: folder to read.
+            photos: folder of the original images, if it has moved since the run.
+
+        Raises:
+            InputError: there is no model, or it is damaged.
         """
         summary = _read_summary(folder / SUMMARY)
         model = read_model(folder)
@@ -75,19 +81,21 @@ class ExportSource:
         for image in model.images.values():
             path = PurePath(str(image.name))
             if path.is_absolute() or path.drive or ".." in path.parts:
-                raise InputError(f"{folder}: the name of image {image.name!r} leads elsewhere")
+                raise InputError(
+                    f"{folder}: the name of image {image.name!r} is not below the images folder"
+                )
         if not model.num_reg_images():
             raise InputError(f"{folder}: the model has no image with a pose")
         if photos is None:
-            known = summary.get("photos")
-            beside = find_model_folder(folder).parent / "images"
-            candidates = [Path(known)] if known else [folder / "images", beside]
+            recorded = summary.get("photos")
+            sibling = find_model_folder(folder).parent / "images"
+            candidates = [Path(recorded)] if recorded else [folder / "images", sibling]
             photos = next((path for path in candidates if path.is_dir()), None)
         return cls(folder, model, photos, summary, guesses)
 
     @property
     def metres_per_unit(self) -> float | None:
-        """Metres in a unit of the exported world, None if unknown."""
+        """Meters per unit of the exported world, None if unknown."""
         if self._metric is None:
             return None
         before = 1.0 if self._metric["trusted"] else float(self._metric["metres_per_unit"])
@@ -95,7 +103,7 @@ class ExportSource:
 
     @property
     def scale_spread(self) -> float | None:
-        """Relative standard deviation of the scale among what told it, None if unknown."""
+        """Relative standard deviation of the scale over its estimates, None if unknown."""
         return None if self._metric is None else float(self._metric["spread"])
 
     @property
@@ -106,23 +114,24 @@ class ExportSource:
 
     @cached_property
     def names(self) -> list[str]:
-        """Names of the images that have a pose, sorted."""
+        """Names of the registered images, sorted."""
         return sorted(str(self.model.images[i].name) for i in self.model.reg_image_ids())
 
     @cached_property
     def images(self) -> ImageSet:
-        """The photos of the registered images in the order of :attr:`names`.
+        """Original images of the registered images in the order of :attr:`names`.
 
-        Raises :class:`InputError` when they are not there.
+        Raises:
+            InputError: the image files are missing.
         """
         if self.photos is None:
-            known = self.summary.get("photos", "")
-            where = f" (the run had them in {known})" if known else ""
+            recorded = self.summary.get("photos", "")
+            where = f" (the run read them from {recorded})" if recorded else ""
             raise InputError(
-                f"{self.folder}: its photos are not known{where}; say where they are with --images"
+                f"{self.folder}: the folder of the photos is unknown{where}; give it with --images"
             )
-        found = match_names(self.names, find_images(self.photos))
-        missing = [name for name in self.names if name not in found]
+        files = match_names(self.names, find_images(self.photos))
+        missing = [name for name in self.names if name not in files]
         if missing:
             raise InputError(
                 f"{self.photos}: has no photo {missing[0]!r}"
@@ -134,24 +143,26 @@ class ExportSource:
             blank_pixels=settings.get("blank_pixels", 0.0),
             strict=True,
         )
-        names = [found[name] for name in self.names]
+        names = [files[name] for name in self.names]
         return load_images(
             self.photos, find_model_folder(self.folder), options=options, names=names
         )
 
     @property
     def is_georeferenced(self) -> bool:
-        """Whether the world is east, north, up in metres."""
+        """True if the world is east, north, up in meters."""
         return "origin" in (self.summary.get("georeference") or {})
 
     @property
     def z_is_up(self) -> bool:
-        """Whether gravity is along -z in the exported world."""
+        """True if gravity is along -z in the exported world."""
         return self.gravity is not None or self.is_georeferenced
 
     def turned(self) -> ExportSource:
-        """In metres where these are known, with gravity along -z; the origin is the middle of the
-        points, else of the cameras."""
+        """Return the reconstruction with gravity along -z, in meters if the scale is known.
+
+        The origin is the median point, or the median camera center without points.
+        """
         gravity = estimate_gravity(self._rotations(), self._world_normals())
         first = self._rotations()[0]
         rotation = rotation_to_z(gravity.up, first[0])
@@ -164,19 +175,19 @@ class ExportSource:
         return replace(self._transformed(moved), gravity=gravity)
 
     def registered(self) -> list[pycolmap.Image]:
-        """The images with a pose, in the order of :attr:`names`."""
+        """Return the registered images in the order of :attr:`names`."""
         by_name = {str(image.name): image for image in self.model.images.values()}
         return [by_name[name] for name in self.names]
 
     def points(self) -> tuple[Float64, UInt8]:
-        """Positions (n, 3) and RGB colours (n, 3) of the model's points, in the order of ids."""
+        """Return positions (n, 3) and RGB colors (n, 3) of the points, sorted by id."""
         ids = sorted(self.model.points3D)
         points = [self.model.points3D[i] for i in ids]
         xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
         return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
     def dense_points(self) -> tuple[Float64, UInt8]:
-        """The fused depth maps as :meth:`points`, else the points of the model."""
+        """Return the fused depth maps as :meth:`points`, else the points of the model."""
         path = self.folder / DENSE
         if not path.is_file():
             return self.points()
@@ -185,9 +196,10 @@ class ExportSource:
         return moved, colors
 
     def maps(self, name: str) -> ExportMaps | None:
-        """Depth and normals of an image, None if the folder has none.
+        """Read depth and normals of an image, None if the folder has none.
 
-        Raises :class:`InputError` when the file is damaged.
+        Raises:
+            InputError: the file is damaged.
         """
         path = self.folder / DEPTH / f"{name}.npz"
         if not path.is_file():
@@ -196,9 +208,9 @@ class ExportSource:
         return ExportMaps(camera, depth, fit_normals(camera, depth, NormalsFromDepthOptions()))
 
     def undistorted(self) -> pycolmap.Reconstruction:
-        """A model of pinhole cameras for what :meth:`write_photos` writes.
+        """Build the model of the undistorted images that :meth:`write_photos` writes.
 
-        Image and point ids are the model's; keypoints without a point are left out.
+        Image and point ids are those of the model; keypoints without a point are omitted.
         """
         model = pycolmap.Reconstruction()
         cameras: dict[str, int] = {}
@@ -209,14 +221,14 @@ class ExportSource:
             if key not in cameras:
                 cameras[key] = camera.camera_id = len(cameras) + 1
                 model.add_camera_with_trivial_rig(camera)
-            seen = [k for k, point in enumerate(image.points2D) if point.has_point3D()]
-            xy = np.array([image.points2D[k].xy for k in seen], dtype=np.float64).reshape(-1, 2)
+            observed = [k for k, point in enumerate(image.points2D) if point.has_point3D()]
+            xy = np.array([image.points2D[k].xy for k in observed], dtype=np.float64).reshape(-1, 2)
             xy = photo.view_pixels(xy)
-            kept = np.flatnonzero(np.isfinite(xy).all(axis=1))
-            rows[image.image_id] = {seen[k]: row for row, k in enumerate(kept)}
+            visible = np.flatnonzero(np.isfinite(xy).all(axis=1))
+            rows[image.image_id] = {observed[k]: row for row, k in enumerate(visible)}
             new = pycolmap.Image(
                 name=exported_image_name(str(image.name)),
-                keypoints=xy[kept],
+                keypoints=xy[visible],
                 camera_id=cameras[key],
                 image_id=image.image_id,
             )
@@ -236,7 +248,7 @@ class ExportSource:
         return model
 
     def write_photos(self, folder: Path) -> None:
-        """The photos upright, undistorted, and in a format that everybody reads."""
+        """Write all images upright, undistorted, and in a common format."""
         for index, name in enumerate(self.names):
             export_view(self.images, index, folder / exported_image_name(name))
 
@@ -249,16 +261,16 @@ class ExportSource:
         return np.stack([image.cam_from_world().rotation.matrix() for image in self.registered()])
 
     def _world_normals(self) -> Float64:
-        """Normals (n, 3) of the surfaces in all photos that have depth."""
-        found = [np.zeros((0, 3))]
+        """Return surface normals (n, 3) in the world, from all images with depth."""
+        normals_of_images = [np.zeros((0, 3))]
         for image in self.registered():
             maps = self.maps(str(image.name))
             if maps is None:
                 continue
             normals = maps.normals.normals[maps.normals.valid].astype(np.float64)
             step = max(1, len(normals) // _NORMALS_AN_IMAGE)
-            found.append(normals[::step] @ image.cam_from_world().rotation.matrix())
-        return np.concatenate(found)
+            normals_of_images.append(normals[::step] @ image.cam_from_world().rotation.matrix())
+        return np.concatenate(normals_of_images)
 
 
 def _read_summary(path: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What Bundler's and VisualSFM's files share: pinhole images in a row, points with their views."""
+"""Points and tracks as text, shared by the exports to Bundler and VisualSFM."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ import pycolmap
 
 
 def sort_images_by_name(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    """The images by name: their places are what the formats number them by."""
+    """Return the images sorted by name; the formats refer to images by this index."""
     return sorted(model.images.values(), key=lambda image: str(image.name))
 
 
 def describe_points(model: pycolmap.Reconstruction, y_sign: int) -> list[tuple[str, str, str]]:
-    """For each point its position, its colour, and its views as text.
+    """Format position, color and track of each point.
 
-    Views: their number, then for each the image's row, the keypoint's row and its x and y in
-    pixels relative to the principal point. ``y_sign``: 1 for y down, -1 for y up.
+    A track is its length, then image index, keypoint index, x and y of each observation. x and y
+    are in pixels relative to the principal point.
+
+    Args:
+        model: model of pinhole cameras.
+        y_sign: 1 for y down, -1 for y up.
     """
     rows = {image.image_id: row for row, image in enumerate(sort_images_by_name(model))}
     described = []
@@ -30,10 +34,10 @@ def describe_points(model: pycolmap.Reconstruction, y_sign: int) -> list[tuple[s
             x, y = x - camera.principal_point_x, y_sign * (y - camera.principal_point_y)
             views.append(f"{rows[element.image_id]} {element.point2D_idx} {x:.8g} {y:.8g}")
         color = " ".join(str(int(value)) for value in point.color)
-        described.append((numbers(point.xyz), color, " ".join([str(len(views)), *views])))
+        described.append((format_numbers(point.xyz), color, " ".join([str(len(views)), *views])))
     return described
 
 
-def numbers(values: Iterable[float]) -> str:
-    """Numbers in a line, to twelve digits."""
+def format_numbers(values: Iterable[float]) -> str:
+    """Format numbers with twelve digits, separated by spaces."""
     return " ".join(f"{value:.12g}" for value in np.asarray(values))

@@ -9,8 +9,8 @@ from mpsfm_core.data import PosedImage, SceneState
 from mpsfm_core.report.viewing import (
     ColoredPoints,
     pictures_from_photos,
-    scene_from_model,
     pictures_from_results,
+    scene_from_model,
 )
 from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_rerun.viewer import RerunViewer

@@ -10,7 +10,12 @@ import rerun
 
 from mpsfm_core import hookimpl
 from mpsfm_core.data import DepthPrior, PosedImage, SceneState
-from mpsfm_core.report.viewing import ColoredPoints, Pictures, certain, lifted
+from mpsfm_core.report.viewing import (
+    ColoredPoints,
+    Pictures,
+    select_certain_pixels,
+    unproject_depth_map,
+)
 
 RECORDING = "scene.rrd"
 TIMELINE = "step"
@@ -97,14 +102,14 @@ class RerunViewer:
         if image.depth is not None and not as_points:
             self._recording.log(f"depth/{_key(image.name)}", _depth_image(image.depth))
         elif as_points:
-            points = lifted(image, picture)
+            points = unproject_depth_map(image, picture)
             depth_place = f"world/depth/{_key(image.name)}"
             self._recording.log(depth_place, rerun.Points3D(points.xyz, colors=points.rgb))
 
 
 def _depth_image(depth: DepthPrior) -> rerun.DepthImage:
     """In steps of 16 bits, 0 where it is not certain."""
-    shown = np.where(certain(depth), depth.depth, 0.0)
+    shown = np.where(select_certain_pixels(depth), depth.depth, 0.0)
     steps = np.iinfo(np.uint16).max / max(float(shown.max()), 1e-12)
     return rerun.DepthImage(np.round(shown * steps).astype(np.uint16), meter=steps)
 

@@ -16,7 +16,7 @@ import viser.transforms
 from mpsfm_core import hookimpl
 from mpsfm_core.data import PosedImage, SceneState
 from mpsfm_core.geometry import camera_center
-from mpsfm_core.report.viewing import ColoredPoints, Pictures, lifted
+from mpsfm_core.report.viewing import ColoredPoints, Pictures, unproject_depth_map
 
 PORT_VARIABLE = "MPSFM_VIEWER_PORT"
 """Environment variable: where the page is served; if it is taken, the next free one."""
@@ -90,7 +90,10 @@ class ViserViewer:
             for image in scene.images:
                 self.frustums[image.name] = self._frustum(image)
                 if cloud is None:
-                    self._cloud(f"/depth/{_key(image.name)}", lifted(image, self._picture(image)))
+                    self._cloud(
+                        f"/depth/{_key(image.name)}",
+                        unproject_depth_map(image, self._picture(image)),
+                    )
             if cloud is None:
                 grey = np.full(scene.points.shape, 200, np.uint8)
                 self._cloud("/sparse", ColoredPoints(scene.points, grey))

@@ -283,7 +283,7 @@ def test_a_colmap_model_is_exported_with_the_photos_that_are_named(
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     model_of(result).write_binary(str(folder))
-    with pytest.raises(InputError, match="say where they are with --images"):
+    with pytest.raises(InputError, match="give it with --images"):
         export(folder, "gsplat")
     described = export(folder, "gsplat", photos=result.parent / "photos")
     assert described["images"] == 4  # nobody says here that one is a guess
