@@ -22,12 +22,12 @@ from benchmarks._scenes import percent
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.geometry import camera_center
-from mpsfm_core.mapping.component import Group
+from mpsfm_core.mapping.component import Component
 from mpsfm_core.mapping.consistency.depth_consistency import DepthConsistencyCheck
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement.maintenance import Upkeep
+from mpsfm_core.mapping.refinement.maintenance import ModelMaintenance
 from mpsfm_core.mapping.scene.tracks import NO_POINT
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors
 from mpsfm_core.testing.synthetic.two_rooms import (
@@ -51,8 +51,8 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
     pairs = tuple(p for p, false in zip(case.problem.pairs, case.false, strict=True) if not false)
     options = MapperOptions(known_poses="fixed")
     mapper = Mapper(MappingProblem(images, pairs), options, NullMappingEvents())
-    mapper.reconstruct_next()
-    scene, std_factor = mapper.group.scene, mapper.group.refiner.std_factor
+    mapper.reconstruct_component()
+    scene, std_factor = mapper.component.scene, mapper.component.refiner.std_factor
     room = np.array(case.room)
     everything = scene.registered.copy()
     for image in np.flatnonzero(room >= 0):
@@ -69,20 +69,20 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
                 int(image), std_factor
             )
             seconds = time.perf_counter() - start
-            yield wrong, check.share > options.consistency.max_violations, seconds
+            yield wrong, check.ratio > options.consistency.max_violations, seconds
             scene.translations[image], scene.registered = truth, everything
             scene.tracks.point_of = seen
 
 
-class Observed(Upkeep):
+class Observed(ModelMaintenance):
     """A scene with a list of every check: whether the pose was wrong, and the verdict."""
 
     case: SymmetricProblem
     verdicts: list[tuple[bool, bool]]
     first: int | None = None
 
-    def contradiction(self, image: int, limit: float) -> str | None:
-        reason = super().contradiction(image, limit)
+    def check_depth(self, image: int, limit: float) -> str | None:
+        reason = super().check_depth(image, limit)
         self.verdicts.append((self._misplaced(image), reason is not None))
         return reason
 
@@ -105,10 +105,10 @@ def mapped(case: SymmetricProblem, enabled: bool) -> tuple[np.ndarray, int, list
     options = MapperOptions.model_validate({"consistency": {"enabled": enabled}})
     verdicts: list[tuple[bool, bool]] = []
     mapper = Mapper(case.problem, options, NullMappingEvents())
-    observed = type("Told", (Observed,), {"case": case, "verdicts": verdicts})
-    mapper.group_type = type("ObservedGroup", (Group,), {"upkeep_type": observed})
+    observed = type("ObservedCase", (Observed,), {"case": case, "verdicts": verdicts})
+    mapper.component_type = type("ObservedComponent", (Component,), {"maintenance_type": observed})
     start = time.perf_counter()
-    best = max(mapper.components(), key=lambda c: len(c.images), default=None)
+    best = max(mapper.reconstruct_components(), key=lambda c: len(c.images), default=None)
     seconds = time.perf_counter() - start
     found = best.poses if best else {}
     views = zip(case.problem.images, case.poses, strict=True)

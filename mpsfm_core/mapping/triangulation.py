@@ -1,7 +1,8 @@
-"""Growing tracks: continue, create, complete and merge, with lifting at low parallax.
+"""Triangulation of tracks: continue, create, complete and merge, with lifting from depth.
 
-The operations are those of COLMAP's incremental triangulator on arrays of edges of the
-correspondence graph; where the parallax is low, a point comes from depth instead of rays.
+The operations are those of COLMAP's ``IncrementalTriangulator`` (``Continue``, ``Create``,
+``Complete``, ``Merge``), vectorized over the edges of the correspondence graph. If the
+triangulation angle is low, a point is lifted from depth instead (paper section 3.2).
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from mpsfm_core.mapping.scene.scene import Scene
 
 
 def triangulate_image(scene: Scene, image: int, options: TriangulationOptions) -> None:
-    """Continue tracks into a newly posed image and create new ones with its neighbours."""
-    edges = _registered_edges(scene, image)
-    max_error = _angle_error_px(scene, image, options)
-    extend_tracks(scene, image, edges, max_error)
-    create_tracks(scene, edges, max_error, options)
+    """Continue tracks into a newly registered image and create new ones with its neighbors."""
+    edges = _get_registered_edges(scene, image)
+    max_error_px = _max_angle_error_px(scene, image, options)
+    extend_tracks(scene, image, edges, max_error_px)
+    create_tracks(scene, edges, max_error_px, options)
 
 
 def complete_and_merge_tracks(
@@ -29,20 +30,25 @@ def complete_and_merge_tracks(
     images: list[int] | None = None,
     create: bool = False,
 ) -> int:
-    """Add missing observations to tracks and join tracks of the same point.
+    """Add missing observations to tracks and merge tracks of the same point.
 
-    ``images``: where to look, by default all registered ones. ``create``: also try anew the
-    matches that have no point (COLMAP's retriangulation). Returns the number of observations
-    changed.
+    Args:
+        scene: The scene.
+        options: ``max_error_px`` limits the reprojection errors.
+        images: Images whose tracks are completed; by default all registered images.
+        create: Also create tracks from matches without a point (COLMAP's ``Retriangulate``).
+
+    Returns:
+        The number of changed observations.
     """
     before = scene.tracks.point_of.copy()
     images = list(map(int, scene.registered_images())) if images is None else images
     for image in images:
-        edges = _registered_edges(scene, image)
-        max_error = options.max_error_px * scene.keypoint_std_px[image]
-        extend_tracks(scene, image, edges, max_error)
+        edges = _get_registered_edges(scene, image)
+        max_error_px = options.max_error_px * scene.keypoint_std_px[image]
+        extend_tracks(scene, image, edges, max_error_px)
         if create:
-            create_tracks(scene, edges, max_error, options)
+            create_tracks(scene, edges, max_error_px, options)
     merge_tracks(scene, options, images)
     return int((before != scene.tracks.point_of).sum())
 
@@ -50,49 +56,62 @@ def complete_and_merge_tracks(
 def extend_tracks(
     scene: Scene, image: int, edges: tuple[Int64, Int64], max_error_px: float
 ) -> None:
-    """Let an image's keypoints without a point observe the points of the keypoints they match."""
+    """Add keypoints of an image without a point to the tracks of the keypoints that they match.
+
+    Args:
+        scene: The scene.
+        image: The image.
+        edges: Source and target keypoints (e,) of its matches to registered images.
+        max_error_px: Largest reprojection error in the image.
+    """
     tracks = scene.tracks
     source, target = edges
-    keep = (tracks.point_of[source] < 0) & (tracks.point_of[target] >= 0)
-    keypoints, points = source[keep], tracks.point_of[target[keep]]
-    errors, _ = scene.project(keypoints, tracks.xyz[points])
+    continues = (tracks.point_of[source] < 0) & (tracks.point_of[target] >= 0)
+    keypoints, points = source[continues], tracks.point_of[target[continues]]
+    errors_px, _ = scene.project(keypoints, tracks.xyz[points])
     observed = tracks.point_of[scene.graph.keypoints_of(image)]
-    seen = np.zeros(len(tracks.xyz), dtype=np.bool_)
-    seen[observed[observed >= 0]] = True
-    order = np.flatnonzero((errors <= max_error_px) & ~seen[points])
-    order = order[np.lexsort((points[order], errors[order]))]
-    order = order[_first_of_each(keypoints[order])]
-    order = order[_first_of_each(points[order])]
+    is_observed = np.zeros(len(tracks.xyz), dtype=np.bool_)
+    is_observed[observed[observed >= 0]] = True
+    order = np.flatnonzero((errors_px <= max_error_px) & ~is_observed[points])
+    order = order[np.lexsort((points[order], errors_px[order]))]
+    order = order[_first_occurrences(keypoints[order])]
+    order = order[_first_occurrences(points[order])]
     tracks.point_of[keypoints[order]] = points[order]
 
 
 def create_tracks(
     scene: Scene, edges: tuple[Int64, Int64], max_error_px: float, options: TriangulationOptions
 ) -> None:
-    """New points for keypoints of one image from their matches that have no point either.
+    """Create tracks for keypoints of one image from matches without a point.
 
-    Each match of a keypoint is a hypothesis (a triangulated or lifted point); the one that most
-    of the keypoint's other matches agree with becomes the point, and they its track.
+    Each match of a keypoint gives one hypothesis, a triangulated or lifted point. The hypothesis
+    that most matches of the keypoint support becomes the point, and its inliers become the track.
+
+    Args:
+        scene: The scene.
+        edges: Source and target keypoints (e,) of matches to registered images.
+        max_error_px: Largest reprojection error of an inlier.
+        options: Angles for triangulation and lifting.
     """
     tracks = scene.tracks
     source, target = edges
-    free = (tracks.point_of[source] < 0) & (tracks.point_of[target] < 0)
-    source, target = source[free], target[free]
-    points, good = triangulate_or_lift(scene, source, target, max_error_px, options)
-    source, target, points = source[good], target[good], points[good]
+    is_free = (tracks.point_of[source] < 0) & (tracks.point_of[target] < 0)
+    source, target = source[is_free], target[is_free]
+    points, valid = triangulate_or_lift(scene, source, target, max_error_px, options)
+    source, target, points = source[valid], target[valid], points[valid]
     if not len(source):
         return
-    hypothesis, witness = _pairs_within_groups(source)
-    errors, _ = scene.project(target[witness], points[hypothesis])
-    agrees = errors <= max_error_px
-    support = np.bincount(hypothesis[agrees], minlength=len(source))
-    total = np.bincount(hypothesis[agrees], errors[agrees], minlength=len(source))
-    order = np.lexsort((total / np.maximum(support, 1), -support, source))
-    best = order[_first_of_each(source[order])]
+    hypothesis, match = _pairs_within_groups(source)
+    errors_px, _ = scene.project(target[match], points[hypothesis])
+    inlier = errors_px <= max_error_px
+    support = np.bincount(hypothesis[inlier], minlength=len(source))
+    error_sum = np.bincount(hypothesis[inlier], errors_px[inlier], minlength=len(source))
+    order = np.lexsort((error_sum / np.maximum(support, 1), -support, source))
+    best = order[_first_occurrences(source[order])]
     track_of = np.full(len(source), -1)
     track_of[best] = np.arange(len(best))
-    member = agrees & (track_of[hypothesis] >= 0)
-    keypoints = np.concatenate([source[best], target[witness[member]]])
+    member = inlier & (track_of[hypothesis] >= 0)
+    keypoints = np.concatenate([source[best], target[match[member]]])
     track = np.concatenate([np.arange(len(best)), track_of[hypothesis[member]]])
     tracks.add(points[best], keypoints, track)
 
@@ -104,35 +123,47 @@ def triangulate_or_lift(
     max_error_px: float,
     options: TriangulationOptions,
 ) -> tuple[Float64, Bool]:
-    """A point for each match: triangulated where the angle allows, else lifted from depth.
+    """Triangulate a point for each match, or lift it from depth if the angle is low.
 
-    Lifts come from the target if its depth is valid (it is refined longer), else from the
-    source. Returns points (m, 3) and where they lie before both cameras within the error.
+    A point is lifted from the target if its depth is valid, because the target has been refined
+    longer. If it is not valid, the point is lifted from the source.
+
+    Args:
+        scene: The scene.
+        source: (m,) keypoints.
+        target: (m,) keypoints that they match.
+        max_error_px: Largest reprojection error in both images.
+        options: ``min_angle_deg`` separates triangulation from lifting.
+
+    Returns:
+        Points (m, 3), and a mask (m,) of those in front of both cameras within the error.
     """
     image_of = scene.graph.image_of
     centers = scene.centers()
     center_a, center_b = centers[image_of[source]], centers[image_of[target]]
-    points = triangulate_midpoints(
-        center_a, scene.world_rays(source), center_b, scene.world_rays(target)
-    )
-    low = ~(triangulation_angle_deg(center_a, center_b, points) >= options.min_angle_deg)
-    low |= ~_fits(scene, source, target, points, max_error_px)
-    from_source, source_valid = scene.lift(source[low])
-    from_target, target_valid = scene.lift(target[low])
-    points[low] = np.where(target_valid[:, None], from_target, from_source)
-    usable = np.zeros_like(low)
-    usable[low] = source_valid | target_valid
-    parallax = triangulation_angle_deg(center_a, center_b, points)
-    good = _fits(scene, source, target, points, max_error_px) & (~low | usable)
-    # a lift is for low parallax; where rays meet at a wide angle but miss, depth must not hide it
-    good &= ~low | (parallax < 2 * options.min_angle_deg) | ~np.isfinite(parallax)
-    return points, good
+    ray_a, ray_b = scene.world_rays(source), scene.world_rays(target)
+    points = triangulate_midpoints(center_a, ray_a, center_b, ray_b)
+    lifts = ~(triangulation_angle_deg(center_a, center_b, points) >= options.min_angle_deg)
+    lifts |= ~_reprojects(scene, source, target, points, max_error_px)
+    from_source, source_valid = scene.lift(source[lifts])
+    from_target, target_valid = scene.lift(target[lifts])
+    points[lifts] = np.where(target_valid[:, None], from_target, from_source)
+    has_depth = np.zeros_like(lifts)
+    has_depth[lifts] = source_valid | target_valid
+    angle_deg = triangulation_angle_deg(center_a, center_b, points)
+    valid = _reprojects(scene, source, target, points, max_error_px) & (~lifts | has_depth)
+    # A lift must not replace the point of rays that miss each other at a wide angle.
+    valid &= ~lifts | (angle_deg < 2 * options.min_angle_deg) | ~np.isfinite(angle_deg)
+    return points, valid
 
 
 def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int]) -> None:
-    """Join points whose keypoints match, where the mean point fits all observations.
+    """Merge the points of matched keypoints if their mean fits all observations.
 
-    ``images``: one end at least of the matches is in one of them.
+    Args:
+        scene: The scene.
+        options: ``max_error_px`` limits the reprojection errors.
+        images: Images whose matches are considered.
     """
     tracks, graph = scene.tracks, scene.graph
     edges = [graph.edges_of(image) for image in images]
@@ -140,10 +171,11 @@ def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int])
         tracks.point_of[np.concatenate([ends[of_image] for of_image in edges] or [ends[:0]])]
         for ends in (graph.source, graph.target)
     )
-    apart = (p >= 0) & (q >= 0) & (p != q)
-    low, high = np.minimum(p, q)[apart], np.maximum(p, q)[apart]
-    count = len(tracks.xyz)
-    candidates = np.stack(np.divmod(np.unique(low * count + high), max(count, 1)), axis=1)
+    differ = (p >= 0) & (q >= 0) & (p != q)
+    low, high = np.minimum(p, q)[differ], np.maximum(p, q)[differ]
+    num_points = len(tracks.xyz)
+    keys = np.unique(low * num_points + high)
+    candidates = np.stack(np.divmod(keys, max(num_points, 1)), axis=1)
     if not len(candidates):
         return
     lengths = tracks.lengths()
@@ -152,92 +184,111 @@ def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int])
     mean /= weights.sum(axis=1, keepdims=True)
     observations = tracks.observations()
     first = np.searchsorted(tracks.point_of[observations], np.arange(len(tracks.xyz)))
-    rows, members = _expand(first[candidates.ravel()], lengths[candidates.ravel()])
+    rows, members = _expand_ranges(first[candidates.ravel()], lengths[candidates.ravel()])
     candidate, keypoints = rows // 2, observations[members]
-    errors, _ = scene.project(keypoints, mean[candidate])
-    limit = options.max_error_px * scene.keypoint_std_px[graph.image_of[keypoints]]
-    bad = np.bincount(candidate, errors > limit, minlength=len(candidates)) > 0
-    places = np.sort(candidate * scene.num_images + graph.image_of[keypoints])
-    twice = places[1:][places[1:] == places[:-1]] // scene.num_images
-    bad[twice] = True
-    candidates, mean = candidates[~bad], mean[~bad]
-    both = np.full(2 * len(candidates), False)
-    both[_first_of_each(candidates.ravel())] = True
-    alone = both.reshape(-1, 2).all(axis=1)
-    keep, gone = candidates[alone].T
-    tracks.xyz[keep] = mean[alone]
-    renumber = np.arange(len(tracks.xyz))
-    renumber[gone] = keep
+    errors_px, _ = scene.project(keypoints, mean[candidate])
+    limit_px = options.max_error_px * scene.keypoint_std_px[graph.image_of[keypoints]]
+    rejected = np.bincount(candidate, errors_px > limit_px, minlength=len(candidates)) > 0
+    candidate_images = np.sort(candidate * scene.num_images + graph.image_of[keypoints])
+    is_repeated = candidate_images[1:] == candidate_images[:-1]
+    rejected[candidate_images[1:][is_repeated] // scene.num_images] = True
+    candidates, mean = candidates[~rejected], mean[~rejected]
+    is_first = np.full(2 * len(candidates), False)
+    is_first[_first_occurrences(candidates.ravel())] = True
+    is_disjoint = is_first.reshape(-1, 2).all(axis=1)
+    remaining, merged = candidates[is_disjoint].T
+    tracks.xyz[remaining] = mean[is_disjoint]
+    new_point = np.arange(len(tracks.xyz))
+    new_point[merged] = remaining
     observed = tracks.point_of >= 0
-    tracks.point_of[observed] = renumber[tracks.point_of[observed]]
+    tracks.point_of[observed] = new_point[tracks.point_of[observed]]
 
 
 def lift_low_parallax(scene: Scene, options: TriangulationOptions) -> None:
-    """Put points of low triangulation angle onto the most certain depth map that sees them."""
+    """Replace points of low triangulation angle by lifts from their most certain depth map."""
     tracks = scene.tracks
     observations = tracks.observations()
     points = tracks.point_of[observations]
-    low = (scene.track_angles_deg() < options.min_angle_deg)[points]
-    observations, points = observations[low], points[low]
+    is_low = (scene.track_angles_deg() < options.min_angle_deg)[points]
+    observations, points = observations[is_low], points[is_low]
     lifted, valid = scene.lift(observations)
     log_std = scene.keypoint_log_std[observations]
     order = np.flatnonzero(valid)
     order = order[np.lexsort((log_std[order], points[order]))]
-    order = order[_first_of_each(points[order])]
+    order = order[_first_occurrences(points[order])]
     tracks.xyz[points[order]] = lifted[order]
 
 
-def _registered_edges(scene: Scene, image: int) -> tuple[Int64, Int64]:
+def triangulate_midpoints(
+    center_a: Float64, ray_a: Float64, center_b: Float64, ray_b: Float64
+) -> Float64:
+    """Triangulate by the midpoint method (Hartley and Sturm 1997).
+
+    Args:
+        center_a: (3,) or (m, 3) camera centers.
+        ray_a: (m, 3) directions, not necessarily of unit length.
+        center_b: (3,) or (m, 3) camera centers.
+        ray_b: (m, 3) directions in the same frame.
+
+    Returns:
+        (m, 3) midpoints between the closest points of both rays; NaN for parallel rays.
+    """
+    aa, bb = (ray_a * ray_a).sum(axis=1), (ray_b * ray_b).sum(axis=1)
+    ab = (ray_a * ray_b).sum(axis=1)
+    baseline = center_b - center_a
+    da, db = (ray_a * baseline).sum(axis=1), (ray_b * baseline).sum(axis=1)
+    determinant = aa * bb - ab * ab
+    nonzero = np.where(determinant > 1e-14 * aa * bb, determinant, np.nan)
+    distance_a = (bb * da - ab * db) / nonzero
+    distance_b = (ab * da - aa * db) / nonzero
+    point_sum = center_a + distance_a[:, None] * ray_a + center_b + distance_b[:, None] * ray_b
+    points: Float64 = 0.5 * point_sum
+    return points
+
+
+def _get_registered_edges(scene: Scene, image: int) -> tuple[Int64, Int64]:
+    """Return source and target keypoints of the matches of an image to registered images."""
     edges = scene.graph.edges_of(image)
     source, target = scene.graph.source[edges], scene.graph.target[edges]
     registered = scene.registered[scene.graph.image_of[target]]
     return source[registered], target[registered]
 
 
-def _angle_error_px(scene: Scene, image: int, options: TriangulationOptions) -> float:
+def _max_angle_error_px(scene: Scene, image: int, options: TriangulationOptions) -> float:
+    """Convert ``max_angle_error_deg`` to pixels at the principal point."""
     return float(scene.intrinsics[image, 0] * np.tan(np.radians(options.max_angle_error_deg)))
 
 
-def triangulate_midpoints(
-    center_a: Float64, ray_a: Float64, center_b: Float64, ray_b: Float64
-) -> Float64:
-    """Points halfway between two rays each, (m, 3); NaN for parallel rays."""
-    aa, bb = (ray_a * ray_a).sum(axis=1), (ray_b * ray_b).sum(axis=1)
-    ab = (ray_a * ray_b).sum(axis=1)
-    between = center_b - center_a
-    da, db = (ray_a * between).sum(axis=1), (ray_b * between).sum(axis=1)
-    determinant = aa * bb - ab * ab
-    safe = np.where(determinant > 1e-14 * aa * bb, determinant, np.nan)
-    along_a = (bb * da - ab * db) / safe
-    along_b = (ab * da - aa * db) / safe
-    middle = center_a + along_a[:, None] * ray_a + center_b + along_b[:, None] * ray_b
-    points: Float64 = 0.5 * middle
-    return points
-
-
-def _fits(scene: Scene, source: Int64, target: Int64, points: Float64, max_error_px: float) -> Bool:
-    fits: Bool = np.asarray(np.isfinite(points).all(axis=1))
+def _reprojects(
+    scene: Scene, source: Int64, target: Int64, points: Float64, max_error_px: float
+) -> Bool:
+    """Return (m,) whether points project within the error to both keypoints of their match."""
+    valid: Bool = np.asarray(np.isfinite(points).all(axis=1))
     for keypoints in (source, target):
         with np.errstate(invalid="ignore"):
-            errors, _ = scene.project(keypoints, points)
-            fits &= errors <= max_error_px
-    return fits
+            errors_px, _ = scene.project(keypoints, points)
+            valid &= errors_px <= max_error_px
+    return valid
 
 
-def _first_of_each(values: Int64) -> Int64:
-    """Positions where a value occurs for the first time, ascending."""
+def _first_occurrences(values: Int64) -> Int64:
+    """Return the positions, ascending, at which a value occurs for the first time."""
     return np.sort(np.unique(values, return_index=True)[1])
 
 
 def _pairs_within_groups(groups: Int64) -> tuple[Int64, Int64]:
-    """All ordered pairs of positions, a position with itself included, of equal sorted value."""
+    """Return all ordered pairs of positions with equal value, each with itself too.
+
+    Args:
+        groups: (m,) sorted values.
+    """
     _, first, counts = np.unique(groups, return_index=True, return_counts=True)
     size, start = np.repeat(counts, counts), np.repeat(first, counts)
-    return _expand(start, size)
+    return _expand_ranges(start, size)
 
 
-def _expand(first: Int64, counts: Int64) -> tuple[Int64, Int64]:
-    """For rows of ``counts[r]`` items from ``first[r]`` on: row and item of each, flattened."""
+def _expand_ranges(first: Int64, counts: Int64) -> tuple[Int64, Int64]:
+    """Expand ranges ``first[r] .. first[r] + counts[r] - 1``; return row and item of each."""
     rows = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     return rows, first[rows] + within

@@ -1,4 +1,4 @@
-"""How much of what the images of a model see others see at the same depth."""
+"""Depth agreement of a model: a measure to choose between models of the same images."""
 
 from __future__ import annotations
 
@@ -10,55 +10,63 @@ from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 GRID = 24
-"""Columns and rows of the pixels of an image that are looked for in the others (ours)."""
+"""Columns and rows of the pixels of an image that are compared with other images. [ours]"""
 
 
 def measure_depth_agreement(model: Reconstruction, options: ConsistencyOptions) -> float:
-    """Pixels of images that lie on the surface another image sees, summed over all pairs of images,
-    in terms of the pixels of one; as near as the depth check takes for the same.
+    """Measure how much of the images' depth agrees with the depth of other images.
 
-    An image in a wrong place may contradict no other, seeing past what they see; but then little of
-    it lies on their surfaces either.
+    A misplaced image may contradict no other image because it looks past their surfaces. Then
+    little of its depth agrees with them either.
+
+    Args:
+        model: The model with refined depth maps.
+        options: ``max_deviation`` and ``min_gap`` decide when two depths agree.
+
+    Returns:
+        The sum over all ordered pairs of images of the share of agreeing pixels.
     """
     images = [image for image in model.images if image.confirmed]
-    samples = [_samples(image) for image in images]
-    total = 0
+    samples = [_sample_points(image) for image in images]
+    num_agreeing = 0
     for row, (points, log_std) in enumerate(samples):
         for other, image in enumerate(images):
             if other != row:
-                total += _num_agreeing(points, log_std, image, options)
-    return total / GRID**2
+                num_agreeing += _count_agreeing(points, log_std, image, options)
+    return num_agreeing / GRID**2
 
 
-def _samples(image: RegisteredImage) -> tuple[Float64, Float64]:
-    """Points (n, 3) that an image sees, and the std of their log depth (n,)."""
+def _sample_points(image: RegisteredImage) -> tuple[Float64, Float64]:
+    """Return world points (n, 3) of a depth map and the std of their log depth (n,)."""
     depth = image.depth
     rows, columns = depth.shape
     xy = pixel_centers(GRID, GRID).reshape(-1, 2) * [columns, rows] / GRID
     column, row = np.floor(xy).astype(np.int64).T
     known = depth.valid[row, column]
     z = depth.depth[row, column].astype(np.float64)
-    assert depth.variance is not None  # of a refined map always
-    std = np.sqrt(depth.variance[row, column]) / np.where(known, z, 1.0)
-    local = unproject(image.camera.resized(columns, rows), xy[known], z[known])
-    return (local - image.translation) @ image.rotation, std[known]
+    assert depth.variance is not None  # refined depth maps have a variance
+    log_std = np.sqrt(depth.variance[row, column]) / np.where(known, z, 1.0)
+    points = unproject(image.camera.resized(columns, rows), xy[known], z[known])
+    return (points - image.translation) @ image.rotation, log_std[known]
 
 
-def _num_agreeing(
+def _count_agreeing(
     points: Float64, log_std: Float64, image: RegisteredImage, options: ConsistencyOptions
 ) -> int:
+    """Count the points whose depth agrees with the depth map of an image."""
     depth = image.depth
     rows, columns = depth.shape
-    seen = transform(image.rotation, image.translation, points)
-    front = seen[:, 2] > 1e-9
-    seen, log_std = seen[front], log_std[front]
-    column, row = np.floor(project(image.camera.resized(columns, rows), seen)).astype(np.int64).T
+    local = transform(image.rotation, image.translation, points)
+    in_front = local[:, 2] > 1e-9
+    local, log_std = local[in_front], log_std[in_front]
+    xy = project(image.camera.resized(columns, rows), local)
+    column, row = np.floor(xy).astype(np.int64).T
     inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    column, row, z, log_std = column[inside], row[inside], seen[inside, 2], log_std[inside]
-    there = depth.depth[row, column].astype(np.float64)
+    column, row, z, log_std = column[inside], row[inside], local[inside, 2], log_std[inside]
+    map_depth = depth.depth[row, column].astype(np.float64)
     assert depth.variance is not None
     with np.errstate(divide="ignore", invalid="ignore"):
-        off = np.abs(np.log(z / there))
-        std = np.hypot(log_std, np.sqrt(depth.variance[row, column]) / there)
-    near = off < np.maximum(options.max_deviation * std, options.min_gap)
-    return int(np.count_nonzero(near & depth.valid[row, column]))
+        errors = np.abs(np.log(z / map_depth))
+        std = np.hypot(log_std, np.sqrt(depth.variance[row, column]) / map_depth)
+    agrees = errors < np.maximum(options.max_deviation * std, options.min_gap)
+    return int(np.count_nonzero(agrees & depth.valid[row, column]))

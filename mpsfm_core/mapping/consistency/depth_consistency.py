@@ -1,36 +1,31 @@
-"""Dense depth consistency check between views (paper section 3.4).
+"""Dense depth consistency check between posed images (paper section 3.4).
 
-Each pixel of one image's refined map is carried into another view. Where it lands clearly in front
-of the surface seen there, the two contradict each other: something would have to float in space
-that was seen to be empty. Behind is an occlusion. Two explanations compete for such a pixel:
+Each pixel of an image's refined depth map is projected into another image. If the pixel is clearly
+in front of the surface there, both depth maps contradict each other. The other image then sees
+empty space where the pixel has a surface. A pixel behind the surface is occluded. Two explanations
+of a contradiction compete:
 
-* The *priors* are off there. The surface then lies elsewhere on the pixel's own ray, and the other
-  surface elsewhere on its ray. If errors of log depth are normal with std ``s`` and ``s'``, what is
-  seen has the likelihood ``L``, the mean of ``exp(-(e' / s')^2 / 2)`` over all ``e`` along the ray,
-  where ``e'`` brings the other surface there (0 where it need not: out of sight, or behind it).
-  This is no matter of depth alone: of two views at a wide angle, an error of depth in one is a
-  shift to the side in the other. The mean and not the best: some error to the side nearly always
-  takes a pixel past an edge, which explains no more than that error is likely.
-* The *pose* is wrong. Then whatever is seen there has nothing to do with the pixel, and one gap is
-  as likely as another.
+* The depth is wrong. The errors of log depth in both images are normal with standard deviations
+  ``s`` and ``s'``. The likelihood is ``L = E_e[exp(-(e' / s')^2 / 2)]`` over the errors ``e`` along
+  the pixel's ray, where ``e'`` moves the other surface to the shifted pixel. ``e'`` is 0 if the
+  shifted pixel is occluded or outside the other image. At wide angles, an error of depth is also a
+  lateral shift in the other image. The expectation replaces the maximum because some error nearly
+  always shifts the pixel past a depth edge.
+* The pose is wrong. Then the other surface is independent of the pixel.
 
-A pixel speaks for the second where ``L`` is below that of a deviation of ``max_deviation`` std
-(2.7: 38 times less likely than none); the share of such pixels decides. So all depends on what std
-is true at the place. A prior that is good on the whole may be far off in one spot, and only there.
-What a map is worth at a place is therefore measured: by the points around whose depth hangs on no
-prior, as rays hold them at wide angles
-(:func:`~mpsfm_core.mapping.refinement.depth_noise.local_noise`). Where they deny the prior, it is
-at fault, its std is what they say, and the pixel contradicts nothing. Where they confirm it, or
-where there are none, the std of the whole stands and so does the contradiction. This tells
-look-alikes from bad priors: an image that stands in the twin of its room has points only on what
-both rooms share, where depth is right; what differs has none to excuse it.
+A pixel is a violation if ``L`` is below the likelihood of a deviation of ``max_deviation`` standard
+deviations. The violation ratio is the share of such pixels, summed over both directions (beta in
+the paper).
 
-What fills the picture of a near view may fall into few pixels of a far one, whose refined map is
-least sure of what is small. Images that hold already go on clear evidence only: there it counts as
-these few pixels. A newcomer, which is tried again, is held to all.
+The check needs the local standard deviation of depth, because a good prior can be wrong in one
+spot. Triangulated points that do not depend on the prior measure it
+(:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_local_depth_noise`). If they contradict
+the prior, the standard deviation grows and the pixel is no violation. If they confirm it, or if
+there are none, the global value applies. An image registered to a look-alike place has points only
+on the shared structure, where depth fits, so the differing structure still counts.
 
-An image is held against all views that it overlaps with, not only those it shares points with:
-those that led an image to a wrong place look alike there, others tell.
+An image is compared with all images that it overlaps with, not only with those that share points.
+The images that share points with a misregistered image look alike, so they cannot reveal it.
 """
 
 from __future__ import annotations
@@ -45,149 +40,169 @@ import numpy as np
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera
 from mpsfm_core.geometry import pixel_centers, unproject
 from mpsfm_core.mapping.options import ConsistencyOptions
-from mpsfm_core.mapping.refinement.depth_noise import local_noise, witnesses
+from mpsfm_core.mapping.refinement.depth_noise import (
+    find_well_constrained_keypoints,
+    measure_local_depth_noise,
+)
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.optimize.depth_integration import RefinedDepth
 from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, subsample_camera
 from mpsfm_core.support import jit
 
-STEPS = 4
-"""Errors to either side along a pixel's ray over which the mean is taken, evenly spaced up to the
-limit (ours)."""
-SAMPLING = 2
-"""Every so many columns and rows a pixel of a thinned map is carried over: thousands are left, and
-a share of 5 % of independent ones is known within 0.4 % (ours)."""
-CLEAR = 3.0
-"""A quarter of these pixels is enough where their share is so many of its stds off the limit (ours:
-most views that overlap agree in all of them)."""
+NUM_ERROR_STEPS = 4
+"""Samples of the depth error on either side of 0, evenly spaced up to ``max_deviation``. [ours]"""
+PIXEL_STRIDE = 2
+"""Distance in pixels between the compared pixels of the subsampled maps. [ours]"""
+MIN_SIGNIFICANCE = 3.0
+"""If a quarter of the pixels puts the violation ratio so many standard deviations from the limit,
+the other pixels are skipped. [ours]"""
 OVERLAP_GRID = 16
-"""Columns and rows of the pixels by which overlap is judged (ours)."""
-MIN_OVERLAP = 0.05
-"""Share of those pixels that must fall into another view for a comparison (ours)."""
+"""Columns and rows of the pixels that measure overlap. [ours]"""
+MIN_OVERLAP_RATIO = 0.05
+"""Share of these pixels that must project into another image for a comparison. [ours]"""
 
 
 class DepthViolation(NamedTuple):
-    """The view that contradicts an image most, and the share of contradicting pixels.
+    """The largest contradiction between an image and the other images."""
 
-    ``share``: of the pixels of either map, summed over both directions, as beta in the paper,
-    in [0, 2]. ``other``: -1 when no view overlaps.
-    """
-
-    share: float
-    other: int
+    ratio: float
+    """Violation ratio, summed over both directions, in [0, 2]."""
+    other_image: int
+    """The image that contradicts it, or -1 if no image overlaps."""
 
 
 class DepthConsistencyCheck:
-    """The check of one scene; remembers what maps are worth as long as they stay what they are.
+    """Depth consistency check of a scene; caches the subsampled depth maps until they change.
 
-    ``fills_holes``: holes of a pixel or two, as sensors leave, are no gap in what is seen. A right
-    pose hides nothing there; one that is a little off may, and so does an image whose pose is not
-    settled (ours, hololens_room).
+    Args:
+        scene: The scene.
+        options: Thresholds of the check.
+        fill_holes: Fill holes of one or two pixels in the depth maps, as sensors leave them.
+            Without filling, a slightly wrong pose looks through the holes. [ours]
     """
 
     def __init__(
-        self, scene: Scene, options: ConsistencyOptions, *, fills_holes: bool = False
+        self, scene: Scene, options: ConsistencyOptions, *, fill_holes: bool = False
     ) -> None:
         self._scene = scene
         self._options = options
-        self._fills_holes = fills_holes
-        self._grids: dict[int, tuple[_MapState, _Grid]] = {}
+        self._fill_holes = fill_holes
+        self._grids: dict[int, tuple[_DepthMapState, _DepthGrid]] = {}
 
     def check_image(
         self, image: int, std_factor: float = 1.0, limit: float = math.nan
     ) -> DepthViolation:
-        """How much an image contradicts the registered views that it overlaps with most.
+        """Return the largest violation ratio of an image with the images that it overlaps most.
 
-        ``std_factor``: how many times its declaration the std of depth is on the whole. ``limit``:
-        as of :meth:`between`.
+        Args:
+            image: A registered image.
+            std_factor: Measured standard deviation of depth, relative to the declared one.
+            limit: See :meth:`measure_violation_ratio`.
         """
-        found = [
-            DepthViolation(self.violation_ratio(image, other, std_factor, limit), other)
+        violations = [
+            DepthViolation(self.measure_violation_ratio(image, other, std_factor, limit), other)
             for other in find_overlapping_images(self._scene, image, self._options.num_views)
         ]
-        return max(found, default=DepthViolation(0.0, -1))
+        return max(violations, default=DepthViolation(0.0, -1))
 
     def find_conflicting_images(
         self, images: Sequence[int] | Int64, limit: float, std_factor: float = 1.0
     ) -> list[tuple[int, float]]:
-        """Registered images to leave out so that none of ``images`` and another contradict each
-        other, and how much each did.
+        """Find registered images to deregister so that no contradiction with ``images`` remains.
 
-        ``limit``: share of contradicting pixels above which two do. The image with most conflicts
-        goes first.
+        The image with the most contradictions goes first (greedy vertex cover).
+
+        Args:
+            images: Images to compare with the images that they overlap with.
+            limit: Violation ratio above which two images contradict each other.
+            std_factor: See :meth:`check_image`.
+
+        Returns:
+            The images to deregister, each with its largest violation ratio.
         """
         scene = self._scene
-        shares = np.full((scene.num_images, scene.num_images), np.nan)
+        ratios = np.full((scene.num_images, scene.num_images), np.nan)
         for image in map(int, images):
             for other in find_overlapping_images(scene, image, self._options.num_views):
-                if np.isnan(shares[image, other]):
-                    share = self.violation_ratio(image, other, std_factor, limit, once=True)
-                    shares[image, other] = shares[other, image] = share
-        shares = np.nan_to_num(shares)
+                if np.isnan(ratios[image, other]):
+                    ratio = self.measure_violation_ratio(
+                        image, other, std_factor, limit, by_target_area=True
+                    )
+                    ratios[image, other] = ratios[other, image] = ratio
+        ratios = np.nan_to_num(ratios)
         removed = []
-        while (shares > limit).any():
-            conflicts = (shares > limit).sum(axis=1)
-            worst = int(np.lexsort((shares.sum(axis=1), conflicts))[-1])
-            removed.append((worst, float(shares[worst].max())))
-            shares[worst] = shares[:, worst] = 0
+        while (ratios > limit).any():
+            num_conflicts = (ratios > limit).sum(axis=1)
+            worst = int(np.lexsort((ratios.sum(axis=1), num_conflicts))[-1])
+            removed.append((worst, float(ratios[worst].max())))
+            ratios[worst] = ratios[:, worst] = 0
         return removed
 
-    def violation_ratio(
+    def measure_violation_ratio(
         self,
         a: int,
         b: int,
         std_factor: float = 1.0,
         limit: float = math.nan,
         *,
-        once: bool = False,
+        by_target_area: bool = False,
     ) -> float:
-        """Share of pixels of two views at which one sees empty space and the other a surface.
+        """Measure the share of pixels at which one image sees empty space and the other a surface.
 
-        ``limit``: that it is held against; what is clearly below or above it is known less exactly.
-        ``once``: those that fall into one pixel of the other view together count as one.
+        Args:
+            a: A registered image.
+            b: Another registered image.
+            std_factor: See :meth:`check_image`.
+            limit: Limit that the ratio is compared with. A ratio that is significantly below or
+                above it is measured on a quarter of the pixels. NaN measures all pixels.
+            by_target_area: Weight a violation by its area in the other image, at most 1. A near
+                surface may project to few pixels, which refined maps resolve worst. This demands
+                clearer evidence against images that are registered already.
         """
         scene, options = self._scene, self._options
         rotation = scene.rotations[b] @ scene.rotations[a].T
         translation = scene.translations[b] - rotation @ scene.translations[a]
         return compute_violation_ratio(
-            self._grid(a, std_factor),
-            self._grid(b, std_factor),
+            self._get_grid(a, std_factor),
+            self._get_grid(b, std_factor),
             rotation,
             translation,
-            ViolationCriteria(options.max_deviation, options.min_gap, once),
+            ViolationCriteria(options.max_deviation, options.min_gap, by_target_area),
             limit,
         )
 
-    def _grid(self, image: int, std_factor: float) -> _Grid:
-        """The depth map of an image, thinned out, with what it was worth when it came about."""
+    def _get_grid(self, image: int, std_factor: float) -> _DepthGrid:
+        """Return the subsampled depth map of an image, from the cache if the map is unchanged."""
         depth_map = self._scene.maps[image]
-        state = _MapState(depth_map.refined, depth_map.scale, depth_map.camera, std_factor)
-        known = self._grids.get(image)
-        if known is None or known[0] != state:
-            known = self._grids[image] = state, self._make_grid(image, std_factor)
-        return known[1]
+        state = _DepthMapState(depth_map.refined, depth_map.scale, depth_map.camera, std_factor)
+        cached = self._grids.get(image)
+        if cached is None or cached[0] != state:
+            cached = self._grids[image] = state, self._make_grid(image, std_factor)
+        return cached[1]
 
-    def _make_grid(self, image: int, std_factor: float) -> _Grid:
+    def _make_grid(self, image: int, std_factor: float) -> _DepthGrid:
         depth_map = self._scene.maps[image]
         step = compute_subsampling_step(depth_map.valid.shape[1], self._options.map_width)
         depth = subsample(depth_map.depth, step)
         valid = subsample(depth_map.valid, step)
         std = subsample(depth_map.log_std, step) * np.float32(std_factor)
         if self._options.weigh_evidence:
-            local = local_noise(self._scene, image, witnesses(self._scene, image), std_factor)
+            local = measure_local_depth_noise(
+                self._scene, image, find_well_constrained_keypoints(self._scene, image), std_factor
+            )
             std = subsample(depth_map.log_std, step) * subsample(local, step)
-        # A pixel's error of place is one of depth at edges and where sight grazes a surface.
-        around = np.ones((3, 3))
-        nearest = cv2.erode(np.where(valid, depth, np.float32(np.inf)), around)
-        if self._fills_holes:
-            std = np.where(valid, std, cv2.dilate(np.where(valid, std, np.float32(0)), around))
+        # An error of one pixel changes the depth at edges and at grazing angles.
+        kernel = np.ones((3, 3))
+        nearest = cv2.erode(np.where(valid, depth, np.float32(np.inf)), kernel)
+        if self._fill_holes:
+            std = np.where(valid, std, cv2.dilate(np.where(valid, std, np.float32(0)), kernel))
             depth, valid = np.where(valid, depth, nearest), np.isfinite(nearest)
-        params = np.array(subsample_camera(depth_map.camera, step).params)
-        return _Grid(depth, np.maximum(std, np.float32(1e-6)), valid, nearest, params)
+        intrinsics = np.array(subsample_camera(depth_map.camera, step).params)
+        return _DepthGrid(depth, np.maximum(std, np.float32(1e-6)), valid, nearest, intrinsics)
 
 
-def find_overlapping_images(scene: Scene, image: int, limit: int) -> list[int]:
-    """Registered images, most overlapping first, into which a good part of a depth map falls."""
+def find_overlapping_images(scene: Scene, image: int, max_images: int) -> list[int]:
+    """Return the registered images into which most of a depth map projects, best first."""
     others = scene.registered_images()
     others = others[(others != image) & np.array([scene.maps[i].active for i in others])]
     depth_map = scene.maps[image]
@@ -197,32 +212,39 @@ def find_overlapping_images(scene: Scene, image: int, limit: int) -> list[int]:
     points = unproject(depth_map.camera, xy, depth_map.depth[at].astype(np.float64))
     world = (points[depth_map.valid[at]] - scene.translations[image]) @ scene.rotations[image]
     sizes = np.array([scene.problem.images[i].camera.size for i in others]).reshape(-1, 2)
-    inside = count_visible_points(
+    counts = count_visible_points(
         world,
         scene.rotations[others],
         scene.translations[others],
         scene.intrinsics[others],
         sizes.astype(np.float64),
     )
-    share = inside / OVERLAP_GRID**2
-    order = np.argsort(-share, kind="stable")[:limit]
-    return [int(others[k]) for k in order if share[k] >= MIN_OVERLAP]
+    overlap = counts / OVERLAP_GRID**2
+    order = np.argsort(-overlap, kind="stable")[:max_images]
+    return [int(others[k]) for k in order if overlap[k] >= MIN_OVERLAP_RATIO]
 
 
 @jit.kernel()
 def count_visible_points(
     points: Float64, rotations: Float64, translations: Float64, intrinsics: Float64, sizes: Float64
 ) -> Int64:
-    """How many of the points (p, 3) project into each of n views, (n,) int64.
+    """Count the points that project into each image.
 
-    ``rotations`` (n, 3, 3), ``translations`` (n, 3): cam_from_world. ``intrinsics`` (n, 4): fx, fy,
-    cx, cy, and ``sizes`` (n, 2) in pixels.
+    Args:
+        points: (p, 3) world points.
+        rotations: (n, 3, 3) ``cam_from_world``.
+        translations: (n, 3) ``cam_from_world``.
+        intrinsics: (n, 4) fx, fy, cx, cy in pixels.
+        sizes: (n, 2) width and height in pixels.
+
+    Returns:
+        (n,) int64.
     """
     counts = np.zeros(len(rotations), np.int64)
-    for view in range(len(rotations)):
-        r, t = rotations[view], translations[view]
-        fx, fy, cx, cy = intrinsics[view]
-        width, height = sizes[view]
+    for image in range(len(rotations)):
+        r, t = rotations[image], translations[image]
+        fx, fy, cx, cy = intrinsics[image]
+        width, height = sizes[image]
         for k in range(len(points)):
             x, y, z = points[k]
             depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
@@ -230,26 +252,31 @@ def count_visible_points(
                 continue
             u = fx * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]) / depth + cx
             v = fy * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) / depth + cy
-            counts[view] += 0 <= u < width and 0 <= v < height
+            counts[image] += 0 <= u < width and 0 <= v < height
     return counts
 
 
-class _Grid(NamedTuple):
-    """A depth map thinned out, (h, w): depth, the std of its logarithm, where it is valid, the
-    least depth around each pixel; and the (fx, fy, cx, cy) that belong to it."""
+class _DepthGrid(NamedTuple):
+    """A subsampled depth map."""
 
     depth: Float32
+    """(h, w) depth."""
     log_std: Float32
+    """(h, w) standard deviation of log depth."""
     valid: Bool
+    """(h, w) whether the depth is known."""
     nearest: Float32
-    params: Float64
+    """(h, w) smallest depth in the 3x3 neighborhood."""
+    intrinsics: Float64
+    """(4,) fx, fy, cx, cy in pixels of the grid."""
 
 
-class _MapState(NamedTuple):
-    """What a grid depends on: the refined map, its scale and camera, the std of depth on the whole.
+class _DepthMapState(NamedTuple):
+    """The inputs of a grid, by which the cache recognizes a change.
 
-    The points that deny or confirm a prior also move on, but they are those that the map was
-    refined with."""
+    The points that measure the local standard deviation also change, but the map is refined
+    whenever they do.
+    """
 
     refined: RefinedDepth | None
     scale: float
@@ -258,90 +285,100 @@ class _MapState(NamedTuple):
 
 
 class ViolationCriteria(NamedTuple):
-    """What a pixel that lies before what another view sees is held to.
-
-    ``max_deviation``: errors in terms of their std up to which they are likely. ``min_gap``: share
-    of the seen depth up to which before it is not in front of it. ``once``: those that fall into
-    one pixel of the other view together count as one."""
+    """Criteria for a pixel to count as a violation."""
 
     max_deviation: float
+    """Largest deviation, in standard deviations, that errors of depth explain."""
     min_gap: float
-    once: bool
+    """Smallest distance in front of the other surface, relative to its depth."""
+    by_target_area: bool
+    """Weight a violation by its area in the other image, at most 1."""
 
 
 @jit.kernel()
 def compute_violation_ratio(
-    one: _Grid,
-    two: _Grid,
+    grid_a: _DepthGrid,
+    grid_b: _DepthGrid,
     rotation: Float64,
     translation: Float64,
-    terms: ViolationCriteria,
+    criteria: ViolationCriteria,
     limit: float,
 ) -> float:
-    """Share of the pixels of two views that lie before what the other sees, whatever errors of
-    depth are likely; summed over both directions.
+    """Compute the violation ratio of two images, summed over both directions.
 
-    ``rotation`` (3, 3), ``translation`` (3,): ``two_from_one``. ``limit``: the answer may be that
-    of a quarter of the pixels where this says on which side of it the share is.
+    Args:
+        grid_a: Depth of the first image.
+        grid_b: Depth of the second image.
+        rotation: (3, 3) ``b_from_a``.
+        translation: (3,) ``b_from_a``.
+        criteria: Criteria of a violation.
+        limit: A quarter of the pixels suffices if it decides on which side of the limit the ratio
+            is.
     """
-    back, found = rotation.T.copy(), np.zeros((2, 2))
+    inverse_rotation, counts = rotation.T.copy(), np.zeros((2, 2))
+    inverse_translation = -inverse_rotation @ translation
     for quarter in range(4):
-        found[0] += _unexplained(one, two, rotation, translation, terms, quarter)
-        found[1] += _unexplained(two, one, back, -back @ translation, terms, quarter)
-        share, looked_at = (found[:, 0] / found[:, 1]).sum(), found[:, 1].mean()
-        if not quarter and abs(share - limit) > CLEAR * math.sqrt(2 * limit / looked_at):
+        counts[0] += _count_violations(grid_a, grid_b, rotation, translation, criteria, quarter)
+        counts[1] += _count_violations(
+            grid_b, grid_a, inverse_rotation, inverse_translation, criteria, quarter
+        )
+        ratio, num_pixels = (counts[:, 0] / counts[:, 1]).sum(), counts[:, 1].mean()
+        std = math.sqrt(2 * limit / num_pixels)
+        if not quarter and abs(ratio - limit) > MIN_SIGNIFICANCE * std:
             break
-    return float(share)
+    return float(ratio)
 
 
 @jit.kernel()
-def _unexplained(
-    source: _Grid,
-    target: _Grid,
+def _count_violations(
+    source: _DepthGrid,
+    target: _DepthGrid,
     rotation: Float64,
     translation: Float64,
-    terms: ViolationCriteria,
+    criteria: ViolationCriteria,
     quarter: int,
 ) -> Float64:
-    """How many pixels do in one direction, and of how many: one of four lattices of them."""
+    """Count violations in one direction and the compared pixels: one of four pixel lattices."""
     rows, columns = target.depth.shape
-    r, t, total, visited = rotation, translation, 0.0, 0.0
-    limit = terms.max_deviation
-    zoom = target.params[0] / source.params[0]
-    # 0, then nearer and farther in turn: most pixels need no error at all
-    turns = np.arange(2 * STEPS + 1)
-    errors = limit * ((turns + 1) // 2) / STEPS * (1 - 2 * (turns % 2))
-    weights = np.exp(-errors * errors / 2) * limit / STEPS / math.sqrt(2 * math.pi)
-    least = math.exp(-limit * limit / 2)
-    top, left = SAMPLING // 2 + SAMPLING * (quarter // 2), SAMPLING // 2 + SAMPLING * (quarter % 2)
-    for row in range(top, source.depth.shape[0], 2 * SAMPLING):
-        y = (row + 0.5 - source.params[3]) / source.params[1]
-        for column in range(left, source.depth.shape[1], 2 * SAMPLING):
-            visited += 1.0
+    r, t, num_violations, num_pixels = rotation, translation, 0.0, 0.0
+    limit = criteria.max_deviation
+    zoom = target.intrinsics[0] / source.intrinsics[0]
+    # 0 first, then alternating signs: most pixels need no error at all
+    steps = np.arange(2 * NUM_ERROR_STEPS + 1)
+    errors = limit * ((steps + 1) // 2) / NUM_ERROR_STEPS * (1 - 2 * (steps % 2))
+    weights = np.exp(-errors * errors / 2) * limit / NUM_ERROR_STEPS / math.sqrt(2 * math.pi)
+    min_likelihood = math.exp(-limit * limit / 2)
+    first_row = PIXEL_STRIDE // 2 + PIXEL_STRIDE * (quarter // 2)
+    first_column = PIXEL_STRIDE // 2 + PIXEL_STRIDE * (quarter % 2)
+    for row in range(first_row, source.depth.shape[0], 2 * PIXEL_STRIDE):
+        y = (row + 0.5 - source.intrinsics[3]) / source.intrinsics[1]
+        for column in range(first_column, source.depth.shape[1], 2 * PIXEL_STRIDE):
+            num_pixels += 1.0
             if not source.valid[row, column]:
                 continue
-            x = (column + 0.5 - source.params[2]) / source.params[0]
-            across = r[0, 0] * x + r[0, 1] * y + r[0, 2]
-            down = r[1, 0] * x + r[1, 1] * y + r[1, 2]
-            along = r[2, 0] * x + r[2, 1] * y + r[2, 2]
-            here, likelihood = np.float64(source.depth[row, column]), 0.0
+            x = (column + 0.5 - source.intrinsics[2]) / source.intrinsics[0]
+            ray_x = r[0, 0] * x + r[0, 1] * y + r[0, 2]
+            ray_y = r[1, 0] * x + r[1, 1] * y + r[1, 2]
+            ray_z = r[2, 0] * x + r[2, 1] * y + r[2, 2]
+            source_depth, likelihood = np.float64(source.depth[row, column]), 0.0
             for step in range(len(errors)):
                 error = errors[step] * source.log_std[row, column]
-                depth = here * math.exp(error) if step else here
-                z, other = depth * along + t[2], 0.0
+                depth = source_depth * math.exp(error) if step else source_depth
+                z, target_error = depth * ray_z + t[2], 0.0
                 if z > 1e-9:
                     inverse = 1.0 / z
-                    u = (depth * across + t[0]) * inverse * target.params[0] + target.params[2]
-                    v = (depth * down + t[1]) * inverse * target.params[1] + target.params[3]
+                    u = (depth * ray_x + t[0]) * inverse * target.intrinsics[0]
+                    v = (depth * ray_y + t[1]) * inverse * target.intrinsics[1]
+                    u, v = u + target.intrinsics[2], v + target.intrinsics[3]
                     if 0 <= u < columns and 0 <= v < rows:
                         i, j = int(v), int(u)
-                        seen = target.nearest[i, j]
-                        if target.valid[i, j] and seen - z > terms.min_gap * seen:
-                            other = math.log(seen / z) / target.log_std[i, j]
-                likelihood += weights[step] * math.exp(-other * other / 2)
-                if likelihood >= least:
+                        surface = target.nearest[i, j]
+                        if target.valid[i, j] and surface - z > criteria.min_gap * surface:
+                            target_error = math.log(surface / z) / target.log_std[i, j]
+                likelihood += weights[step] * math.exp(-target_error * target_error / 2)
+                if likelihood >= min_likelihood:
                     break
-            if likelihood < least:
-                pixels = (zoom * here / (here * along + t[2])) ** 2
-                total += min(1.0, pixels) if terms.once else 1.0
-    return np.array([total, max(visited, 1.0)])
+            if likelihood < min_likelihood:
+                area = (zoom * source_depth / (source_depth * ray_z + t[2])) ** 2
+                num_violations += min(1.0, area) if criteria.by_target_area else 1.0
+    return np.array([num_violations, max(num_pixels, 1.0)])

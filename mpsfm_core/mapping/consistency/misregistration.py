@@ -1,12 +1,15 @@
-"""Images that fewer matches hold where they are than would hold them elsewhere.
+"""Detection of misregistered images: more matches contradict their pose than support it.
 
-Where two registered images see hardly any of their matches as common points, either these are
-false, or one of the two stands where it does by others that are. What lies between them tells: the
-fewest explained matches that must go for the two to come apart (a minimum cut). If those are fewer
-than the matches that the two have with each other, the images on the smaller side of the cut may
-belong elsewhere. The same holds for two images that another one, which could not be registered,
-matches both: it can stand beside one of them only. And a single image may belong elsewhere that no
-pair alone outweighs, but all of its pairs together.
+A match is explained if both keypoints observe the same 3D point. If hardly any match of a pair of
+registered images is explained, the matches are wrong or one image is misregistered. Three cases
+count as evidence for misregistration:
+
+1. A pair has more unexplained matches than the explained matches that connect its images along all
+   paths. This is a minimum cut of the match graph (max-flow min-cut). The images on the smaller
+   side of the cut may be misregistered.
+2. The same for two images that both match a third image which cannot be registered: at most one of
+   the two can be correct.
+3. The unexplained matches of all pairs of one image clearly outnumber its explained matches.
 """
 
 from __future__ import annotations
@@ -20,64 +23,70 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from mpsfm_core.data import Bool, Int64
 from mpsfm_core.mapping.scene.scene import Scene
 
-MAX_EXPLAINED = 0.25
-"""Share of the matches of two images that see the same point, up to which the two stand against
-each other (ours; of right pairs it is well above a half)."""
-CLEARLY_MORE = 0.5
-"""Of what the matches of so many pairs would come to by chance, if each pair spoke for one place or
-the other as it happens: by so much more must those against an image's place be. (Ours, two rooms:
-with 0 right images move too, whose false matches are a few more; ``benchmarks/symmetry.py``.)"""
+MAX_EXPLAINED_RATIO = 0.25
+"""Share of explained matches up to which a pair contradicts the poses of its images. For correct
+poses the share is well above 0.5. [ours]"""
+MIN_SIGNIFICANCE = 0.5
+"""Excess of contradicting matches of one image, in standard deviations of the sum if each pair
+supported or contradicted its pose at random. [tuned: benchmarks.symmetry]"""
 
 
 class Misregistration(NamedTuple):
-    """``images``: of the smaller side of a cut. ``links`` (k, 2): one of them and an image of the
-    rest beside which it stands. ``margin``: by how many matches what is torn apart has more than
-    what holds them."""
+    """Images that may be misregistered together."""
 
     images: tuple[int, ...]
-    links: Int64
+    """The images, which are the smaller side of a cut."""
+    supporting_pairs: Int64
+    """(k, 2) pairs of one of them and another image whose matches support the present poses."""
     margin: int
+    """Number of contradicting matches minus number of supporting matches."""
 
 
 def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistration]:
-    """All such groups of registered images, the largest margin first.
+    """Detect groups of registered images whose matches mostly contradict their poses.
 
-    ``min_matches``: of two images whose matches are heard.
+    Args:
+        scene: The scene with the registered images.
+        min_matches: Smallest number of matches of a pair that can contradict poses.
+
+    Returns:
+        The groups, the largest margin first.
     """
     matches, explained = count_pair_matches(scene)
-    held = explained > MAX_EXPLAINED * matches
-    against = np.where(held | (matches < min_matches), 0, matches)
-    apart = _apart(scene.registered, against)
-    if not apart.any():
+    is_explained = explained > MAX_EXPLAINED_RATIO * matches
+    contradicting = np.where(is_explained | (matches < min_matches), 0, matches)
+    separating = _count_separating_matches(scene.registered, contradicting)
+    if not separating.any():
         return []
-    flows = csr_array(explained.astype(np.int32))
-    found: dict[tuple[int, ...], Misregistration] = {}
+    capacities = csr_array(explained.astype(np.int32))
+    detected: dict[tuple[int, ...], Misregistration] = {}
 
     def add(inside: Bool, margin: int) -> None:
         images = tuple(map(int, np.flatnonzero(inside)))
-        if images not in found or found[images].margin < margin:
-            links = np.argwhere(held & inside[:, None] & (scene.registered & ~inside))
-            found[images] = Misregistration(images, links, margin)
+        if images not in detected or detected[images].margin < margin:
+            outside = scene.registered & ~inside
+            pairs = np.argwhere(is_explained & inside[:, None] & outside)
+            detected[images] = Misregistration(images, pairs, margin)
 
-    for image, margin in _outweighed(scene.registered, against, explained):
+    for image, margin in _find_contradicted_images(scene.registered, contradicting, explained):
         add(scene.mask([image]), margin)
-    for a, b in np.argwhere(np.triu(apart > compute_widest_paths(explained))):
-        flow = maximum_flow(flows, int(a), int(b))
-        margin = int(apart[a, b] - flow.flow_value)
+    for a, b in np.argwhere(np.triu(separating > compute_widest_paths(explained))):
+        flow = maximum_flow(capacities, int(a), int(b))
+        margin = int(separating[a, b] - flow.flow_value)
         if margin <= 0:
             continue
-        open_ways = flows - flow.flow
-        open_ways.eliminate_zeros()
-        side = breadth_first_order(open_ways, int(a), return_predecessors=False)
+        residual_graph = capacities - flow.flow
+        residual_graph.eliminate_zeros()
+        side = breadth_first_order(residual_graph, int(a), return_predecessors=False)
         inside = scene.mask(side)
         if 2 * inside.sum() > scene.registered.sum():
             inside = scene.registered & ~inside
         add(inside, margin)
-    return sorted(found.values(), key=lambda hold: (-hold.margin, hold.images))
+    return sorted(detected.values(), key=lambda group: (-group.margin, group.images))
 
 
 def count_pair_matches(scene: Scene) -> tuple[Int64, Int64]:
-    """(n, n) matches of each two images, and those of them that see the same point."""
+    """Count the matches and the explained matches of each two images, both (n, n)."""
     graph, n = scene.graph, scene.num_images
     a, b = graph.image_of[graph.source], graph.image_of[graph.target]
     pairs = a * n + b
@@ -88,48 +97,63 @@ def count_pair_matches(scene: Scene) -> tuple[Int64, Int64]:
     return matches, explained
 
 
-def compute_widest_paths(held: Int64) -> Int64:
-    """(n, n) the most that each two images are held by along one way: its weakest link.
+def compute_widest_paths(capacities: Int64) -> Int64:
+    """Compute the capacity of the widest path between each two nodes (Kruskal's algorithm).
 
-    ``held`` (n, n): of each two images; what holds two along all ways is at least this.
+    The capacity of a path is that of its narrowest edge. It is a lower bound of the maximum flow.
+
+    Args:
+        capacities: (n, n) symmetric capacities of the edges, 0 without an edge.
+
+    Returns:
+        (n, n) symmetric, 0 for nodes that are not connected.
     """
-    widest = np.zeros_like(held)
-    group = [np.array([image]) for image in range(len(held))]
-    a, b = np.nonzero(np.triu(held))
-    for link in np.argsort(-held[a, b], kind="stable"):
-        one, other = group[a[link]], group[b[link]]
-        if one is other:
+    widest = np.zeros_like(capacities)
+    component = [np.array([node]) for node in range(len(capacities))]
+    a, b = np.nonzero(np.triu(capacities))
+    for edge in np.argsort(-capacities[a, b], kind="stable"):
+        component_a, component_b = component[a[edge]], component[b[edge]]
+        if component_a is component_b:
             continue
-        widest[np.ix_(one, other)] = widest[np.ix_(other, one)] = held[a[link], b[link]]
-        joined = np.concatenate([one, other])
-        for image in joined:
-            group[image] = joined
+        capacity = capacities[a[edge], b[edge]]
+        widest[np.ix_(component_a, component_b)] = capacity
+        widest[np.ix_(component_b, component_a)] = capacity
+        merged = np.concatenate([component_a, component_b])
+        for node in merged:
+            component[node] = merged
     return widest
 
 
-def _outweighed(registered: Bool, against: Int64, explained: Int64) -> list[tuple[int, int]]:
-    """Registered images against whose place clearly more matches of all their pairs speak than for
-    it, and by how many more.
+def _find_contradicted_images(
+    registered: Bool, contradicting: Int64, explained: Int64
+) -> list[tuple[int, int]]:
+    """Return registered images with clearly more contradicting than explained matches.
 
-    ``against``, ``explained`` (n, n): of each two images; only registered ones explain any.
+    Args:
+        registered: (n,) bool.
+        contradicting: (n, n) unexplained matches of contradicting pairs.
+        explained: (n, n) explained matches.
+
+    Returns:
+        The images, each with its excess of contradicting matches.
     """
-    against = np.where(registered[:, None] & registered, against, 0)
-    margin = (against - explained).sum(axis=1)
-    by_chance = np.sqrt((against**2 + explained**2).sum(axis=1))
-    clear = np.flatnonzero(margin > CLEARLY_MORE * by_chance)
-    return [(int(image), int(margin[image])) for image in clear]
+    contradicting = np.where(registered[:, None] & registered, contradicting, 0)
+    margin = (contradicting - explained).sum(axis=1)
+    std = np.sqrt((contradicting**2 + explained**2).sum(axis=1))
+    images = np.flatnonzero(margin > MIN_SIGNIFICANCE * std)
+    return [(int(image), int(margin[image])) for image in images]
 
 
-def _apart(registered: Bool, against: Int64) -> Int64:
-    """(n, n) matches that stand against the places of each two registered images.
+def _count_separating_matches(registered: Bool, contradicting: Int64) -> Int64:
+    """Count for each two registered images (n, n) the matches that contradict their poses.
 
-    ``against`` (n, n): those of each two images that see no common points. Of an image that is not
-    registered, two others can have what the lesser of them has.
+    They are the unexplained matches of the pair. If both images match an unregistered image, they
+    are the smaller one of both numbers of matches with that image.
     """
-    both = registered[:, None] & registered
-    apart = np.where(both, against, 0)
+    both_registered = registered[:, None] & registered
+    separating = np.where(both_registered, contradicting, 0)
     for image in np.flatnonzero(~registered):
-        of_image = np.where(registered, against[image], 0)
-        apart = np.maximum(apart, np.minimum(of_image[:, None], of_image))
-    np.fill_diagonal(apart, 0)
-    return apart
+        counts = np.where(registered, contradicting[image], 0)
+        separating = np.maximum(separating, np.minimum(counts[:, None], counts))
+    np.fill_diagonal(separating, 0)
+    return separating

@@ -1,16 +1,17 @@
-"""Which verified pairs depth refutes (paper section 3.4, before anything else holds their images).
+"""Depth consistency of verified pairs before registration (paper section 3.4).
 
-What looks alike matches in hundreds of points, and one pose explains them all: two ends of a table,
-two rooms of one kind. But all that lies around them is seen too, and there a wrong pose puts
-surfaces where the other view sees empty space. So each pair's pose is held against the depth of
-both images, and where that contradicts it, the poses that its matches support less.
+Look-alike places give hundreds of matches that one relative pose explains. The surroundings differ,
+so the wrong pose puts surfaces where the other image sees empty space.
 
-A pair without a pose that depth allows may still be right: few or bad matches turn it, and depth is
-exact. What other pairs say tells. Where those that depth allows tie its images together by more
-matches than it has, and turn them otherwise, the pair is refuted twice, and does not count. Of the
-others the matches count as far as the best pose that depth allows is supported, in terms of the
-best one of all. Pairs of fewer matches than an image needs to be registered decide nothing, and
-are not asked.
+1. The verified pose of each pair is checked for depth consistency. If it fails, the pose hypotheses
+   of its matches are checked in the order of their support.
+2. The matches of a pair are weighted by the support of the best consistent pose relative to the
+   best pose.
+3. A pair without a consistent pose may still be correct, if few or bad matches make its pose
+   inaccurate. It is removed if consistent pairs connect its images by more matches (maximum flow)
+   and imply another relative rotation.
+
+Pairs with fewer matches than a registration needs are not checked.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from mpsfm_core.mapping.initialization.global_initialization import (
 )
 from mpsfm_core.mapping.initialization.initial_pair import (
     InitialPair,
-    estimate_pairs_from_depth,
+    estimate_initial_pairs,
     refine_initial_pairs,
     register_first_image,
     scale_verified_pair,
@@ -41,128 +42,157 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.registration.correspondences import find_correspondences
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 
-MAX_TURN_DEG = 30.0
-"""Between what a pair says and what all others do, along a few links of some degrees (ours)."""
+MAX_ROTATION_ERROR_DEG = 30.0
+"""Largest angle between the rotation of a pair and that of consistent pairs. It allows for errors
+of some degrees along a chain of pairs. [ours]"""
 
 
 class PairConsistency(NamedTuple):
-    """Of a pair. ``rotation`` (3, 3): ``b_from_a`` of the best pose that depth allows, or else of
-    the best; ``share``: how well it is supported in terms of the best, 0 if none is allowed."""
+    """Result of the check of one pair."""
 
     rotation: Float64
-    share: float
+    """(3, 3) ``b_from_a`` of the best consistent pose; of the best pose if none is consistent."""
+    support_ratio: float
+    """Support of the best consistent pose relative to the best pose; 0 if none is consistent."""
 
 
 class PairConsistencyCheck:
-    """Holds the pairs of a scene without images against depth and against each other."""
+    """Consistency check of the pairs of a scene without registered images."""
 
-    def __init__(self, search: AbsolutePoseEstimator, options: MapperOptions) -> None:
-        self._search, self._scene, self._options = search, search.scene, options
-        self._check = DepthConsistencyCheck(search.scene, options.consistency, fills_holes=True)
+    def __init__(self, pose_estimator: AbsolutePoseEstimator, options: MapperOptions) -> None:
+        self._pose_estimator, self._scene = pose_estimator, pose_estimator.scene
+        self._options = options
+        self._depth_check = DepthConsistencyCheck(
+            pose_estimator.scene, options.consistency, fill_holes=True
+        )
 
-    def reweight_pairs(self, problem: MappingProblem, left: Bool) -> MappingProblem:
-        """The problem with the matches of pairs as far as depth allows them, and without the pairs
-        that depth and others refute; pairs of images that are not ``left`` (n,) stay as they are.
+    def reweight_pairs(self, problem: MappingProblem, candidates: Bool) -> MappingProblem:
+        """Return the problem with reweighted match scores and without inconsistent pairs.
+
+        Args:
+            problem: The problem.
+            candidates: (n,) bool, images whose pairs are checked; other pairs stay unchanged.
         """
-        needed = self._options.registration.min_inliers
-        verdicts = {
+        min_matches = self._options.registration.min_inliers
+        results = {
             pair: self.check_pair(pair)
             for pair in problem.pairs
-            if len(pair) >= needed and left[pair.image_a] and left[pair.image_b]
+            if len(pair) >= min_matches and candidates[pair.image_a] and candidates[pair.image_b]
         }
-        sure = {p: v.rotation for p, v in verdicts.items() if v.share * len(p) >= needed}
-        links, rotations = _turned(sure, len(problem.images))
+        consistent = {
+            pair: result.rotation
+            for pair, result in results.items()
+            if result.support_ratio * len(pair) >= min_matches
+        }
+        match_graph, rotations = _average_consistent_pairs(consistent, len(problem.images))
         pairs = []
         for pair in problem.pairs:
-            verdict = verdicts.get(pair, PairConsistency(pair.rotation, 1.0))
-            if verdict.share > 0:
-                pairs.append(_times(pair, verdict.share))
+            result = results.get(pair, PairConsistency(pair.rotation, 1.0))
+            if result.support_ratio > 0:
+                pairs.append(_scale_scores(pair, result.support_ratio))
                 continue
             a, b = pair.image_a, pair.image_b
-            turn = rotation_angle_deg(rotations[b] @ rotations[a].T @ verdict.rotation.T)
-            tied = maximum_flow(links, a, b).flow_value
-            if tied <= len(pair) or turn <= MAX_TURN_DEG:
+            error_deg = rotation_angle_deg(rotations[b] @ rotations[a].T @ result.rotation.T)
+            num_connecting = maximum_flow(match_graph, a, b).flow_value
+            if num_connecting <= len(pair) or error_deg <= MAX_ROTATION_ERROR_DEG:
                 pairs.append(pair)
         return replace(problem, pairs=tuple(pairs))
 
     def check_pair(self, pair: VerifiedPair) -> PairConsistency:
-        """What depth says of a pair; where nothing gives a pose, it allows the verified one."""
+        """Check a pair; without any pose hypothesis, the verified pose counts as consistent."""
         verified = scale_verified_pair(self._scene, pair, self._options.initialization)
-        if verified is not None and self._allows(verified):
+        if verified is not None and self._is_consistent(verified):
             return PairConsistency(pair.rotation, 1.0)
-        search, options = self._search, self._options.registration
-        found = estimate_pairs_from_depth(search, pair, options, rough=True)
-        starts = [start for start in found if start.pose.support > 0]
-        if not starts:
+        pose_estimator, options = self._pose_estimator, self._options.registration
+        hypotheses = [
+            initial
+            for initial in estimate_initial_pairs(pose_estimator, pair, options, refine=False)
+            if initial.pose.support > 0
+        ]
+        if not hypotheses:
             return PairConsistency(pair.rotation, 1.0)
-        allowed = self._best_allowed(starts)
-        if allowed is None:
-            starts = refine_initial_pairs(search, pair, starts, options)
-            allowed = self._best_allowed(starts)
-        best = max(starts, key=_support)
-        if allowed is None:
+        consistent = self._find_best_consistent(hypotheses)
+        if consistent is None:
+            hypotheses = refine_initial_pairs(pose_estimator, pair, hypotheses, options)
+            consistent = self._find_best_consistent(hypotheses)
+        best = max(hypotheses, key=_get_support)
+        if consistent is None:
             return PairConsistency(_b_from_a(pair, best), 0.0)
-        return PairConsistency(_b_from_a(pair, allowed), _support(allowed) / _support(best))
+        support_ratio = _get_support(consistent) / _get_support(best)
+        return PairConsistency(_b_from_a(pair, consistent), support_ratio)
 
-    def _best_allowed(self, starts: Sequence[InitialPair]) -> InitialPair | None:
-        """The best supported pose that depth allows, if there is one."""
-        ranked = sorted(starts, key=_support, reverse=True)
-        return next((start for start in ranked if self._allows(start)), None)
+    def _find_best_consistent(self, hypotheses: Sequence[InitialPair]) -> InitialPair | None:
+        """Return the best supported pose that passes the depth check."""
+        ranked = sorted(hypotheses, key=_get_support, reverse=True)
+        return next((initial for initial in ranked if self._is_consistent(initial)), None)
 
-    def _allows(self, start: InitialPair) -> bool:
-        """Whether depth does not contradict a pose."""
+    def _is_consistent(self, initial: InitialPair) -> bool:
+        """Return whether a relative pose passes the depth check."""
         scene, limit = self._scene, self._options.consistency.max_violations_pair
         empty = scene.snapshot()
-        register_first_image(scene, start.reference)
-        scale = self._scale_of(start)
-        scene.register(start.image, start.pose.rotation, start.pose.translation)
-        scene.maps[start.image].set_scale(scale)
-        share = self._check.violation_ratio(start.reference, start.image, limit=limit)
-        scene.restore(empty)
-        return share <= limit
-
-    def _scale_of(self, start: InitialPair) -> float:
-        """Scale of the other image's depth that fits the first one's where they match."""
-        scene, pose = self._scene, start.pose
-        found = find_correspondences(
-            scene, start.image, [start.reference], self._options.registration
+        register_first_image(scene, initial.reference)
+        scale = self._estimate_scale(initial)
+        scene.register(initial.image, initial.pose.rotation, initial.pose.translation)
+        scene.maps[initial.image].set_scale(scale)
+        ratio = self._depth_check.measure_violation_ratio(
+            initial.reference, initial.image, limit=limit
         )
-        depth_map = scene.maps[start.image]
-        rows = found.keypoints - scene.graph.offsets[start.image]
-        z = found.points @ pose.rotation[2] + pose.translation[2]
-        use = found.known & depth_map.keypoint_valid[rows] & (z > 0)
-        ratios = np.log(z[use] / depth_map.prior_at_keypoints(rows[use]))
-        return float(np.exp(np.median(ratios))) if use.any() else 1.0
+        scene.restore(empty)
+        return ratio <= limit
+
+    def _estimate_scale(self, initial: InitialPair) -> float:
+        """Estimate the scale of the other image's prior from the depth of matched points."""
+        scene, pose = self._scene, initial.pose
+        correspondences = find_correspondences(
+            scene, initial.image, [initial.reference], self._options.registration
+        )
+        depth_map = scene.maps[initial.image]
+        rows = correspondences.keypoints - scene.graph.offsets[initial.image]
+        z = correspondences.points @ pose.rotation[2] + pose.translation[2]
+        usable = correspondences.depth_known & depth_map.keypoint_valid[rows] & (z > 0)
+        log_ratios = np.log(z[usable] / depth_map.prior_at_keypoints(rows[usable]))
+        return float(np.exp(np.median(log_ratios))) if usable.any() else 1.0
 
 
-def _turned(turns: Mapping[VerifiedPair, Float64], count: int) -> tuple[csr_array, Float64]:
-    """``(links, rotations)``: (count, count) matches by which pairs tie images together, and
-    (count, 3, 3) how they are turned by what all pairs of a group say. ``turns``: ``b_from_a``
-    (3, 3) of each pair."""
-    a = np.array([pair.image_a for pair in turns], dtype=np.int64)
-    b = np.array([pair.image_b for pair in turns], dtype=np.int64)
-    weights = np.array([len(pair) for pair in turns], dtype=np.int32)
-    said = np.array(list(turns.values())).reshape(-1, 3, 3)
-    ways = np.concatenate([a, b]), np.concatenate([b, a])
-    links = csr_array((np.tile(weights, 2), ways), shape=(count, count))
-    group = label_components(a, b, count)
-    rotations = np.tile(np.eye(3), (count, 1, 1))
-    for number in np.unique(group[a]):
-        own = group[a] == number
-        found = average_rotations(a[own], b[own], said[own], 1.0 * weights[own], count)
-        rotations[group == number] = found[group == number]
-    return links, rotations
+def _average_consistent_pairs(
+    rotation_of: Mapping[VerifiedPair, Float64], num_images: int
+) -> tuple[csr_array, Float64]:
+    """Build the match graph of consistent pairs and average their relative rotations.
+
+    Args:
+        rotation_of: ``b_from_a`` (3, 3) of each consistent pair.
+        num_images: Number of images.
+
+    Returns:
+        The number of matches of each two images, a sparse matrix (n, n), and the rotations
+        (n, 3, 3) of the images in one frame per connected component.
+    """
+    a = np.array([pair.image_a for pair in rotation_of], dtype=np.int64)
+    b = np.array([pair.image_b for pair in rotation_of], dtype=np.int64)
+    weights = np.array([len(pair) for pair in rotation_of], dtype=np.int32)
+    b_from_a = np.array(list(rotation_of.values())).reshape(-1, 3, 3)
+    directed_edges = np.concatenate([a, b]), np.concatenate([b, a])
+    match_graph = csr_array((np.tile(weights, 2), directed_edges), shape=(num_images, num_images))
+    label = label_components(a, b, num_images)
+    rotations = np.tile(np.eye(3), (num_images, 1, 1))
+    for component in np.unique(label[a]):
+        rows = label[a] == component
+        averaged = average_rotations(
+            a[rows], b[rows], b_from_a[rows], 1.0 * weights[rows], num_images
+        )
+        rotations[label == component] = averaged[label == component]
+    return match_graph, rotations
 
 
-def _support(start: InitialPair) -> float:
-    return start.pose.support
+def _get_support(initial: InitialPair) -> float:
+    return initial.pose.support
 
 
-def _b_from_a(pair: VerifiedPair, start: InitialPair) -> Float64:
-    rotation = start.pose.rotation
-    return rotation if start.reference == pair.image_a else rotation.T
+def _b_from_a(pair: VerifiedPair, initial: InitialPair) -> Float64:
+    rotation = initial.pose.rotation
+    return rotation if initial.reference == pair.image_a else rotation.T
 
 
-def _times(pair: VerifiedPair, share: float) -> VerifiedPair:
-    """The pair with scores that are so much less."""
-    return pair if share == 1.0 else replace(pair, scores=pair.scores * np.float32(share))
+def _scale_scores(pair: VerifiedPair, factor: float) -> VerifiedPair:
+    """Return the pair with its match scores multiplied by a factor."""
+    return pair if factor == 1.0 else replace(pair, scores=pair.scores * np.float32(factor))

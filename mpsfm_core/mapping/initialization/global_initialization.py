@@ -1,11 +1,16 @@
-"""Poses of all images at once, from what all pairs together say of them.
+"""Global initialization: poses of all well-connected images from relative poses and depth.
 
-Verified pairs know how their images are turned, and in which direction one lies from the other;
-depth priors say how far. Rotations are averaged over all pairs; with lengths known, the scales of
-the priors and the places of the images are linear in what the pairs say, and follow from least
-squares that pairs leave which disagree. A pair has a say as far as depth fits its points: where all
-matches lie in a plane, another pose explains them as well, and tells another plane. Images that
-cycles of agreeing pairs hold are placed so; the others are left to registration one by one.
+1. Measure for each verified pair its relative pose and, from depth, the length of its baseline.
+   Pairs whose points do not fit the depth prior get a low weight: planar scenes have a second
+   relative pose, which implies other depth.
+2. Keep the largest component of the view graph whose edges are on cycles. A bridge cannot be
+   verified by other pairs.
+3. Average rotations (IRLS with a Cauchy loss).
+4. Solve for the scales of the depth priors, then for the camera centers. Both are linear in the
+   measurements and solved by the same robust least squares.
+5. Remove the pairs that disagree with the result, and return the component that remains.
+
+The other images are left to incremental registration.
 """
 
 from __future__ import annotations
@@ -29,232 +34,287 @@ from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import triangulate_midpoints
 
 MIN_ANGLE_DEG = 1.5
-"""Between the rays of a match whose depth says how long a baseline is (as for points that are
-triangulated)."""
+"""Smallest triangulation angle of a match that measures a baseline. [COLMAP min_angle]"""
 MIN_MATCHES = 10
-"""That say so, for their median to count (ours)."""
-MAX_TURN_DEG = 5.0
-"""Between what a pair says and where its images are placed, to agree (ours)."""
-MAX_SHIFT = 0.3
-"""The same of their distance, in terms of it: priors are off by a few percent, directions of short
-baselines by several degrees (ours)."""
+"""Smallest number of such matches of a pair. [ours]"""
+MAX_ROTATION_ERROR_DEG = 5.0
+"""Largest angle between a measured and a resulting relative rotation. [ours]"""
+MAX_CENTER_ERROR = 0.3
+"""Largest distance between a measured and a resulting relative center, relative to the baseline.
+It allows for errors of direction of several degrees. [ours]"""
 PLANAR_WEIGHT = 0.1
-"""Of a match of a pair that planes explain as well: the pose may be the other one of two. Ours:
-with SIFT on rendered_kitchen 80 % of these are right and 98 % of the others, and all 54 images are
-placed within 0.2 degrees instead of 1.2; from 0.01 to 0.3 much the same."""
-ROUNDS = 20
-"""Of least squares, each of which weighs pairs by how well the last one average_differences with them (ours)."""
+"""Weight of a match if a homography also explains the pair: the relative pose may be the wrong one
+of two. [tuned: benchmarks.accuracy on rendered_kitchen]"""
+NUM_ITERATIONS = 20
+"""Iterations of IRLS. [ours]"""
+DAMPING = 1e-9
+"""Damping of the Laplacian relative to its largest diagonal entry; it fixes the gauge."""
 
 
 class GlobalPoses(NamedTuple):
-    """Images (m,) with their poses, ``cam_from_world``, and the scales of their priors."""
+    """Poses of the images of one component."""
 
     images: Int64
+    """(m,) images."""
     rotations: Float64
+    """(m, 3, 3) ``cam_from_world``."""
     translations: Float64
+    """(m, 3) ``cam_from_world``."""
     scales: Float64
+    """(m,) scales of the depth priors."""
 
 
-class _Links(NamedTuple):
-    """What pairs say: image ``b`` from ``a``, and the logarithm of their distance in terms of the
-    prior of each. ``weight``: number of matches, less where the prior bends their points."""
+class _RelativePoses(NamedTuple):
+    """Measured relative poses of (m,) pairs."""
 
     a: Int64
+    """(m,) first image."""
     b: Int64
+    """(m,) second image."""
     rotation: Float64
+    """(m, 3, 3) ``b_from_a``."""
     translation: Float64
+    """(m, 3) ``b_from_a``, of length 1."""
     log_length: Float64
+    """(m, 2) logarithm of the baseline in the unit of the depth prior of ``a`` and of ``b``."""
     weight: Float64
+    """(m,) number of matches, reduced if depth does not fit the points."""
 
-    def select(self, chosen: Bool) -> _Links:
-        """Some of them."""
-        parts: list[Any] = [values[chosen] for values in self]
-        return _Links(*parts)
+    def select(self, rows: Bool) -> _RelativePoses:
+        """Return some of the pairs."""
+        fields: list[Any] = [values[rows] for values in self]
+        return _RelativePoses(*fields)
 
 
-def estimate_global_poses(scene: Scene, left: Bool) -> GlobalPoses | None:
-    """Poses of the images of the largest group that agreeing pairs hold; None without one.
+def estimate_global_poses(scene: Scene, candidates: Bool) -> GlobalPoses | None:
+    """Estimate the poses of the largest component of consistent pairs.
 
-    ``left``: (n,) bool, images that may be placed. The scene stays as it is.
+    Args:
+        scene: The scene with its verified pairs; it stays unchanged.
+        candidates: (n,) bool, images that may be registered.
+
+    Returns:
+        None if no pairs are consistent along cycles.
     """
-    pairs = [p for p in scene.problem.pairs if left[p.image_a] and left[p.image_b]]
-    links = _links(scene, pairs)
-    links = links.select(_well_held(links, scene.num_images))
-    if not len(links.a):
+    pairs = [p for p in scene.problem.pairs if candidates[p.image_a] and candidates[p.image_b]]
+    num_images = scene.num_images
+    edges = _measure_relative_poses(scene, pairs)
+    edges = edges.select(_select_largest_cyclic_component(edges, num_images))
+    if not len(edges.a):
         return None
-    rotations = average_rotations(links.a, links.b, links.rotation, links.weight, scene.num_images)
-    differences = links.log_length[:, 0] - links.log_length[:, 1]
-    unit = scene.depth_group_of  # priors in one unit share one scale
-    scales = average_differences(
-        unit[links.a], unit[links.b], differences, links.weight, scene.num_images
+    rotations = average_rotations(edges.a, edges.b, edges.rotation, edges.weight, num_images)
+    log_ratios = edges.log_length[:, 0] - edges.log_length[:, 1]
+    group = scene.depth_group_of  # depth priors of one group share a scale
+    group_log_scales = average_differences(
+        group[edges.a], group[edges.b], log_ratios, edges.weight, num_images
     )
-    log_scales = scales[unit]
-    lengths = np.exp((log_scales[links.a] + log_scales[links.b] + links.log_length.sum(axis=1)) / 2)
-    steps = -np.einsum("nji,nj->ni", rotations[links.b], links.translation) * lengths[:, None]
-    centers = average_differences(links.a, links.b, steps, links.weight / lengths, scene.num_images)
-    turns = rotations[links.b] @ rotations[links.a].transpose(0, 2, 1)
-    turned = rotation_angle_deg(turns.transpose(0, 2, 1) @ links.rotation)
-    shifts = np.linalg.norm(centers[links.b] - centers[links.a] - steps, axis=1) / lengths
-    agree = (turned <= MAX_TURN_DEG) & (shifts <= MAX_SHIFT)
-    links = links.select(agree)
-    links = links.select(_well_held(links, scene.num_images))
-    images = np.unique(np.concatenate([links.a, links.b]))
+    log_scales = group_log_scales[group]
+    lengths = np.exp((log_scales[edges.a] + log_scales[edges.b] + edges.log_length.sum(axis=1)) / 2)
+    baselines = -np.einsum("nji,nj->ni", rotations[edges.b], edges.translation) * lengths[:, None]
+    centers = average_differences(edges.a, edges.b, baselines, edges.weight / lengths, num_images)
+    relative = rotations[edges.b] @ rotations[edges.a].transpose(0, 2, 1)
+    rotation_errors_deg = rotation_angle_deg(relative.transpose(0, 2, 1) @ edges.rotation)
+    center_errors = np.linalg.norm(centers[edges.b] - centers[edges.a] - baselines, axis=1)
+    is_consistent = rotation_errors_deg <= MAX_ROTATION_ERROR_DEG
+    is_consistent &= center_errors / lengths <= MAX_CENTER_ERROR
+    edges = edges.select(is_consistent)
+    edges = edges.select(_select_largest_cyclic_component(edges, num_images))
+    images = np.unique(np.concatenate([edges.a, edges.b]))
     if not len(images):
         return None
     translations = -np.einsum("nij,nj->ni", rotations[images], centers[images])
     return GlobalPoses(images, rotations[images], translations, np.exp(log_scales[images]))
 
 
-def average_rotations(a: Int64, b: Int64, turns: Float64, weights: Float64, count: int) -> Float64:
-    """Rotations (count, 3, 3) that agree best with ``turns`` (m, 3, 3) = ``R[b] @ R[a].T``.
+def average_rotations(
+    a: Int64, b: Int64, b_from_a: Float64, weights: Float64, num_images: int
+) -> Float64:
+    """Average relative rotations: IRLS in the tangent space with a Cauchy loss.
 
-    From the tree of heaviest links on, least squares in the tangent space, weighted again and again
-    as Cauchy's loss wants it (Chatterjee and Govindu, Efficient and Robust Large-Scale Rotation
-    Averaging, ICCV 2013, with another loss). Links hold all that is placed in one group.
+    Follows Chatterjee and Govindu, Efficient and Robust Large-Scale Rotation Averaging, ICCV 2013,
+    with another loss. The maximum spanning tree gives the initial rotations. The edges must form
+    one connected component.
+
+    Args:
+        a: (m,) first image of each edge.
+        b: (m,) second image of each edge.
+        b_from_a: (m, 3, 3) relative rotations ``R[b] @ R[a].T``.
+        weights: (m,) weights of the edges.
+        num_images: Number of images.
+
+    Returns:
+        (num_images, 3, 3) rotations ``cam_from_world``.
     """
-    rotations = _rotations_of_tree(a, b, turns, weights, count)
-    for _ in range(ROUNDS):
-        left = rotations[b].transpose(0, 2, 1) @ turns @ rotations[a]
-        steps = -Rotation.from_matrix(left).as_rotvec()
-        robust = _robust_weights(np.linalg.norm(steps, axis=1))
-        moved = _solved(a, b, steps, weights * robust, count)
-        rotations = rotations @ Rotation.from_rotvec(-moved).as_matrix()
+    rotations = _chain_rotations(a, b, b_from_a, weights, num_images)
+    for _ in range(NUM_ITERATIONS):
+        residuals = rotations[b].transpose(0, 2, 1) @ b_from_a @ rotations[a]
+        rotvecs = -Rotation.from_matrix(residuals).as_rotvec()
+        robust_weights = _cauchy_weights(np.linalg.norm(rotvecs, axis=1))
+        updates = _solve_differences(a, b, rotvecs, weights * robust_weights, num_images)
+        rotations = rotations @ Rotation.from_rotvec(-updates).as_matrix()
     return rotations
 
 
 def average_differences(
-    a: Int64, b: Int64, steps: Float64, weights: Float64, count: int
+    a: Int64, b: Int64, differences: Float64, weights: Float64, num_nodes: int
 ) -> Float64:
-    """Values (count, ...) whose differences ``x[b] - x[a]`` agree best with ``steps`` (m, ...).
+    """Solve ``x[b] - x[a] = differences`` robustly: IRLS with a Cauchy loss.
 
-    Least squares, weighted again and again as Cauchy's loss wants it. The mean of the values is 0;
-    what no link holds stays there.
+    Args:
+        a: (m,) first node of each edge.
+        b: (m,) second node of each edge.
+        differences: (m, ...) measured differences.
+        weights: (m,) weights of the edges.
+        num_nodes: Number of nodes.
+
+    Returns:
+        (num_nodes, ...) values of mean 0; nodes without edges share one value.
     """
-    values = steps.reshape(len(steps), -1)
-    robust = np.ones(len(a))
-    for _ in range(ROUNDS):
-        found = _solved(a, b, values, weights * robust, count)
-        robust = _robust_weights(np.linalg.norm(found[b] - found[a] - values, axis=1))
-    found -= found.mean(axis=0)
-    return found.reshape(count, *steps.shape[1:])
+    measured = differences.reshape(len(differences), -1)
+    robust_weights = np.ones(len(a))
+    for _ in range(NUM_ITERATIONS):
+        values = _solve_differences(a, b, measured, weights * robust_weights, num_nodes)
+        errors = np.linalg.norm(values[b] - values[a] - measured, axis=1)
+        robust_weights = _cauchy_weights(errors)
+    values -= values.mean(axis=0)
+    return values.reshape(num_nodes, *differences.shape[1:])
 
 
-def _solved(a: Int64, b: Int64, steps: Float64, weights: Float64, count: int) -> Float64:
-    """Values (count, d) whose differences ``x[b] - x[a]`` come nearest ``steps`` (m, d)."""
+def _solve_differences(
+    a: Int64, b: Int64, differences: Float64, weights: Float64, num_nodes: int
+) -> Float64:
+    """Return values (n, d) with the least-squares differences: normal equations of a Laplacian."""
     ends = np.concatenate([a, b])
-    diagonal = np.bincount(ends, np.concatenate([weights, weights]), minlength=count)
-    # a little of the identity: the links say nothing of the mean
-    held = diagonal + 1e-9 * diagonal.max()
-    own = np.arange(count)
-    entries = np.concatenate([-weights, -weights, held])
-    places = np.concatenate([a, b, own]), np.concatenate([b, a, own])
-    laplacian = coo_matrix((entries, places), shape=(count, count)).tocsc()
-    side = np.zeros((count, steps.shape[1]))
-    np.add.at(side, b, weights[:, None] * steps)
-    np.add.at(side, a, -weights[:, None] * steps)
-    found: Float64 = splu(laplacian).solve(side)
-    return found
+    degree = np.bincount(ends, np.concatenate([weights, weights]), minlength=num_nodes)
+    diagonal = degree + DAMPING * degree.max()
+    nodes = np.arange(num_nodes)
+    entries = np.concatenate([-weights, -weights, diagonal])
+    rows_and_columns = np.concatenate([a, b, nodes]), np.concatenate([b, a, nodes])
+    laplacian = coo_matrix((entries, rows_and_columns), shape=(num_nodes, num_nodes)).tocsc()
+    right_side = np.zeros((num_nodes, differences.shape[1]))
+    np.add.at(right_side, b, weights[:, None] * differences)
+    np.add.at(right_side, a, -weights[:, None] * differences)
+    values: Float64 = splu(laplacian).solve(right_side)
+    return values
 
 
-def _robust_weights(off: Float64) -> Float64:
-    """Of Cauchy's loss, whose scale is the robust std of what is off."""
-    scale = max(MAD_TO_STD * float(np.median(off)), 1e-12)
-    weights: Float64 = 1 / (1 + (off / scale) ** 2)
+def _cauchy_weights(errors: Float64) -> Float64:
+    """Return the IRLS weights of a Cauchy loss whose scale is the robust std of the errors."""
+    scale = max(MAD_TO_STD * float(np.median(errors)), 1e-12)
+    weights: Float64 = 1 / (1 + (errors / scale) ** 2)
     return weights
 
 
-def _rotations_of_tree(a: Int64, b: Int64, turns: Float64, weights: Float64, count: int) -> Float64:
-    """The same along the tree of heaviest links."""
-    graph = coo_matrix((1 / weights, (a, b)), shape=(count, count)).tocsr()
+def _chain_rotations(
+    a: Int64, b: Int64, b_from_a: Float64, weights: Float64, num_images: int
+) -> Float64:
+    """Chain relative rotations along the maximum spanning tree."""
+    graph = coo_matrix((1 / weights, (a, b)), shape=(num_images, num_images)).tocsr()
     tree = minimum_spanning_tree(graph)
     order, parents = breadth_first_order(tree, int(a[0]), directed=False)
-    turn = {
-        (int(i), int(j)): there
-        for one, other, r in zip(a, b, turns, strict=True)
-        for i, j, there in ((one, other, r), (other, one, r.T))
+    relative = {
+        (int(i), int(j)): j_from_i
+        for image_a, image_b, rotation in zip(a, b, b_from_a, strict=True)
+        for i, j, j_from_i in ((image_a, image_b, rotation), (image_b, image_a, rotation.T))
     }
-    rotations = np.tile(np.eye(3), (count, 1, 1))
+    rotations = np.tile(np.eye(3), (num_images, 1, 1))
     for image in map(int, order[1:]):
         parent = int(parents[image])
-        rotations[image] = turn[parent, image] @ rotations[parent]
+        rotations[image] = relative[parent, image] @ rotations[parent]
     return rotations
 
 
-def _links(scene: Scene, pairs: list[VerifiedPair]) -> _Links:
-    """The pairs whose length depth tells in both images."""
+def _measure_relative_poses(scene: Scene, pairs: list[VerifiedPair]) -> _RelativePoses:
+    """Measure the baseline of each pair by the depth priors of both images.
+
+    The log length is the median over the matches of ``log(depth prior / triangulated depth)``. The
+    median absolute deviation from it gives the Cauchy weight of the pair.
+    """
     empty = np.zeros(0, np.int64)
     a = np.array([pair.image_a for pair in pairs], dtype=np.int64)
     b = np.array([pair.image_b for pair in pairs], dtype=np.int64)
     rotation = np.array([pair.rotation for pair in pairs]).reshape(-1, 3, 3)
     translation = np.array([pair.translation for pair in pairs]).reshape(-1, 3)
     translation = translation / np.maximum(np.linalg.norm(translation, axis=1), 1e-12)[:, None]
-    of = np.repeat(np.arange(len(pairs)), [len(pair) for pair in pairs])
+    pair_of = np.repeat(np.arange(len(pairs)), [len(pair) for pair in pairs])
     offsets = scene.graph.offsets
     source = np.concatenate([empty, *(p.matches[:, 0] + offsets[p.image_a] for p in pairs)])
     target = np.concatenate([empty, *(p.matches[:, 1] + offsets[p.image_b] for p in pairs)])
-    centers = camera_center(rotation, translation)[of]
-    rays_b = np.einsum("nji,nj->ni", rotation[of], scene.rays(target))
+    centers = camera_center(rotation, translation)[pair_of]
+    rays_b = np.einsum("nji,nj->ni", rotation[pair_of], scene.rays(target))
     points = triangulate_midpoints(np.zeros_like(rays_b), scene.rays(source), centers, rays_b)
     z_a = points[:, 2]
-    z_b = np.einsum("nj,nj->n", rotation[of, 2], points) + translation[of, 2]
+    z_b = np.einsum("nj,nj->n", rotation[pair_of, 2], points) + translation[pair_of, 2]
     with np.errstate(invalid="ignore", divide="ignore"):
-        wide = triangulation_angle_deg(np.zeros_like(centers), centers, points) >= MIN_ANGLE_DEG
-        use = wide & (z_a > 0) & (z_b > 0)
-        use &= scene.keypoint_valid[source] & scene.keypoint_valid[target]
-        logs = np.log(
+        angles_deg = triangulation_angle_deg(np.zeros_like(centers), centers, points)
+        usable = (angles_deg >= MIN_ANGLE_DEG) & (z_a > 0) & (z_b > 0)
+        usable &= scene.keypoint_valid[source] & scene.keypoint_valid[target]
+        log_ratios = np.log(
             np.stack([scene.keypoint_prior[source] / z_a, scene.keypoint_prior[target] / z_b])
         )
-    counts = np.bincount(of[use], minlength=len(pairs))
-    lengths = np.stack([group_medians(values[use], of[use], len(pairs)) for values in logs], axis=1)
-    off = np.max(np.abs(logs - lengths[of].T), axis=0)
-    bend = group_medians(off[use], of[use], len(pairs))
+    counts = np.bincount(pair_of[usable], minlength=len(pairs))
+    log_lengths = np.stack(
+        [group_medians(ratios[usable], pair_of[usable], len(pairs)) for ratios in log_ratios],
+        axis=1,
+    )
+    deviations = np.max(np.abs(log_ratios - log_lengths[pair_of].T), axis=0)
+    pair_deviations = group_medians(deviations[usable], pair_of[usable], len(pairs))
     weight = np.array([len(p) * (1.0 if p.calibrated else PLANAR_WEIGHT) for p in pairs])
-    enough = counts >= MIN_MATCHES
-    if enough.any():
-        weight[enough] *= _robust_weights(bend[enough])
-    return _Links(a, b, rotation, translation, lengths, weight).select(enough)
+    is_measured = counts >= MIN_MATCHES
+    if is_measured.any():
+        weight[is_measured] *= _cauchy_weights(pair_deviations[is_measured])
+    return _RelativePoses(a, b, rotation, translation, log_lengths, weight).select(is_measured)
 
 
-def _well_held(links: _Links, count: int) -> Bool:
-    """(m,) bool, links of the largest group of images that cycles of links hold.
+def _select_largest_cyclic_component(edges: _RelativePoses, num_images: int) -> Bool:
+    """Return (m,) the edges on cycles that belong to the largest component of such edges.
 
-    A link on no cycle always agrees with itself, and nothing else says whether it is right.
+    An edge on no cycle always agrees with the result, so nothing verifies it.
     """
-    chosen = find_cycle_edges(links.a, links.b, count)
-    if chosen.any():
-        ends = np.concatenate([links.a[chosen], links.b[chosen]])
-        group = label_components(links.a[chosen], links.b[chosen], count)
-        sizes = np.bincount(group[np.unique(ends)])
-        chosen &= group[links.a] == sizes.argmax()
-    return chosen
+    selected = find_cycle_edges(edges.a, edges.b, num_images)
+    if selected.any():
+        ends = np.concatenate([edges.a[selected], edges.b[selected]])
+        label = label_components(edges.a[selected], edges.b[selected], num_images)
+        sizes = np.bincount(label[np.unique(ends)])
+        selected &= label[edges.a] == sizes.argmax()
+    return selected
 
 
-def find_cycle_edges(a: Int64, b: Int64, count: int) -> Bool:
-    """(m,) bool, links without which their images would still hang together.
+def find_cycle_edges(a: Int64, b: Int64, num_nodes: int) -> Bool:
+    """Find the edges that are not bridges, by random labels on the cycle space.
 
-    ``a``, ``b``: (m,) images of each link, no pair twice. Labels drawn at random run through
-    cycles of the links, each closed through a tree of them: a link of the tree that no label
-    passes is on no cycle.
+    Each edge outside a spanning forest gets a random label, which runs through the cycle that it
+    closes. An edge of the forest is a bridge if the XOR of the labels through it is 0.
+
+    Args:
+        a: (m,) first node of each edge.
+        b: (m,) second node; no pair of nodes occurs twice.
+        num_nodes: Number of nodes.
+
+    Returns:
+        (m,) bool, True for edges on a cycle.
     """
-    root = count  # of the trees of all groups
-    firsts = np.unique(label_components(a, b, count), return_index=True)[1]
-    one, other = np.concatenate([a, firsts]), np.concatenate([b, np.full(len(firsts), root)])
-    graph = coo_matrix((np.ones(len(one)), (one, other)), shape=(count + 1, count + 1))
+    root = num_nodes  # joins the trees of all components
+    component_nodes = np.unique(label_components(a, b, num_nodes), return_index=True)[1]
+    first = np.concatenate([a, component_nodes])
+    second = np.concatenate([b, np.full(len(component_nodes), root)])
+    graph = coo_matrix((np.ones(len(first)), (first, second)), shape=(num_nodes + 1,) * 2)
     order, parents = breadth_first_order(graph.tocsr(), root, directed=False)
-    down = parents[one] == other
-    in_tree = down | (parents[other] == one)
-    labels = np.random.default_rng(0).integers(1, np.iinfo(np.int64).max, len(one))
-    passing = np.zeros(count + 1, dtype=np.int64)
-    for ends in (one, other):
-        np.bitwise_xor.at(passing, ends[~in_tree], labels[~in_tree])
-    for image in order[:0:-1]:
-        passing[parents[image]] ^= passing[image]
-    on_cycle: Bool = ~in_tree | (passing[np.where(down, one, other)] != 0)
+    first_is_child = parents[first] == second
+    in_tree = first_is_child | (parents[second] == first)
+    labels = np.random.default_rng(0).integers(1, np.iinfo(np.int64).max, len(first))
+    node_labels = np.zeros(num_nodes + 1, dtype=np.int64)
+    for ends in (first, second):
+        np.bitwise_xor.at(node_labels, ends[~in_tree], labels[~in_tree])
+    for node in order[:0:-1]:
+        node_labels[parents[node]] ^= node_labels[node]
+    child = np.where(first_is_child, first, second)
+    on_cycle: Bool = ~in_tree | (node_labels[child] != 0)
     return on_cycle[: len(a)]
 
 
-def label_components(a: Int64, b: Int64, count: int) -> Int64:
-    """(count,) number of the group that links hold together, of each image."""
-    matrix = coo_matrix((np.ones(len(a)), (a, b)), shape=(count, count))
-    group: Int64 = connected_components(matrix, directed=False)[1]
-    return group
+def label_components(a: Int64, b: Int64, num_nodes: int) -> Int64:
+    """Label the connected components of a graph; return (num_nodes,) the label of each node."""
+    matrix = coo_matrix((np.ones(len(a)), (a, b)), shape=(num_nodes, num_nodes))
+    labels: Int64 = connected_components(matrix, directed=False)[1]
+    return labels

@@ -1,7 +1,7 @@
-"""The first two images: which pairs to start from, and how one image lies beside the other.
+"""Selection and relative pose of the initial image pair (paper section 3.1).
 
-With lifting, the pose is found as that of any next image, beside a scene of one view. Without, it
-is that of the verified pair's essential matrix.
+With lifting, the relative pose is estimated as that of any next image, in a scene with one
+registered image. Without lifting, it is the pose of the verified pair, scaled by depth.
 """
 
 from __future__ import annotations
@@ -26,102 +26,135 @@ from mpsfm_core.mapping.triangulation import triangulate_midpoints
 
 
 class InitialPair(NamedTuple):
-    """Pose of ``image`` in a world whose origin is the camera of ``reference``, and whose unit is
-    that of its prior."""
+    """Two images with their relative pose.
+
+    The camera of the reference image is the world frame, and its depth prior defines the unit.
+    """
 
     reference: int
+    """Image whose camera is the world frame."""
     image: int
+    """The other image."""
     pose: ScoredPose
+    """Pose of the other image."""
 
 
 class InitialPairSelector:
-    """First pairs and the poses they start with; each is found once."""
+    """Ranking of initial pairs; the relative pose of each pair is estimated once."""
 
     def __init__(self, options: MapperOptions) -> None:
         self._options = options
-        self._found: dict[VerifiedPair, InitialPair | Reason] = {}
+        self._results: dict[VerifiedPair, InitialPair | Reason] = {}
 
-    def rank_pairs(self, search: AbsolutePoseEstimator, left: Bool) -> list[VerifiedPair]:
-        """Pairs to start from: of those with most matches, the best supported poses first.
+    def rank_pairs(
+        self, pose_estimator: AbsolutePoseEstimator, candidates: Bool
+    ) -> list[VerifiedPair]:
+        """Rank the pairs to initialize from (COLMAP's ``FindInitialImagePair``).
 
-        ``left``: (n,) bool, the images that may be in one.
+        Pairs are ranked by their number of matches. The first ``num_compared`` pairs are ranked
+        again by the support of their relative poses.
+
+        Args:
+            pose_estimator: Estimator on a scene without registered images.
+            candidates: (n,) bool, images that may be in an initial pair.
         """
         options = self._options.initialization
-        pairs = [p for p in rank_initial_pairs(search.scene) if left[p.image_a] and left[p.image_b]]
-        first = pairs[: options.num_compared]
-        starts = {pair: self.estimate_pair(search, pair) for pair in first}
-        support = {k: v.pose.support for k, v in starts.items() if isinstance(v, InitialPair)}
-        first.sort(key=lambda pair: -support.get(pair, 0.0))
-        return first + pairs[options.num_compared : options.max_pairs]
+        pairs = [
+            pair
+            for pair in rank_initial_pairs(pose_estimator.scene)
+            if candidates[pair.image_a] and candidates[pair.image_b]
+        ]
+        first_pairs = pairs[: options.num_compared]
+        results = {pair: self.estimate_pair(pose_estimator, pair) for pair in first_pairs}
+        support = {
+            pair: result.pose.support
+            for pair, result in results.items()
+            if isinstance(result, InitialPair)
+        }
+        first_pairs.sort(key=lambda pair: -support.get(pair, 0.0))
+        return first_pairs + pairs[options.num_compared : options.max_pairs]
 
     def estimate_pair(
-        self, search: AbsolutePoseEstimator, pair: VerifiedPair
+        self, pose_estimator: AbsolutePoseEstimator, pair: VerifiedPair
     ) -> InitialPair | Reason:
-        """The best supported pose of one image beside the other, or why the pair is no start."""
-        if pair not in self._found:
-            scene, options = search.scene, self._options
+        """Return the best supported relative pose of a pair, or why the pair is rejected."""
+        if pair not in self._results:
+            scene, options = pose_estimator.scene, self._options
             if options.registration.lifting:
-                starts = estimate_pairs_from_depth(search, pair, options.registration)
-                start = max(starts, key=lambda each: each.pose.support, default=None)
+                candidates = estimate_initial_pairs(pose_estimator, pair, options.registration)
+                best = max(candidates, key=lambda c: c.pose.support, default=None)
             elif pair.calibrated:
-                start = scale_verified_pair(scene, pair, options.initialization)
+                best = scale_verified_pair(scene, pair, options.initialization)
             else:
-                start = None
-            self._found[pair] = start or ImageReason.NO_POSE.because()
-        return self._found[pair]
+                best = None
+            self._results[pair] = best or ImageReason.NO_POSE.because()
+        return self._results[pair]
 
     def reject_pair(self, pair: VerifiedPair, reason: Reason) -> None:
-        """Remember why a pair is no start."""
-        self._found[pair] = reason
+        """Record why a pair cannot initialize a component."""
+        self._results[pair] = reason
 
 
 def register_first_image(scene: Scene, image: int) -> None:
-    """Let the world begin with an image."""
+    """Register an image at the origin of the world, with its depth prior as the unit."""
     scene.register(image, np.eye(3), np.zeros(3))
     scene.maps[image].set_scale(1.0)
 
 
 def rank_initial_pairs(scene: Scene) -> list[VerifiedPair]:
-    """Pairs to start from: calibrated configurations first, then by number of inliers."""
+    """Rank verified pairs: calibrated two-view geometries first, then by number of matches."""
     return sorted(scene.problem.pairs, key=lambda pair: (not pair.calibrated, -len(pair)))
 
 
-def estimate_pairs_from_depth(
-    search: AbsolutePoseEstimator,
+def estimate_initial_pairs(
+    pose_estimator: AbsolutePoseEstimator,
     pair: VerifiedPair,
     options: RegistrationOptions,
     *,
-    rough: bool = False,
+    refine: bool = True,
 ) -> list[InitialPair]:
-    """Poses found as those of any next image, for each of both images; ``rough``: not refined."""
-    find = search.estimate_unrefined_poses if rough else search.estimate_poses
+    """Estimate relative poses of a pair from depth-lifted points, for each reference image.
+
+    Args:
+        pose_estimator: Estimator on a scene without registered images.
+        pair: The verified pair.
+        options: Options of the correspondences.
+        refine: Refine the poses by bundle adjustment.
+    """
+    estimate = pose_estimator.estimate_poses if refine else pose_estimator.estimate_unrefined_poses
     return [
         InitialPair(reference, image, pose)
-        for reference, image, found in _each_way(search.scene, pair, options)
-        for pose in find(image, found, attempt=0)
+        for reference, image, correspondences in _register_each_reference(
+            pose_estimator.scene, pair, options
+        )
+        for pose in estimate(image, correspondences, attempt=0)
     ]
 
 
 def refine_initial_pairs(
-    search: AbsolutePoseEstimator,
+    pose_estimator: AbsolutePoseEstimator,
     pair: VerifiedPair,
-    rough: Sequence[InitialPair],
+    initial_pairs: Sequence[InitialPair],
     options: RegistrationOptions,
 ) -> list[InitialPair]:
-    """Rough starts of a pair with their poses bundle-adjusted, each if that finds more support."""
+    """Refine relative poses of a pair by bundle adjustment; poses that lose support stay."""
     return [
         InitialPair(reference, image, pose)
-        for reference, image, found in _each_way(search.scene, pair, options)
-        for pose in search.refine_poses(
-            image, [start.pose for start in rough if start.reference == reference], found
+        for reference, image, correspondences in _register_each_reference(
+            pose_estimator.scene, pair, options
+        )
+        for pose in pose_estimator.refine_poses(
+            image,
+            [initial.pose for initial in initial_pairs if initial.reference == reference],
+            correspondences,
         )
     ]
 
 
-def _each_way(
+def _register_each_reference(
     scene: Scene, pair: VerifiedPair, options: RegistrationOptions
 ) -> Iterator[tuple[int, int, PoseCorrespondences]]:
-    """Either image of a pair alone in the scene, the other, and what that one is posed by."""
+    """Yield reference, other image and its correspondences, with only the reference registered."""
     empty = scene.snapshot()
     for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
         register_first_image(scene, reference)
@@ -132,7 +165,14 @@ def _each_way(
 def scale_verified_pair(
     scene: Scene, pair: VerifiedPair, options: InitializationOptions
 ) -> InitialPair | None:
-    """The verified pose, its length chosen such that points agree with the prior."""
+    """Scale the pose of a verified pair so that triangulated points agree with the depth prior.
+
+    The scale is the median over the points whose triangulation angle is at least
+    ``high_parallax_deg``.
+
+    Returns:
+        None if the pair has no translation, or if no such point has known depth.
+    """
     length = np.linalg.norm(pair.translation)
     if length < 1e-12:
         return None
@@ -144,22 +184,22 @@ def scale_verified_pair(
     points = triangulate_midpoints(center_a, rays_a, center_b, rays_b @ rotation)
     depth_b = (points @ rotation.T + translation)[:, 2]
     with np.errstate(invalid="ignore"):
-        angles = triangulation_angle_deg(center_a, center_b, points)
-        safe = (points[:, 2] > 0) & (depth_b > 0)
-        safe &= angles >= options.high_parallax_deg
+        angles_deg = triangulation_angle_deg(center_a, center_b, points)
+        supporting = (points[:, 2] > 0) & (depth_b > 0)
+        supporting &= angles_deg >= options.high_parallax_deg
     depth_map = scene.maps[pair.image_a]
     rows = pair.matches[:, 0]
-    known = safe & depth_map.keypoint_valid[rows]
+    known = supporting & depth_map.keypoint_valid[rows]
     if not known.any():
         return None
-    ratio = depth_map.prior_at_keypoints(rows)[known] / points[known, 2]
-    count = int(safe.sum())
+    depth_ratios = depth_map.prior_at_keypoints(rows)[known] / points[known, 2]
+    num_points = int(supporting.sum())
     pose = ScoredPose(
         rotation,
-        translation * float(np.median(ratio)),
+        translation * float(np.median(depth_ratios)),
         "verified pair",
-        support=float(count),
-        num_inliers=count,
-        inlier_ratio=1.0,  # all verified matches agree with it
+        support=float(num_points),
+        num_inliers=num_points,
+        inlier_ratio=1.0,  # geometric verification has removed the outliers
     )
     return InitialPair(pair.image_a, pair.image_b, pose)

@@ -1,4 +1,4 @@
-"""What a finished reconstruction holds in place, as the start of another with more matches."""
+"""Seed poses: an earlier reconstruction initializes another one with more matches."""
 
 from __future__ import annotations
 
@@ -9,22 +9,32 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, RegisteredImage
 
 
-def select_seed_images(mapping: MappingResult, least: int) -> list[RegisteredImage]:
-    """The confirmed images of the largest reconstruction that see at least ``least`` points which
-    three images see."""
+def select_seed_images(mapping: MappingResult, min_points: int) -> list[RegisteredImage]:
+    """Select the well-constrained images of the largest reconstruction.
+
+    Args:
+        mapping: The earlier result.
+        min_points: Points, each observed by at least three images, that an image must observe.
+    """
     return [
         image
-        for part in mapping.reconstructions[:1]
-        for image, count in zip(part.images, part.num_multi_view_points(), strict=True)
-        if image.confirmed and count >= least
+        for reconstruction in mapping.reconstructions[:1]
+        for image, num_points in zip(
+            reconstruction.images, reconstruction.num_multi_view_points(), strict=True
+        )
+        if image.confirmed and num_points >= min_points
     ]
 
 
-def with_seed_poses(problem: MappingProblem, held: Collection[RegisteredImage]) -> MappingProblem:
-    """The problem with the poses of these images as known, beside those that are, and with their
-    focal lengths for all images of their cameras."""
-    cameras = {problem.images[image.index].camera: image.camera for image in held}
-    poses = {image.index: (image.rotation, image.translation) for image in held}
+def apply_seed_poses(
+    problem: MappingProblem, seed_images: Collection[RegisteredImage]
+) -> MappingProblem:
+    """Return the problem with the poses of the seed images as known poses.
+
+    Known poses of other images stay. All images of a seed image's camera take its focal length.
+    """
+    cameras = {problem.images[seed.index].camera: seed.camera for seed in seed_images}
+    poses = {seed.index: (seed.rotation, seed.translation) for seed in seed_images}
     images = tuple(
         replace(
             image,

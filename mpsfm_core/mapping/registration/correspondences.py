@@ -1,4 +1,9 @@
-"""What matches say of a new image's pose: its keypoints, and the 3D points they may see."""
+"""2D-3D correspondences of an image that is to be registered.
+
+Each match to a registered image gives one correspondence between a keypoint of the new image and a
+3D point. The point is triangulated, or lifted from the depth of the registered image (paper section
+3.2). If that depth is unknown, the point may be anywhere on a part of the matched keypoint's ray.
+"""
 
 from __future__ import annotations
 
@@ -11,96 +16,111 @@ from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.scene.scene import Scene
 
 MIN_DEPTH_RATIO = 1e-3
-"""Smallest share of its depth that an uncertain depth may shrink to."""
+"""Lower bound of the near point's depth, relative to the depth of the point."""
 RAY_MATCH_WEIGHT = 0.5
-"""A match of unknown depth: it fixes one of two coordinates. Ours; on hololens_room, where sensor
-depth is known at half of the keypoints, with such matches and without (means of seeds): `all`
-100 instead of 91 of 112 images and AUC@20 47 instead of 44, random 20 of those 28 images 134
-instead of 105 of 160 and 23 instead of 18, leq10 29.0 instead of 27.9, smaller sets as before."""
+"""Weight of a match of unknown depth: it constrains one of two image coordinates. [tuned:
+benchmarks.accuracy on hololens_room, where sensor depth covers half of the keypoints]"""
 
 
 class PoseCorrespondences(NamedTuple):
-    """Keypoints of an image and what they see.
-
-    ``keypoints`` (m,): of the image. ``matched`` (m,): their matches in registered images.
-    ``near``, ``far``: (m, 3) world points that bound where the point may lie along the ray of the
-    matched keypoint (the same point twice when triangulated); ``points`` (m, 3): the best guess.
-    ``references`` (m,): the image the match comes from. ``known`` (m,) bool: whether the depth of
-    the point is. ``weights`` (m,): the scores of the matches, in (0, 1], times their worth.
-    """
+    """2D-3D correspondences of one image with registered images."""
 
     keypoints: Int64
-    matched: Int64
+    """(m,) global keypoints of the image."""
+    matched_keypoints: Int64
+    """(m,) global keypoints of registered images that they match."""
     points: Float64
-    near: Float64
-    far: Float64
+    """(m, 3) most likely 3D points, world frame."""
+    near_points: Float64
+    """(m, 3) nearest 3D points on the rays of the matched keypoints that depth allows."""
+    far_points: Float64
+    """(m, 3) farthest 3D points; equal to the near points if the point is triangulated."""
     references: Int64
-    known: Bool
+    """(m,) registered images of the matched keypoints."""
+    depth_known: Bool
+    """(m,) False if the point may be anywhere between the image's nearest and farthest depth."""
     weights: Float64
+    """(m,) match scores in (0, 1], times :attr:`depth_weights`."""
 
     @property
     def depth_weights(self) -> Float64:
-        """(m,) 1, or :data:`RAY_MATCH_WEIGHT` where depth is unknown."""
-        return _depth_weights(self.known)
+        """(m,) 1 for points of known depth, else :data:`RAY_MATCH_WEIGHT`."""
+        return _depth_weights(self.depth_known)
 
-    def select(self, chosen: Int64 | Bool) -> PoseCorrespondences:
-        """Some of them, by row or mask."""
-        parts: list[Any] = [values[chosen] for values in self]
-        return PoseCorrespondences(*parts)
+    def select(self, rows: Int64 | Bool) -> PoseCorrespondences:
+        """Return the correspondences of some rows, given as indices or as a mask."""
+        fields: list[Any] = [values[rows] for values in self]
+        return PoseCorrespondences(*fields)
 
 
 def find_correspondences(
     scene: Scene, image: int, references: list[int], options: RegistrationOptions
 ) -> PoseCorrespondences:
-    """What the matches of an image to some registered images say of its pose.
+    """Collect the 2D-3D correspondences of an image with some registered images.
 
-    A matched keypoint gives its 3D point where that has enough parallax; else, with lifting, the
-    part of its ray that depth allows. Where depth is unknown, that is all between the nearest and
-    the farthest depth that is known elsewhere in the image.
+    A match uses the triangulated point of its keypoint if the triangulation angle suffices.
+    If not, lifting uses the part of the keypoint's ray that the depth prior allows.
+
+    Args:
+        scene: The scene with the registered images.
+        image: The image to register.
+        references: Registered images whose matches are used.
+        options: ``lifting``, ``min_point_angle_deg`` and ``depth_deviations`` apply.
     """
     graph, tracks = scene.graph, scene.tracks
     edges = graph.edges_of(image)
     source, target, scores = graph.source[edges], graph.target[edges], graph.score[edges]
-    chosen = scene.mask(references)[graph.image_of[target]]
-    source, target, scores = source[chosen], target[chosen], scores[chosen]
+    in_references = scene.mask(references)[graph.image_of[target]]
+    source, target, scores = source[in_references], target[in_references], scores[in_references]
     point = tracks.point_of[target]
-    angle = np.append(scene.track_angles_deg(), 0.0)[point]
-    stable = (point >= 0) & (angle >= options.min_point_angle_deg)
-    depth, slack, known = _depths(scene, target, options)
-    use = stable | ((depth > 0) & options.lifting)
-    source, target, scores, point = source[use], target[use], scores[use], point[use]
-    stable, depth, known = stable[use], depth[use], (stable | known)[use]
+    angle_deg = np.append(scene.track_angles_deg(), 0.0)[point]
+    triangulated = (point >= 0) & (angle_deg >= options.min_point_angle_deg)
+    depth, log_range, depth_known = _depth_ranges(scene, target, options)
+    usable = triangulated | ((depth > 0) & options.lifting)
+    source, target, scores, point = source[usable], target[usable], scores[usable], point[usable]
+    depth_known = (triangulated | depth_known)[usable]
+    triangulated, depth, log_range = triangulated[usable], depth[usable], log_range[usable]
     points = scene.at_depth(target, depth)
-    points[stable] = tracks.xyz[point[stable]]
-    slack = np.where(stable, 0.0, slack[use])
+    points[triangulated] = tracks.xyz[point[triangulated]]
+    log_range = np.where(triangulated, 0.0, log_range)
     centers = scene.centers()[graph.image_of[target]]
-    along = points - centers
-    near = centers + along * np.maximum(np.exp(-slack), MIN_DEPTH_RATIO)[:, None]
-    far = centers + along * np.exp(slack)[:, None]
-    of, weights = graph.image_of[target], scores * _depth_weights(known)
-    return PoseCorrespondences(source, target, points, near, far, of, known, weights)
+    rays = points - centers
+    near_points = centers + rays * np.maximum(np.exp(-log_range), MIN_DEPTH_RATIO)[:, None]
+    far_points = centers + rays * np.exp(log_range)[:, None]
+    return PoseCorrespondences(
+        source,
+        target,
+        points,
+        near_points,
+        far_points,
+        graph.image_of[target],
+        depth_known,
+        scores * _depth_weights(depth_known),
+    )
 
 
-def _depth_weights(known: Bool) -> Float64:
-    """(m,) what matches count for whose depth is known or not."""
-    return np.where(known, 1.0, RAY_MATCH_WEIGHT)
+def _depth_weights(depth_known: Bool) -> Float64:
+    """Return (m,) the weights of matches by whether their depth is known."""
+    return np.where(depth_known, 1.0, RAY_MATCH_WEIGHT)
 
 
-def _depths(
+def _depth_ranges(
     scene: Scene, keypoints: Int64, options: RegistrationOptions
 ) -> tuple[Float64, Float64, Bool]:
-    """Depth of keypoints in their images, the slack of its logarithm, and where it is known.
+    """Return depth, half range of log depth, and whether the depth is known, each (m,).
 
-    Elsewhere it is in the middle of the known depths of the image, and 0 where there are none.
+    A keypoint of unknown depth gets the range of the known depths in its image, and depth 0 if the
+    image has none.
     """
     depth, known = scene.depth_at(keypoints)
-    slack = options.depth_deviations * scene.keypoint_log_std[keypoints]
+    log_range = options.depth_deviations * scene.keypoint_log_std[keypoints]
     images = scene.graph.image_of[keypoints]
     for image in map(int, np.unique(images[~known])):
         depth_map = scene.maps[image]
-        elsewhere = depth_map.at_keypoints()[depth_map.keypoint_valid]
-        if depth_map.active and len(elsewhere):
+        known_depths = depth_map.at_keypoints()[depth_map.keypoint_valid]
+        if depth_map.active and len(known_depths):
             rows = (images == image) & ~known
-            ends = np.log([elsewhere.min(), elsewhere.max()])
-            depth[rows], slack[rows] = np.exp(ends.mean()), (ends[1] - ends[0]) / 2
-    return depth, slack, known
+            log_ends = np.log([known_depths.min(), known_depths.max()])
+            depth[rows] = np.exp(log_ends.mean())
+            log_range[rows] = (log_ends[1] - log_ends[0]) / 2
+    return depth, log_range, known

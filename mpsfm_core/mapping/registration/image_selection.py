@@ -1,4 +1,4 @@
-"""Which image comes next, and which registered images it is judged beside."""
+"""Selection of the next image and of the registered images that it is registered with."""
 
 from __future__ import annotations
 
@@ -10,14 +10,19 @@ from mpsfm_core.mapping.scene.scene import Scene
 
 
 def compute_pair_scores(scene: Scene, criterion: str) -> Float64:
-    """(n, n) symmetric float64: how well each two images match, 0 for pairs without matches.
+    """Compute how well each two images match.
 
-    ``criterion``: "match-scores" sums the matcher's scores, anything else counts matches.
+    Args:
+        scene: The scene with its verified pairs.
+        criterion: "match-scores" sums the matcher's scores; any other value counts the matches.
+
+    Returns:
+        (n, n) symmetric float64, 0 for images without verified matches.
     """
     scores = np.zeros((scene.num_images, scene.num_images))
     for row, pair in enumerate(scene.problem.pairs):
-        by_score = criterion == "match-scores"
-        score = scene.graph.pair_scores[row] if by_score else float(len(pair))
+        use_match_scores = criterion == "match-scores"
+        score = scene.graph.pair_scores[row] if use_match_scores else float(len(pair))
         scores[pair.image_a, pair.image_b] = scores[pair.image_b, pair.image_a] = score
     return scores
 
@@ -25,35 +30,43 @@ def compute_pair_scores(scene: Scene, criterion: str) -> Float64:
 def rank_next_images(
     scene: Scene, scores: Float64, candidates: Bool, options: RegistrationOptions
 ) -> list[tuple[int, int]]:
-    """Unregistered candidates with their best registered image, best first.
+    """Rank the unregistered candidates, best first (COLMAP's ``FindNextImages``).
 
-    ``scores``: from :func:`compute_pair_scores`. ``candidates``: (n,) bool.
+    Args:
+        scene: The scene with the registered images.
+        scores: (n, n) from :func:`compute_pair_scores`.
+        candidates: (n,) bool, images that may be registered.
+        options: ``next_view`` selects the ranking.
+
+    Returns:
+        Each image with the registered image that it matches best.
     """
     images = np.flatnonzero(candidates & ~scene.registered)
     registered = scene.registered_images()
     if not len(images) or not len(registered):
         return []
-    linked = scores[np.ix_(images, registered)]
-    rank = linked.max(axis=1)
+    pair_scores = scores[np.ix_(images, registered)]
+    rank = pair_scores.max(axis=1)
     if options.next_view == "visible-points":
-        rank = np.where(rank > 0, _visible_points(scene)[images], 0)
+        rank = np.where(rank > 0, _count_visible_points(scene)[images], 0)
     order = [int(k) for k in np.argsort(-rank, kind="stable") if rank[k] > 0]
-    return [(int(images[k]), int(registered[linked[k].argmax()])) for k in order]
+    return [(int(images[k]), int(registered[pair_scores[k].argmax()])) for k in order]
 
 
 def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: Float64) -> list[int]:
-    """The image and the registered images that share most points with it.
+    """Return the image and the registered images that share most 3D points with it.
 
-    Where fewer than ``num_neighbors`` share any, the best matching ones follow.
+    If fewer than ``num_neighbors`` images share points, the best matching images follow. COLMAP's
+    ``FindLocalBundle`` also ranks by shared points.
     """
     tracks, graph = scene.tracks, scene.graph
-    seen = tracks.point_of[graph.keypoints_of(image)]
-    seen = seen[seen >= 0]
-    observing = np.zeros(len(tracks.xyz), dtype=np.bool_)
-    observing[seen] = True
-    observed = np.flatnonzero(tracks.point_of >= 0)
-    shared = observing[tracks.point_of[observed]]
-    counts = np.bincount(graph.image_of[observed[shared]], minlength=scene.num_images)
+    points = tracks.point_of[graph.keypoints_of(image)]
+    points = points[points >= 0]
+    is_observed = np.zeros(len(tracks.xyz), dtype=np.bool_)
+    is_observed[points] = True
+    observations = np.flatnonzero(tracks.point_of >= 0)
+    shared = is_observed[tracks.point_of[observations]]
+    counts = np.bincount(graph.image_of[observations[shared]], minlength=scene.num_images)
     order = np.lexsort((-scores[image], -counts))
     usable = scene.registered & ((counts > 0) | (scores[image] > 0))
     usable[image] = False
@@ -61,9 +74,9 @@ def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: Floa
     return [image, *neighbors[:num_neighbors]]
 
 
-def _visible_points(scene: Scene) -> Int64:
-    """(n,) for each image, how many of its keypoints match a registered image."""
+def _count_visible_points(scene: Scene) -> Int64:
+    """Count for each image (n,) the keypoints that match a registered image."""
     graph = scene.graph
     matched = scene.registered[graph.image_of[graph.target]]
-    visible = np.unique(graph.source[matched])
-    return np.bincount(graph.image_of[visible], minlength=scene.num_images).astype(np.int64)
+    keypoints = np.unique(graph.source[matched])
+    return np.bincount(graph.image_of[keypoints], minlength=scene.num_images).astype(np.int64)

@@ -1,4 +1,4 @@
-"""How the next image comes in: which one, by which pose, and what speaks against it."""
+"""Incremental registration of the next image, with verification and rollback."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from mpsfm_core.data import Bool
 from mpsfm_core.data.decisions import ImageReason, Reason
-from mpsfm_core.mapping.refinement.filtering import filter_points, lost_images
-from mpsfm_core.mapping.refinement.maintenance import Upkeep
+from mpsfm_core.mapping.refinement.filtering import filter_points, find_lost_images
+from mpsfm_core.mapping.refinement.maintenance import ModelMaintenance
 from mpsfm_core.mapping.registration.correspondences import (
     PoseCorrespondences,
     find_correspondences,
@@ -23,190 +23,232 @@ from mpsfm_core.mapping.registration.pose_support import ScoredPose, score_pose
 from mpsfm_core.mapping.triangulation import triangulate_image
 
 NUM_WIDE_REFERENCES = 10
-"""Images beside which one is posed that matches want elsewhere (ours; 5 hold fewer images)."""
+"""Number of reference images for the re-registration of misregistered images. [ours]"""
 
 
 class IncrementalRegistration:
-    """Registers image after image in the scene of a group."""
+    """Registration of further images into the scene of a component."""
 
-    def __init__(self, upkeep: Upkeep, search: AbsolutePoseEstimator) -> None:
-        self._upkeep, self._search = upkeep, search
-        self._scene, self._scores = upkeep.scene, upkeep.scores
-        self._refiner, self._history = upkeep.refiner, upkeep.history
-        self._thresholds, self._journal, self._options = (
-            upkeep.thresholds,
-            upkeep.journal,
-            upkeep.options,
-        )
+    def __init__(
+        self, maintenance: ModelMaintenance, pose_estimator: AbsolutePoseEstimator
+    ) -> None:
+        self._maintenance, self._pose_estimator = maintenance, pose_estimator
+        self._scene, self._scores = maintenance.scene, maintenance.scores
+        self._refiner, self._history = maintenance.refiner, maintenance.history
+        self._thresholds, self._options = maintenance.thresholds, maintenance.options
+        self._event_log = maintenance.event_log
 
-    def register_next_image(self, available: Bool, *, wide: bool = False) -> bool:
-        """Register one more image, relaxing step by step; False when none can be."""
+    def register_next_image(self, candidates: Bool, *, wide: bool = False) -> bool:
+        """Register one more image; relax the thresholds until one is registered.
+
+        Args:
+            candidates: (n,) bool, images that may be registered.
+            wide: If an image fails with its usual references, also use the images that match it
+                best, before the thresholds relax.
+
+        Returns:
+            False if no image can be registered at the most relaxed thresholds.
+        """
         options = self._options.registration
         while True:
-            trusted = np.where(self._history.excluded_references, 0, self._scores)
-            ranked = rank_next_images(self._scene, trusted, available, options)
-            if self._register_one_of(ranked, wide=False):
+            scores = np.where(self._history.excluded_references, 0, self._scores)
+            ranked = rank_next_images(self._scene, scores, candidates, options)
+            if self._register_first_possible(ranked, wide=False):
                 return True
             if self.deregister_contradicted_image():
                 continue
-            if wide and self._register_one_of(ranked, wide=True):
+            if wide and self._register_first_possible(ranked, wide=True):
                 return True
             if not ranked or not self._thresholds.relax():
-                return self._register_contradicted_image(available)
+                return self._register_contradicted_image(candidates)
 
     def deregister_contradicted_image(self) -> bool:
-        """Take out the image that most newcomers contradicted, if several did; each image once."""
-        culprit = self._history.pop_contradicted_image(self._scene.registered)
-        if culprit is None or self._upkeep.size <= 2:
+        """Deregister the image whose depth several rejected images contradict.
+
+        Each image is deregistered once. Returns False if there is no such image.
+        """
+        contradicted = self._history.pop_contradicted_image(self._scene.registered)
+        if contradicted is None or self._maintenance.size <= 2:
             return False
-        image, count = culprit
-        reason = ImageReason.CONTRADICTED_BY_IMAGES.because(num_images=count)
-        self._upkeep.drop([image], reason)
+        image, num_images = contradicted
+        reason = ImageReason.CONTRADICTED_BY_IMAGES.because(num_images=num_images)
+        self._maintenance.deregister([image], reason)
         self._history.clear()
         return True
 
-    def _register_one_of(self, ranked: Sequence[tuple[int, int]], *, wide: bool) -> bool:
-        """Register the first of some images that can be; each comes with a registered one."""
-        for image, reference in ranked:
-            references = self._references(image, reference, wide=wide)
-            if self._known_to_fail(image, references):
+    def _register_first_possible(self, ranked: Sequence[tuple[int, int]], *, wide: bool) -> bool:
+        """Register the first image that passes verification.
+
+        Args:
+            ranked: Images, each with the registered image that it matches best.
+            wide: See :meth:`register_next_image`.
+        """
+        for image, best_match in ranked:
+            references = self._select_references(image, best_match, wide=wide)
+            if self._would_fail_again(image, references):
                 continue
             reason = self._register_image(image, references)
             if reason is None:
                 self._thresholds.reset()
-                self._upkeep.accept(image)
+                self._maintenance.confirm(image)
                 return True
-            self._journal.rejected(image, reason)
+            self._event_log.rejected(image, reason)
         return False
 
-    def _register_contradicted_image(self, available: Bool) -> bool:
-        """Register a contradicted image, if refining everything around it settles that.
+    def _register_contradicted_image(self, candidates: Bool) -> bool:
+        """Register an image that contradicts the depth, if global refinement removes the conflict.
 
-        Where a loop closes, drift contradicts a right pose. False when none can be.
+        At a loop closure, drift makes a correct pose contradict the depth of the scene. Returns
+        False if no image can be registered.
         """
         self._thresholds.reset()
         scores = np.where(self._history.excluded_references, self._scores, 0)
         options = self._options.registration
-        for image, reference in rank_next_images(self._scene, scores, available, options):
+        for image, best_match in rank_next_images(self._scene, scores, candidates, options):
             self._history.excluded_references[image] = False
-            references = self._references(image, reference)
-            if self._register_image(image, references, everything=True) is None:
-                self._upkeep.accept(image)
+            references = self._select_references(image, best_match)
+            if self._register_image(image, references, refine_globally=True) is None:
+                self._maintenance.confirm(image)
                 self._history.clear()
                 return True
         return False
 
-    def _references(self, image: int, reference: int, *, wide: bool = False) -> list[int]:
-        """The registered images by whose points an image is posed.
+    def _select_references(self, image: int, best_match: int, *, wide: bool = False) -> list[int]:
+        """Select the registered images whose points and depth determine the pose of an image.
 
-        Those that share most points with the ``reference``; or, if ``wide``, match the image best.
+        They are the local bundle of the best match, or the best matching images if ``wide``.
         """
         scores, options = self._scores, self._options.registration
         if wide:
             matching = np.flatnonzero(self._scene.registered & (scores[image] > 0))
             order = np.argsort(-scores[image, matching], kind="stable")
-            nearby = matching[order[:NUM_WIDE_REFERENCES]].tolist()
+            references = matching[order[:NUM_WIDE_REFERENCES]].tolist()
         else:
-            nearby = find_local_bundle(self._scene, reference, options.num_neighbors, scores)
-        return [other for other in nearby if not self._history.excluded_references[image, other]]
+            references = find_local_bundle(self._scene, best_match, options.num_neighbors, scores)
+        return [k for k in references if not self._history.excluded_references[image, k]]
 
-    def _known_to_fail(self, image: int, references: list[int]) -> bool:
-        """Whether even the best pose of the same attempt before lacks support still."""
+    def _would_fail_again(self, image: int, references: list[int]) -> bool:
+        """Return whether the attempt would repeat the last one, whose best pose lacks support."""
         if not self._history.is_exhausted(image, references):
             return False
-        best = self._history.last_best_pose(image)
+        best = self._history.get_last_pose(image)
         return best is None or self._thresholds.check_support(best) is not None
 
-    def _find_poses(
-        self, image: int, references: list[int], found: PoseCorrespondences
+    def _estimate_poses(
+        self, image: int, references: list[int], correspondences: PoseCorrespondences
     ) -> list[ScoredPose]:
-        """Possible poses of an image, best first, that of earlier history among them."""
+        """Estimate poses of an image, best first; the best pose of the last attempt competes."""
         options, history = self._options.registration, self._history
         poses = []
-        known = history.last_best_pose(image)
-        if known:
-            poses.append(score_pose(self._scene, found, known.hypothesis, options))
+        last_pose = history.get_last_pose(image)
+        if last_pose:
+            hypothesis = last_pose.hypothesis
+            poses.append(score_pose(self._scene, correspondences, hypothesis, options))
         search = not history.is_exhausted(image, references)
         if search:
-            poses += self._search.estimate_poses(image, found, attempt=history.num_searches(image))
+            attempt = history.count_searches(image)
+            poses += self._pose_estimator.estimate_poses(image, correspondences, attempt=attempt)
         poses = select_distinct_poses(poses)
         history.record_attempt(image, references, poses[0] if poses else None, searched=search)
         return poses
 
     def _register_image(
-        self, image: int, references: list[int], *, everything: bool = False
+        self, image: int, references: list[int], *, refine_globally: bool = False
     ) -> Reason | None:
-        """Register an image with the first of its possible poses that holds; None, or why not.
+        """Register an image with its first pose that passes verification.
 
-        ``everything``: refine all before the depth check, not just the image. Only a pose that
-        nearly all matches support is worth that time.
+        Args:
+            image: The image to register.
+            references: Registered images whose matches are used.
+            refine_globally: Refine all images before the depth check. This takes long, so the pose
+                needs a high inlier ratio.
+
+        Returns:
+            None if the image is registered, else why not; the scene is then unchanged.
         """
         scene = self._scene
-        with self._journal.timed("registration"):
-            found = find_correspondences(scene, image, references, self._options.registration)
-            most = int(np.bincount(found.references, found.depth_weights, minlength=1).max())
-            if most < self._thresholds.min_inliers:
+        with self._event_log.timed("registration"):
+            correspondences = find_correspondences(
+                scene, image, references, self._options.registration
+            )
+            counts = np.bincount(
+                correspondences.references, correspondences.depth_weights, minlength=1
+            )
+            num_matches = int(counts.max())
+            if num_matches < self._thresholds.min_inliers:
                 return ImageReason.TOO_FEW_POINTS.because(
-                    num_matches=most, min_matches=self._thresholds.min_inliers
+                    num_matches=num_matches, min_matches=self._thresholds.min_inliers
                 )
-            poses = self._find_poses(image, references, found)
+            poses = self._estimate_poses(image, references, correspondences)
         snapshot, noise = scene.snapshot(), self._refiner.noise
         reason: Reason | None = ImageReason.NO_POSE.because()
         for pose in poses:
-            reason = self._thresholds.check_support(pose, certain=everything)
-            if not everything:
-                reason = reason or self._history.pose_rejection(image, pose)
+            reason = self._thresholds.check_support(pose, confident=refine_globally)
+            if not refine_globally:
+                reason = reason or self._history.get_rejection(image, pose)
             if reason is None:
-                reason = self._extend_model(image, pose, found, everything=everything)
+                reason = self._extend_model(
+                    image, pose, correspondences, refine_globally=refine_globally
+                )
                 if reason is None:
                     return None
                 self._history.reject_pose(image, pose, reason)
                 scene.restore(snapshot)
                 self._refiner.noise = noise
-                self._refiner.forget(image)
+                self._refiner.discard_integrator(image)
         return reason
 
     def _extend_model(
-        self, image: int, pose: ScoredPose, found: PoseCorrespondences, *, everything: bool
+        self,
+        image: int,
+        pose: ScoredPose,
+        correspondences: PoseCorrespondences,
+        *,
+        refine_globally: bool,
     ) -> Reason | None:
-        """Grow and refine the scene around a new pose; None, or why it is rejected."""
+        """Register an image with a pose, triangulate, refine locally and check depth consistency.
+
+        Returns:
+            None if the pose passes, else why it is rejected; the caller then restores the scene.
+        """
         scene, options = self._scene, self._options
-        with self._journal.timed("local refinement"):
+        with self._event_log.timed("local refinement"):
             scene.register(image, pose.rotation, pose.translation)
             triangulate_image(scene, image, options.triangulation)
-            bundle = find_local_bundle(
-                scene, image, options.refinement.local_images - 1, self._scores
-            )
-            self._refiner.estimate_scale(image, bundle[1:])
-            wide = options.refinement.first_reprojection_scale
-            self._refiner.adjust([image], local=True, reprojection_scale=wide)
+            num_neighbors = options.refinement.local_images - 1
+            _, *neighbors = find_local_bundle(scene, image, num_neighbors, self._scores)
+            self._refiner.estimate_scale(image, neighbors)
+            loss_factor = options.refinement.first_reprojection_scale
+            self._refiner.adjust([image], local=True, reprojection_scale=loss_factor)
             filter_points(scene, options.triangulation, [image])
-            if image in lost_images(scene):
+            if image in find_lost_images(scene):
                 return ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()
-            self._refiner.estimate_scale(image, bundle[1:])
+            self._refiner.estimate_scale(image, neighbors)
             self._refiner.integrate([image])
-        if everything:
-            with self._journal.timed("global refinement"):
+        if refine_globally:
+            with self._event_log.timed("global refinement"):
                 self._refiner.refine_locally(image)
                 self._refiner.refine_globally()
-        reason = self._upkeep.contradiction(image, self._options.consistency.max_violations)
+        reason = self._maintenance.check_depth(image, self._options.consistency.max_violations)
         if reason:
-            self._refute(image, pose, found)
+            self._exclude_references(image, pose, correspondences)
             return reason
-        with self._journal.timed("local refinement"):
+        with self._event_log.timed("local refinement"):
             self._refiner.refine_locally(image)
-        lost = lost_images(scene)
+        lost = find_lost_images(scene)
         if image in lost:
             return ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()
-        self._upkeep.drop(lost, ImageReason.LOST_POINTS.because(step="local-refinement"))
+        self._maintenance.deregister(lost, ImageReason.LOST_POINTS.because(step="local-refinement"))
         return None
 
-    def _refute(self, image: int, pose: ScoredPose, found: PoseCorrespondences) -> None:
-        """Try an image no more beside those whose matches led to a contradicted pose."""
-        for other in map(int, np.unique(found.references)):
-            alone = found.select(found.references == other)
-            options = self._options.registration
-            led = score_pose(self._scene, alone, pose.hypothesis, options)
-            self._history.excluded_references[image, other] |= (
-                led.inlier_ratio >= options.min_inlier_share
+    def _exclude_references(
+        self, image: int, pose: ScoredPose, correspondences: PoseCorrespondences
+    ) -> None:
+        """Exclude the references whose matches alone support a pose that contradicts the depth."""
+        options = self._options.registration
+        for reference in map(int, np.unique(correspondences.references)):
+            rows = correspondences.references == reference
+            scored = score_pose(self._scene, correspondences.select(rows), pose.hypothesis, options)
+            self._history.excluded_references[image, reference] |= (
+                scored.inlier_ratio >= options.min_inlier_share
             )

@@ -1,10 +1,13 @@
-"""Possible poses of a new image: hypotheses, each to be judged by all matches.
+"""Pose hypotheses of an image that is to be registered.
 
-Lifted points of an uncertain depth miss by many pixels over a wide baseline, so one PnP is not
-enough. PoseHypothesisGenerator come from PnP on the points of the scene, from PnP the other way round (the new
-image's own lifts seen in a registered image), and from the essential matrices of verified pairs
-with the length that depth gives them, and from what a network that saw several photos at once
-proposes.
+A single PnP estimate is not enough: over a wide baseline, points lifted from uncertain depth have
+reprojection errors of many pixels. All correspondences score each hypothesis. Hypotheses come from
+four sources:
+
+* PnP of the image on the points of the scene,
+* reverse PnP: a registered image on the points that the new image lifts from its own depth,
+* the essential matrix of a verified pair, with the baseline length from depth,
+* the pose that a multi-view network predicts relative to a registered image.
 """
 
 from __future__ import annotations
@@ -26,19 +29,28 @@ from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import triangulate_midpoints
 
 MIN_CORRESPONDENCES = 4
-"""PnP needs three; the fourth chooses among the solutions."""
+"""Correspondences that PnP needs: the minimal sample is three, the fourth selects the solution."""
+PNP_CONFIDENCE = 0.99999
+"""Confidence of the RANSAC of PnP. [COLMAP, reference]"""
+PNP_TRIALS = (100, 10_000)
+"""Smallest and largest number of RANSAC trials of PnP. [COLMAP, reference]"""
+ESSENTIAL_TRIALS = (50, 500)
+"""The same for the essential matrix: few, because other subsets of the matches follow. [ours]"""
 
 
 class PoseHypothesis(NamedTuple):
-    """``cam_from_world`` of an image, and where it comes from."""
+    """Candidate pose of an image."""
 
     rotation: Float64
+    """(3, 3) ``cam_from_world``."""
     translation: Float64
+    """(3,) ``cam_from_world``."""
     source: str
+    """Name of the estimator."""
 
 
 HypothesisEstimator = Callable[[], PoseHypothesis | None]
-"""Makes a hypothesis; COLMAP's estimators let other threads work meanwhile."""
+"""Estimates one hypothesis; COLMAP's estimators release the GIL."""
 
 
 def estimate_absolute_pose(
@@ -50,19 +62,28 @@ def estimate_absolute_pose(
     *,
     refine: bool = True,
 ) -> tuple[Float64, Float64, Bool] | None:
-    """Robust PnP of pixels (m, 2) and world points (m, 3).
+    """Estimate an absolute pose by PnP in LO-RANSAC (pycolmap).
 
-    Returns rotation, translation and inliers (m,), or None when it fails. ``refine``: also
-    minimise the reprojection error of the inliers; RANSAC alone takes a fifth of the time.
+    Args:
+        camera: Camera of the image.
+        xy: (m, 2) keypoints in pixels.
+        points: (m, 3) world points.
+        options: ``max_error_px`` and ``min_inlier_ratio`` apply.
+        seed: Seed of RANSAC.
+        refine: Minimize the reprojection error of the inliers afterwards.
+
+    Returns:
+        Rotation and translation ``cam_from_world`` and the inlier mask (m,), or None if it fails.
     """
     if len(xy) < MIN_CORRESPONDENCES:
         return None
+    min_trials, max_trials = PNP_TRIALS
     ransac = pycolmap.RANSACOptions(
         max_error=options.max_error_px,
         min_inlier_ratio=options.min_inlier_ratio,
-        confidence=0.99999,  # COLMAP, reference
-        min_num_trials=100,
-        max_num_trials=10_000,
+        confidence=PNP_CONFIDENCE,
+        min_num_trials=min_trials,
+        max_num_trials=max_trials,
         random_seed=seed,
     )
     estimate = (
@@ -86,85 +107,98 @@ def estimate_absolute_pose(
 
 @dataclass(frozen=True, eq=False)
 class PoseHypothesisGenerator:
-    """The estimators of an image's pose on some correspondences."""
+    """Generator of pose hypotheses of one image from its correspondences."""
 
     scene: Scene
+    """The scene with the registered images."""
     image: int
-    found: PoseCorrespondences
+    """The image to register."""
+    correspondences: PoseCorrespondences
+    """2D-3D correspondences of the image."""
     options: RegistrationOptions
+    """Thresholds and number of resamples."""
     seed: int
+    """Seed of RANSAC and of the resampling."""
 
     def generate_from_all(self) -> Iterator[HypothesisEstimator]:
-        """From all correspondences, and from each reference image alone."""
-        yield self._forward
+        """Generate estimators that use all matches, and all matches of each reference image."""
+        yield self._estimate_pnp
         if not self.options.lifting:
             return
-        references = set(self.found.references.tolist())
+        references = set(self.correspondences.references.tolist())
         for pair in self.scene.graph.pairs_of[self.image]:
             reference = pair.image_a if self.image == pair.image_b else pair.image_b
             if reference not in references:
                 continue
-            yield partial(self._reverse, reference)
+            yield partial(self._estimate_reverse_pnp, reference)
             if pair.calibrated:
                 relative = pair.rotation, pair.translation
                 if self.image == pair.image_a:
                     relative = invert(*relative)
-                yield partial(self._scaled, self.found, reference, relative)
-            yield partial(self._proposed, reference)
+                yield partial(self._scale_relative_pose, self.correspondences, reference, relative)
+            yield partial(self._use_network_pose, reference)
 
     def generate_from_halves(self) -> Iterator[HypothesisEstimator]:
-        """From random halves of the matches to the image that has most of them.
+        """Generate estimators that use random halves of the matches to the best reference image.
 
-        A match is drawn in proportion to its weight.
+        The best reference image has the most correspondences. The probability of drawing a match is
+        proportional to its weight.
         """
-        found = self.found
-        if len(found.keypoints) < MIN_CORRESPONDENCES:
+        correspondences = self.correspondences
+        if len(correspondences.keypoints) < MIN_CORRESPONDENCES:
             return
         rng = np.random.default_rng(self.seed)
-        reference = int(np.bincount(found.references).argmax())
-        mine = np.flatnonzero(found.references == reference)
-        half_size = min(max(len(mine) // 2, MIN_CORRESPONDENCES), len(mine))
-        odds = found.weights[mine] / found.weights[mine].sum()
+        reference = int(np.bincount(correspondences.references).argmax())
+        rows = np.flatnonzero(correspondences.references == reference)
+        num_sampled = min(max(len(rows) // 2, MIN_CORRESPONDENCES), len(rows))
+        probabilities = correspondences.weights[rows] / correspondences.weights[rows].sum()
         for _ in range(self.options.num_resamples):
-            chosen = np.sort(rng.choice(mine, half_size, replace=False, p=odds))
-            half = replace(self, found=found.select(chosen))
-            yield half._forward
-            yield partial(half._reverse, reference)
-            yield partial(half._essential, found, reference)
+            sampled = np.sort(rng.choice(rows, num_sampled, replace=False, p=probabilities))
+            half = replace(self, correspondences=correspondences.select(sampled))
+            yield half._estimate_pnp
+            yield partial(half._estimate_reverse_pnp, reference)
+            yield partial(half._estimate_from_essential_matrix, correspondences, reference)
 
-    def _forward(self) -> PoseHypothesis | None:
-        """PnP on the points of the scene."""
-        found = self.found.select(self.found.known)
-        pose = self._pnp(self.image, self.scene.keypoints[found.keypoints], found.points)
+    def _estimate_pnp(self) -> PoseHypothesis | None:
+        """Estimate the pose by PnP on the points of the scene."""
+        correspondences = self.correspondences.select(self.correspondences.depth_known)
+        xy = self.scene.keypoints[correspondences.keypoints]
+        pose = self._solve_pnp(self.image, xy, correspondences.points)
         return PoseHypothesis(*pose, "PnP") if pose else None
 
-    def _reverse(self, reference: int) -> PoseHypothesis | None:
-        """PnP of the reference on the image's own lifts, at the reference's scale."""
-        scene, found = self.scene, self.found
-        depth_map = scene.maps[self.image]
-        rows = found.keypoints - scene.graph.offsets[self.image]
-        use = (found.references == reference) & depth_map.keypoint_valid[rows]
-        if use.sum() < MIN_CORRESPONDENCES or not depth_map.prior.metric:
-            return None
-        depth = depth_map.prior_at_keypoints(rows[use]) * scene.maps[reference].scale
-        points = scene.rays(found.keypoints[use]) * depth[:, None]
-        xy = scene.keypoints[found.matched[use]]
-        pose = self._pnp(reference, xy, points)
-        return self._placed(reference, invert(*pose), "reverse PnP") if pose else None
+    def _estimate_reverse_pnp(self, reference: int) -> PoseHypothesis | None:
+        """Estimate the pose of the reference by PnP on points lifted from the image's own prior.
 
-    def _essential(self, judges: PoseCorrespondences, reference: int) -> PoseHypothesis | None:
-        """The essential matrix of the matches, its length by the depth of the ``judges``."""
-        scene, found = self.scene, self.found
+        The prior has the scale of the reference's prior, so it must be metric.
+        """
+        scene, correspondences = self.scene, self.correspondences
+        depth_map = scene.maps[self.image]
+        rows = correspondences.keypoints - scene.graph.offsets[self.image]
+        usable = (correspondences.references == reference) & depth_map.keypoint_valid[rows]
+        if usable.sum() < MIN_CORRESPONDENCES or not depth_map.prior.metric:
+            return None
+        depth = depth_map.prior_at_keypoints(rows[usable]) * scene.maps[reference].scale
+        points = scene.rays(correspondences.keypoints[usable]) * depth[:, None]
+        xy = scene.keypoints[correspondences.matched_keypoints[usable]]
+        pose = self._solve_pnp(reference, xy, points)
+        return self._to_world(reference, invert(*pose), "reverse PnP") if pose else None
+
+    def _estimate_from_essential_matrix(
+        self, depth_correspondences: PoseCorrespondences, reference: int
+    ) -> PoseHypothesis | None:
+        """Estimate the essential matrix; the depth of further matches gives the baseline length."""
+        scene, correspondences = self.scene, self.correspondences
+        min_trials, max_trials = ESSENTIAL_TRIALS
         result = pycolmap.estimate_essential_matrix(
-            scene.keypoints[found.matched],
-            scene.keypoints[found.keypoints],
+            scene.keypoints[correspondences.matched_keypoints],
+            scene.keypoints[correspondences.keypoints],
             colmap_from_pinhole(scene.camera(reference)),
             colmap_from_pinhole(scene.camera(self.image)),
             pycolmap.RANSACOptions(
                 max_error=0.5 * self.options.max_support_error_px,
                 min_inlier_ratio=self.options.min_inlier_ratio,
-                min_num_trials=50,
-                max_num_trials=500,  # a half without a good sample is followed by another half
+                min_num_trials=min_trials,
+                max_num_trials=max_trials,
                 random_seed=self.seed,
             ),
         )
@@ -172,51 +206,59 @@ class PoseHypothesisGenerator:
             return None
         pose = result["cam2_from_cam1"]
         relative = np.array(pose.rotation.matrix()), np.array(pose.translation)
-        return self._scaled(judges, reference, relative)
+        return self._scale_relative_pose(depth_correspondences, reference, relative)
 
-    def _scaled(
-        self, judges: PoseCorrespondences, reference: int, relative: Pose
+    def _scale_relative_pose(
+        self, depth_correspondences: PoseCorrespondences, reference: int, relative: Pose
     ) -> PoseHypothesis | None:
-        """A pose relative to a reference, known up to its length."""
-        length = _baseline(self.scene, judges, reference, relative)
+        """Scale a pose relative to the reference by known depth, and convert it to the world."""
+        length = _estimate_baseline(self.scene, depth_correspondences, reference, relative)
         if not length:
             return None
-        return self._placed(reference, (relative[0], relative[1] * length), "essential matrix")
+        return self._to_world(reference, (relative[0], relative[1] * length), "essential matrix")
 
-    def _proposed(self, reference: int) -> PoseHypothesis | None:
-        """As the image lies to the reference in the frame of the group that both are of."""
+    def _use_network_pose(self, reference: int) -> PoseHypothesis | None:
+        """Use the pose that a multi-view network predicts relative to the reference.
+
+        Both images must belong to one group of the network, which has one frame and one unit.
+        """
         scene = self.scene
         images, depth_map = scene.problem.images, scene.maps[reference]
-        own, other = images[self.image].proposed_pose, images[reference].proposed_pose
-        same = scene.depth_group_of[self.image] == scene.depth_group_of[reference]
-        if own is None or other is None or not same or not depth_map.active:
+        image_pose = images[self.image].proposed_pose
+        reference_pose = images[reference].proposed_pose
+        same_group = scene.depth_group_of[self.image] == scene.depth_group_of[reference]
+        if image_pose is None or reference_pose is None or not same_group or not depth_map.active:
             return None
-        rotation, translation = compose(own, invert(*other))
+        rotation, translation = compose(image_pose, invert(*reference_pose))
         relative = rotation, depth_map.scale * translation
-        return self._placed(reference, relative, "multi-view network")
+        return self._to_world(reference, relative, "multi-view network")
 
-    def _placed(self, reference: int, relative: Pose, source: str) -> PoseHypothesis:
-        """A pose relative to a reference as one in the world."""
+    def _to_world(self, reference: int, relative: Pose, source: str) -> PoseHypothesis:
+        """Convert a pose relative to a registered image to ``cam_from_world``."""
         world = self.scene.rotations[reference], self.scene.translations[reference]
         return PoseHypothesis(*compose(relative, world), source)
 
-    def _pnp(self, image: int, xy: Float64, points: Float64) -> Pose | None:
+    def _solve_pnp(self, image: int, xy: Float64, points: Float64) -> Pose | None:
         camera, options = self.scene.camera(image), self.options
         pose = estimate_absolute_pose(camera, xy, points, options, self.seed, refine=False)
         return (pose[0], pose[1]) if pose else None
 
 
-def _baseline(
-    scene: Scene, found: PoseCorrespondences, reference: int, relative: Pose
+def _estimate_baseline(
+    scene: Scene, correspondences: PoseCorrespondences, reference: int, relative: Pose
 ) -> float | None:
-    """Factor of a relative translation that brings triangulated points to the known depth."""
-    mine = (found.references == reference) & found.known
+    """Return the scale of a relative translation that fits triangulated points to known depth.
+
+    The scale is the median ratio of known depth to triangulated depth in the reference camera.
+    """
+    rows = (correspondences.references == reference) & correspondences.depth_known
     rotation, translation = relative
-    known = found.points[mine] @ scene.rotations[reference].T + scene.translations[reference]
-    rays_a = known / known[:, 2:]
-    rays_b = scene.rays(found.keypoints[mine]) @ rotation
+    world_points = correspondences.points[rows]
+    points = world_points @ scene.rotations[reference].T + scene.translations[reference]
+    rays_a = points / points[:, 2:]
+    rays_b = scene.rays(correspondences.keypoints[rows]) @ rotation
     center_b = -rotation.T @ translation
     z = triangulate_midpoints(np.zeros(3), rays_a, center_b, rays_b)[:, 2]
     with np.errstate(invalid="ignore"):
-        good = (z > 0) & (known[:, 2] > 0)
-    return float(np.median(known[good, 2] / z[good])) if good.any() else None
+        in_front = (z > 0) & (points[:, 2] > 0)
+    return float(np.median(points[in_front, 2] / z[in_front])) if in_front.any() else None

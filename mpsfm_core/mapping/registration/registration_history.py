@@ -1,4 +1,4 @@
-"""What history to register images have shown: not to be repeated, and which view is to blame."""
+"""Record of registration attempts: avoids repetition and finds misplaced registered images."""
 
 from __future__ import annotations
 
@@ -13,95 +13,104 @@ from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
 
 MIN_CONTRADICTING_IMAGES = 2
-"""Newcomers that contradict a view before it is the one to go (ours)."""
+"""Number of rejected images whose depth must contradict a registered image before that image is
+deregistered. [ours]"""
 
 
 class _Attempt(NamedTuple):
-    """The images that an image was posed beside, and the best pose that was found."""
+    """The last attempt to estimate the pose of an image."""
 
     references: list[int]
     pose: ScoredPose | None
 
 
 class RegistrationHistory:
-    """Memory of the history within one component.
+    """Registration attempts within one component.
 
-    ``refuted``: (n, n) bool, an image is not to be posed beside another: their matches led to a
-    pose whose depth contradicted the scene.
+    Attributes:
+        excluded_references: (n, n) bool; image ``i`` is not registered with reference ``j``,
+            because their matches led to a pose that contradicts the depth of the scene.
     """
 
     def __init__(self, num_images: int, options: RegistrationOptions) -> None:
         self.excluded_references: Bool = np.zeros((num_images, num_images), dtype=np.bool_)
         self._options = options
-        self._searches: dict[int, int] = defaultdict(int)
-        self._last: dict[int, _Attempt] = {}
-        self._contradicted: dict[int, set[int]] = defaultdict(set)
-        self._refused: dict[tuple[int, bytes], Reason] = {}
-        self._displaced: set[int] = set()
+        self._num_searches: dict[int, int] = defaultdict(int)
+        self._last_attempts: dict[int, _Attempt] = {}
+        self._contradicting: dict[int, set[int]] = defaultdict(set)
+        self._rejected_poses: dict[tuple[int, bytes], Reason] = {}
+        self._deregistered: set[int] = set()
 
-    def num_searches(self, image: int) -> int:
-        """How often the pose of an image was searched for."""
-        return self._searches[image]
+    def count_searches(self, image: int) -> int:
+        """Return how often the pose of an image was estimated."""
+        return self._num_searches[image]
 
-    def last_best_pose(self, image: int) -> ScoredPose | None:
-        """The best pose that the last attempt at an image knew."""
-        return self._last[image].pose if image in self._last else None
+    def get_last_pose(self, image: int) -> ScoredPose | None:
+        """Return the best pose of the last attempt at an image."""
+        return self._last_attempts[image].pose if image in self._last_attempts else None
 
     def is_exhausted(self, image: int, references: list[int]) -> bool:
-        """Whether another search for the pose of an image would only repeat the last one.
+        """Return whether another search with the same references would repeat the last one.
 
-        A few are different in any case: they take other halves of the matches.
+        The first searches differ because each draws other subsets of the matches.
         """
-        several = self._searches[image] >= self._options.resampled_attempts
-        return several and image in self._last and self._last[image].references == references
+        is_resampled = self._num_searches[image] >= self._options.resampled_attempts
+        last = self._last_attempts.get(image)
+        return is_resampled and last is not None and last.references == references
 
     def record_attempt(
         self, image: int, references: list[int], best: ScoredPose | None, *, searched: bool
     ) -> None:
-        """Note an attempt and the best pose known after it."""
-        self._searches[image] += searched
-        self._last[image] = _Attempt(references, best)
+        """Record an attempt and the best pose after it; ``searched`` if poses were estimated."""
+        self._num_searches[image] += searched
+        self._last_attempts[image] = _Attempt(references, best)
 
-    def record_contradiction(self, view: int, newcomer: int) -> None:
-        """Note that the depth of a newcomer contradicts that of a registered view."""
-        self._contradicted[view].add(newcomer)
+    def record_contradiction(self, registered_image: int, new_image: int) -> None:
+        """Record that the depth of a new image contradicts the depth of a registered image."""
+        self._contradicting[registered_image].add(new_image)
 
     def pop_contradicted_image(self, registered: Bool) -> tuple[int, int] | None:
-        """The view that most newcomers contradict who are not registered yet, and their number.
+        """Return the image that most unregistered images contradict, and their number.
 
-        The check blames the newcomer, but several of them may be right and the one view wrong.
-        Each view is named once; None when no registered one is contradicted by several.
+        The depth check rejects the new image, but the registered image can be the wrong one. Each
+        image is returned once. Returning an image clears the record of contradictions.
+
+        Args:
+            registered: (n,) bool, the images that are registered now.
+
+        Returns:
+            None if fewer than :data:`MIN_CONTRADICTING_IMAGES` images contradict every image.
         """
-        blame = {
-            view: int((~registered[list(newcomers)]).sum())
-            for view, newcomers in self._contradicted.items()
-            if registered[view] and view not in self._displaced
+        counts = {
+            image: int((~registered[list(new_images)]).sum())
+            for image, new_images in self._contradicting.items()
+            if registered[image] and image not in self._deregistered
         }
-        worst = max(blame, key=lambda view: blame[view], default=-1)
-        if blame.get(worst, 0) < MIN_CONTRADICTING_IMAGES:
+        worst = max(counts, key=lambda image: counts[image], default=-1)
+        if counts.get(worst, 0) < MIN_CONTRADICTING_IMAGES:
             return None
-        self._contradicted.clear()
-        self._displaced.add(worst)
-        return worst, blame[worst]
+        self._contradicting.clear()
+        self._deregistered.add(worst)
+        return worst, counts[worst]
 
-    def pose_rejection(self, image: int, pose: ScoredPose) -> Reason | None:
-        """Why this very pose of an image was refused in the present scene, if it was."""
-        return self._refused.get(_key(image, pose))
+    def get_rejection(self, image: int, pose: ScoredPose) -> Reason | None:
+        """Return why this pose was rejected in the present scene, or None if it was not."""
+        return self._rejected_poses.get(_pose_key(image, pose))
 
     def reject_pose(self, image: int, pose: ScoredPose, reason: Reason) -> None:
-        """Note that the scene around a pose of an image did not hold."""
-        self._refused[_key(image, pose)] = reason
+        """Record that a pose of an image failed verification in the present scene."""
+        self._rejected_poses[_pose_key(image, pose)] = reason
 
     def clear_pose_rejections(self) -> None:
-        """Let refused poses be tried again."""
-        self._refused.clear()
+        """Allow rejected poses again, because the scene has changed."""
+        self._rejected_poses.clear()
 
     def clear(self) -> None:
-        """Let everything be tried again: the scene may be right now where it was wrong."""
+        """Allow all attempts again, because the scene has been refined or corrected."""
         self.excluded_references[:] = False
-        self._last.clear()
+        self._last_attempts.clear()
         self.clear_pose_rejections()
 
 
-def _key(image: int, pose: ScoredPose) -> tuple[int, bytes]:
+def _pose_key(image: int, pose: ScoredPose) -> tuple[int, bytes]:
     return image, pose.rotation.tobytes() + pose.translation.tobytes()

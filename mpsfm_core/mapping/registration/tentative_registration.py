@@ -1,4 +1,8 @@
-"""Images that no group holds, placed where their matches fit best; nothing confirms that."""
+"""Tentative registration of images that no verification confirms.
+
+Images outside the largest component are registered where their matches fit best. They observe no
+points and change neither the points nor the other poses.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ from mpsfm_core.mapping.registration.image_selection import (
 )
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
-from mpsfm_core.mapping.scene.conversion import registered_image
+from mpsfm_core.mapping.scene.conversion import convert_image
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import triangulate_image
@@ -27,36 +31,45 @@ from mpsfm_core.mapping.triangulation import triangulate_image
 
 def register_tentatively(
     reconstruction: Reconstruction,
-    others: Sequence[Reconstruction],
+    components: Sequence[Reconstruction],
     problem: MappingProblem,
     options: MapperOptions,
 ) -> Reconstruction:
-    """The reconstruction with all further images that have matches to it, however doubtful.
+    """Register all further images that have matches with the reconstruction.
 
-    Again and again the image comes next whose pose is supported best, beside those placed before
-    as well; an image of one of the ``others`` takes that whole group along. They see no points,
-    and change neither the points nor the other poses.
+    The image with the best supported pose comes next, until none has matches. Tentatively
+    registered images serve as references of the following ones.
+
+    Args:
+        reconstruction: The largest component.
+        components: The other components. If one of their images is registered, the whole component
+            moves along.
+        problem: The problem that was reconstructed.
+        options: Options of the mapper.
+
+    Returns:
+        The reconstruction with the further images, whose ``confirmed`` is False.
     """
-    completion = _Completion(reconstruction, others, problem, options)
-    placed = completion.place_all()
-    if not placed:
+    registration = _TentativeRegistration(reconstruction, components, problem, options)
+    registered = registration.register_all()
+    if not registered:
         return reconstruction
-    in_metres = reconstruction.metric is not None and reconstruction.metric.trusted
-    further = [
-        replace(registered_image(completion.scene, image, 1.0, in_metres), confirmed=False)
-        for image in placed
+    is_metric = reconstruction.metric is not None and reconstruction.metric.trusted
+    tentative = [
+        replace(convert_image(registration.scene, image, 1.0, is_metric), confirmed=False)
+        for image in registered
     ]
-    images = sorted([*reconstruction.images, *further], key=lambda image: image.index)
+    images = sorted([*reconstruction.images, *tentative], key=lambda image: image.index)
     return replace(reconstruction, images=tuple(images))
 
 
-class _Completion:
-    """A scene like the finished one, to which images are added."""
+class _TentativeRegistration:
+    """Registration of further images into a copy of the reconstructed scene."""
 
     def __init__(
         self,
         reconstruction: Reconstruction,
-        others: Sequence[Reconstruction],
+        components: Sequence[Reconstruction],
         problem: MappingProblem,
         options: MapperOptions,
     ) -> None:
@@ -65,67 +78,72 @@ class _Completion:
         self._scores = compute_pair_scores(self.scene, options.registration.next_view)
         self._triangulation = options.triangulation
         self._refiner = Refiner(self.scene, options, self._scores)
-        self._search = AbsolutePoseEstimator(self.scene, self._refiner, options)
-        self._found: dict[int, tuple[list[int], ScoredPose | None]] = {}
-        self._groups = {image.index: group for group in others for image in group.images}
-        self._scale = float(np.median([image.scale for image in reconstruction.images]))
+        self._pose_estimator = AbsolutePoseEstimator(self.scene, self._refiner, options)
+        self._poses: dict[int, tuple[list[int], ScoredPose | None]] = {}
+        self._component_of = {
+            image.index: component for component in components for image in component.images
+        }
+        self._median_scale = float(np.median([image.scale for image in reconstruction.images]))
         self.scene.resume(reconstruction)
 
-    def place_all(self) -> list[int]:
-        """Place one image or group after the other; the images placed."""
+    def register_all(self) -> list[int]:
+        """Register one image or component after another; return the registered images."""
         before = self.scene.registered.copy()
-        while best := self._best():
+        while best := self._find_next_image():
             image, pose = best
-            self._place(image, pose)
-            if image in self._groups:
-                self._place_beside(image, self._groups[image])
+            self._register_image(image, pose)
+            if image in self._component_of:
+                self._register_component(image, self._component_of[image])
         return [int(image) for image in np.flatnonzero(self.scene.registered & ~before)]
 
-    def _place(self, image: int, pose: ScoredPose) -> None:
-        """Register an image and scale its prior to the points that it may see."""
+    def _register_image(self, image: int, pose: ScoredPose) -> None:
+        """Register an image, and scale its depth prior by points that are discarded afterwards."""
         scene, depth_map = self.scene, self.scene.maps[image]
         before = scene.snapshot()
         scene.register(image, pose.rotation, pose.translation)
         triangulate_image(scene, image, self._triangulation)
-        self._refiner.estimate_scale(image, self._found[image][0])
-        scale = depth_map.scale if depth_map.active else self._scale
+        self._refiner.estimate_scale(image, self._poses[image][0])
+        scale = depth_map.scale if depth_map.active else self._median_scale
         scene.restore(before)
         scene.register(image, pose.rotation, pose.translation)
         depth_map.set_scale(scale)
 
-    def _place_beside(self, image: int, group: Reconstruction) -> None:
-        """Register the other images of a placed image's group as they lie to it."""
+    def _register_component(self, image: int, component: Reconstruction) -> None:
+        """Register the other images of a component by their poses relative to one of its images."""
         scene = self.scene
-        (own,) = (member for member in group.images if member.index == image)
-        growth = scene.maps[image].scale / own.scale
-        placed = scene.rotations[image].copy(), scene.translations[image].copy()
-        inverse = invert(own.rotation, own.translation)
-        for member in group.images:
+        (anchor,) = (member for member in component.images if member.index == image)
+        scale_ratio = scene.maps[image].scale / anchor.scale
+        anchor_pose = scene.rotations[image].copy(), scene.translations[image].copy()
+        component_from_anchor = invert(anchor.rotation, anchor.translation)
+        for member in component.images:
             if member.index != image:
-                turn, step = compose((member.rotation, member.translation), inverse)
-                scene.register(member.index, *compose((turn, growth * step), placed))
-                scene.maps[member.index].set_scale(growth * member.scale)
+                rotation, translation = compose(
+                    (member.rotation, member.translation), component_from_anchor
+                )
+                pose = compose((rotation, scale_ratio * translation), anchor_pose)
+                scene.register(member.index, *pose)
+                scene.maps[member.index].set_scale(scale_ratio * member.scale)
 
-    def _best(self) -> tuple[int, ScoredPose] | None:
-        """The image whose pose is supported best."""
+    def _find_next_image(self) -> tuple[int, ScoredPose] | None:
+        """Return the unregistered image with the best supported pose."""
         candidates = ~self.scene.registered
         best: tuple[int, ScoredPose] | None = None
-        for image, reference in rank_next_images(
+        for image, best_match in rank_next_images(
             self.scene, self._scores, candidates, self._options
         ):
-            pose = self._pose(image, reference)
+            pose = self._estimate_pose(image, best_match)
             if pose and (best is None or pose.support > best[1].support):
                 best = image, pose
         return best
 
-    def _pose(self, image: int, reference: int) -> ScoredPose | None:
-        """The best pose beside some images; found once as long as these are the same."""
+    def _estimate_pose(self, image: int, best_match: int) -> ScoredPose | None:
+        """Estimate the pose of an image, or reuse it if the reference images are the same."""
         scene, options = self.scene, self._options
-        references = find_local_bundle(scene, reference, options.num_neighbors, self._scores)
-        if image not in self._found or self._found[image][0] != references:
-            found = find_correspondences(scene, image, references, options)
-            poses = (
-                self._search.estimate_poses(image, found, attempt=0) if len(found.keypoints) else []
-            )
-            self._found[image] = references, max(poses, key=lambda p: p.support, default=None)
-        return self._found[image][1]
+        references = find_local_bundle(scene, best_match, options.num_neighbors, self._scores)
+        if image not in self._poses or self._poses[image][0] != references:
+            correspondences = find_correspondences(scene, image, references, options)
+            poses = []
+            if len(correspondences.keypoints):
+                poses = self._pose_estimator.estimate_poses(image, correspondences, attempt=0)
+            self._poses[image] = references, max(poses, key=lambda p: p.support, default=None)
+        return self._poses[image][1]

@@ -1,4 +1,4 @@
-"""What to relax when no image can be registered any more."""
+"""Schedule of the acceptance thresholds while no image can be registered."""
 
 from __future__ import annotations
 
@@ -6,59 +6,66 @@ from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
 
+RELAXATION_FACTOR = 1.2
+"""Factor of the thresholds from one step to the next. [reference]"""
+
 
 class ThresholdSchedule:
-    """Thresholds that give way step by step and snap back at the next success.
+    """Acceptance thresholds that relax step by step and reset when an image is registered.
 
-    PnP may do with fewer inliers (reference). The depth check does not give way, unlike the
-    reference's: that would let in what it is there to keep out. It tightens by the same factor, as
-    what matches do not bear out depth has to (ours).
+    As the inlier thresholds relax, the depth threshold tightens by the same factor: a pose with
+    fewer inliers needs a better depth agreement. (The reference relaxes both.)
     """
 
     def __init__(self, options: RegistrationOptions) -> None:
         self._options = options
-        self._relaxations = 0
-
-    def reset(self) -> None:
-        """Back to the strict thresholds, after a success."""
-        self._relaxations = 0
+        self._num_relaxations = 0
 
     @property
     def min_inliers(self) -> int:
-        """PnP inliers that an image needs."""
+        """Inliers that a pose needs now."""
         return int(self._options.min_inliers / self._factor)
 
     @property
-    def min_inlier_share(self) -> float:
-        """Share of the correspondences that must be inliers."""
+    def min_inlier_ratio(self) -> float:
+        """Share of the correspondences that must be inliers now."""
         return self._options.min_inlier_share / self._factor
 
-    def max_violations(self, strict: float) -> float:
-        """Share of pixels that may contradict another view, ``strict`` before any relaxation."""
-        return strict / self._factor
+    def tighten_violations(self, max_violations: float) -> float:
+        """Return the present limit of the violation ratio, given its initial value."""
+        return max_violations / self._factor
 
-    def check_support(self, pose: ScoredPose, *, certain: bool = False) -> Reason | None:
-        """Why too few matches agree with a pose, if so; ``certain``: nearly all have to."""
-        needed = self.min_inliers
-        share = self._options.confident_share if certain else self.min_inlier_share
-        if pose.num_inliers < needed:
+    def check_support(self, pose: ScoredPose, *, confident: bool = False) -> Reason | None:
+        """Return why a pose has too little support, or None if the support suffices.
+
+        Args:
+            pose: The pose with its inliers.
+            confident: Require the inlier ratio ``confident_share`` of the options.
+        """
+        min_inliers = self.min_inliers
+        min_ratio = self._options.confident_share if confident else self.min_inlier_ratio
+        if pose.num_inliers < min_inliers:
             return ImageReason.TOO_FEW_INLIERS.because(
-                num_inliers=pose.num_inliers, min_inliers=needed
+                num_inliers=pose.num_inliers, min_inliers=min_inliers
             )
-        if pose.inlier_ratio < share:
+        if pose.inlier_ratio < min_ratio:
             return ImageReason.LOW_INLIER_RATIO.because(
                 inlier_ratio=round(float(pose.inlier_ratio), 4),
-                min_inlier_ratio=round(float(share), 4),
+                min_inlier_ratio=round(float(min_ratio), 4),
             )
         return None
 
     def relax(self) -> bool:
-        """One step down; False at the bottom."""
-        if self._relaxations == self._options.max_relaxations:
+        """Relax the inlier thresholds by one step; return False after the last step."""
+        if self._num_relaxations == self._options.max_relaxations:
             return False
-        self._relaxations += 1
+        self._num_relaxations += 1
         return True
+
+    def reset(self) -> None:
+        """Return to the initial thresholds."""
+        self._num_relaxations = 0
 
     @property
     def _factor(self) -> float:
-        return 1.2**self._relaxations
+        return RELAXATION_FACTOR**self._num_relaxations
