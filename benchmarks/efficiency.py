@@ -45,7 +45,7 @@ def _step(*functions: tuple[str, str], paper: tuple[float, ...] = ()) -> Step:
 
 STEPS: Mapping[str, Step] = MappingProxyType(
     {
-        "placing all images at once": _step(("global_start.py", "place_all")),
+        "placing all images at once": _step(("global_initialization.py", "estimate_global_poses")),
         "bundle adjustment": _step(
             ("bundle_adjustment.py", "adjust_bundle"), paper=(3.43, 21.34, 48.59, 636.6)
         ),
@@ -56,13 +56,13 @@ STEPS: Mapping[str, Step] = MappingProxyType(
             ("refinement.py", "_covariances"), paper=(2.26, 11.06, 19.94, 153.8)
         ),
         "depth check": _step(
-            ("group.py", "_conflicts"),
-            ("group.py", "_contradiction"),
+            ("maintenance.py", "_find_conflicts"),
+            ("maintenance.py", "check_depth"),
             paper=(0.44, 0.73, 2.01, 13.9),
         ),
         "tracks": _step(
             ("triangulation.py", "triangulate_image"),
-            ("triangulation.py", "complete_and_merge"),
+            ("triangulation.py", "complete_and_merge_tracks"),
             ("triangulation.py", "lift_low_parallax"),
             ("filtering.py", "filter_points"),
         ),

@@ -1,67 +1,79 @@
-"""When the state of the mapper may be kept, and how it is taken up again."""
+"""Checkpoints of the mapper: an interrupted run continues with the same bits."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import NamedTuple, Protocol
 
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.mapping.events import MappingEvents
-from mpsfm_core.mapping.model_selection import Run
-from mpsfm_core.mapping.state import Frozen, freeze, thaw
-
-if TYPE_CHECKING:
-    from mpsfm_core.mapping.mapper import Mapper
+from mpsfm_core.mapping.model_selection import MapperRun
+from mpsfm_core.mapping.state import CheckpointArrays, freeze, thaw
 
 
-class Checkpoints(Protocol):
-    """Keeps states; whoever implements it decides where, and which state fits a problem.
+class CheckpointStore(Protocol):
+    """Storage of checkpoints; decides where they are kept and which one fits a problem.
 
-    States are taken between two images, and taking one changes nothing: results are the same
-    however often that happens.
+    The mapper saves between two registrations. Saving changes no result.
     """
 
-    def load(self) -> Frozen | None:
-        """The last state of a run with this problem and these options, None for a new start."""
+    def load(self) -> CheckpointArrays | None:
+        """Return the last checkpoint of this problem and these options, or None."""
 
     def unreadable(self, reason: str) -> None:
-        """What :meth:`load` gave is of no use: there is a new start."""
+        """Handle a checkpoint that cannot be restored; the mapper starts again."""
 
     def due(self) -> bool:
-        """Whether to keep the state now."""
+        """Return whether a checkpoint is to be saved now."""
 
-    def save(self, state: Frozen, registered: int) -> None:
-        """Keep a state; ``registered``: images in the group that is growing."""
+    def save(self, state: CheckpointArrays, registered: int) -> None:
+        """Save a checkpoint.
+
+        Args:
+            state: Arrays of the checkpoint.
+            registered: Number of registered images of the current component.
+        """
 
 
-class Keeper:
-    """Takes and restores the states of the mapper."""
+class MapperProgress(NamedTuple):
+    """Content of a checkpoint."""
+
+    runs: list[MapperRun]
+    """Completed runs."""
+    mapper: object | None
+    """The mapper of the interrupted run; None with runs means that all runs are complete."""
+
+
+class Checkpointer:
+    """Saves and restores the progress of the mapper."""
 
     def __init__(
-        self, checkpoints: Checkpoints | None, problem: MappingProblem, events: MappingEvents
+        self, store: CheckpointStore | None, problem: MappingProblem, events: MappingEvents
     ) -> None:
-        self._checkpoints = checkpoints
+        self._store = store
         self._shared = (problem, events)
 
-    def load(self) -> tuple[list[Run], Mapper | None]:
-        """The runs that are finished, and the mapper of the one that is not; runs without a mapper
-        are all that there will be."""
-        if self._checkpoints is None or (frozen := self._checkpoints.load()) is None:
-            return [], None
+    def load(self) -> MapperProgress:
+        """Restore the last checkpoint; empty progress if there is none or it is unreadable."""
+        if self._store is None or (arrays := self._store.load()) is None:
+            return MapperProgress([], None)
         try:
-            runs, mapper = thaw(frozen, self._shared)
+            runs, mapper = thaw(arrays, self._shared)
         except (DataError, TypeError, ValueError) as error:
-            self._checkpoints.unreadable(str(error))
-            return [], None
-        return runs, mapper
+            self._store.unreadable(str(error))
+            return MapperProgress([], None)
+        return MapperProgress(runs, mapper)
 
-    def save(self, runs: list[Run], mapper: Mapper) -> None:
-        """Keep the state if it is time."""
-        if self._checkpoints is not None and self._checkpoints.due():
-            self._checkpoints.save(freeze((runs, mapper), self._shared), mapper.group.size)
+    def save_if_due(self, progress: MapperProgress, num_registered: int) -> None:
+        """Save a checkpoint if the store asks for one."""
+        if self._store is not None and self._store.due():
+            self._save(progress, num_registered)
 
-    def finish(self, runs: list[Run]) -> None:
-        """Keep what came out, for who is killed in what follows."""
-        if self._checkpoints is not None:
-            registered = max(run.size for run in runs)
-            self._checkpoints.save(freeze((runs, None), self._shared), registered)
+    def save_completed(self, runs: list[MapperRun]) -> None:
+        """Save the completed runs, for an interruption of a later stage."""
+        if self._store is not None:
+            self._save(MapperProgress(runs, None), max(run.size for run in runs))
+
+    def _save(self, progress: MapperProgress, num_registered: int) -> None:
+        assert self._store is not None
+        self._store.save(freeze(tuple(progress), self._shared), num_registered)

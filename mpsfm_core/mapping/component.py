@@ -1,4 +1,4 @@
-"""One connected group of images: its start, its growth, its end (paper, system overview)."""
+"""One connected component: initialization, incremental registration and final refinement."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mpsfm_core.data import Bool, Int64, MappingProblem, VerifiedPair
 from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.consistency.misregistration import Misregistration, detect_misregistrations
 from mpsfm_core.mapping.consistency.pair_consistency import PairConsistencyCheck
-from mpsfm_core.mapping.event_log import Journal
+from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.initialization.global_initialization import (
     GlobalPoses,
     estimate_global_poses,
@@ -22,253 +22,285 @@ from mpsfm_core.mapping.initialization.initial_pair import (
     register_first_image,
 )
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement.filtering import filter_points, lost_images
-from mpsfm_core.mapping.refinement.maintenance import State, Upkeep
+from mpsfm_core.mapping.refinement.filtering import filter_points, find_lost_images
+from mpsfm_core.mapping.refinement.maintenance import ModelMaintenance, ModelState
 from mpsfm_core.mapping.registration.incremental_registration import IncrementalRegistration
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, triangulate_image
 
 _log = logging.getLogger(__name__)
 
-_WITHOUT = {
-    True: "the scale of their depth is unknown",
-    False: "starting without these poses, in another world",
+_WITHOUT_POINTS = {
+    True: "the scale of their depth is unknown; check that the poses and the images match",
+    False: "the mapper starts without these poses, in another world",
 }
 
 
-def nothing() -> None:
-    """Nobody wants to know."""
+def do_nothing() -> None:
+    """Default of optional callbacks."""
 
 
-class Group:
-    """Images that hold together: started, grown image by image, and finished.
+class Component:
+    """A connected set of images, from its initialization to its final refinement.
 
-    ``starts``: first pairs, which all groups of a run share.
+    Attributes:
+        maintenance: Refinement, depth checks and deregistration.
+        registration: Registration of further images.
+        scene: Poses, points and depth maps.
+        refiner: Bundle adjustment and depth integration.
     """
 
-    upkeep_type: type[Upkeep] = Upkeep
-    growth_type: type[IncrementalRegistration] = IncrementalRegistration
+    maintenance_type: type[ModelMaintenance] = ModelMaintenance
+    registration_type: type[IncrementalRegistration] = IncrementalRegistration
 
     def __init__(
         self,
         problem: MappingProblem,
         options: MapperOptions,
-        starts: InitialPairSelector,
-        journal: Journal,
+        pair_selector: InitialPairSelector,
+        event_log: EventLog,
     ) -> None:
-        self.upkeep = self.upkeep_type(problem, options, journal)
-        self.scene, self.refiner = self.upkeep.scene, self.upkeep.refiner
-        self._options, self._starts, self._journal = options, starts, journal
-        self._search = AbsolutePoseEstimator(self.scene, self.refiner, options)
-        self.growth = self.growth_type(self.upkeep, self._search)
+        self.maintenance = self.maintenance_type(problem, options, event_log)
+        self.scene, self.refiner = self.maintenance.scene, self.maintenance.refiner
+        self._options, self._pair_selector, self._event_log = options, pair_selector, event_log
+        self._pose_estimator = AbsolutePoseEstimator(self.scene, self.refiner, options)
+        self.registration = self.registration_type(self.maintenance, self._pose_estimator)
 
     @property
     def size(self) -> int:
         """Number of registered images."""
-        return self.upkeep.size
+        return self.maintenance.size
 
-    def weighed_problem(self, left: Bool) -> MappingProblem:
-        """The problem with pairs of the images that are left as far as depth allows them; for a
-        group without images."""
-        # which poses are tried is no matter of chance that runs should differ by
+    def reweight_pairs(self, unregistered: Bool) -> MappingProblem:
+        """Return the problem with the pairs of unregistered images reweighted by depth.
+
+        The scene must have no registered image.
+        """
+        # all runs use the same seed here, so that they compare pairs with the same poses
         options = self._options.model_copy(update={"seed": 0})
-        search = AbsolutePoseEstimator(self.scene, self.refiner, options)
-        return PairConsistencyCheck(search, options).reweight_pairs(self.upkeep.problem, left)
+        pose_estimator = AbsolutePoseEstimator(self.scene, self.refiner, options)
+        check = PairConsistencyCheck(pose_estimator, options)
+        return check.reweight_pairs(self.maintenance.problem, unregistered)
 
-    def start_from_known_poses(self, left: Bool) -> bool:
-        """Register all images that came with a pose; False when fewer than two hold together."""
-        images = self.upkeep.problem.images
-        poses = {int(i): images[i].known_pose for i in np.flatnonzero(left)}
+    def initialize_from_known_poses(self, unregistered: Bool) -> bool:
+        """Register all unregistered images that came with a pose.
+
+        Returns:
+            False if fewer than two images keep enough points.
+        """
+        images = self.maintenance.problem.images
+        poses = {int(i): images[i].known_pose for i in np.flatnonzero(unregistered)}
         known = {image: pose for image, pose in poses.items() if pose is not None}
         if len(known) < 2:
             return False
         scene, options = self.scene, self._options
         for image, pose in known.items():
             scene.register(image, *pose)
-        fixed = options.known_poses == "fixed"
-        self.refiner.fixed[list(known)] = fixed
+        is_fixed = options.known_poses == "fixed"
+        self.refiner.fixed[list(known)] = is_fixed
         complete_and_merge_tracks(scene, options.triangulation, create=True)
-        self.refiner.scale_together(list(known))
+        self.refiner.estimate_scales(list(known))
         if not len(scene.tracks):
-            _log.warning("images with known poses share no points: %s", _WITHOUT[fixed])
-        self.upkeep.refine_globally()
+            _log.warning("images with known poses share no points: %s", _WITHOUT_POINTS[is_fixed])
+        self.maintenance.refine_globally()
         if self.size < 2:
             return False
         for image in map(int, scene.registered_images()):
-            self.upkeep.accept(image)
+            self.maintenance.confirm(image)
         return True
 
-    def start_from_all(self, left: Bool) -> bool:
-        """Place all well connected images at once; False, and nothing done, unless that holds.
+    def initialize_globally(self, unregistered: Bool) -> bool:
+        """Register all well connected images at once (motion averaging).
 
-        It does where, without views that contradict others, the points explain as many of the
-        matches of all as make other runs needless.
+        The result is kept if, without images whose depth contradicts others, the points explain
+        ``enough_explained`` of the matches between the registered images.
+
+        Returns:
+            False if the initialization is rejected; the scene is then empty.
         """
         before = self.scene.snapshot()
-        with self._journal.timed("global start"):
-            placed = estimate_global_poses(self.scene, left)
-            if placed is None:
+        with self._event_log.timed("global start"):
+            poses = estimate_global_poses(self.scene, unregistered)
+            if poses is None:
                 return False
-            self._build(placed)
-        self.refiner.clean_matches = True
-        self.upkeep.refine_globally()
+            self._register_global_poses(poses)
+        self.refiner.adapts_reprojection_loss = True
+        self.maintenance.refine_globally()
         if self.refiner.focal_is_stable():
-            # the first time was around poses that a wrong focal length bent
-            self.upkeep.refine_globally()
-        limit = self._options.consistency.max_violations
-        self.upkeep.check_all(limit, "global-initialization")
-        if self._explained_share(placed.images) < self._options.enough_explained:
-            self.upkeep.empty(before)
+            # the first refinement started from poses that a wrong focal length had bent
+            self.maintenance.refine_globally()
+        max_violations = self._options.consistency.max_violations
+        self.maintenance.check_all_images(max_violations, "global-initialization")
+        if self._explained_ratio(poses.images) < self._options.enough_explained:
+            self.maintenance.clear(before)
             return False
         for image in map(int, self.scene.registered_images()):
-            self.upkeep.accept(image)
+            self.maintenance.confirm(image)
         return True
 
-    def _build(self, placed: GlobalPoses) -> None:
-        """Points and a first refinement of images that were placed at once."""
+    def _register_global_poses(self, poses: GlobalPoses) -> None:
+        """Register images with global poses, triangulate and refine once."""
         scene, options = self.scene, self._options
-        images = [int(image) for image in placed.images]
+        images = [int(image) for image in poses.images]
         for image, rotation, translation, scale in zip(
-            images, placed.rotations, placed.translations, placed.scales, strict=True
+            images, poses.rotations, poses.translations, poses.scales, strict=True
         ):
             scene.register(image, rotation, translation)
             scene.maps[image].set_scale(float(scale))
         for image in images:
             triangulate_image(scene, image, options.triangulation)
-        wide = options.refinement.first_reprojection_scale
-        self.refiner.adjust(images, reprojection_scale=wide)
+        loss_factor = options.refinement.first_reprojection_scale
+        self.refiner.adjust(images, reprojection_scale=loss_factor)
         filter_points(scene, options.triangulation)
 
-    def _explained_share(self, images: Int64) -> float:
-        """Of the matches between some images, by score, whose keypoints see the same point."""
+    def _explained_ratio(self, images: Int64) -> float:
+        """Return the share of the match scores between images that points explain."""
         graph = self.scene.graph
-        chosen = self.scene.mask(images)[graph.image_of]
-        between = chosen[graph.source] & chosen[graph.target]
-        same = between & self.scene.explained_edges()
-        return float(graph.score[same].sum() / max(graph.score[between].sum(), 1e-12))
+        is_chosen = self.scene.mask(images)[graph.image_of]
+        is_between = is_chosen[graph.source] & is_chosen[graph.target]
+        is_explained = is_between & self.scene.explained_edges()
+        return float(graph.score[is_explained].sum() / max(graph.score[is_between].sum(), 1e-12))
 
-    def start_from_pair(self, left: Bool) -> bool:
-        """Find the first pair among the images that are left and refine it."""
-        with self._journal.timed("initialization"):
-            pairs = self._starts.rank_pairs(self._search, left)
+    def initialize_from_pair(self, unregistered: Bool) -> bool:
+        """Initialize from the best pair of unregistered images; relax thresholds until one works.
+
+        Returns:
+            False if no pair works at the most relaxed thresholds.
+        """
+        with self._event_log.timed("initialization"):
+            pairs = self._pair_selector.rank_pairs(self._pose_estimator, unregistered)
         snapshot = self.scene.snapshot()
         while True:
             for pair in pairs:
-                with self._journal.timed("initialization"):
+                with self._event_log.timed("initialization"):
                     reason = self._try_pair(pair)
                 if reason is None:
-                    self.upkeep.thresholds.reset()
-                    self.upkeep.accept(pair.image_a)
-                    self.upkeep.accept(pair.image_b)
-                    self.upkeep.refine_globally()
+                    self.maintenance.thresholds.reset()
+                    self.maintenance.confirm(pair.image_a)
+                    self.maintenance.confirm(pair.image_b)
+                    self.maintenance.refine_globally()
                     return True
-                self._journal.pair_rejected(pair, reason)
+                self._event_log.pair_rejected(pair, reason)
                 self.scene.restore(snapshot)
-            if not pairs or not self.upkeep.thresholds.relax():
+            if not pairs or not self.maintenance.thresholds.relax():
                 return False
 
     def _try_pair(self, pair: VerifiedPair) -> Reason | None:
-        """InitialPair with a pair; None, or why it cannot be the first (remembered if that is final)."""
-        start = self._starts.estimate_pair(self._search, pair)
-        if isinstance(start, Reason):
-            return start
-        reason = self.upkeep.thresholds.check_support(start.pose)
+        """Register a pair; None on success, else the reason, which is recorded if it is final."""
+        initial_pair = self._pair_selector.estimate_pair(self._pose_estimator, pair)
+        if isinstance(initial_pair, Reason):
+            return initial_pair
+        reason = self.maintenance.thresholds.check_support(initial_pair.pose)
         if reason is None:
-            reason = self._grow_start(start)
+            reason = self._register_pair(initial_pair)
             if reason:
-                self._starts.reject_pair(pair, reason)
+                self._pair_selector.reject_pair(pair, reason)
         return reason
 
-    def _grow_start(self, start: InitialPair) -> Reason | None:
-        """Refine the first two images and their points; None, or why they are rejected."""
-        a, b = start.reference, start.image
+    def _register_pair(self, initial_pair: InitialPair) -> Reason | None:
+        """Register both images, triangulate, refine and check depth; None or why that fails."""
+        a, b = initial_pair.reference, initial_pair.image
         register_first_image(self.scene, a)
-        self.scene.register(b, start.pose.rotation, start.pose.translation)
+        self.scene.register(b, initial_pair.pose.rotation, initial_pair.pose.translation)
         triangulate_image(self.scene, b, self._options.triangulation)
         self.refiner.estimate_scale(b, [])
         self.refiner.adjust([a, b])
         filter_points(self.scene, self._options.triangulation)
-        if lost_images(self.scene):
+        if find_lost_images(self.scene):
             return ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()
         self.refiner.estimate_scale(a, [])
         self.refiner.estimate_scale(b, [])
         self.refiner.integrate([a, b])
         self.refiner.adjust([a, b])
         filter_points(self.scene, self._options.triangulation)
-        if lost_images(self.scene):
+        if find_lost_images(self.scene):
             return ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()
-        return self.upkeep.contradiction(b, self._options.consistency.max_violations_initial)
+        return self.maintenance.check_depth(b, self._options.consistency.max_violations_initial)
 
-    def grow(
-        self, available: Bool, paused: Callable[[], None] = nothing, *, wide: bool = False
+    def register_images(
+        self,
+        candidates: Bool,
+        save_checkpoint: Callable[[], None] = do_nothing,
+        *,
+        wide: bool = False,
     ) -> None:
-        """Register images until none of the available ones can be; ``paused`` after each.
+        """Register images until no candidate can be registered.
 
-        ``wide``: also beside those that they match best, before thresholds give way.
+        Args:
+            candidates: (n,) bool, images that may be registered.
+            save_checkpoint: Called after each registration.
+            wide: If an image fails with its usual references, also use the images that match it
+                best, before the thresholds relax.
         """
-        while self.growth.register_next_image(available, wide=wide):
-            self.upkeep.refresh()
-            paused()
+        while self.registration.register_next_image(candidates, wide=wide):
+            self.maintenance.refine_if_grown()
+            save_checkpoint()
 
-    def reseat(self, available: Bool) -> None:
-        """Take out images that matches hold weakly, and register them elsewhere.
+    def reregister_images(self, candidates: Bool) -> None:
+        """Deregister misregistered images and register them with other references.
 
-        That counts if no image is lost, more matches than before see common points, and no others
-        want them away; each such group of images is taken out once. Images that came with a pose
-        stay, unless that is a guess.
+        The change is kept if no image is lost, more matches are explained, and the images are no
+        longer misregistered. Each set of images is tried once. Images with a known pose stay,
+        unless that pose is only an initial guess.
+
+        Args:
+            candidates: (n,) bool, images that may be registered.
         """
         tried: set[tuple[int, ...]] = set()
-        holds = self._weak_holds()
-        while hold := next((h for h in holds if h.images not in tried), None):
-            tried.add(hold.images)
-            before, explained = self.upkeep.state(), self._num_explained()
-            self._take_out(hold)
-            self.grow(available, wide=True)
-            if not self._lost_since(before):
-                self.upkeep.refine_globally()
-            lost = self._lost_since(before)
-            if not lost and self._num_explained() > explained:
-                left = self._weak_holds()
-                if all(other.images != hold.images for other in left):
-                    holds = left
+        detections = self._detect_misregistrations()
+        while detection := next((d for d in detections if d.images not in tried), None):
+            tried.add(detection.images)
+            before, num_explained = self.maintenance.state(), self._count_explained_matches()
+            self._deregister_misregistered(detection)
+            self.register_images(candidates, wide=True)
+            if not self._find_deregistered(before):
+                self.maintenance.refine_globally()
+            lost = self._find_deregistered(before)
+            if not lost and self._count_explained_matches() > num_explained:
+                remaining = self._detect_misregistrations()
+                if all(other.images != detection.images for other in remaining):
+                    detections = remaining
                     continue
-            self.upkeep.restore(before)
+            self.maintenance.restore(before)
             for image in lost:
-                self._journal.registered(image, self.size)
-            self._journal.scene_changed(self.scene)
+                self._event_log.registered(image, self.size)
+            self._event_log.scene_changed(self.scene)
 
-    def _lost_since(self, before: State) -> list[int]:
-        """Images that were registered then and are not now."""
+    def _find_deregistered(self, before: ModelState) -> list[int]:
+        """Return the images that were registered in an earlier state and are not now."""
         return [int(i) for i in np.flatnonzero(before.scene.registered & ~self.scene.registered)]
 
-    def _take_out(self, hold: Misregistration) -> None:
-        """Take weakly held images out, not to be posed again beside those that hold them."""
-        upkeep = self.upkeep
-        reason = ImageReason.MISREGISTERED.because(num_matches=int(hold.margin))
-        upkeep.drop(list(hold.images), reason)
+    def _deregister_misregistered(self, detection: Misregistration) -> None:
+        """Deregister images and exclude the references that supported their wrong poses."""
+        maintenance = self.maintenance
+        reason = ImageReason.MISREGISTERED.because(num_matches=int(detection.margin))
+        maintenance.deregister(list(detection.images), reason)
         reason = ImageReason.LOST_POINTS.because(step="re-registration")
-        upkeep.drop(lost_images(self.scene), reason)
-        upkeep.history.clear()
-        upkeep.history.excluded_references[hold.links[:, 0], hold.links[:, 1]] = True
+        maintenance.deregister(find_lost_images(self.scene), reason)
+        maintenance.history.clear()
+        image, reference = detection.supporting_pairs.T
+        maintenance.history.excluded_references[image, reference] = True
 
-    def _weak_holds(self) -> list[Misregistration]:
-        """Weakly held images that may be taken out."""
-        guess = self._options.known_poses == "guess"
-        stays = np.array([image.known_pose is not None for image in self.upkeep.problem.images])
-        holds = detect_misregistrations(self.scene, self._options.registration.min_inliers)
-        return [hold for hold in holds if guess or not stays[list(hold.images)].any()]
+    def _detect_misregistrations(self) -> list[Misregistration]:
+        """Detect misregistered images that may be moved."""
+        is_guess = self._options.known_poses == "guess"
+        has_pose = np.array(
+            [image.known_pose is not None for image in self.maintenance.problem.images]
+        )
+        detections = detect_misregistrations(self.scene, self._options.registration.min_inliers)
+        return [d for d in detections if is_guess or not has_pose[list(d.images)].any()]
 
-    def _num_explained(self) -> int:
-        """Matches of which both keypoints see the same point."""
+    def _count_explained_matches(self) -> int:
+        """Count the matches whose keypoints observe the same point."""
         return int(np.count_nonzero(self.scene.explained_edges()))
 
-    def finish(self) -> None:
-        """Last refinements, and the depth check once more for every image."""
-        if self.upkeep.all_checked:
+    def finalize(self) -> None:
+        """Refine globally, check the depth of every image again, and refine as the options say."""
+        if self.maintenance.is_checked:
             return
-        self.upkeep.refine_globally()
+        self.maintenance.refine_globally()
         consistency = self._options.consistency
         if consistency.enabled and consistency.check_at_end:
-            self.upkeep.check_all(consistency.max_violations_final, "final-check")
+            self.maintenance.check_all_images(consistency.max_violations_final, "final-check")
         if self._options.refinement.final_robust:
-            self.upkeep.refine_globally(final=True)
+            self.maintenance.refine_globally(final=True)

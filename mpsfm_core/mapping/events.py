@@ -1,4 +1,4 @@
-"""What the mapper tells the outside while it works."""
+"""Interface for progress events of the mapper."""
 
 from __future__ import annotations
 
@@ -10,23 +10,26 @@ from mpsfm_core.data.decisions import Reason
 
 
 class MappingEvents(Protocol):
-    """Receives progress; the pipeline forwards it to plugins and progress bars."""
+    """Receiver of progress events; the pipeline forwards them to plugins and progress bars."""
 
-    def image_registered(self, name: str, registered: int, total: int) -> None: ...
+    def image_registered(self, name: str, registered: int, total: int) -> None:
+        """Handle the registration of an image, the ``registered``-th of its component."""
 
-    def image_rejected(self, name: str, reason: Reason) -> None: ...
+    def image_rejected(self, name: str, reason: Reason) -> None:
+        """Handle a failed registration, or the deregistration of an image."""
 
-    def scene_changed(self, scene: Callable[[], SceneState]) -> None: ...
+    def scene_changed(self, scene: Callable[[], SceneState]) -> None:
+        """Handle a change of poses or points; calling ``scene`` copies the current state."""
 
 
 class NullMappingEvents:
-    """Nobody listens."""
+    """Receiver that ignores all events."""
 
     def image_registered(self, name: str, registered: int, total: int) -> None:
-        """Nothing."""
+        """Ignore the event."""
 
     def image_rejected(self, name: str, reason: Reason) -> None:
-        """Nothing."""
+        """Ignore the event."""
 
     def scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """Nothing."""
+        """Ignore the event."""

@@ -1,202 +1,275 @@
-"""A reconstruction of all images: group after group, each from its own start; in several runs where
-random choices decide."""
+"""Incremental mapper with depth and normal priors: poses, points and refined depth of all images.
+
+Usage::
+
+    result = reconstruct(problem, MapperOptions())
+    for model in result.reconstructions:  # components, the largest first
+        print(len(model.images), len(model.points))
+
+What :func:`reconstruct` does, compared with COLMAP's ``IncrementalMapper``::
+
+    for each seed:
+        while images are unregistered:
+            component = new component
+            component.initialize_from_known_poses()     # poses that came with the images, or
+            component.initialize_globally()             # all well connected images at once, or
+            component.initialize_from_pair()            # one pair, best first
+            while an image registers:                   # component.register_images()
+                select the next image, estimate its pose, verify it by depth, triangulate
+                refine locally; refine globally if the model has grown
+            component.reregister_images()               # misregistered images, elsewhere
+            component.finalize()                        # global refinement, depth check of all
+        stop if enough matches are explained
+    select the run that explains the most matches
+    register the remaining images tentatively           # if the options ask for it
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 
 from mpsfm_core.data import Bool, MappingProblem
 from mpsfm_core.data.decisions import ImageReason, Reason
-from mpsfm_core.mapping.checkpoints import Checkpoints, Keeper
-from mpsfm_core.mapping.component import Group, nothing
-from mpsfm_core.mapping.event_log import Journal
+from mpsfm_core.mapping.checkpoints import Checkpointer, CheckpointStore, MapperProgress
+from mpsfm_core.mapping.component import Component, do_nothing
+from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.events import MappingEvents, NullMappingEvents
 from mpsfm_core.mapping.initialization.initial_pair import InitialPairSelector
-from mpsfm_core.mapping.model_selection import Run, best, explained_shares, settled, with_all_times
+from mpsfm_core.mapping.model_selection import (
+    MapperRun,
+    compute_explained_ratios,
+    is_settled,
+    select_run,
+    sum_run_times,
+)
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.registration.tentative_registration import register_tentatively
-from mpsfm_core.mapping.scene.conversion import finished
+from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.mapping.state import canonical
 
-CONTENDER_SHARE = 0.25
-"""Of the number of images of the largest group, with which another contends for them (ours)."""
+MIN_ABSORBING_RATIO = 0.25
+"""Size relative to the largest component from which a component may absorb images of it. [ours]"""
 
 
 def reconstruct(
     problem: MappingProblem,
     options: MapperOptions | None = None,
     events: MappingEvents | None = None,
-    checkpoints: Checkpoints | None = None,
+    checkpoints: CheckpointStore | None = None,
 ) -> MappingResult:
-    """Pose as many images as can be posed confidently, with points and refined depth.
+    """Reconstruct poses, points and refined depth of all images that can be verified.
 
-    Disconnected groups of images become reconstructions of their own, the largest first. Where
-    much of the matches stays unexplained, other random choices may come to more: then there are
-    several runs, and that counts which explains most, or one that came out twice if it explains as
-    much. The result is the same bit for bit for the same problem, options and machine, also where a
-    run that ended early goes on from one of its ``checkpoints``.
+    If many matches remain unexplained, the mapper runs again with other seeds and the run that
+    explains most of them is kept. The same problem, options and machine give the same bits, also
+    if an interrupted run continues from a checkpoint.
+
+    Args:
+        problem: Images with priors, and verified matches.
+        options: Options of the mapper.
+        events: Receiver of progress events.
+        checkpoints: Storage of checkpoints.
+
+    Returns:
+        Connected components, the largest first, and the report.
     """
     options, events = options or MapperOptions(), events or NullMappingEvents()
     problem = canonical(problem)
-    keeper = Keeper(checkpoints, problem, events)
-    runs, unfinished = keeper.load()
-    finished_before = bool(runs) and unfinished is None
-    weighed = None
-    for number in range(len(runs), 0 if finished_before else options.max_runs):
-        own = options.model_copy(update={"seed": options.seed + number})
-        mapper = unfinished or Mapper(problem, own, events, weighed)
-        runs.append(mapper.run(partial(keeper.save, runs, mapper)))
-        weighed = mapper.weighed
-        unfinished = None
-        if mapper.keeps_poses or settled(runs, options.enough_explained):
+    checkpointer = Checkpointer(checkpoints, problem, events)
+    runs, interrupted = checkpointer.load()
+    is_complete = bool(runs) and interrupted is None
+    reweighted_problem = None
+    for number in range(len(runs), 0 if is_complete else options.max_runs):
+        if interrupted is None:
+            run_options = options.model_copy(update={"seed": options.seed + number})
+            mapper = Mapper(problem, run_options, events, reweighted_problem)
+        else:
+            assert isinstance(interrupted, Mapper)
+            mapper, interrupted = interrupted, None
+
+        def save_checkpoint(mapper: Mapper = mapper) -> None:
+            checkpointer.save_if_due(MapperProgress(runs, mapper), mapper.component.size)
+
+        runs.append(mapper.run(save_checkpoint))
+        reweighted_problem = mapper.reweighted_problem
+        if mapper.is_deterministic or is_settled(runs, options.enough_explained):
             break
-    keeper.finish(runs)
-    chosen = best(runs, options.consistency)
-    models = list(chosen.models)
+    checkpointer.save_completed(runs)
+    selected = select_run(runs, options.consistency)
+    models = list(selected.models)
     if models and options.register_tentatively:
         models[0] = register_tentatively(models[0], models[1:], problem, options)
-    return MappingResult(tuple(models), with_all_times(chosen.report, runs))
+    return MappingResult(tuple(models), sum_run_times(selected.report, runs))
 
 
 class Mapper:
-    """One run. ``models`` are the groups, ``left`` the images in none, ``group`` the last one.
-    ``weighed``: the problem with its pairs as far as depth allows them, once that was asked.
+    """One run of the mapper with one seed.
 
-    All that decides how a run goes on is in its attributes: between two images it can be kept and
-    taken up again.
+    Its attributes hold all that decides how the run continues, so that a checkpoint between two
+    registrations restores it.
+
+    Attributes:
+        component: The current component.
+        models: The completed components.
+        unregistered: (n,) bool, images that are in no completed component.
+        reweighted_problem: The problem with pairs reweighted by depth, once that was needed.
     """
 
-    group: Group
-    group_type: type[Group] = Group
+    component: Component
+    component_type: type[Component] = Component
 
     def __init__(
         self,
         problem: MappingProblem,
         options: MapperOptions,
         events: MappingEvents,
-        weighed: MappingProblem | None = None,
+        reweighted_problem: MappingProblem | None = None,
     ) -> None:
         self.problem = problem
-        self.weighed = weighed
+        self.reweighted_problem = reweighted_problem
         self.options = options
-        self.journal = Journal(problem, events)
+        self.event_log = EventLog(problem, events)
         self.models: list[Reconstruction] = []
-        self.left: Bool = np.ones(len(problem.images), dtype=np.bool_)
-        self._starts = InitialPairSelector(options)
-        self._tried = 0
-        self._growing = False
-        self._poses_hold = sum(image.known_pose is not None for image in problem.images) >= 2
+        self.unregistered: Bool = np.ones(len(problem.images), dtype=np.bool_)
+        self._pair_selector = InitialPairSelector(options)
+        self._num_components = 0
+        self._is_growing = False
+        self._uses_known_poses = sum(image.known_pose is not None for image in problem.images) >= 2
 
     @property
-    def keeps_poses(self) -> bool:
-        """Whether known poses stay as they are, so that nothing is left to chance."""
-        return self._poses_hold and self.options.known_poses == "fixed"
+    def is_deterministic(self) -> bool:
+        """Whether known poses stay fixed, so that another seed changes nothing."""
+        return self._uses_known_poses and self.options.known_poses == "fixed"
 
-    def run(self, paused: Callable[[], None] = nothing) -> Run:
-        """Reconstruct all groups; ``paused`` is called where the run could be taken up again."""
-        models = sorted(self.components(paused), key=lambda model: -len(model.images))
-        return Run(models, explained_shares(models, self.problem), self.journal.report(models))
+    def run(self, save_checkpoint: Callable[[], None] = do_nothing) -> MapperRun:
+        """Reconstruct all components.
 
-    def components(self, paused: Callable[[], None] = nothing) -> list[Reconstruction]:
-        """Reconstruct one group of images after the other."""
-        most = self.options.max_components
-        while self._tried < most:
-            if not self.reconstruct_next(paused):
+        Args:
+            save_checkpoint: Called whenever the run could continue from a checkpoint.
+        """
+        components = self.reconstruct_components(save_checkpoint)
+        models = sorted(components, key=lambda model: -len(model.images))
+        explained_ratios = compute_explained_ratios(models, self.problem)
+        return MapperRun(models, explained_ratios, self.event_log.report(models))
+
+    def reconstruct_components(
+        self, save_checkpoint: Callable[[], None] = do_nothing
+    ) -> list[Reconstruction]:
+        """Reconstruct components until no image remains or none can be initialized."""
+        max_components = self.options.max_components
+        while self._num_components < max_components:
+            if not self.reconstruct_component(save_checkpoint):
                 return self.models
-            self._tried += 1
-        self._reject(self.left, ImageReason.COMPONENT_LIMIT.because(max_components=most))
+            self._num_components += 1
+        reason = ImageReason.COMPONENT_LIMIT.because(max_components=max_components)
+        self._reject(self.unregistered, reason)
         return self.models
 
-    def reconstruct_next(self, paused: Callable[[], None] = nothing) -> bool:
-        """Reconstruct a group among the images that are left, or go on with the one that grows;
-        False when there is none."""
-        if not self._growing:
-            if np.count_nonzero(self.left) < 2:
-                return False
-            self.group = self._new_group()
-            if not self._start_from_known_poses() and not self._start():
-                return False
-            self._growing = True
-        paused()
-        known = self._poses_hold
-        fixed = known and self.options.known_poses == "fixed"
-        if not fixed:
-            self.group.grow(self.left, paused)
-            self.group.reseat(self.left)
-        self._growing = False
-        if known or not self._outgrow():
-            self.group.finish()
-        self._keep(in_users_world=known and self.options.known_poses != "guess")
-        if fixed:
-            self._reject(self.left, ImageReason.NO_KNOWN_POSE.because())
-        return not fixed
+    def reconstruct_component(self, save_checkpoint: Callable[[], None] = do_nothing) -> bool:
+        """Reconstruct the next component, or continue an interrupted one.
 
-    def _new_group(self) -> Group:
-        problem = self.weighed or self.problem
-        return self.group_type(problem, self.options, self._starts, self.journal)
-
-    def _start(self) -> bool:
-        """Start from all images at once, or else from a pair; if not all pairs go together, with
-        those alone that depth allows."""
-        if self._start_from_all():
-            return True
-        if self.weighed is None and self.options.checks_pairs:
-            with self.journal.timed("pair check"):
-                self.weighed = self.group.weighed_problem(self.left)
-            self.group = self._new_group()
-            if self._start_from_all():
-                return True
-        return self.group.start_from_pair(self.left)
-
-    def _start_from_all(self) -> bool:
-        at_once = self.options.initialization.global_initialization
-        return at_once and self.group.start_from_all(self.left)
-
-    def _start_from_known_poses(self) -> bool:
-        if self._poses_hold and not self.group.start_from_known_poses(self.left):
-            self._poses_hold = False
-            self.group = self._new_group()
-        return self._poses_hold
-
-    def _outgrow(self) -> bool:
-        """Take images of earlier groups, if this ends as the largest; those are dissolved then.
-
-        A bad start holds few images, and would keep them from a good one that comes after it.
-        Images that came with a pose stay where they are. Whether it came so; it is finished then.
+        Returns:
+            False if no further component is possible.
         """
-        group = self.group
-        largest = max((len(model.images) for model in self.models), default=0)
-        if not largest or group.size < CONTENDER_SHARE * largest:
+        if not self._is_growing:
+            if np.count_nonzero(self.unregistered) < 2:
+                return False
+            self.component = self._create_component()
+            if not self._initialize_from_known_poses() and not self._initialize():
+                return False
+            self._is_growing = True
+        save_checkpoint()
+        if not self.is_deterministic:
+            self.component.register_images(self.unregistered, save_checkpoint)
+            self.component.reregister_images(self.unregistered)
+        self._is_growing = False
+        if self._uses_known_poses or not self._absorb_components():
+            self.component.finalize()
+        self._store_component()
+        if self.is_deterministic:
+            self._reject(self.unregistered, ImageReason.NO_KNOWN_POSE.because())
+        return not self.is_deterministic
+
+    def _create_component(self) -> Component:
+        problem = self.reweighted_problem or self.problem
+        return self.component_type(problem, self.options, self._pair_selector, self.event_log)
+
+    def _initialize(self) -> bool:
+        """Initialize the component globally, or else from a pair.
+
+        If the first global initialization fails, a second one uses pairs reweighted by depth.
+        """
+        if self._initialize_globally():
+            return True
+        if self.reweighted_problem is None and self.options.checks_pairs:
+            with self.event_log.timed("pair check"):
+                self.reweighted_problem = self.component.reweight_pairs(self.unregistered)
+            self.component = self._create_component()
+            if self._initialize_globally():
+                return True
+        return self.component.initialize_from_pair(self.unregistered)
+
+    def _initialize_globally(self) -> bool:
+        is_enabled = self.options.initialization.global_initialization
+        return is_enabled and self.component.initialize_globally(self.unregistered)
+
+    def _initialize_from_known_poses(self) -> bool:
+        if self._uses_known_poses and not self.component.initialize_from_known_poses(
+            self.unregistered
+        ):
+            self._uses_known_poses = False
+            self.component = self._create_component()
+        return self._uses_known_poses
+
+    def _absorb_components(self) -> bool:
+        """Register images of completed components too, if that makes this one the largest.
+
+        A bad initialization leads to a small component, whose images a later, better component
+        needs. Completed components that lose an image are dissolved, and their images become
+        unregistered. Images with a known pose are not absorbed.
+
+        Returns:
+            Whether components were absorbed; the component is then finalized.
+        """
+        component = self.component
+        max_size = max((len(model.images) for model in self.models), default=0)
+        if not max_size or component.size < MIN_ABSORBING_RATIO * max_size:
             return False
-        before = group.upkeep.state()
-        group.upkeep.history.clear()
-        group.grow(np.array([image.known_pose is None for image in self.problem.images]))
-        if group.size > largest:
-            group.finish()
-        if group.size <= largest:
-            group.upkeep.restore(before)
+        before = component.maintenance.state()
+        component.maintenance.history.clear()
+        component.register_images(
+            np.array([image.known_pose is None for image in self.problem.images])
+        )
+        if component.size > max_size:
+            component.finalize()
+        if component.size <= max_size:
+            component.maintenance.restore(before)
             return False
         for model in list(self.models):
             images = [image.index for image in model.images]
-            if group.scene.registered[images].any():
+            if component.scene.registered[images].any():
                 self.models.remove(model)
-                self.left[images] = True
+                self.unregistered[images] = True
         return True
 
-    def _keep(self, *, in_users_world: bool) -> None:
-        """Keep the group if it is large enough; its images are no longer left."""
-        scene, size, least = self.group.scene, self.group.size, self.options.min_model_size
-        self.left &= ~scene.registered
-        if size >= least:
-            self.models.append(finished(scene, keep_units=in_users_world))
+    def _store_component(self) -> None:
+        """Convert the component to a reconstruction, or reject its images if it is too small."""
+        scene, size, min_size = (
+            self.component.scene,
+            self.component.size,
+            self.options.min_model_size,
+        )
+        self.unregistered &= ~scene.registered
+        if size >= min_size:
+            # known poses define the world and its unit, unless they are only an initial guess
+            keep_units = self._uses_known_poses and self.options.known_poses != "guess"
+            self.models.append(convert_scene(scene, keep_units=keep_units))
         else:
-            reason = ImageReason.COMPONENT_TOO_SMALL.because(num_images=size, min_images=least)
+            reason = ImageReason.COMPONENT_TOO_SMALL.because(num_images=size, min_images=min_size)
             self._reject(scene.registered, reason)
 
     def _reject(self, images: Bool, reason: Reason) -> None:
         for image in np.flatnonzero(images):
-            self.journal.rejected(int(image), reason)
+            self.event_log.rejected(int(image), reason)

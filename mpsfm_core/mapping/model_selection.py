@@ -1,7 +1,7 @@
-"""Runs of the mapper with different random choices: which counts, and when no more are needed.
+"""Selection among mapper runs with different seeds.
 
-They are compared by how many of the matches they explain, and where that is much the same by how
-much of what images see lies in others at the same depth.
+The run whose largest component explains the most match scores wins. A match is explained if both
+of its keypoints observe the same point. Among equal runs, depth agreement decides.
 """
 
 from __future__ import annotations
@@ -16,53 +16,67 @@ from mpsfm_core.mapping.consistency.depth_agreement import measure_depth_agreeme
 from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
 
-AGREEMENT = 0.01
-"""Of all matches; two runs that differ by less in what they explain came to the same (ours)."""
+MAX_RATIO_DIFFERENCE = 0.01
+"""Difference of the explained match ratios below which two runs are equal. [ours]"""
 
 
-class Run(NamedTuple):
-    """``models``: the groups of one run, the largest first. ``explained``: by each, of the summed
-    scores of all matches."""
+class MapperRun(NamedTuple):
+    """Result of the mapper with one seed."""
 
     models: Sequence[Reconstruction]
-    explained: Sequence[float]
+    """Components, the largest first."""
+    explained_ratios: Sequence[float]
+    """Share of the summed match scores that each component explains."""
     report: MappingReport
 
     @property
-    def of_largest(self) -> float:
-        """Share of the matches that the largest group explains."""
-        return self.explained[0] if self.explained else 0.0
+    def largest_explained_ratio(self) -> float:
+        """Share of the match scores that the largest component explains."""
+        return self.explained_ratios[0] if self.explained_ratios else 0.0
 
     @property
     def size(self) -> int:
-        """Number of images of the largest group."""
+        """Number of images of the largest component."""
         return len(self.models[0].images) if self.models else 0
 
 
-def settled(runs: Sequence[Run], enough: float) -> bool:
-    """Whether the last run explains enough, or came to the same as one before it."""
-    *before, last = runs
-    return sum(last.explained) >= enough or any(_agree(run, last) for run in before)
+def is_settled(runs: Sequence[MapperRun], min_explained_ratio: float) -> bool:
+    """Return whether the last run explains enough matches, or equals an earlier run."""
+    *earlier, last = runs
+    is_explained = sum(last.explained_ratios) >= min_explained_ratio
+    return is_explained or any(_are_equal(run, last) for run in earlier)
 
 
-def best(runs: Sequence[Run], options: ConsistencyOptions) -> Run:
-    """The run whose largest group explains most; of those that explain about as much, one to which
-    most others came too, and of these the one in which most depth agrees."""
-    most = max(run.of_largest for run in runs)
-    equal = [run for run in runs if most - run.of_largest < AGREEMENT]
-    times = [sum(_agree(run, other) for other in runs) for run in equal]
-    often = [run for run, count in zip(equal, times, strict=True) if count == max(times)]
-    if len(often) == 1 or not most:
-        return often[0]
-    return max(often, key=lambda run: (measure_depth_agreement(run.models[0], options), run.of_largest))
+def select_run(runs: Sequence[MapperRun], options: ConsistencyOptions) -> MapperRun:
+    """Select the run whose largest component explains the most matches.
+
+    Among runs that explain equally many, the result that most runs share wins; among several of
+    these, the one with the best depth agreement.
+    """
+    max_ratio = max(run.largest_explained_ratio for run in runs)
+    candidates = [
+        run for run in runs if max_ratio - run.largest_explained_ratio < MAX_RATIO_DIFFERENCE
+    ]
+    counts = [sum(_are_equal(run, other) for other in runs) for run in candidates]
+    frequent = [run for run, count in zip(candidates, counts, strict=True) if count == max(counts)]
+    if len(frequent) == 1 or not max_ratio:
+        return frequent[0]
+    return max(
+        frequent,
+        key=lambda run: (
+            measure_depth_agreement(run.models[0], options),
+            run.largest_explained_ratio,
+        ),
+    )
 
 
-def _agree(one: Run, other: Run) -> bool:
-    return one.size == other.size and abs(one.of_largest - other.of_largest) < AGREEMENT
+def _are_equal(a: MapperRun, b: MapperRun) -> bool:
+    difference = abs(a.largest_explained_ratio - b.largest_explained_ratio)
+    return a.size == b.size and difference < MAX_RATIO_DIFFERENCE
 
 
-def with_all_times(report: MappingReport, runs: Sequence[Run]) -> MappingReport:
-    """The report with the time that all runs took."""
+def sum_run_times(report: MappingReport, runs: Sequence[MapperRun]) -> MappingReport:
+    """Return the report of one run with the step times of all runs."""
     seconds: Counter[str] = Counter()
     counts: Counter[str] = Counter()
     for run in runs:
@@ -71,24 +85,27 @@ def with_all_times(report: MappingReport, runs: Sequence[Run]) -> MappingReport:
     return replace(report, seconds=dict(seconds), counts=dict(counts), runs=len(runs))
 
 
-def explained_shares(models: Sequence[Reconstruction], problem: MappingProblem) -> list[float]:
-    """What each model explains of the summed scores of all matches."""
-    total = total_score(problem) or 1.0
-    return [explained_score(model, problem) / total for model in models]
+def compute_explained_ratios(
+    models: Sequence[Reconstruction], problem: MappingProblem
+) -> list[float]:
+    """Compute the share of the summed scores of all matches that each model explains."""
+    total = compute_total_score(problem) or 1.0
+    return [compute_explained_score(model, problem) / total for model in models]
 
 
-def explained_score(model: Reconstruction, problem: MappingProblem) -> float:
-    """Summed scores of the matches of which both keypoints see the same point of a model."""
-    points = {image.index: image.point_ids for image in model.images}
+def compute_explained_score(model: Reconstruction, problem: MappingProblem) -> float:
+    """Sum the scores of the matches whose keypoints observe the same point of a model."""
+    point_ids = {image.index: image.point_ids for image in model.images}
     total = 0.0
     for pair in problem.pairs:
-        if pair.image_a in points and pair.image_b in points:
-            seen_a = points[pair.image_a][pair.matches[:, 0]]
-            seen_b = points[pair.image_b][pair.matches[:, 1]]
-            total += float(pair.scores[(seen_a >= 0) & (seen_a == seen_b)].sum(dtype=float))
+        if pair.image_a in point_ids and pair.image_b in point_ids:
+            points_a = point_ids[pair.image_a][pair.matches[:, 0]]
+            points_b = point_ids[pair.image_b][pair.matches[:, 1]]
+            is_explained = (points_a >= 0) & (points_a == points_b)
+            total += float(pair.scores[is_explained].sum(dtype=float))
     return total
 
 
-def total_score(problem: MappingProblem) -> float:
-    """Summed scores of all matches."""
+def compute_total_score(problem: MappingProblem) -> float:
+    """Sum the scores of all matches."""
     return sum(float(pair.scores.sum(dtype=float)) for pair in problem.pairs)

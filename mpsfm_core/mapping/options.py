@@ -158,7 +158,7 @@ class ConsistencyOptions(Options):
     enabled: bool = True
     weigh_evidence: bool = True
     """Take a prior's noise at a place from the points around that rays alone hold
-    (:func:`~mpsfm_core.mapping.refinement.depth_noise.local_noise`); off: from the whole scene."""
+    (:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_local_depth_noise`); off: from the whole scene."""
     check_pairs: bool = True
     """Where not all images go together at once, hold pairs against depth before they count
     (:mod:`~mpsfm_core.mapping.consistency.pair_consistency`)."""

@@ -22,7 +22,7 @@ from pydantic import BaseModel
 
 from mpsfm_core.data.errors import DataError
 
-Frozen: TypeAlias = Mapping[str, NDArray[Any]]
+CheckpointArrays: TypeAlias = Mapping[str, NDArray[Any]]
 """The arrays of a state by name; ``tree`` says how they belong together."""
 
 T = TypeVar("T")
@@ -40,7 +40,7 @@ _MAPS: dict[str, type[dict[Any, Any]]] = {
 _GENERATORS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 
 
-def freeze(state: object, shared: object = None) -> Frozen:
+def freeze(state: object, shared: object = None) -> CheckpointArrays:
     """Take an object apart.
 
     ``shared``: what the reader has as well, as the problem; objects and arrays of it are not kept
@@ -52,7 +52,7 @@ def freeze(state: object, shared: object = None) -> Frozen:
     return {_TREE: np.frombuffer(text.encode(), dtype=np.uint8), **writer.arrays}
 
 
-def thaw(frozen: Frozen, shared: object = None) -> Any:
+def thaw(frozen: CheckpointArrays, shared: object = None) -> Any:
     """The object that :func:`freeze` took apart, beside an equal ``shared``.
 
     Raises :class:`DataError` when that is no such state or one of another format.
@@ -160,7 +160,7 @@ class _Writer:
 
 
 class _Reader:
-    def __init__(self, frozen: Frozen, shared: object) -> None:
+    def __init__(self, frozen: CheckpointArrays, shared: object) -> None:
         self._arrays = frozen
         self._shared = list(_parts(shared))
         self._met: dict[int, Any] = {}

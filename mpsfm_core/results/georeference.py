@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data.decisions import GpsReason, Reason
 from mpsfm_core.data import Float64, Pose
+from mpsfm_core.data.decisions import GpsReason, Reason
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.inputs.gps import GpsPosition, convert_to_enu
 from mpsfm_core.mapping.scene.reconstruction import (

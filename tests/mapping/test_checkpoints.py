@@ -14,7 +14,7 @@ from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper, reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult
-from mpsfm_core.mapping.state import Frozen, canonical, fingerprint, freeze, thaw
+from mpsfm_core.mapping.state import CheckpointArrays, canonical, fingerprint, freeze, thaw
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -28,11 +28,11 @@ class Killed(Exception):
 class Memory:
     """Keeps every state and ends the mapper after the ``last``."""
 
-    def __init__(self, states: list[Frozen], last: int) -> None:
+    def __init__(self, states: list[CheckpointArrays], last: int) -> None:
         self.states, self.reasons = states, []
         self._last = last
 
-    def load(self) -> Frozen | None:
+    def load(self) -> CheckpointArrays | None:
         return self.states[-1] if self.states else None
 
     def unreadable(self, reason: str) -> None:
@@ -41,27 +41,27 @@ class Memory:
     def due(self) -> bool:
         return True
 
-    def save(self, state: Frozen, registered: int) -> None:
+    def save(self, state: CheckpointArrays, registered: int) -> None:
         self.states.append({name: array.copy() for name, array in state.items()})
         if len(self.states) == self._last:
             raise Killed
 
 
-def same(a: Frozen, b: Frozen) -> bool:
+def same(a: CheckpointArrays, b: CheckpointArrays) -> bool:
     return a.keys() == b.keys() and all(
         a[name].dtype == b[name].dtype and a[name].tobytes() == b[name].tobytes() for name in a
     )
 
 
-def content(result: MappingResult, problem: MappingProblem) -> Frozen:
+def content(result: MappingResult, problem: MappingProblem) -> CheckpointArrays:
     """All of a result but the seconds that it took."""
     report = replace(result.report, seconds={})
     return freeze(replace(result, report=report), problem)
 
 
-def thawed_poses(state: Frozen, problem: MappingProblem) -> Frozen:
+def thawed_poses(state: CheckpointArrays, problem: MappingProblem) -> CheckpointArrays:
     _, mapper = thaw(state, (problem, NullMappingEvents()))
-    return freeze(mapper.group.scene.snapshot())
+    return freeze(mapper.component.scene.snapshot())
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ OPTIONS = MapperOptions(max_runs=2, enough_explained=1.0)
 
 
 @pytest.fixture(scope="module")
-def undisturbed(problem: MappingProblem) -> tuple[MappingResult, list[Frozen]]:
+def undisturbed(problem: MappingProblem) -> tuple[MappingResult, list[CheckpointArrays]]:
     memory = Memory([], -1)
     return reconstruct(problem, OPTIONS, checkpoints=memory), memory.states
 
@@ -104,7 +104,7 @@ def test_a_resumed_run_ends_the_same_bit_for_bit(problem: MappingProblem, undist
 
 def test_killed_after_each_state(problem: MappingProblem, undisturbed) -> None:
     result, states = undisturbed
-    kept: list[Frozen] = []
+    kept: list[CheckpointArrays] = []
     for last in range(1, len(states) + 1):
         with pytest.raises(Killed):
             reconstruct(problem, OPTIONS, checkpoints=Memory(kept, last))
@@ -150,9 +150,9 @@ def test_no_other_classes_come_out_of_a_state(path: str) -> None:
 
 def test_what_cannot_be_kept_is_named_with_its_place(problem: MappingProblem) -> None:
     mapper = Mapper(problem, OPTIONS, NullMappingEvents())
-    mapper.journal._seconds["lock"] = threading.Lock()
-    with pytest.raises(TypeError, match=r"state\.journal\._seconds\['lock'\]: a _thread\.lock"):
-        freeze(mapper, (problem, mapper.journal._events))
+    mapper.event_log._seconds["lock"] = threading.Lock()
+    with pytest.raises(TypeError, match=r"state\.event_log\._seconds\['lock'\]: a _thread\.lock"):
+        freeze(mapper, (problem, mapper.event_log._events))
 
 
 def moved(array: np.ndarray) -> np.ndarray:

@@ -71,7 +71,7 @@ HERE = np.eye(3, 4)
 
 
 def between(scene: Scene, a: int, b: int, **settings: float) -> float:
-    return DepthConsistencyCheck(scene, OPTIONS).violation_ratio(a, b, **settings)
+    return DepthConsistencyCheck(scene, OPTIONS).measure_violation_ratio(a, b, **settings)
 
 
 def test_a_surface_in_seen_empty_space_is_a_violation_and_one_behind_is_not() -> None:
@@ -83,8 +83,8 @@ def test_a_surface_in_seen_empty_space_is_a_violation_and_one_behind_is_not() ->
     assert between(scene, 0, 1) == pytest.approx(box)
     assert between(scene, 1, 0) == pytest.approx(box)
     check = DepthConsistencyCheck(scene, OPTIONS).check_image(0)
-    assert check.other == 1
-    assert check.share == pytest.approx(box)
+    assert check.other_image == 1
+    assert check.ratio == pytest.approx(box)
 
 
 def test_what_a_far_view_sees_in_few_pixels_counts_as_few() -> None:
@@ -93,8 +93,8 @@ def test_what_a_far_view_sees_in_few_pixels_counts_as_few() -> None:
     behind[2, 3] = 10.0
     scene = posed_scene([wall(1.0), wall(20.0)], [HERE, behind], SMALL)
     check = DepthConsistencyCheck(scene, OPTIONS)
-    assert check.violation_ratio(0, 1) == 1
-    assert check.violation_ratio(0, 1, once=True) == pytest.approx(1 / 11**2)
+    assert check.measure_violation_ratio(0, 1) == 1
+    assert check.measure_violation_ratio(0, 1, by_target_area=True) == pytest.approx(1 / 11**2)
     assert not check.find_conflicting_images([0, 1], OPTIONS.max_violations)
 
 
@@ -105,7 +105,7 @@ def test_an_occluded_surface_is_no_violation() -> None:
     grid = CAMERA.resized(160, 120)
     maps = [rooms.render(grid, pose).depth for pose in poses[:7]]
     scene = posed_scene(maps, poses[:7], CAMERA)
-    assert max(DepthConsistencyCheck(scene, OPTIONS).check_image(i).share for i in range(7)) < 0.03
+    assert max(DepthConsistencyCheck(scene, OPTIONS).check_image(i).ratio for i in range(7)) < 0.03
 
 
 @pytest.mark.parametrize(("gap", "contradicts"), [(0.03, False), (0.10, True)])
@@ -161,7 +161,7 @@ def hall_at_truth(errors: PriorErrors) -> Scene:
     for image, pose in enumerate(truth.values()):
         scene.register(image, *pose)
     complete_and_merge_tracks(scene, TriangulationOptions(), create=True)
-    Refiner(scene, MapperOptions(), np.zeros((16, 16))).scale_together(list(range(16)))
+    Refiner(scene, MapperOptions(), np.zeros((16, 16))).estimate_scales(list(range(16)))
     return scene
 
 
@@ -169,7 +169,7 @@ def worst(scene: Scene, *, weigh_evidence: bool) -> Float64:
     """(n,) largest share of contradicting pixels of each image."""
     options = OPTIONS.model_copy(update={"weigh_evidence": weigh_evidence})
     check = DepthConsistencyCheck(scene, options)
-    return np.array([check.check_image(i).share for i in range(scene.num_images)])
+    return np.array([check.check_image(i).ratio for i in range(scene.num_images)])
 
 
 def test_what_points_deny_is_the_fault_of_the_prior() -> None:
@@ -197,7 +197,7 @@ def test_what_points_confirm_or_leave_open_is_the_fault_of_the_pose() -> None:
         complete_and_merge_tracks(scene, TriangulationOptions(), create=True)
         if (scene.tracks.point_of[scene.graph.keypoints_of(image)] >= 0).sum() > 30:
             wrong.append(
-                DepthConsistencyCheck(scene, OPTIONS).check_image(image).share
+                DepthConsistencyCheck(scene, OPTIONS).check_image(image).ratio
                 > OPTIONS.max_violations
             )
         scene.translations[image] = truth
@@ -209,7 +209,7 @@ def test_views_that_look_elsewhere_do_not_overlap() -> None:
     back = np.column_stack([np.diag([-1.0, 1.0, -1.0]), np.zeros(3)])
     scene = posed_scene([wall(3.0)] * 3, [HERE, back, HERE], SMALL)
     assert find_overlapping_images(scene, 0, 5) == [2]
-    assert DepthConsistencyCheck(scene, OPTIONS).check_image(1).other == -1
+    assert DepthConsistencyCheck(scene, OPTIONS).check_image(1).other_image == -1
 
 
 def test_the_thinned_map_is_where_the_map_is() -> None:
@@ -220,7 +220,7 @@ def test_the_thinned_map_is_where_the_map_is() -> None:
     scene = posed_scene(maps, [pose, pose], CAMERA)
     assert between(scene, 0, 1) == 0
     whole = OPTIONS.model_copy(update={"map_width": 480})
-    assert DepthConsistencyCheck(scene, whole).violation_ratio(0, 1) == 0
+    assert DepthConsistencyCheck(scene, whole).measure_violation_ratio(0, 1) == 0
 
 
 def test_a_view_in_the_twin_room_is_told_by_what_differs() -> None:
@@ -232,13 +232,13 @@ def test_a_view_in_the_twin_room_is_told_by_what_differs() -> None:
     for image in np.flatnonzero(np.array(room) == 1):
         scene = posed_scene(maps, poses, CAMERA)
         assert (
-            DepthConsistencyCheck(scene, OPTIONS).check_image(int(image)).share
+            DepthConsistencyCheck(scene, OPTIONS).check_image(int(image)).ratio
             < OPTIONS.max_violations
         )
         scene.translations[image] = shift_pose(poses[image], 1)[:, 3]
         scene.registered &= np.array(room) != 1
         wrong.append(
-            DepthConsistencyCheck(scene, OPTIONS).check_image(int(image)).share
+            DepthConsistencyCheck(scene, OPTIONS).check_image(int(image)).ratio
             > OPTIONS.max_violations
         )
     assert np.mean(wrong) >= 0.75
@@ -254,8 +254,8 @@ def test_what_a_quarter_of_the_pixels_tells_is_what_all_of_them_do() -> None:
         scene.translations[image] = shift_pose(poses[image], 1)[:, 3]
     check, limit = DepthConsistencyCheck(scene, OPTIONS), OPTIONS.max_violations
     pairs = list(combinations(range(len(poses)), 2))
-    every = np.array([check.violation_ratio(a, b) for a, b in pairs])
-    enough = np.array([check.violation_ratio(a, b, limit=limit) for a, b in pairs])
+    every = np.array([check.measure_violation_ratio(a, b) for a, b in pairs])
+    enough = np.array([check.measure_violation_ratio(a, b, limit=limit) for a, b in pairs])
     assert ((every > limit) == (enough > limit)).all()
     assert 0.05 < (every > limit).mean() < 0.95
     assert (every != enough).any()

@@ -58,8 +58,8 @@ def test_images_of_a_group_share_their_scale(global_initialization: bool) -> Non
     )
     options = options.model_copy(update={"initialization": initialization})
     mapper = Mapper(in_units([0, 0, 1, 1]), options, NullMappingEvents())
-    mapper.reconstruct_next()
-    scene = mapper.group.scene
+    mapper.reconstruct_component()
+    scene = mapper.component.scene
     assert scene.registered.all()
     scales = [depth_map.scale for depth_map in scene.maps]
     assert scales[0] == scales[1] and scales[2] == scales[3]
@@ -68,8 +68,8 @@ def test_images_of_a_group_share_their_scale(global_initialization: bool) -> Non
 
 def test_without_groups_each_image_has_its_own_scale() -> None:
     mapper = Mapper(in_units([None] * 3), MapperOptions(), NullMappingEvents())
-    mapper.reconstruct_next()
-    assert len({depth_map.scale for depth_map in mapper.group.scene.maps}) == 3
+    mapper.reconstruct_component()
+    assert len({depth_map.scale for depth_map in mapper.component.scene.maps}) == 3
 
 
 def proposals(problem: MappingProblem, reference: int = 0, image: int = 1) -> list[PoseHypothesis]:

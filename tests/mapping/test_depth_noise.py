@@ -13,9 +13,9 @@ from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera
 from mpsfm_core.mapping.options import TriangulationOptions
 from mpsfm_core.mapping.refinement.depth_noise import (
     DepthNoise,
-    local_noise,
+    find_well_constrained_keypoints,
     measure_depth_noise,
-    witnesses,
+    measure_local_depth_noise,
 )
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks
@@ -115,7 +115,7 @@ def test_noise_is_measured_where_a_prior_is_off(views: int) -> None:
     scene = scene_with(spot)
     if views == 2:
         scene.deregister(2)
-    noise = local_noise(scene, 1, witnesses(scene, 1), 1.0)
+    noise = measure_local_depth_noise(scene, 1, find_well_constrained_keypoints(scene, 1), 1.0)
     assert noise.shape == scene.maps[1].valid.shape
     columns = noise.shape[1]
     middle = noise[round(0.4 * columns), round(0.45 * columns)]
@@ -123,4 +123,4 @@ def test_noise_is_measured_where_a_prior_is_off(views: int) -> None:
     assert middle == pytest.approx(0.2 / declared / np.sqrt(2), rel=0.1)
     assert np.median(noise) == 1.0
     no_points = np.zeros(len(scene.maps[1].keypoints), np.bool_)
-    assert (local_noise(scene, 1, no_points, 1.5) == 1.5).all()
+    assert (measure_local_depth_noise(scene, 1, no_points, 1.5) == 1.5).all()

@@ -8,7 +8,7 @@ import pytest
 from mpsfm_core.mapping.refinement.keypoint_noise import (
     EFFICIENT,
     MAX_RESIDUAL,
-    epipolar_residuals,
+    compute_epipolar_residuals,
     measure_loss_scale,
 )
 from mpsfm_core.mapping.scene.scene import Scene
@@ -32,7 +32,7 @@ def scene_of(noise_px: float, *, tails: bool = False, wrong: float = 0.0) -> Sce
 
 
 def test_distances_of_matches_have_the_std_of_the_keypoints() -> None:
-    residuals = epipolar_residuals(scene_of(0.7))
+    residuals = compute_epipolar_residuals(scene_of(0.7))
     assert np.sqrt((residuals**2).mean()) == pytest.approx(1.0, rel=0.05)
     assert (residuals < MAX_RESIDUAL).all()
 

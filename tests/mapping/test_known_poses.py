@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera
+from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data import Float64, MappingProblem, PinholeCamera
+from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions

@@ -70,13 +70,13 @@ def pose_errors_deg(problem: MappingProblem, *, weigh_by_score: bool) -> list[fl
 
 
 def test_matches_that_the_matcher_doubts_hardly_bend_the_poses() -> None:
-    weighed: list[float] = []
+    weighted: list[float] = []
     alike: list[float] = []
     for seed in range(12):
         problem = problem_with_doubtful_matches(seed)
-        weighed += pose_errors_deg(problem, weigh_by_score=True)
+        weighted += pose_errors_deg(problem, weigh_by_score=True)
         alike += pose_errors_deg(problem, weigh_by_score=False)
-    assert np.mean(weighed) < 0.75 * np.mean(alike)
+    assert np.mean(weighted) < 0.75 * np.mean(alike)
 
 
 def test_keypoints_weigh_by_their_best_match_relative_to_the_mean() -> None:
@@ -117,10 +117,10 @@ def test_equal_scores_are_as_good_as_none(score: float) -> None:
             for pair in problem.pairs
         ),
     )
-    weighed = CorrespondenceGraph(equal)
+    weighted = CorrespondenceGraph(equal)
     alike = CorrespondenceGraph(equal, weigh_by_score=False)
-    assert (weighed.score >= MIN_SCORE).all()
-    np.testing.assert_allclose(weighed.keypoint_weight, alike.keypoint_weight, rtol=1e-6)
+    assert (weighted.score >= MIN_SCORE).all()
+    np.testing.assert_allclose(weighted.keypoint_weight, alike.keypoint_weight, rtol=1e-6)
 
 
 def test_support_and_inlier_share_count_scores_and_inliers_count_matches() -> None:

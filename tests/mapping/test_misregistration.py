@@ -10,7 +10,7 @@ import pytest
 
 from mpsfm_core.data import Bool, Int64, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.mapping.component import Group
+from mpsfm_core.mapping.component import Component
 from mpsfm_core.mapping.consistency import misregistration as module
 from mpsfm_core.mapping.consistency.misregistration import (
     Misregistration,
@@ -54,7 +54,7 @@ def test_a_pair_that_has_more_matches_than_hold_it_apart(monkeypatch: pytest.Mon
     (hold,) = holds(matches, explained, np.ones(5, np.bool_), monkeypatch)
     assert hold.images == (3, 4)
     assert hold.margin == 150 - 70
-    assert hold.links.tolist() == [[3, 2], [4, 2]]
+    assert hold.supporting_pairs.tolist() == [[3, 2], [4, 2]]
 
 
 def test_matches_that_are_fewer_than_what_holds_are_not_heard(
@@ -84,7 +84,7 @@ def test_an_image_that_all_its_pairs_together_outweigh(monkeypatch: pytest.Monke
     torn = {(6, 3): 170, (6, 4): 170, (6, 5): 170}
     (hold,) = holds(explained + symmetric(7, torn), explained, everything, monkeypatch)
     assert (hold.images, hold.margin) == ((6,), 510 - 300)
-    assert hold.links.tolist() == [[6, 0], [6, 1], [6, 2]]
+    assert hold.supporting_pairs.tolist() == [[6, 0], [6, 1], [6, 2]]
 
     torn = {(6, 3): 120, (6, 4): 120, (6, 5): 120}  # more, but not clearly
     assert holds(explained + symmetric(7, torn), explained, everything, monkeypatch) == []
@@ -104,15 +104,15 @@ def test_widest_ways_are_those_of_all_ways() -> None:
 
 
 @pytest.fixture
-def group() -> Group:
+def group() -> Component:
     """All of an exact scene is registered."""
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0))
     mapper = Mapper(problem, MapperOptions(), NullMappingEvents())
-    mapper.reconstruct_next()
-    return mapper.group
+    mapper.reconstruct_component()
+    return mapper.component
 
 
-def misplace(group: Group, image: int) -> None:
+def misplace(group: Component, image: int) -> None:
     """Turn a camera, with ten points left."""
     scene = group.scene
     turn = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
@@ -123,12 +123,12 @@ def misplace(group: Group, image: int) -> None:
     scene.tracks.remove_observations(seen[10:])
 
 
-def test_an_image_comes_to_where_more_matches_tie_it(group: Group) -> None:
+def test_an_image_comes_to_where_more_matches_tie_it(group: Component) -> None:
     assert detect_misregistrations(group.scene, 30) == []
     right = group.scene.rotations.copy()
     misplace(group, 4)
     assert [hold.images for hold in detect_misregistrations(group.scene, 30)] == [(4,)]
-    group.reseat(np.ones(5, np.bool_))
+    group.reregister_images(np.ones(5, np.bool_))
     assert group.scene.registered.all()
     assert rotation_angle_deg(group.scene.rotations @ right.transpose(0, 2, 1)).max() < 0.1
     matches, explained = count_pair_matches(group.scene)
@@ -136,12 +136,12 @@ def test_an_image_comes_to_where_more_matches_tie_it(group: Group) -> None:
 
 
 def test_an_image_that_nothing_else_holds_stays(
-    group: Group, monkeypatch: pytest.MonkeyPatch
+    group: Component, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     misplace(group, 4)
     before, noise = group.scene.snapshot(), group.refiner.noise
     monkeypatch.setattr(group, "grow", lambda available, *, wide: None)
-    group.reseat(np.ones(5, np.bool_))
+    group.reregister_images(np.ones(5, np.bool_))
     after = group.scene.snapshot()
     np.testing.assert_array_equal(after.rotations, before.rotations)
     np.testing.assert_array_equal(after.point_of, before.point_of)
@@ -156,8 +156,8 @@ def test_images_that_came_with_a_pose_stay_unless_it_is_a_guess(known: str, move
     named = zip(problem.images, poses, strict=True)
     problem = problem.with_poses({i.name: (p[:, :3].copy(), p[:, 3].copy()) for i, p in named})
     mapper = Mapper(problem, MapperOptions(known_poses=known), NullMappingEvents())  # type: ignore[arg-type]
-    mapper.reconstruct_next()
-    misplace(mapper.group, 4)
-    wrong = mapper.group.scene.rotations[4].copy()
-    mapper.group.reseat(np.ones(5, np.bool_))
-    assert (rotation_angle_deg(mapper.group.scene.rotations[4] @ wrong.T) > 10) == moves
+    mapper.reconstruct_component()
+    misplace(mapper.component, 4)
+    wrong = mapper.component.scene.rotations[4].copy()
+    mapper.component.reregister_images(np.ones(5, np.bool_))
+    assert (rotation_angle_deg(mapper.component.scene.rotations[4] @ wrong.T) > 10) == moves

@@ -12,7 +12,12 @@ from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.consistency.depth_agreement import measure_depth_agreement
 from mpsfm_core.mapping.mapper import reconstruct
-from mpsfm_core.mapping.model_selection import Run, best, explained_score, total_score
+from mpsfm_core.mapping.model_selection import (
+    MapperRun,
+    compute_explained_score,
+    compute_total_score,
+    select_run,
+)
 from mpsfm_core.mapping.options import ConsistencyOptions, MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
@@ -43,14 +48,14 @@ def with_false_matches(problem: MappingProblem, share: float) -> MappingProblem:
 
 def test_right_poses_explain_right_matches(problem: MappingProblem) -> None:
     (model,) = reconstruct(problem).reconstructions
-    total = total_score(problem)
+    total = compute_total_score(problem)
     assert total == pytest.approx(sum(pair.scores.sum() for pair in problem.pairs))
-    assert 0.85 * total < explained_score(model, problem) <= total
+    assert 0.85 * total < compute_explained_score(model, problem) <= total
     fewer = replace(model, images=model.images[:2])
     first = next(pair for pair in problem.pairs if (pair.image_a, pair.image_b) == (0, 1))
-    assert 0 < explained_score(fewer, problem) <= first.scores.sum()
+    assert 0 < compute_explained_score(fewer, problem) <= first.scores.sum()
     doubtful = with_false_matches(problem, 0.5)
-    assert explained_score(model, doubtful) < 0.6 * total
+    assert compute_explained_score(model, doubtful) < 0.6 * total
 
 
 def test_one_run_is_enough_where_matches_are_explained(problem: MappingProblem) -> None:
@@ -63,7 +68,7 @@ def test_runs_that_come_to_the_same_are_the_last(problem: MappingProblem) -> Non
     assert result.report.runs == 2
     alone = [reconstruct(doubtful, MapperOptions(max_runs=1, seed=seed)) for seed in range(2)]
     assert [run.report.runs for run in alone] == [1, 1]
-    scores = [explained_score(run.reconstructions[0], doubtful) for run in alone]
+    scores = [compute_explained_score(run.reconstructions[0], doubtful) for run in alone]
     best = alone[int(np.argmax(scores))].reconstructions[0]
     for image, same in zip(result.reconstructions[0].images, best.images, strict=True):
         np.testing.assert_array_equal(image.rotation, same.rotation)
@@ -75,18 +80,19 @@ class Scripted:
     """A mapper whose runs are given: of each, what its groups explain."""
 
     script: Sequence[Sequence[float]] = ()
-    keeps_poses = False
-    weighed = None
+    is_deterministic = False
+    reweighted_problem = None
 
     def __init__(
         self, problem: MappingProblem, options: MapperOptions, events: object, weighed: object
     ) -> None:
         self.explained = self.script[options.seed]
 
-    def run(self, paused: object = None) -> Run:
+    def run(self, paused: object = None) -> MapperRun:
         # a group's only mark is here how much it explains
         models = [Reconstruction((), np.full((1, 3), e), np.zeros(1)) for e in self.explained]
-        return Run(models, self.explained, MappingReport(seconds={"all": 2.0}, counts={"all": 1}))
+        report = MappingReport(seconds={"all": 2.0}, counts={"all": 1})
+        return MapperRun(models, self.explained, report)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +128,7 @@ def test_poses_that_stay_leave_nothing_to_chance(
     monkeypatch: pytest.MonkeyPatch, problem: MappingProblem
 ) -> None:
     monkeypatch.setattr(Scripted, "script", [[0.1], [0.2]])
-    monkeypatch.setattr(Scripted, "keeps_poses", True)
+    monkeypatch.setattr(Scripted, "is_deterministic", True)
     monkeypatch.setattr(mapper, "Mapper", Scripted)
     assert reconstruct(problem).report.runs == 1
 
@@ -131,14 +137,14 @@ def test_a_tie_goes_to_what_came_out_twice(problem: MappingProblem) -> None:
     """A run that stands alone has to explain clearly more than two that came to the same."""
     (model,) = reconstruct(problem).reconstructions
 
-    def run(size: int, explained: float) -> Run:
-        return Run([replace(model, images=model.images[:size])], [explained], MappingReport())
+    def run(size: int, explained: float) -> MapperRun:
+        return MapperRun([replace(model, images=model.images[:size])], [explained], MappingReport())
 
     alone, one, other = run(4, 0.662), run(3, 0.655), run(3, 0.660)
-    assert best([alone, one, other], OPTIONS) is other
-    assert best([alone, one], OPTIONS) is alone
+    assert select_run([alone, one, other], OPTIONS) is other
+    assert select_run([alone, one], OPTIONS) is alone
     clearly = run(4, 0.68)
-    assert best([clearly, one, other], OPTIONS) is clearly
+    assert select_run([clearly, one, other], OPTIONS) is clearly
 
 
 def test_of_runs_that_are_alike_that_counts_in_which_depth_agrees(problem: MappingProblem) -> None:
@@ -149,5 +155,6 @@ def test_of_runs_that_are_alike_that_counts_in_which_depth_agrees(problem: Mappi
     away = replace(last, rotation=turned @ last.rotation, translation=turned @ last.translation)
     elsewhere = replace(model, images=(*rest, away))
     assert measure_depth_agreement(elsewhere, OPTIONS) < measure_depth_agreement(model, OPTIONS)
-    right, wrong = (Run([m], [e], MappingReport()) for m, e in ((model, 0.650), (elsewhere, 0.655)))
-    assert best([right, wrong], OPTIONS) is best([wrong, right], OPTIONS) is right
+    right = MapperRun([model], [0.650], MappingReport())
+    wrong = MapperRun([elsewhere], [0.655], MappingReport())
+    assert select_run([right, wrong], OPTIONS) is select_run([wrong, right], OPTIONS) is right

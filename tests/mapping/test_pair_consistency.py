@@ -37,7 +37,7 @@ def test_right_pairs_are_allowed_and_many_look_alikes_are_not() -> None:
     """Views of twin rooms, of which the pieces that differ tell."""
     case = make_twin_room_problem(0)
     check, false = checker(case.problem, PairConsistencyCheck), np.array(case.false)
-    shares = np.array([check.check_pair(pair).share for pair in case.problem.pairs])
+    shares = np.array([check.check_pair(pair).support_ratio for pair in case.problem.pairs])
     assert (shares[~false] > 0).mean() > 0.97
     assert (shares[false] == 0).mean() > 0.5
 
@@ -51,7 +51,7 @@ class Judged(PairConsistencyCheck):
         return self.verdicts[pair.image_a, pair.image_b]
 
 
-def weighed(
+def reweighted_problem(
     counts: Sequence[int], share: float, turn_deg: float
 ) -> tuple[MappingProblem, MappingProblem]:
     """Three images, and what is left of them: pairs 0-1 and 1-2, which depth allows, and 0-2 with
@@ -74,7 +74,7 @@ def weighed(
 
 
 def test_what_depth_and_other_pairs_refute_does_not_count() -> None:
-    problem, left = weighed([60, 50, 60], share=0.0, turn_deg=90.0)
+    problem, left = reweighted_problem([60, 50, 60], share=0.0, turn_deg=90.0)
     assert left.pairs == (problem.pairs[0], problem.pairs[2])
 
 
@@ -84,12 +84,12 @@ def test_what_depth_and_other_pairs_refute_does_not_count() -> None:
     ids=["others say the same", "tied by fewer", "tied by too few to register", "has too few"],
 )
 def test_a_pair_that_depth_alone_refutes_stays(counts: list[int], turn_deg: float) -> None:
-    problem, left = weighed(counts, share=0.0, turn_deg=turn_deg)
+    problem, left = reweighted_problem(counts, share=0.0, turn_deg=turn_deg)
     assert left.pairs == problem.pairs
 
 
 def test_matches_count_as_far_as_an_allowed_pose_is_supported() -> None:
-    problem, left = weighed([60, 50, 60], share=0.5, turn_deg=90.0)
+    problem, left = reweighted_problem([60, 50, 60], share=0.5, turn_deg=90.0)
     assert [len(pair) for pair in left.pairs] == [60, 50, 60]
     np.testing.assert_allclose(left.pairs[1].scores, 0.5 * problem.pairs[1].scores)
     assert left.pairs[0] is problem.pairs[0]

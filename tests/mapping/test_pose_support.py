@@ -87,6 +87,10 @@ def test_a_depth_that_denies_the_new_images_prior_is_no_support(
     def moved(points: Float64) -> Float64:
         return np.where(nearer[:, None], center + 0.5 * (points - center), points)
 
-    wrong = found._replace(points=moved(found.points), near_points=moved(found.near_points), far_points=moved(found.far_points))
+    wrong = found._replace(
+        points=moved(found.points),
+        near_points=moved(found.near_points),
+        far_points=moved(found.far_points),
+    )
     before, after = rated(scene, found, 0.0), rated(scene, wrong, 0.0)
     assert after.num_inliers <= 0.75 * before.num_inliers

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import Float64, PinholeCamera
-from mpsfm_core.mapping.component import Group
+from mpsfm_core.mapping.component import Component
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
@@ -19,7 +19,7 @@ from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
-def mapped(declared_depth_std: float, *, nearer: float = 1.0) -> Group:
+def mapped(declared_depth_std: float, *, nearer: float = 1.0) -> Component:
     """Three registered images, in metres; the prior of the last one is so many times too near."""
     problem = make_mapping_problem(
         room_scene(), CAMERA, arc_poses(3, 14.0), declared_depth_std=declared_depth_std
@@ -28,14 +28,14 @@ def mapped(declared_depth_std: float, *, nearer: float = 1.0) -> Group:
     depth = replace(last.depth, depth=last.depth.depth / np.float32(nearer))
     problem = replace(problem, images=(*problem.images[:-1], replace(last, depth=depth)))
     mapper = Mapper(problem, MapperOptions(), NullMappingEvents())
-    mapper.reconstruct_next()
-    group = mapper.group
+    mapper.reconstruct_component()
+    group = mapper.component
     assert group.scene.registered.all()
     group.refiner.noise = group.refiner.noise._replace(multiplier=1.0)
     return group
 
 
-def push(group: Group, image: int, factor: float) -> None:
+def push(group: Component, image: int, factor: float) -> None:
     """Move the points an image sees along its rays."""
     scene = group.scene
     seen = np.unique(scene.tracks.point_of[scene.graph.keypoints_of(image)])
@@ -94,8 +94,8 @@ def test_a_focal_length_that_runs_away_changes_nothing() -> None:
     images = tuple(replace(image, camera=guess, focal_known=False) for image in problem.images)
     keep = MapperOptions.model_validate({"refinement": {"refine_focal": False}})
     mapper = Mapper(replace(problem, images=images), keep, NullMappingEvents())
-    mapper.reconstruct_next()
-    group = mapper.group
+    mapper.reconstruct_component()
+    group = mapper.component
     scene, refiner = group.scene, group.refiner
     before = scene.snapshot()
     refiner.options = refiner.options.model_copy(update={"focal_max_change": 1.01})

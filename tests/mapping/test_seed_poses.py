@@ -9,7 +9,7 @@ import pytest
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.mapping.initialization.seed_poses import select_seed_images, with_seed_poses
+from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, MappingResult, Reconstruction
@@ -55,7 +55,7 @@ def test_it_goes_on_in_metres(problem: MappingProblem, mapped: MappingResult) ->
     assert len(held) == 4
     tenth = [replace(image, translation=image.translation / 10) for image in held]
     guess = MapperOptions(known_poses="guess")
-    (found,) = reconstruct(with_seed_poses(problem, tenth), guess).reconstructions
+    (found,) = reconstruct(apply_seed_poses(problem, tenth), guess).reconstructions
     assert found.metric is not None and found.metric.trusted
     assert [image.index for image in found.images] == [0, 1, 2, 3, 4]
     first, *others = found.images
@@ -75,7 +75,7 @@ def test_refined_focal_lengths_are_those_of_all_images_of_a_camera(
     images = mapped.reconstructions[0].images[:2]
     known = replace(problem.images[4], known_pose=(np.eye(3), np.ones(3)))
     problem = replace(problem, images=(*problem.images[:4], known))
-    started = with_seed_poses(problem, [replace(image, camera=refined) for image in images])
+    started = apply_seed_poses(problem, [replace(image, camera=refined) for image in images])
     assert {image.camera for image in started.images} == {refined}
     given = [image.known_pose is not None for image in started.images]
     assert given == [True, True, False, False, True]

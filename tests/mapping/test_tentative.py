@@ -70,10 +70,10 @@ def test_a_group_is_placed_as_a_whole(problem: MappingProblem) -> None:
         compose((b.rotation, b.translation), invert(a.rotation, a.translation))
         for a, b in (placed, group.images)
     )
-    growth = placed[0].scale / group.images[0].scale
+    ratio = placed[0].scale / group.images[0].scale
     np.testing.assert_allclose(turn, own_turn, atol=1e-12)
-    np.testing.assert_allclose(step, growth * own_step, atol=1e-12)
-    assert placed[1].scale == pytest.approx(growth * group.images[1].scale)
+    np.testing.assert_allclose(step, ratio * own_step, atol=1e-12)
+    assert placed[1].scale == pytest.approx(ratio * group.images[1].scale)
 
 
 def test_what_is_confirmed_does_not_change(problem: MappingProblem) -> None:

@@ -14,7 +14,9 @@ def test_depth_has_to_bear_out_what_matches_lack() -> None:
     ladder = ThresholdSchedule(options)
     found = []
     while True:
-        found.append((ladder.min_inliers, ladder.min_inlier_share, ladder.max_violations(0.036)))
+        found.append(
+            (ladder.min_inliers, ladder.min_inlier_ratio, ladder.tighten_violations(0.036))
+        )
         if not ladder.relax():
             break
     assert found == [
@@ -23,4 +25,4 @@ def test_depth_has_to_bear_out_what_matches_lack() -> None:
         (25, pytest.approx(0.50), pytest.approx(0.025)),
     ]
     ladder.reset()
-    assert ladder.max_violations(0.036) == 0.036
+    assert ladder.tighten_violations(0.036) == 0.036

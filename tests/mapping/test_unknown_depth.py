@@ -84,7 +84,9 @@ def test_rays_count_half() -> None:
     found = find_correspondences(scene, 1, [0], OPTIONS)
     everywhere = find_correspondences(scene_with_depth_in(EVERYWHERE), 1, [0], OPTIONS)
     np.testing.assert_array_equal(found.keypoints, everywhere.keypoints)
-    np.testing.assert_array_equal(found.depth_weights, np.where(found.depth_known, 1.0, RAY_MATCH_WEIGHT))
+    np.testing.assert_array_equal(
+        found.depth_weights, np.where(found.depth_known, 1.0, RAY_MATCH_WEIGHT)
+    )
     np.testing.assert_allclose(
         found.weights / found.depth_weights, everywhere.weights / everywhere.depth_weights
     )

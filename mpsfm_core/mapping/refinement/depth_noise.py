@@ -6,7 +6,7 @@ compared: the depth of one, carried into the other, against the other's own. Bun
 takes observations as independent; a hundred observations with one common error must not count a
 hundred times.
 
-How good a prior is at one place may be another matter (:func:`local_noise`): points that rays hold
+How good a prior is at one place may be another matter (:func:`measure_local_depth_noise`): points that rays hold
 without its help tell.
 """
 
@@ -44,7 +44,7 @@ NUM_WITNESSES = 7
 so that no single wrong point does (ours)."""
 WITNESS_REACH = 1 / 8
 """Share of a map's width that errors have in common (as
-:class:`~mpsfm_core.testing.synthetic.degraded_depth.DepthErrors`): farther witnesses say
+:class:`~mpsfm_core.testing.synthetic.degraded_depth.DepthErrors`): farther find_well_constrained_keypoints say
 nothing."""
 PLACES = 16
 """Columns and rows of the places at which noise is measured (ours; half the reach apart)."""
@@ -106,7 +106,7 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
     return DepthNoise(multiplier, correlation, effect)
 
 
-def witnesses(scene: Scene, image: int) -> Bool:
+def find_well_constrained_keypoints(scene: Scene, image: int) -> Bool:
     """(k,) bool, keypoints of an image whose points rays hold without depth."""
     points = scene.tracks.point_of[scene.graph.keypoints_of(image)]
     seen = points >= 0
@@ -115,7 +115,7 @@ def witnesses(scene: Scene, image: int) -> Bool:
     return holds
 
 
-def local_noise(scene: Scene, image: int, witness: Bool, least: float) -> Float32:
+def measure_local_depth_noise(scene: Scene, image: int, witness: Bool, least: float) -> Float32:
     """How many times its declaration the std of a prior is from place to place: (h, w) float32.
 
     Witnesses (``witness``: (k,) bool, of the image's keypoints) that are near have an error in

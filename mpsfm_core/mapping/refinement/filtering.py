@@ -49,14 +49,14 @@ def _points_of(scene: Scene, images: list[int] | None) -> Int64:
     return np.unique(seen[seen >= 0])
 
 
-def lost_images(scene: Scene) -> list[int]:
+def find_lost_images(scene: Scene) -> list[int]:
     """Registered images that observe too few points to keep their pose."""
     observed = np.flatnonzero(scene.tracks.point_of >= 0)
     counts = np.bincount(scene.graph.image_of[observed], minlength=scene.num_images)
     return [int(i) for i in scene.registered_images() if counts[i] < MIN_IMAGE_POINTS]
 
 
-def disconnected_images(scene: Scene) -> list[int]:
+def find_disconnected_images(scene: Scene) -> list[int]:
     """Registered images that share no chain of points with the largest group of images."""
     observations = scene.tracks.observations()
     points = scene.tracks.point_of[observations]

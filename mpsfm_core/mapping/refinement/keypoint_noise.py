@@ -43,28 +43,30 @@ def measure_loss_scale(scene: Scene, scale: float) -> float:
 
     ``scale``: that for keypoints with tails, or where too few matches tell.
     """
-    residuals = epipolar_residuals(scene)
+    residuals = compute_epipolar_residuals(scene)
     if len(residuals) < MIN_MATCHES:
         return scale
     std = float(np.sqrt((residuals**2).mean()))
-    if log_likelihood_of_normal(residuals, std) > log_likelihood_of_tails(residuals, scale):
+    if compute_normal_log_likelihood(residuals, std) > compute_student_log_likelihood(
+        residuals, scale
+    ):
         return max(scale, EFFICIENT * std)
     return scale
 
 
-def log_likelihood_of_normal(residuals: Float64, std: float) -> float:
+def compute_normal_log_likelihood(residuals: Float64, std: float) -> float:
     """Mean log likelihood of residuals (m,) below :data:`MAX_RESIDUAL`, were they normal."""
     norm = std * np.sqrt(np.pi / 2) * erf(MAX_RESIDUAL / (std * np.sqrt(2)))
     return float(-0.5 * (residuals**2).mean() / std**2 - np.log(norm))
 
 
-def log_likelihood_of_tails(residuals: Float64, scale: float) -> float:
+def compute_student_log_likelihood(residuals: Float64, scale: float) -> float:
     """The same for the t distribution of that scale, with the best degrees of freedom."""
     spread = np.log1p((residuals / scale) ** 2).mean()
     return float((-(FREEDOMS + 1) / 2 * spread - _log_norms(scale)).max())
 
 
-def epipolar_residuals(scene: Scene) -> Float64:
+def compute_epipolar_residuals(scene: Scene) -> Float64:
     """(m,) distances of matches of registered images from meeting, in stds of a keypoint.
 
     To first order how far both keypoints of a match must move for their rays to meet (Sampson).

@@ -1,5 +1,4 @@
-"""What keeps the scene of a group right while it grows: refinement of everything, the depth check,
-and who goes when it fails."""
+"""Maintenance of a growing model: global refinement, depth checks, deregistration, rollback."""
 
 from __future__ import annotations
 
@@ -11,40 +10,53 @@ from mpsfm_core.data import Bool, Int64, MappingProblem
 from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.consistency.depth_consistency import DepthConsistencyCheck
-from mpsfm_core.mapping.event_log import Journal
+from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.depth_noise import DepthNoise
-from mpsfm_core.mapping.refinement.filtering import disconnected_images, lost_images
+from mpsfm_core.mapping.refinement.filtering import find_disconnected_images, find_lost_images
 from mpsfm_core.mapping.refinement.refinement import Refiner
 from mpsfm_core.mapping.registration.image_selection import compute_pair_scores
 from mpsfm_core.mapping.registration.registration_history import RegistrationHistory
 from mpsfm_core.mapping.registration.threshold_schedule import ThresholdSchedule
 from mpsfm_core.mapping.scene.scene import Scene, Snapshot
 
-JUMP_DEG = 3.0
-"""A camera that turns more in a global refinement may have found a wrong minimum (ours)."""
+MAX_ROTATION_DEG = 3.0
+"""Rotation of a camera in one global refinement above which depth decides whether the refinement
+is kept: it may have reached a wrong local minimum. [ours]"""
 
 
-class State(NamedTuple):
-    """To return to: the scene, which of its images were checked, and what was measured of noise."""
+class ModelState(NamedTuple):
+    """Copy of a model, for a rollback."""
 
     scene: Snapshot
     checked: Bool
+    """(n,) bool, images whose depth was compared with all others."""
     noise: DepthNoise
     loss_scale: float
+    """Measured scale of the reprojection loss, in standard deviations of a keypoint."""
 
 
-class Upkeep:
-    """The scene of a group. ``scores`` (n, n): of the matches of each two images."""
+class ModelMaintenance:
+    """The model of one component, with what its maintenance needs.
 
-    def __init__(self, problem: MappingProblem, options: MapperOptions, journal: Journal) -> None:
-        self.problem, self.options, self.journal = problem, options, journal
+    Attributes:
+        scene: Poses, points and depth maps.
+        scores: (n, n) float64, score of the matches of each two images.
+        refiner: Bundle adjustment and depth integration.
+        history: Record of registration attempts.
+        thresholds: Thresholds of registration, which relax.
+    """
+
+    def __init__(
+        self, problem: MappingProblem, options: MapperOptions, event_log: EventLog
+    ) -> None:
+        self.problem, self.options, self.event_log = problem, options, event_log
         self.scene = Scene(problem, weigh_by_score=options.weigh_by_score)
         self.scores = compute_pair_scores(self.scene, options.registration.next_view)
         self.refiner = Refiner(self.scene, options, self.scores)
         self.history = RegistrationHistory(self.scene.num_images, options.registration)
         self.thresholds = ThresholdSchedule(options.registration)
-        self._check = DepthConsistencyCheck(self.scene, options.consistency)
+        self._depth_check = DepthConsistencyCheck(self.scene, options.consistency)
         self._last_size = (0, 0)
         self._checked: Bool = np.zeros(self.scene.num_images, dtype=np.bool_)
 
@@ -54,118 +66,131 @@ class Upkeep:
         return int(self.scene.registered.sum())
 
     @property
-    def all_checked(self) -> bool:
-        """Whether no image came since all were compared with each other."""
+    def is_checked(self) -> bool:
+        """Whether the depth of all registered images was compared with each other."""
         return bool(self._checked[self.scene.registered].all())
 
-    def state(self) -> State:
-        """To :meth:`restore`."""
+    def state(self) -> ModelState:
+        """Return a copy of the model for :meth:`restore`."""
         measured = self.refiner.noise, self.refiner.loss_scale
-        return State(self.scene.snapshot(), self._checked.copy(), *measured)
+        return ModelState(self.scene.snapshot(), self._checked.copy(), *measured)
 
-    def restore(self, state: State) -> None:
-        """Return to an earlier state; what was tried in between may be tried again."""
+    def restore(self, state: ModelState) -> None:
+        """Roll back to an earlier state and clear the history of attempts since then."""
         self.scene.restore(state.scene)
         self._checked = state.checked.copy()
         self.refiner.noise, self.refiner.loss_scale = state.noise, state.loss_scale
         self.history.clear()
 
-    def empty(self, before: Snapshot) -> None:
-        """Return to a scene without images, as if nothing had been."""
-        self.scene.restore(before)
-        self.refiner.forget_all()
+    def clear(self, empty: Snapshot) -> None:
+        """Reset the model to a scene without registered images."""
+        self.scene.restore(empty)
+        self.refiner.reset()
         self._checked[:] = False
         self._last_size = (0, 0)
 
-    def refresh(self) -> None:
-        """Refine everything, if images or points grew so much since the last time."""
-        images, points = self.size, len(self.scene.tracks)
+    def refine_if_grown(self) -> None:
+        """Refine globally if images or points grew by ``global_growth`` since the last time."""
+        num_images, num_points = self.size, len(self.scene.tracks)
         growth = 1 + self.options.refinement.global_growth
-        if images > growth * self._last_size[0] or points > growth * self._last_size[1]:
+        if num_images > growth * self._last_size[0] or num_points > growth * self._last_size[1]:
             self.refine_globally()
 
     def refine_globally(self, *, final: bool = False) -> None:
-        """Refine all images and points; those that lose their points by it go."""
+        """Refine all images and points; deregister images that lose their points.
+
+        Args:
+            final: Sharpen the depth loss (paper, robust reconstruction).
+        """
         before = self.scene.snapshot()
-        with self.journal.timed("global refinement"):
+        with self.event_log.timed("global refinement"):
             self.refiner.refine_globally(final=final)
             self.scene.tracks.compact()
         self._undo_jump(before)
         self.history.clear()
         self._last_size = self.size, len(self.scene.tracks)
-        self.drop(
-            lost_images(self.scene), ImageReason.LOST_POINTS.because(step="global-refinement")
-        )
-        self.journal.scene_changed(self.scene)
+        reason = ImageReason.LOST_POINTS.because(step="global-refinement")
+        self.deregister(find_lost_images(self.scene), reason)
+        self.event_log.scene_changed(self.scene)
 
-    def check_all(self, limit: float, step: str) -> None:
-        """Deregister images until no two views contradict each other.
+    def check_all_images(self, max_violations: float, step: str) -> None:
+        """Deregister images until no two images contradict each other's depth.
 
-        Those that held before are not compared with each other again.
+        Images that were compared before are not compared with each other again.
+
+        Args:
+            max_violations: Largest violation ratio that is accepted.
+            step: Step of the mapper, for the reason.
         """
         images = self.scene.registered & ~self._checked
         self._checked |= images
-        conflicting = self._conflicts(np.flatnonzero(images), limit)
-        for image, share in conflicting:
-            ratio = round(float(share), 4)
+        conflicting = self._find_conflicts(np.flatnonzero(images), max_violations)
+        for image, violation_ratio in conflicting:
+            ratio = round(float(violation_ratio), 4)
             reason = ImageReason.CONTRADICTS_DEPTH.because(violation_ratio=ratio, step=step)
-            self.drop([image], reason)
+            self.deregister([image], reason)
         if conflicting:
-            apart = disconnected_images(self.scene)
-            self.drop(apart, ImageReason.CONNECTED_BY_DROPPED_IMAGE.because(step=step))
+            reason = ImageReason.CONNECTED_BY_DROPPED_IMAGE.because(step=step)
+            self.deregister(find_disconnected_images(self.scene), reason)
 
-    def contradiction(self, image: int, limit: float) -> Reason | None:
-        """Why the depth of an image contradicts that of another view, if it does.
+    def check_depth(self, image: int, max_violations: float) -> Reason | None:
+        """Check the depth of a new image against the images that it overlaps (paper 3.4).
 
-        ``limit``: share of pixels at the strict thresholds.
+        Args:
+            image: The image.
+            max_violations: Largest violation ratio at the strict thresholds.
+
+        Returns:
+            None if the depth is consistent, else the reason.
         """
         if not self.options.consistency.enabled:
             return None
-        limit = self.thresholds.max_violations(limit)
-        with self.journal.timed("depth check"):
-            check = self._check.check_image(image, self.refiner.std_factor, limit)
-        if check.share <= limit:
+        limit = self.thresholds.tighten_violations(max_violations)
+        with self.event_log.timed("depth check"):
+            violation = self._depth_check.check_image(image, self.refiner.std_factor, limit)
+        if violation.ratio <= limit:
             return None
-        self.history.record_contradiction(check.other, image)
-        other = self.problem.images[check.other].name
-        ratio = round(float(check.share), 4)
+        self.history.record_contradiction(violation.other_image, image)
+        other = self.problem.images[violation.other_image].name
+        ratio = round(float(violation.ratio), 4)
         return ImageReason.CONTRADICTS_IMAGE.because(violation_ratio=ratio, other_image=other)
 
-    def accept(self, image: int) -> None:
-        """Tell of an image that was registered."""
+    def confirm(self, image: int) -> None:
+        """Report a verified registration; poses that failed in the former scene may work now."""
         self.history.clear_pose_rejections()
-        self.journal.registered(image, self.size)
-        self.journal.scene_changed(self.scene)
+        self.event_log.registered(image, self.size)
+        self.event_log.scene_changed(self.scene)
 
-    def drop(self, images: list[int], reason: Reason) -> None:
-        """Take images out that were registered before; the run goes on."""
+    def deregister(self, images: list[int], reason: Reason) -> None:
+        """Deregister images, except those with a fixed pose."""
         for image in images:
             if self.refiner.fixed[image]:
                 continue
             self._checked[image] = False
             self.scene.deregister(image)
-            self.refiner.forget(image)
+            self.refiner.discard_integrator(image)
             self.history.clear_pose_rejections()
-            self.journal.rejected(image, reason)
+            self.event_log.rejected(image, reason)
 
     def _undo_jump(self, before: Snapshot) -> None:
-        """Return to an earlier state if cameras jumped and their depth contradicts since then.
+        """Undo a refinement that turned a camera far and increased the number of conflicts.
 
-        A robust loss has many minima; where few matches hold images, the next one may be wrong.
+        A robust loss has several minima. If few matches connect an image, the next minimum may be
+        a wrong one.
         """
         images = self.scene.registered_images()
         turns = self.scene.rotations[images] @ before.rotations[images].transpose(0, 2, 1)
-        if not len(images) or rotation_angle_deg(turns).max() < JUMP_DEG:
+        if not len(images) or rotation_angle_deg(turns).max() < MAX_ROTATION_DEG:
             return
         limit = self.options.consistency.max_violations
-        after, worse = self.scene.snapshot(), len(self._conflicts(images, limit))
+        after, num_conflicts = self.scene.snapshot(), len(self._find_conflicts(images, limit))
         self.scene.restore(before)
-        if not worse > len(self._conflicts(images, limit)):
+        if not num_conflicts > len(self._find_conflicts(images, limit)):
             self.scene.restore(after)
 
-    def _conflicts(self, images: Int64, limit: float) -> list[tuple[int, float]]:
-        """Views to leave out so that none contradicts one of the images, and how much each did."""
+    def _find_conflicts(self, images: Int64, limit: float) -> list[tuple[int, float]]:
+        """Find images to deregister so that no depth contradicts ``images``, with their ratios."""
         if not self.options.consistency.enabled:
             return []
-        with self.journal.timed("depth check"):
-            return self._check.find_conflicting_images(images, limit, self.refiner.std_factor)
+        with self.event_log.timed("depth check"):
+            return self._depth_check.find_conflicting_images(images, limit, self.refiner.std_factor)

@@ -1,4 +1,4 @@
-"""From the working scene to the finished reconstruction, in metres when that can be trusted."""
+"""From the working scene to the convert_scene reconstruction, in metres when that can be trusted."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MIN_METRIC_IMAGES = 3
 """Fewer images cannot show a spread (ours)."""
 
 
-def metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | None:
+def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | None:
     """Metres per world unit, from the scales of the registered images' metric priors.
 
     ``keep_units``: the world is the user's; the scale is told, but not trusted to be applied.
@@ -32,10 +32,10 @@ def metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | None:
     return MetricScale(float(np.exp(-center)), spread, len(log_scales), trusted)
 
 
-def finished(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
+def convert_scene(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
     """The reconstruction as results are written from it; metres if the scale is trusted."""
     scene.tracks.compact()
-    metric = metric_scale(scene, keep_units=keep_units)
+    metric = estimate_metric_scale(scene, keep_units=keep_units)
     in_metres = metric is not None and metric.trusted
     factor = metric.metres_per_unit if metric and in_metres else 1.0
     tracks = scene.tracks
@@ -46,14 +46,14 @@ def finished(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
     lengths = np.bincount(points, minlength=count)
     mean_errors = np.bincount(points, errors, minlength=count) / np.maximum(lengths, 1)
     images = tuple(
-        registered_image(scene, int(i), factor, in_metres) for i in scene.registered_images()
+        convert_image(scene, int(i), factor, in_metres) for i in scene.registered_images()
     )
     return Reconstruction(images, tracks.xyz * factor, mean_errors, metric)
 
 
-def current(scene: Scene) -> SceneState:
+def capture_scene_state(scene: Scene) -> SceneState:
     """The scene as it is now, in its own units."""
-    images = (registered_image(scene, int(i), 1.0, False) for i in scene.registered_images())
+    images = (convert_image(scene, int(i), 1.0, False) for i in scene.registered_images())
     tracks = scene.tracks
     used = np.unique(tracks.point_of[tracks.observations()])
     return SceneState(
@@ -62,7 +62,7 @@ def current(scene: Scene) -> SceneState:
     )
 
 
-def registered_image(scene: Scene, index: int, factor: float, in_metres: bool) -> RegisteredImage:
+def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> RegisteredImage:
     """An image as the scene has it, in units that are ``factor`` times smaller than the scene's."""
     image, depth_map = scene.problem.images[index], scene.maps[index]
     depth = depth_map.depth * np.float32(factor)

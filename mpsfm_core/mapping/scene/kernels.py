@@ -11,7 +11,7 @@ from mpsfm_core.support import jit
 
 
 @jit.kernel()
-def sorted_by_point(point_of: Int64, num_points: int) -> Int64:
+def sort_keypoints_by_point(point_of: Int64, num_points: int) -> Int64:
     """Keypoints that observe a point, sorted by point, then keypoint (counting sort).
 
     ``point_of``: (k,) point of each keypoint or negative, below ``num_points``.
@@ -31,7 +31,7 @@ def sorted_by_point(point_of: Int64, num_points: int) -> Int64:
 
 
 @jit.kernel()
-def max_triangulation_angles(
+def compute_max_triangulation_angles(
     points: Float64, observation_points: Int64, centers: Float64
 ) -> Float64:
     """Largest angle in degrees between any two rays of each point's track.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, Float64, Int64, PinholeCamera, Pose
+from mpsfm_core.data.decisions import Reason
 
 _NO_ROWS = np.zeros(0, np.int64)
 
@@ -90,8 +91,8 @@ class MappingReport:
     both of all ``runs``.
     """
 
-    image_reasons: Mapping[str, str] = field(default_factory=dict)
-    pair_reasons: Mapping[str, str] = field(default_factory=dict)
+    image_reasons: Mapping[str, Reason] = field(default_factory=dict)
+    pair_reasons: Mapping[str, Reason] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
     runs: int = 1
@@ -105,7 +106,7 @@ class MappingResult:
     report: MappingReport
 
 
-def transformed(
+def transform_reconstruction(
     reconstruction: Reconstruction,
     scale: float,
     rotation: Float64,

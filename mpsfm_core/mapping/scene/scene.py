@@ -11,7 +11,7 @@ from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.mapping.scene.depth_map import DepthMap
 from mpsfm_core.mapping.scene.graph import CorrespondenceGraph
-from mpsfm_core.mapping.scene.kernels import max_triangulation_angles
+from mpsfm_core.mapping.scene.kernels import compute_max_triangulation_angles
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.mapping.scene.tracks import Tracks
 from mpsfm_core.optimize.depth_integration import RefinedDepth
@@ -190,7 +190,7 @@ class Scene:
         """(p,) largest triangulation angle of each point of the tracks, degrees."""
         observations = self.tracks.observations()
         centers = self.centers()[self.graph.image_of[observations]]
-        angles: Float64 = max_triangulation_angles(
+        angles: Float64 = compute_max_triangulation_angles(
             self.tracks.xyz, self.tracks.point_of[observations], centers
         )
         return angles
@@ -199,7 +199,7 @@ class Scene:
         """Largest triangulation angle of some points (m,), each once, in degrees; track lengths."""
         keypoints, rows = self.tracks.observations_of(points)
         centers = self.centers()[self.graph.image_of[keypoints]]
-        angles: Float64 = max_triangulation_angles(self.tracks.xyz[points], rows, centers)
+        angles: Float64 = compute_max_triangulation_angles(self.tracks.xyz[points], rows, centers)
         return angles, np.bincount(rows, minlength=len(points)).astype(np.int64)
 
     def resume(self, reconstruction: Reconstruction) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64
-from mpsfm_core.mapping.scene.kernels import sorted_by_point
+from mpsfm_core.mapping.scene.kernels import sort_keypoints_by_point
 
 NO_POINT = -1
 
@@ -37,7 +37,7 @@ class Tracks:
 
     def observations(self) -> Int64:
         """Global keypoints that observe a point, sorted by point, then keypoint."""
-        keypoints: Int64 = sorted_by_point(self.point_of, len(self.xyz))
+        keypoints: Int64 = sort_keypoints_by_point(self.point_of, len(self.xyz))
         return keypoints
 
     def observations_of(self, points: Int64) -> tuple[Int64, Int64]:
@@ -46,7 +46,7 @@ class Tracks:
         row_of = np.full(len(self.xyz) + 1, NO_POINT, dtype=np.int64)
         row_of[points] = np.arange(len(points))
         row_of_keypoint = row_of[self.point_of]  # of those without a point, the last entry
-        keypoints = sorted_by_point(row_of_keypoint, len(points))
+        keypoints = sort_keypoints_by_point(row_of_keypoint, len(points))
         return keypoints, row_of_keypoint[keypoints]
 
     def add(self, xyz: Float64, keypoints: Int64, track: Int64) -> Int64:
