@@ -1,1 +1,1 @@
-"""A small network of our own: metric depth, normals, their uncertainty and validity."""
+"""Small network with weights in the package: metric depth, normals, their variance and a mask."""

@@ -1,5 +1,4 @@
-"""How the contract kit tests the providers: a stand-in that reads painted views in place of the
-network."""
+"""Contract setup: a stand-in network that decodes painted views."""
 
 from __future__ import annotations
 
@@ -13,6 +12,6 @@ from mpsfm_core.testing import ContractSetup
 
 
 def setup(folder: Path) -> ContractSetup:
-    """A network with the same tensors that reads painted views."""
+    """Write a stand-in with the tensors of the network that decodes painted views."""
     model = stand_in(describe(CompactOptions()), folder)
     return ContractSetup(options={"weights": str(model)}, truth_source="painted")

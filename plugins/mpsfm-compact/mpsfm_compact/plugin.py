@@ -1,4 +1,4 @@
-"""Announces the providers. Imports neither onnxruntime nor OpenCV."""
+"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 from mpsfm_compact.options import WEIGHTS, CompactOptions
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
 from mpsfm_core.providers import Capability, Kind, weights_from_option
-from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind, load_calibration
 from mpsfm_core.providers.uncertainty.calibration import Calibration
+from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind, load_calibration
 
 _LICENSE = "Apache-2.0"
 _ACCURACY: dict[Kind, str] = {
@@ -16,12 +16,12 @@ _ACCURACY: dict[Kind, str] = {
     "normals": "median 6 deg in a rendered kitchen (measured)",
     "mask": "sky well, mirrors and glass hardly",
 }
-"""benchmarks/results/priors.md."""
+"""Measured in benchmarks/results/priors.md."""
 
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Depth, which gives normals in the same pass, normals alone, and a mask."""
+    """Register depth (with normals of the same pass), normals and a mask."""
     return [
         _spec("depth", "Depth", "metric depth and normals", "metric", "variance", "joint-normals"),
         _spec("normals", "Normals", "normals", "variance"),

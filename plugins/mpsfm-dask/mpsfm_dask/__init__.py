@@ -1,1 +1,1 @@
-"""Runs the extraction on workers of Dask."""
+"""Extraction on the workers of a Dask cluster."""

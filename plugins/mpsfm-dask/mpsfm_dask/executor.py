@@ -1,4 +1,4 @@
-"""An executor on the workers of a Dask cluster."""
+"""Executor on the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -13,25 +13,31 @@ from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.data.options import Options, SettingsError, parse_settings
 
 MAX_TASKS = 50_000
-"""Beyond, a task has several items: the scheduler holds all tasks of a stage (our choice)."""
+"""Maximum number of tasks per step; more items are grouped, because the scheduler stores all tasks
+of a step. [ours]
+"""
 
 
 class DaskOptions(Options):
-    """Where the workers are."""
+    """Address and number of the workers."""
 
     address: str | None = None
-    """Of the scheduler, ``tcp://HOST:8786``; null starts workers on this machine."""
+    """Address of the scheduler, ``tcp://HOST:8786``; null starts workers on this machine."""
     workers: int | None = Field(None, ge=1)
-    """On this machine: processes, null for one a core."""
+    """Number of processes on this machine; null: one per core."""
     timeout_s: float = Field(30.0, gt=0)
-    """How long to wait for the scheduler and a first worker."""
+    """Seconds to wait for the scheduler and a first worker."""
 
 
 class DaskExecutor:
-    """Sends a stage's step to every worker once, and the items as tasks."""
+    """Executor that sends a step to every worker once, and the items as tasks."""
 
     def __init__(self, options: Mapping[str, Any]) -> None:
-        """Raises ConfigError when options are wrong or the scheduler does not answer."""
+        """Connect to the scheduler, or start workers on this machine.
+
+        Raises:
+            ConfigError: The options are wrong or the scheduler does not answer.
+        """
         try:
             checked = parse_settings(DaskOptions, options, ("runtime", "executor_options"))
         except SettingsError as error:
@@ -49,7 +55,7 @@ class DaskExecutor:
             raise ConfigError(f"no Dask workers at {where}: {error}") from error
 
     def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
-        """As :meth:`mpsfm_core.providers.Executor.run`."""
+        """Run a step on items; see :meth:`mpsfm_core.providers.Executor.run`."""
         name, size = f"mpsfm-{uuid.uuid4().hex}", 1 + len(items) // MAX_TASKS
         parts = [list(items[n : n + size]) for n in range(0, len(items), size)]
         self._client.register_plugin(_StepOnWorker(step), name=name)
@@ -65,14 +71,14 @@ class DaskExecutor:
             self._client.unregister_worker_plugin(name)
 
     def close(self) -> None:
-        """End the connection, and the workers that were started for it."""
+        """Close the connection and stop the workers that were started for it."""
         self._client.close()
         if self._cluster is not None:
             self._cluster.close()
 
 
 class _StepOnWorker(WorkerPlugin):  # type: ignore[misc, unused-ignore]
-    """Brings a step to every worker, also to those that join or come back later."""
+    """Worker plugin that sends a step to every worker, also to workers that join later."""
 
     def __init__(self, step: Callable[[Any], None]) -> None:
         self.step = step

@@ -1,1 +1,1 @@
-"""Depth Anything 3 as an MP-SfM provider."""
+"""Depth Anything 3 as a multi-view provider."""

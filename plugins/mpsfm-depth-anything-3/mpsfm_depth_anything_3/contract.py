@@ -1,5 +1,4 @@
-"""How the contract kit tests the provider without published weights: on the real architecture of
-the smallest size with random ones, which are written once for a process."""
+"""Contract setup: the smallest architecture with random weights, written once per process."""
 
 from __future__ import annotations
 
@@ -12,20 +11,20 @@ from mpsfm_core.testing import ContractSetup
 from mpsfm_depth_anything_3.provider import as_published, network_of
 
 SIDE = 56
-"""Of the views that the network sees, in pixels."""
+"""Side of the network input in pixels."""
 _SEED = 3
 _ANGLE = 1.0
-"""Of view, in radians: random ones have no tangent."""
+"""Fixed angle of view in radians, because random weights can predict angles without a tangent."""
 
 
 def contract(folder: Path) -> ContractSetup:
-    """It answers, and means nothing."""
+    """Write random weights; the answers are valid but not accurate."""
     path = write_weights(folder / "model.safetensors")
     return ContractSetup(options={"weights": str(path), "resize": SIDE}, truth_source="none")
 
 
 def write_weights(path: Path) -> Path:
-    """Random weights of the smallest network, in a file as the authors publish it."""
+    """Write random weights of the smallest network in the authors' file format."""
     with torch.random.fork_rng():
         torch.manual_seed(_SEED)
         network = network_of("da3-small")

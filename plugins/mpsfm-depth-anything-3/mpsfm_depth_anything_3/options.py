@@ -1,4 +1,4 @@
-"""What a user can set, and what is known of the published weights. Imports nothing heavy."""
+"""Options of the provider and its published weights; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -18,32 +18,33 @@ LICENSES: dict[str, str] = {
     "da3-giant": _NON_COMMERCIAL,
     "da3nested-giant-large": _NON_COMMERCIAL,
 }
-"""Of the published weights, from their cards."""
+"""Licenses of the published weights, from their model cards."""
 
 
 class DepthAnything3Options(Options):
-    """Depth Anything 3 (2025) for any number of photos."""
+    """Options of Depth Anything 3 (2025)."""
 
     network: Network = "da3-small"
     """The authors' name of the architecture."""
     weights: str | None = None
-    """A safetensors file, as path or URI; null for the authors' published one of the network."""
+    """Path or URI of a safetensors file; null: the published weights of the network."""
     sha256: str | None = None
-    """Expected hash of it."""
+    """Expected hash of ``weights``."""
     resize: int = Field(504, ge=28)
-    """Longer side of the photos in pixels, rounded to multiples of 14 (authors' default)."""
+    """Longer side of the photos in pixels, rounded to multiples of 14. [authors' default]"""
     relative_std: float = Field(0.2, gt=0)
-    """Std of depth for a confidence of 1, in terms of the mean depth of a group. Trained with
-    ``confidence * error - alpha * log(confidence)`` a network says ``alpha / error``; the authors
-    do not publish alpha, 0.2 is that of DUSt3R, which the loss is from."""
+    """Std of depth for a confidence of 1, relative to the mean depth of a group. The training loss
+    ``confidence * error - alpha * log(confidence)`` makes the confidence ``alpha / error``; alpha
+    is not published. [alpha of DUSt3R]
+    """
 
     @property
     def file(self) -> str:
-        """The weights, named or published."""
+        """Return the weights file of the options."""
         return self.weights or f"hf://depth-anything/{self.network.upper()}@main/model.safetensors"
 
 
 def weights(options: Any) -> tuple[WeightsFile, ...]:
-    """For ``ProviderSpec.weights``."""
+    """Return the weights for ``ProviderSpec.weights``."""
     license = LICENSES[options.network] if options.weights is None else "unknown"
     return (WeightsFile(options.file, options.sha256, license),)

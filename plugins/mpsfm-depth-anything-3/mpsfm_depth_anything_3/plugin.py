@@ -1,4 +1,4 @@
-"""Announces the provider; imports nothing heavy."""
+"""Registration of the provider; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mpsfm_depth_anything_3.options import LICENSES, DepthAnything3Options, weig
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Depth, poses and intrinsics of groups of photos."""
+    """Register the provider of depth, poses and intrinsics of groups of photos."""
     return [
         ProviderSpec(
             kind="multiview",

@@ -1,4 +1,4 @@
-"""Depth Anything 3 of the authors' package, on groups of views."""
+"""Depth Anything 3 of the authors' package on groups of views."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _PATCH = 14
 _MEAN = np.float32([0.485, 0.456, 0.406])
 _STD = np.float32([0.229, 0.224, 0.225])
 _WARNINGS = 1
-"""The library's level of messages without its talk."""
+"""Log level of the library without its progress messages."""
 
 
 class DepthAnything3:
-    """Depth of all views in one unit, with poses and intrinsics.
+    """Provider of depth of several views in one unit, with poses and intrinsics.
 
-    Views keep their aspect ratio; those of a group that differ in size are padded to the same on
-    all sides, with the mean colour, where the authors' loader would cut borders off.
+    Views keep their aspect ratio. Smaller views of a group are padded with the mean color on all
+    sides; the authors' loader crops the larger ones instead.
     """
 
     def __init__(self, options: DepthAnything3Options, context: ProviderContext) -> None:
@@ -48,7 +48,14 @@ class DepthAnything3:
         self._network.to(self._device)
 
     def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
-        """Depth in one unit (metres of the nested network), with its std by the confidence."""
+        """Predict depth of a group in one unit, its std, poses and intrinsics.
+
+        Args:
+            views: The views of the group.
+
+        Returns:
+            The prior of the group; depth is in meters for the nested network.
+        """
         sizes = [_network_size(view, self._options.resize) for view in views]
         width, height = np.max(sizes, axis=0).tolist()
         starts = [((width - w) // 2, (height - h) // 2) for w, h in sizes]
@@ -75,7 +82,7 @@ class DepthAnything3:
 
 
 def network_of(name: str) -> Any:
-    """The architecture, whose parts the library looks up in files of its own."""
+    """Create the architecture from the configuration files of the library."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about what it uses of omegaconf and torch
         from depth_anything_3.cfg import create_object, load_config
@@ -87,13 +94,15 @@ def network_of(name: str) -> Any:
 
 
 def as_published(network: Any) -> torch.nn.Module:
-    """The network inside of an interface, as files with weights have it; tensors that parts of it
-    share are in them once."""
+    """Return the inner network with the tensor names of the published files.
+
+    Tensors that several parts share are stored once.
+    """
     return torch.nn.ModuleDict({"model": network})
 
 
 def _network_size(view: View, longest: int) -> tuple[int, int]:
-    """``(width, height)`` in whole patches; the aspect ratio is kept up to that."""
+    """Compute ``(width, height)`` in whole patches, with the aspect ratio as close as possible."""
     scale = longest / max(view.camera.size)
     width, height = (max(1, round(side * scale / _PATCH)) for side in view.camera.size)
     return width * _PATCH, height * _PATCH
@@ -105,7 +114,7 @@ def _intrinsics(
     starts: Sequence[tuple[int, int]],
     sizes: Sequence[tuple[int, int]],
 ) -> Float64:
-    """From matrices (n, 3, 3) of the network's grid to fx, fy, cx, cy of the views."""
+    """Convert matrices (n, 3, 3) of the network grid to fx, fy, cx, cy of the views."""
     scale = np.array([view.camera.size for view in views]) / np.array(sizes)
     focal = found[:, [0, 1], [0, 1]] * scale
     center = (found[:, :2, 2] - np.array(starts)) * scale

@@ -1,1 +1,1 @@
-"""DSINE surface normals in an ONNX file."""
+"""DSINE surface normals from an ONNX file."""

@@ -1,4 +1,4 @@
-"""How the contract kit tests the provider without weights."""
+"""Contract setup: a stand-in network without weights."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ from mpsfm_dsine.provider import describe
 
 
 def setup(folder: Path) -> ContractSetup:
-    """A network that reads painted views and is told the camera."""
+    """Write a network with an intrinsics input that decodes painted views."""
     model = stand_in(describe(DsineOptions(model="")), folder)
     return ContractSetup(options={"model": str(model)}, truth_source="painted")

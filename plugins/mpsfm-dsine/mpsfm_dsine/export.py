@@ -1,5 +1,7 @@
-"""DSINE with concentration as ONNX, by its authors' code; run as a program, see
-:mod:`mpsfm_core.providers.model_export`."""
+"""Export of DSINE with concentration to ONNX, with its authors' code.
+
+Runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+"""
 
 from __future__ import annotations
 
@@ -17,19 +19,20 @@ _SIDES = ((96, 128), (160, 96))
 
 
 class Last(torch.nn.Module):
-    """The last of the refinements, as the authors' scripts take it."""
+    """Module that returns the last refinement, as the authors' scripts do."""
 
     def __init__(self, model: torch.nn.Module) -> None:
         super().__init__()
         self.model = model
 
     def forward(self, image: torch.Tensor, intrins: torch.Tensor) -> torch.Tensor:
+        """Run the network."""
         found: torch.Tensor = self.model(image, intrins=intrins.clone(), mode="test")[-1]
         return found
 
 
 class _Here:
-    """Coordinates that the constructor wants on the first GPU."""
+    """Context that keeps the constructor's coordinates on the CPU instead of the first GPU."""
 
     def __init__(self, coordinates: torch.Tensor) -> None:
         self._coordinates = coordinates
@@ -39,7 +42,7 @@ class _Here:
 
 
 def network(encoder: int) -> Last:
-    """As the authors' experiment exp002_kappa, with EfficientNet-B0 or -B5."""
+    """Create the network of the authors' experiment exp002_kappa, with EfficientNet-B0 or -B5."""
     settings = SimpleNamespace(
         NNET_encoder_B=encoder,
         NNET_decoder_NF={0: 1280, 5: 2048}[encoder],
@@ -61,7 +64,7 @@ def network(encoder: int) -> Last:
 
 
 def export(job: ExportJob, model: Last) -> None:
-    """Images of any size in steps of 32, and their intrinsics."""
+    """Export the network for images of any size in steps of 32, with their intrinsics."""
     examples = []
     for height, width in _SIDES:
         intrinsics = torch.tensor([[100.0, 0, width / 2], [0, 100.0, height / 2], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""What a user can set. Imports nothing heavy."""
+"""Options of the provider; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from mpsfm_core import Options
 
 
 class DsineOptions(Options):
-    """The network."""
+    """Options of the network."""
 
     model: str = "export:dsine"
-    """Path or URI of the ONNX file; by default what ``mpsfm models export dsine`` made."""
+    """Path or URI of the ONNX file; default: the output of ``mpsfm models export dsine``."""
     sha256: str | None = None
     """Expected hash of ``model``."""
     size: int = Field(1200, ge=32, le=2000)
-    """Longer side in pixels at which the network sees a view, never enlarged (reference: the size
-    of its images); the network knows rays up to 2000 pixels."""
+    """Longer side of the network input in pixels; views are never enlarged. The network supports up
+    to 2000 pixels. [reference]
+    """

@@ -1,4 +1,4 @@
-"""Announces the provider. Imports neither onnxruntime nor OpenCV."""
+"""Registration of the provider; imports neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mpsfm_dsine.options import DsineOptions
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Normals."""
+    """Register the normals provider."""
     return [
         ProviderSpec(
             kind="normals",
@@ -23,7 +23,9 @@ def mpsfm_providers() -> list[ProviderSpec]:
             install_hint="pip install mpsfm-dsine",
             code_license="Apache-2.0",
             weights_license="of the authors' checkpoint (code MIT)",
-            weights=weights_from_option("model", WeightsFile("export:dsine", license="of the authors")),
+            weights=weights_from_option(
+                "model", WeightsFile("export:dsine", license="of the authors")
+            ),
             calibration=NormalCalibration(std_scale=1.0, std_floor_deg=1.0),
             contract="mpsfm_dsine.contract:setup",
         )
@@ -32,7 +34,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
 
 @hookimpl
 def mpsfm_exports() -> dict[str, ModelExport]:
-    """From the authors' code and checkpoint."""
+    """Register the export from the authors' code and checkpoint."""
     return {
         "dsine": ModelExport(
             script="mpsfm_dsine.export",

@@ -12,14 +12,14 @@ from mpsfm_dsine.options import DsineOptions
 
 
 class Dsine(DescribedNormals):
-    """Normals with the variance of their concentration."""
+    """Provider of normals with a variance from their concentration."""
 
     def __init__(self, options: DsineOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context, options.model, options.sha256)
 
 
 def describe(options: DsineOptions) -> Description:
-    """The description of the network at the size that the options name."""
+    """Return the description of the network at the size of the options."""
     general = load_description(str(Path(__file__).with_name("description.yaml")))
     assert isinstance(general.input.size, SideSize)
     size = general.input.size.model_copy(update={"side": options.size})

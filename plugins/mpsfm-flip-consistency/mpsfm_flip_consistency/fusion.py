@@ -1,9 +1,9 @@
-"""Mean of two passes, and the variance that their disagreement says they have.
+"""Mean of two passes, and its variance from their difference (paper, appendix B).
 
-Paper appendix B: the covariance is the sum of the outer products of both deviations from the mean,
-which for two samples is their unbiased covariance; where the network gives a variance too, the
-larger one is taken. Errors of two passes of one network are correlated, so the variance of the
-mean is not taken to be smaller than that of one pass.
+The covariance is the sum of the outer products of both deviations from the mean, which is the
+unbiased covariance of two samples. If the network predicts a variance, the larger one is used.
+Errors of two passes are correlated, so the variance of the mean is not reduced below that of one
+pass.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from mpsfm_core import DepthPrior, NormalPrior
 from mpsfm_core.data import Bool, Float32, Float64
 
 _SMALLEST_RELATIVE_STD = 1e-4
-"""Of depth, where both passes agree exactly: a variance must be positive."""
+"""Minimum std relative to depth, because a variance must be positive if both passes agree."""
 _SMALLEST_STD_RAD = 1e-3
 
 
 def fuse_depth(first: DepthPrior, second: DepthPrior) -> DepthPrior:
-    """Both passes as one prior, valid where both are.
+    """Fuse two depth maps to one prior that is valid where both are.
 
-    With network variances the mean is weighted by their inverses (reference), else both passes
-    weigh the same.
+    The mean is weighted by the inverse network variances if both have one [reference], else
+    equally.
     """
     valid = first.valid & second.valid
     depths = _stack(first.depth, second.depth, valid)
@@ -40,12 +40,12 @@ def fuse_depth(first: DepthPrior, second: DepthPrior) -> DepthPrior:
 
 
 def fuse_normals(first: NormalPrior, second: NormalPrior) -> NormalPrior:
-    """Both passes as one prior, valid where both are; it faces the camera, as both do.
+    """Fuse two normal maps to one prior that is valid where both are.
 
-    The mean is the unit vector halfway between both. Both deviate from it by half the angle
-    between them, to opposite sides, so their covariance in the tangent plane has the eigenvalues
-    ``angle**2 / 2`` along the deviation and 0 across it. A :class:`NormalPrior` has one variance
-    for both tangent directions: half the trace, ``angle**2 / 4``, which keeps the total variance.
+    The mean is the normalized sum. Both normals deviate from it by half of their angle, in opposite
+    directions, so their covariance in the tangent plane has the eigenvalues ``angle**2 / 2`` and 0.
+    A :class:`NormalPrior` has one variance for both tangent directions: half of the trace,
+    ``angle**2 / 4``.
     """
     valid = first.valid & second.valid
     total = first.normals.astype(np.float64) + second.normals
@@ -59,5 +59,5 @@ def fuse_normals(first: NormalPrior, second: NormalPrior) -> NormalPrior:
 
 
 def _stack(first: Float32, second: Float32, valid: Bool) -> Float64:
-    """Both maps as (2, h, w) float64, 1 where not valid."""
+    """Stack both maps as (2, h, w) float64, with 1 at invalid pixels."""
     return np.where(valid, np.stack([first, second]).astype(np.float64), 1.0)

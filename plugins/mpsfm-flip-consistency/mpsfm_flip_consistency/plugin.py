@@ -1,4 +1,4 @@
-"""Announces the wrapper."""
+"""Registration of the wrapper."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from mpsfm_core import ProviderSpec, hookimpl
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """One wrapper, for depth and for normals."""
+    """Register one wrapper for depth and normals."""
     return [
         ProviderSpec(
             kind="wrapper",

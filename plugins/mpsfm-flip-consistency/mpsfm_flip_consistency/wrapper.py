@@ -1,4 +1,4 @@
-"""The wrapper of a depth or normals provider."""
+"""Wrapper around a depth or normals provider."""
 
 from __future__ import annotations
 
@@ -11,16 +11,20 @@ from mpsfm_flip_consistency.mirror import mirror_depth, mirror_normals, mirror_v
 
 
 class FlipConsistency:
-    """Runs a provider on the view and on its mirror image, and fuses both."""
+    """Wrapper that runs a provider on a view and its mirror image, and fuses both."""
 
     def __init__(self, inner: Any, options: None, context: ProviderContext) -> None:
         self._inner = inner
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> DepthPrior | NormalPrior:
-        """What the provider predicts, with a variance; ``depth`` is for normals that need it.
+        """Predict with the wrapped provider, and add a variance.
+
+        Args:
+            view: The view.
+            depth: Depth of the view, for normal providers that need it.
 
         Raises:
-            DataError: both passes have grids of different sizes.
+            DataError: The grids of both passes differ in size.
         """
         given, mirrored = ((), ()) if depth is None else ((depth,), (mirror_depth(depth),))
         first = self._inner.predict(view, *given)

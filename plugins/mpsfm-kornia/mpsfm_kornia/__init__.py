@@ -1,1 +1,1 @@
-"""Local features and matchers of kornia as MP-SfM providers."""
+"""Local features and matchers of kornia."""

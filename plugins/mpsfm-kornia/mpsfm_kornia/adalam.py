@@ -1,4 +1,4 @@
-"""AdaLAM as a sparse matcher: nearest neighbours that agree with those around them."""
+"""AdaLAM as a sparse matcher: nearest neighbors with local affine consistency."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from mpsfm_core.providers.torch_runtime import inference, use_threads
 from mpsfm_kornia.options import AdalamOptions
 
 _FEWEST = 2
-"""AdaLAM compares the nearest with the second nearest."""
+"""Minimum number of features: AdaLAM compares the nearest and second nearest neighbor."""
 
 
 class AdalamMatcher:
-    """For features of any kind; without weights.
+    """Matcher for features of any kind, without weights.
 
-    A neighbourhood of matches is kept when one affine map explains enough of them. Features carry
-    no orientation, so that is not compared; scales are, where they are known. The score of a match
-    is ``c / (c + min_confidence)`` of the confidence c of its neighbourhood.
+    A neighborhood of matches is kept if one affine map explains enough of them. Orientations are
+    not compared, because features carry none; scales are compared if known. The score of a match is
+    ``c / (c + min_confidence)`` with the confidence c of its neighborhood.
     """
 
     def __init__(self, options: AdalamOptions, context: ProviderContext) -> None:
@@ -38,10 +38,8 @@ class AdalamMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Matches that others around them support, each feature once."""
-        features_a, features_b = require_features(
-            "adalam matches features", features_a, features_b
-        )
+        """Return matches with local support, each feature at most once."""
+        features_a, features_b = require_features("adalam matches features", features_a, features_b)
         if features_a.descriptors.shape[1] != features_b.descriptors.shape[1]:
             raise ProviderError(
                 f"descriptors of {view_a.name!r} and {view_b.name!r} differ in dimension"
@@ -89,5 +87,5 @@ class AdalamMatcher:
 
 
 def _matches(indices: Any, scores: Any) -> PairMatches:
-    """The best match of each feature; kornia may match one of the second view several times."""
+    """Select the best match of each feature; kornia may return several."""
     return PairMatches(sparse=SparseMatches.from_best_scores(indices, scores))

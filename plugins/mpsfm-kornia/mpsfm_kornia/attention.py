@@ -1,8 +1,7 @@
-"""LightGlue's cross attention without its matrix, for CPUs.
+"""Cross attention of LightGlue without explicit matrices, for CPUs.
 
-On a GPU kornia runs it by ``scaled_dot_product_attention``. On a CPU it builds the matrix between
-all keypoints of both images, twice the softmax and a transposed copy of it for each head and layer:
-at 4096 keypoints and 4 heads 268 MB each, and most of the time is spent moving them.
+On a GPU, kornia uses ``scaled_dot_product_attention``. On a CPU it builds the matrix between all
+keypoints of both images for each head and layer, and spends most of the time on memory transfers.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from torch.nn.functional import scaled_dot_product_attention
 
 
 class FusedCrossBlock(nn.Module):
-    """Computes what a :class:`CrossBlock` does with that block's own layers and their names."""
+    """Replacement of a :class:`CrossBlock` with the layers of that block and their names."""
 
     def __init__(self, block: CrossBlock) -> None:
         super().__init__()
@@ -28,7 +27,7 @@ class FusedCrossBlock(nn.Module):
         )
 
     def forward(self, x0: torch.Tensor, x1: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Descriptors (b, m, d) and (b, n, d) of two images after looking at each other."""
+        """Apply cross attention to descriptors (b, m, d) and (b, n, d) of two images."""
         qk0, qk1 = self._by_head(self.to_qk(x0)), self._by_head(self.to_qk(x1))
         v0, v1 = self._by_head(self.to_v(x0)), self._by_head(self.to_v(x1))
         m0 = scaled_dot_product_attention(qk0, qk1, v1)
@@ -36,7 +35,7 @@ class FusedCrossBlock(nn.Module):
         return self._updated(x0, m0), self._updated(x1, m1)
 
     def _by_head(self, x: torch.Tensor) -> torch.Tensor:
-        """(b, n, d) as (b, heads, n, d / heads)."""
+        """Reshape (b, n, d) to (b, heads, n, d / heads)."""
         return x.unflatten(-1, (self._heads, -1)).transpose(1, 2)
 
     def _updated(self, x: torch.Tensor, message: torch.Tensor) -> torch.Tensor:
@@ -46,6 +45,6 @@ class FusedCrossBlock(nn.Module):
 
 
 def fuse_cross_attention(network: LightGlue) -> None:
-    """Replace the cross blocks of this network (not of kornia's classes); weights stay its own."""
+    """Replace the cross blocks of this network; its weights stay the same."""
     for layer in network.transformers:
         layer.cross_attn = FusedCrossBlock(layer.cross_attn)

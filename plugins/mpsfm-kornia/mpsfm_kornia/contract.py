@@ -1,7 +1,4 @@
-"""How the contract kit tests networks without their weights: on random ones.
-
-They detect and match, and it means nothing.
-"""
+"""Contract setup: networks with random weights, whose answers are valid but not accurate."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from mpsfm_kornia.lightglue import LIGHTGLUE_256
 
 
 def loftr(folder: Path) -> ContractSetup:
-    """Saved as the published weights are."""
+    """Write random weights of LoFTR in the published format."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = LoFTR(pretrained=None).eval()
@@ -27,7 +24,7 @@ def loftr(folder: Path) -> ContractSetup:
 
 
 def dedode(folder: Path) -> ContractSetup:
-    """Detector and descriptor in files of their own, as the published ones are."""
+    """Write random weights of detector and descriptor in separate files, as published."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = DeDoDe("L", "B", amp_dtype=torch.float32).eval()
@@ -39,7 +36,7 @@ def dedode(folder: Path) -> ContractSetup:
 
 
 def lightglue_dedode(folder: Path) -> ContractSetup:
-    """LightGlue for 256 dimensions."""
+    """Write random weights of LightGlue for 256 dimensions."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = LightGlue(None, **LIGHTGLUE_256, weights=None).eval()  # type: ignore[arg-type]

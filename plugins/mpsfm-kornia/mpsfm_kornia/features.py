@@ -1,7 +1,7 @@
 """XFeat, ALIKED, DISK, DeDoDe and SIFT as feature providers.
 
-kornia reports keypoints in a frame whose pixel centres are integers, on the image it was given.
-Here they become COLMAP pixels of the view: half a pixel is added, then the size is scaled.
+kornia's keypoints refer to the resized image, with the first pixel at (0, 0). They are converted to
+COLMAP pixels of the view: add half a pixel, then scale.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _Detections = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 class KorniaFeatures(ABC):
-    """What the detectors share."""
+    """Base class of the detectors."""
 
     multiple = 1
-    """The sides of the network's image are multiples of this."""
+    """The sides of the network input are multiples of this."""
 
     def __init__(self, options: FeatureOptions, context: ProviderContext) -> None:
         use_threads(context)
@@ -41,15 +41,17 @@ class KorniaFeatures(ABC):
 
     @abstractmethod
     def _detect(self, image: torch.Tensor) -> _Detections:
-        """Keypoints (n, 2), scores (n,) in [0, 1] and descriptors (n, d) of a (1, 3, h, w) image.
+        """Detect features in a (1, 3, h, w) image.
 
-        Keypoints are kornia's: the centre of the first pixel is (0, 0).
+        Returns:
+            Keypoints (n, 2) in kornia's pixels (first pixel at (0, 0)), scores (n,) in [0, 1] and
+            descriptors (n, d).
         """
 
     def extract(self, view: View) -> Features:
-        """The strongest keypoints inside of the view's mask, best first.
+        """Extract the strongest keypoints inside the mask, best first.
 
-        ``std_px`` is 1, or the size of a pixel of the resized image if that is more.
+        ``std_px`` is 1, or the pixel size of the resized image if larger.
         """
         grid = Grid.fit(view, self._options.resize, self.multiple)
         with inference():
@@ -67,7 +69,7 @@ class KorniaFeatures(ABC):
 
 
 class XFeatFeatures(KorniaFeatures):
-    """XFeat. Sides are multiples of 32, so that kornia's own resizing has nothing to do."""
+    """XFeat; sides are multiples of 32, which avoids kornia's own resizing."""
 
     multiple = 32
 
@@ -87,7 +89,7 @@ class XFeatFeatures(KorniaFeatures):
 
 
 class AlikedFeatures(KorniaFeatures):
-    """ALIKED."""
+    """ALIKED features."""
 
     def __init__(self, options: AlikedOptions, context: ProviderContext) -> None:
         super().__init__(options, context)
@@ -107,8 +109,11 @@ class AlikedFeatures(KorniaFeatures):
 
 
 class DiskFeatures(KorniaFeatures):
-    """DISK. Its heatmap ``h > 0`` has no upper end; ``h / (1 + h)`` is the score, since the
-    logistic function is 1 in float32 for nearly all of its keypoints."""
+    """DISK features.
+
+    The heatmap h > 0 is unbounded; the score is ``h / (1 + h)``, because the logistic function
+    saturates in float32.
+    """
 
     def __init__(self, options: DiskOptions, context: ProviderContext) -> None:
         super().__init__(options, context)
@@ -132,7 +137,7 @@ class DiskFeatures(KorniaFeatures):
 
 
 class DedodeFeatures(KorniaFeatures):
-    """DeDoDe. Its scores are probabilities of pixels, which are 1 together."""
+    """DeDoDe features; the scores are pixel probabilities that sum to 1."""
 
     def __init__(self, options: DedodeOptions, context: ProviderContext) -> None:
         super().__init__(options, context)
@@ -150,7 +155,7 @@ class DedodeFeatures(KorniaFeatures):
 
 
 class SiftFeatures(KorniaFeatures):
-    """RootSIFT. The score is the contrast that the detector maximises."""
+    """RootSIFT features; the score is the contrast of the extremum."""
 
     def __init__(self, options: SiftOptions, context: ProviderContext) -> None:
         super().__init__(options, context)

@@ -33,7 +33,7 @@ _FIXED = {
 
 
 class LightGlueMatcher:
-    """LightGlue with the architecture it has for 128-dimensional ALIKED and DISK features."""
+    """LightGlue with the architecture for 128-dimensional ALIKED and DISK features."""
 
     architecture: dict[str, int] = _LIGHTGLUE
 
@@ -61,10 +61,13 @@ class LightGlueMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Mutual matches with their confidence.
+        """Match features of two views.
+
+        Returns:
+            Mutual matches with their confidence as score.
 
         Raises:
-            ProviderError: the descriptors are not of the family this network was trained for.
+            ProviderError: The descriptors do not have the dimension of this network.
         """
         features_a, features_b = require_features(
             "LightGlue matches features", features_a, features_b
@@ -98,13 +101,13 @@ class LightGlueMatcher:
 
 
 class DedodeLightGlueMatcher(LightGlueMatcher):
-    """LightGlue with the architecture it has for 256-dimensional DeDoDe features."""
+    """LightGlue with the architecture for 256-dimensional DeDoDe features."""
 
     architecture = LIGHTGLUE_256
 
 
 class LighterGlueMatcher(LightGlueMatcher):
-    """LighterGlue with the architecture it has for 64-dimensional XFeat features."""
+    """LighterGlue with the architecture for 64-dimensional XFeat features."""
 
     architecture = _LIGHTERGLUE
 
@@ -114,7 +117,7 @@ def _matches(indices: Any, scores: Any) -> PairMatches:
 
 
 def _renamed(state: dict[str, Any]) -> dict[str, Any]:
-    """Published names as kornia's: without the trainer's prefix, layers under ``transformers``."""
+    """Rename published tensors to kornia's names."""
     renamed = {}
     for name, tensor in state.items():
         if name.startswith("extractor."):

@@ -16,18 +16,17 @@ from mpsfm_kornia.options import LoftrOptions
 from mpsfm_kornia.runtime import Grid, fill, load_weights, usable
 
 _MULTIPLE = 8
-"""The coarse level has one cell every 8 pixels."""
+"""The coarse level has one cell per 8 pixels."""
 _STD_NETWORK_PX = 0.5
-"""Localisation noise in network pixels (reference: half that of sparse keypoints)."""
+"""Keypoint noise in network pixels. [reference: half of the noise of sparse keypoints]"""
 _LUMA = (0.299, 0.587, 0.114)
-"""ITU-R BT.601, as in the training's image reader."""
+"""Luma coefficients of ITU-R BT.601, as in training."""
 
 
 class LoftrMatcher:
     """LoFTR with the architecture of its published weights.
 
-    Its keypoints already are in the frame of its training data, COLMAP's (kornia documents that
-    the published weights put a pixel's centre at +0.5), so nothing is added to them.
+    Its keypoints already use COLMAP's pixel convention (documented by kornia).
     """
 
     def __init__(self, options: LoftrOptions, context: ProviderContext) -> None:
@@ -49,7 +48,7 @@ class LoftrMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Matches of cells of the first view with sub-pixel positions in the second."""
+        """Match cells of the first view to subpixel positions in the second view."""
         grids = [Grid.fit(view, self._longest, _MULTIPLE) for view in (view_a, view_b)]
         images = [
             self._gray(grid, view) for grid, view in zip(grids, (view_a, view_b), strict=True)

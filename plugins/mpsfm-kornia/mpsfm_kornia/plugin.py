@@ -1,4 +1,4 @@
-"""Announces the providers. Imports neither torch nor kornia."""
+"""Registration of the providers; imports neither torch nor kornia."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LIGHTGLUE_HINT = "pip install mpsfm-kornia && pip install --no-deps scm-lightgl
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Detectors, their matchers, a matcher for any features, and a dense matcher."""
+    """Register detectors, their matchers, a matcher for any features, and a dense matcher."""
     return [
         ProviderSpec(
             kind="features",

@@ -1,4 +1,4 @@
-"""What the networks share: weights, and the network's pixel grid."""
+"""Weights and pixel grid of the networks."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mpsfm_core.providers.weights import load_torch_state
 from mpsfm_kornia.options import KNOWN_HASHES
 
 _SMALLEST_SIDE = 32
-"""The networks shrink their input by up to 32."""
+"""Minimum side in pixels; the networks reduce their input by up to 32."""
 
 
 def load_weights(context: ProviderContext, uri: str, sha256: str | None) -> dict[str, Any]:
-    """The state dictionary of a weights file, its hash checked where one is known."""
+    """Load the state dictionary of a weights file, and check its hash if known."""
     return load_torch_state(context.resolve_weights(uri, sha256 or KNOWN_HASHES.get(uri)))
 
 
@@ -28,7 +28,7 @@ def fill(module: torch.nn.Module, state: dict[str, Any], uri: str) -> None:
     """Load all learned values of a network and switch it to evaluation.
 
     Raises:
-        WeightsError: the file lacks some of them, or has them in other shapes.
+        WeightsError: The file lacks tensors, or their shapes differ.
     """
     try:
         mismatch = module.load_state_dict(state, strict=False)
@@ -42,37 +42,39 @@ def fill(module: torch.nn.Module, state: dict[str, Any], uri: str) -> None:
 
 
 def usable(view: View, xy: Float64) -> Bool:
-    """Which pixels (n, 2) lie in the view and in its mask."""
+    """Return which pixels (n, 2) are inside the view and its mask."""
     ok = inside(xy, view.camera.size)
     return ok if view.mask is None else ok & sample_nearest(view.mask, xy)
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The image size at which a network runs, beside the size of the view."""
+    """Size of the network input and of the view."""
 
     view: tuple[int, int]
     network: tuple[int, int]
 
     @classmethod
     def fit(cls, view: View, longest: int | None, multiple: int = 1) -> Grid:
-        """At most ``longest`` pixels long, sides rounded down to a multiple, never enlarged
-        (except to the networks' smallest side)."""
+        """Compute a size of at most ``longest`` pixels, with sides rounded down to a multiple.
+
+        Views are never enlarged, except to the minimum side of the networks.
+        """
         scale = min(1.0, (longest or np.inf) / max(view.camera.size))
         sides = (round(side * scale) // multiple * multiple for side in view.camera.size)
         width, height = (max(side, _SMALLEST_SIDE) for side in sides)
         return cls(view.camera.size, (width, height))
 
     def image(self, view: View, device: str) -> torch.Tensor:
-        """The resized image, (1, 3, h, w) float32, RGB in [0, 1]."""
+        """Resize an image to (1, 3, h, w) float32, RGB in [0, 1]."""
         resized = resize_map(view.image, *self.network) / np.float32(255)
         return torch.from_numpy(resized).permute(2, 0, 1)[None].contiguous().to(device)
 
     def to_view(self, xy: Float64) -> Float64:
-        """Pixels of the network's image (centre of the first at 0.5) as pixels of the view."""
+        """Convert pixels of the network input (first pixel at 0.5) to pixels of the view."""
         return scale_pixels(xy, self.network, self.view)
 
     @property
     def pixel_size(self) -> float:
-        """Longer side of a network pixel, in pixels of the view."""
+        """Return the longer side of a network pixel, in pixels of the view."""
         return max(v / n for v, n in zip(self.view, self.network, strict=True))

@@ -1,5 +1,4 @@
-"""How the contract kit tests the providers without weights: a detector of bright and dark spots
-that describes them by the pixels around, and a matcher by mutual nearest descriptors."""
+"""Contract setup: a blob detector with patch descriptors, and mutual nearest neighbors."""
 
 from __future__ import annotations
 
@@ -70,17 +69,17 @@ lightglue (float[b,n,2] kpts0, float[b,m,2] kpts1, float[b,n,d] desc0, float[b,m
 
 
 def superpoint(folder: Path) -> ContractSetup:
-    """On grey images."""
+    """Write a stand-in for gray images."""
     return ContractSetup(options=_detector(folder, 1), truth_source="image")
 
 
 def disk(folder: Path) -> ContractSetup:
-    """On colour images."""
+    """Write a stand-in for color images."""
     return ContractSetup(options=_detector(folder, 3), truth_source="image")
 
 
 def lightglue(folder: Path) -> ContractSetup:
-    """For descriptors of any detector; the features are the stand-ins'."""
+    """Write a matcher for the descriptors of the stand-in detectors."""
     numbers = {"one": 1, "zero": 0, "one_step": 1, "none": -1}
     model = save_model(
         _MATCHER,

@@ -14,18 +14,18 @@ from mpsfm_lightglue_onnx.options import DiskOptions, FeatureOptions, SuperPoint
 
 _OUTPUTS = ("keypoints", "scores", "descriptors")
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
-"""ITU-R BT.601, as in LightGlue's own reader."""
+"""Luma coefficients of ITU-R BT.601, as in LightGlue's image reader."""
 
 
 class OnnxFeatures:
-    """An extractor of LightGlue-ONNX.
+    """Extractor of LightGlue-ONNX.
 
-    Input ``image`` (1, c, h, w) in [0, 1]. Outputs ``keypoints`` (1, n, 2), pixels of that image
-    whose first has its centre at (0, 0), ``scores`` (1, n) and ``descriptors`` (1, n, d).
+    Input ``image`` (1, c, h, w) in [0, 1]. Outputs ``keypoints`` (1, n, 2) in pixels of that image
+    (first pixel at (0, 0)), ``scores`` (1, n) and ``descriptors`` (1, n, d).
     """
 
     multiple = 8
-    """The sides of the network's image are multiples of this."""
+    """The sides of the network input are multiples of this."""
 
     def __init__(self, options: FeatureOptions, context: ProviderContext, model: str) -> None:
         self._model = Model(context.resolve_weights(model, options.sha256), context)
@@ -33,13 +33,13 @@ class OnnxFeatures:
         self._options = options
 
     def channels(self, rgb: Float32) -> Float32:
-        """What the network wants of an image (1, 3, h, w) in [0, 1]."""
+        """Convert an image (1, 3, h, w) in [0, 1] to the channels of the network."""
         return rgb
 
     def extract(self, view: View) -> Features:
-        """The strongest keypoints inside of the view and its mask, best first.
+        """Extract the strongest keypoints inside the view and its mask, best first.
 
-        ``std_px`` is 1, or the size of a pixel of the resized image if that is more.
+        ``std_px`` is 1, or the pixel size of the resized image if larger.
         """
         longest = max(view.camera.size)
         side = min(longest, self._options.resize or longest)
@@ -64,13 +64,13 @@ class OnnxFeatures:
 
 
 class SuperPoint(OnnxFeatures):
-    """SuperPoint, which wants grey images."""
+    """SuperPoint, for gray images."""
 
     def __init__(self, options: SuperPointOptions, context: ProviderContext) -> None:
         super().__init__(options, context, options.model)
 
     def channels(self, rgb: Float32) -> Float32:
-        """The luma, (1, 1, h, w)."""
+        """Compute the luma, (1, 1, h, w)."""
         return np.tensordot(rgb, _LUMA, axes=(1, 0))[:, np.newaxis]
 
 

@@ -16,11 +16,11 @@ _OUTPUTS = ("matches0", "mscores0")
 
 
 class LightGlue:
-    """A matcher of LightGlue-ONNX.
+    """Matcher of LightGlue-ONNX.
 
-    Inputs ``kpts0``, ``kpts1`` (1, n, 2), normalised, and ``desc0``, ``desc1`` (1, n, d). Outputs
-    ``matches0``, ``mscores0``: of the matches alone, (m, 2) and (m,), or of all keypoints of the
-    first view, (1, n), with -1 for those that have no match.
+    Inputs ``kpts0``, ``kpts1`` (1, n, 2), normalized, and ``desc0``, ``desc1`` (1, n, d). Outputs
+    ``matches0`` and ``mscores0``: either matches (m, 2) and scores (m,), or both for all keypoints
+    of the first view, (1, n), with -1 for no match.
     """
 
     def __init__(self, options: LightGlueOptions, context: ProviderContext) -> None:
@@ -35,7 +35,7 @@ class LightGlue:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Mutual matches with their confidence."""
+        """Match features of two views; returns mutual matches with their confidence as score."""
         features_a, features_b = require_features(
             "LightGlue matches features", features_a, features_b
         )
@@ -53,8 +53,10 @@ class LightGlue:
 
 
 def _normalised(view: View, features: Features) -> Float64:
-    """Keypoints with the image's centre at 0 and its longer side from -1 to 1, from pixels whose
-    first has its centre at (0, 0), as in training."""
+    """Normalize keypoints to the image center and half of the longer side, as in training.
+
+    Input pixels have the first pixel at (0, 0).
+    """
     size = np.array(view.camera.size, dtype=np.float64)
     normalised: Float64 = (features.keypoints - 0.5 - size / 2) / (size.max() / 2)
     return normalised
@@ -63,7 +65,7 @@ def _normalised(view: View, features: Features) -> Float64:
 def _listed(
     matches: NDArray[np.int64], scores: NDArray[np.float32]
 ) -> tuple[Int64, NDArray[np.float32]]:
-    """Pairs (m, 2) and scores (m,) of either form of the outputs."""
+    """Convert both forms of the outputs to pairs (m, 2) and scores (m,)."""
     if scores.ndim == 1:
         return matches, scores
     there, scores = matches[0], scores[0]

@@ -1,4 +1,4 @@
-"""What a user can set, and the default weights. Imports nothing heavy."""
+"""Options and default weights; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -16,38 +16,40 @@ LIGHTGLUE_DISK = WeightsFile(f"{_RELEASE}/disk_lightglue.onnx", license="Apache-
 
 
 class FeatureOptions(Options):
-    """Settings that both detectors share; thresholds are part of the exported model."""
+    """Options of both detectors; thresholds are part of the exported model."""
 
     max_keypoints: int = Field(6000, gt=0)
-    """The strongest are kept (reference, for SuperPoint)."""
+    """Number of keypoints with the highest score to keep. [reference, for SuperPoint]"""
     resize: int | None = Field(1600, ge=32)
-    """Longer side in pixels at which to detect, never enlarged (reference); None keeps the
-    view's."""
+    """Longer side for detection in pixels, never enlarged; null: the size of the view. [reference]
+    """
     sha256: str | None = None
     """Expected hash of ``model``."""
 
 
 class SuperPointOptions(FeatureOptions):
-    """SuperPoint (2018), 256 dimensions."""
+    """Options of SuperPoint (2018), 256 dimensions."""
 
     model: str = SUPERPOINT.uri
     """Path or URI of the ONNX file."""
 
 
 class DiskOptions(FeatureOptions):
-    """DISK (NeurIPS 2020), 128 dimensions."""
+    """Options of DISK (NeurIPS 2020), 128 dimensions."""
 
     max_keypoints: int = Field(2048, gt=0)
-    """The strongest are kept (what LightGlue was trained with)."""
+    """Number of keypoints with the highest score to keep. [LightGlue: as in training]"""
     model: str = DISK.uri
     """Path or URI of the ONNX file."""
 
 
 class LightGlueOptions(Options):
-    """LightGlue for one feature family."""
+    """Options of LightGlue for one feature family."""
 
     min_score: float = Field(0.1, ge=0, lt=1)
-    """Smallest score of a match (LightGlue's filter_threshold; exports have one, too)."""
+    """Minimum score of a match, in addition to the threshold of the exported model. [LightGlue
+    filter_threshold]
+    """
     model: str = LIGHTGLUE_SUPERPOINT.uri
     """Path or URI of the ONNX file."""
     sha256: str | None = None
@@ -55,6 +57,6 @@ class LightGlueOptions(Options):
 
 
 class DiskLightGlueOptions(LightGlueOptions):
-    """LightGlue for DISK."""
+    """Options of LightGlue for DISK."""
 
     model: str = LIGHTGLUE_DISK.uri

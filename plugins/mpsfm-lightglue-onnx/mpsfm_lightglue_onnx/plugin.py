@@ -1,4 +1,4 @@
-"""Announces the providers. Imports neither onnxruntime nor OpenCV."""
+"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _HINT = "pip install mpsfm-lightglue-onnx"
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Two detectors and their matchers."""
+    """Register two detectors and their matchers."""
     return [
         ProviderSpec(
             kind="features",

@@ -1,5 +1,4 @@
-"""How the contract kit tests the matchers without weights: a stand-in that really matches, by the
-pixels around each pixel."""
+"""Contract setup: a stand-in that matches by patches around each pixel."""
 
 from __future__ import annotations
 
@@ -31,12 +30,12 @@ _TENSORS = (
 
 
 def dense(folder: Path) -> ContractSetup:
-    """Small, so that comparing all pixels is quick."""
+    """Write a small stand-in, so that comparing all pixels is quick."""
     return ContractSetup(options={**_stand_in(folder), "subsample": 8}, truth_source="image")
 
 
 def sparse(folder: Path) -> ContractSetup:
-    """The same stand-in at the keypoints of any detector."""
+    """Write the same stand-in for keypoints of any detector."""
     return ContractSetup(options=_stand_in(folder), truth_source="image")
 
 

@@ -1,5 +1,7 @@
-"""MASt3R as ONNX, by its authors' code; run as a program, see
-:mod:`mpsfm_core.providers.model_export`."""
+"""Export of MASt3R to ONNX, with its authors' code.
+
+Runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,9 @@ _PUBLISHED = """AsymmetricMASt3R(
     conf_mode=('exp', 1, inf), enc_embed_dim=1024, enc_depth=24, enc_num_heads=16,
     dec_embed_dim=768, dec_depth=12, dec_num_heads=12, two_confs=True,
     desc_conf_mode=('exp', 0, inf))"""
-"""What the published checkpoint says of itself: the authors' README, training of
-MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric."""
+"""Arguments of the published checkpoint (authors' README, training of
+MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric).
+"""
 _NARROW = {
     "enc_embed_dim": 128,
     "enc_depth": 2,
@@ -33,22 +36,24 @@ _NARROW = {
     "dec_embed_dim": 128,
     "dec_num_heads": 2,
 }
-"""Of size ``tiny``, to try things: the same classes and heads, which want 12 decoder blocks."""
+"""Arguments of size ``tiny`` for tests: the same classes and heads, which need 12 decoder blocks.
+"""
 _POSITIONS = 256
-"""Patches along a side that the file has rotations for: photos of up to 4096 pixels."""
+"""Patches along a side with rotary embeddings in the file: photos of up to 4096 pixels."""
 _SIDES = (((96, 128), (128, 64)), ((64, 160), (64, 160)))
 _KEYS = ("pts3d", "conf", "desc", "desc_conf")
 _OUTPUTS = [f"{key}_{side}" for side in (1, 2) for key in _KEYS]
 
 
 class TwoViews(torch.nn.Module):
-    """As the authors' scripts ask the network about two photos."""
+    """Module that calls the network with two images, as the authors' scripts do."""
 
     def __init__(self, model: AsymmetricMASt3R) -> None:
         super().__init__()
         self.model = model
 
     def forward(self, img1: torch.Tensor, img2: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Run the network."""
         views = [
             {"img": image, "true_shape": torch.tensor([image.shape[-2:]]), "instance": [str(n)]}
             for n, image in enumerate((img1, img2))
@@ -59,14 +64,17 @@ class TwoViews(torch.nn.Module):
 
 
 class AnySize(torch.nn.Module):
-    """The same for photos of any size in steps of a patch: each encoded by itself, sizes and
-    positions computed from what is given."""
+    """Module for images of any size in steps of a patch.
+
+    Each image is encoded by itself; sizes and positions are computed from the input.
+    """
 
     def __init__(self, model: AsymmetricMASt3R) -> None:
         super().__init__()
         self.model = model
 
     def forward(self, img1: torch.Tensor, img2: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Run the network."""
         model, images = self.model, (img1, img2)
         (feat1, pos1), (feat2, pos2) = (self._encoded(image) for image in images)
         heads = model.downstream_head1, model.downstream_head2
@@ -86,7 +94,7 @@ class AnySize(torch.nn.Module):
 
 
 def arguments(said: str) -> dict[str, Any]:
-    """Of the constructor call that a checkpoint holds as text, which is read and not run."""
+    """Parse the arguments of the constructor call in a checkpoint, without executing it."""
     call = ast.parse(said.replace("inf", _INFINITE), mode="eval").body
     if not (isinstance(call, ast.Call) and ast.unparse(call.func) == AsymmetricMASt3R.__name__):
         raise SystemExit(f"the checkpoint is of another network: {said}")
@@ -95,7 +103,7 @@ def arguments(said: str) -> dict[str, Any]:
 
 
 def network(size: str) -> AsymmetricMASt3R:
-    """As published or ``tiny``, with random weights that see points in front of the camera."""
+    """Create the published or ``tiny`` network, with random weights that predict positive depth."""
     narrowed = {"": {}, "tiny": _NARROW}[size]
     model = AsymmetricMASt3R(**(arguments(_PUBLISHED) | narrowed)).eval()
     for head in (model.downstream_head1, model.downstream_head2):
@@ -104,7 +112,7 @@ def network(size: str) -> AsymmetricMASt3R:
 
 
 def export(job: ExportJob, model: AsymmetricMASt3R) -> None:
-    """Two photos, each of any size in steps of 16."""
+    """Export the network for two images, each of any size in steps of 16."""
     given = [
         {f"img{n}": torch.rand(1, 3, *sides) * 2 - 1 for n, sides in enumerate(pair, start=1)}
         for pair in _SIDES
@@ -122,7 +130,7 @@ def export(job: ExportJob, model: AsymmetricMASt3R) -> None:
 
 
 def main() -> None:
-    """Export the network of the checkpoint, which says its own architecture."""
+    """Export the network of the checkpoint, which contains its architecture."""
     job = ExportJob.from_arguments()
     if job.weights is None:
         export(job, network(job.size))

@@ -1,7 +1,7 @@
-"""MASt3R as a dense and as a sparse matcher; both give the depth of the pair.
+"""MASt3R as a dense and a sparse matcher; both predict the depth of the pair.
 
-The network runs twice, with either view first: depth of a view is right in its own frame, and
-matches of both passes are better than those of one.
+The network runs twice, with either view first: depth is most accurate in the frame of the first
+view, and merged matches are better than those of one pass.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from mpsfm_mast3r.network import OnnxPairNetwork, PairNetwork, Seen
 from mpsfm_mast3r.options import DenseSearch, SparseSearch
 
 _STD_NETWORK_PX = 0.5
-"""Localisation noise of dense matches in network pixels (reference)."""
+"""Noise of dense matches in network pixels. [reference]"""
 
 
 class DenseMatcher:
-    """Reciprocal nearest neighbours of the descriptors of all pixels."""
+    """Matcher by reciprocal nearest neighbors of the descriptors of all pixels."""
 
     network: ClassVar[Callable[..., PairNetwork]] = OnnxPairNetwork
 
@@ -47,7 +47,7 @@ class DenseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Matches of both passes, the more certain one where both find the same."""
+        """Return the matches of both passes; duplicates keep the larger score."""
         passes = self._network.both(view_a, view_b)
         found = [self._reciprocal(a, b) for a, b in passes]
         scores = [_scores(a, b, pairs) for (a, b), pairs in zip(passes, found, strict=True)]
@@ -60,7 +60,7 @@ class DenseMatcher:
         return PairMatches(dense=dense, depth=_depth(passes))
 
     def _reciprocal(self, a: Seen, b: Seen) -> Int64:
-        """Pairs (m, 2) of cells, searched from both sides."""
+        """Find pairs (m, 2) of cells, searching from both sides."""
         there = reciprocal(a.descriptors, b.descriptors, self._start(a))
         back = reciprocal(b.descriptors, a.descriptors, self._start(b))
         return np.unique(np.concatenate([there, back[:, ::-1]]), axis=0)
@@ -74,7 +74,7 @@ class DenseMatcher:
 
 
 class SparseMatcher:
-    """Mutual nearest neighbours among the descriptors at given keypoints."""
+    """Matcher by mutual nearest neighbors of the descriptors at given keypoints."""
 
     network: ClassVar[Callable[..., PairNetwork]] = OnnxPairNetwork
 
@@ -89,7 +89,7 @@ class SparseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Matches of keypoints by the mean similarity of both passes."""
+        """Match keypoints by the mean similarity of both passes."""
         features_a, features_b = require_features(
             "mast3r-sparse matches keypoints", features_a, features_b
         )
@@ -110,20 +110,22 @@ class SparseMatcher:
 
 
 def _scores(a: Seen, b: Seen, cells: Int64) -> Float32:
-    """Scores of pairs (m, 2) of cells: the geometric mean c of both certainties (reference), as
-    ``c / (1 + c)`` in [0, 1)."""
+    """Compute scores ``c / (1 + c)`` in [0, 1) of pairs (m, 2) of cells.
+
+    c is the geometric mean of both descriptor confidences [reference].
+    """
     certainty = np.sqrt(a.match_certainty[cells[:, 0]] * b.match_certainty[cells[:, 1]])
     scores: Float32 = (certainty / (1 + certainty)).astype(np.float32)
     return scores
 
 
 def _merge(pairs: Int64, scores: Float32) -> tuple[Int64, Float32]:
-    """Each pair once, with its best score."""
+    """Merge duplicate pairs with their best score."""
     order = np.argsort(-scores, kind="stable")
     unique, first = np.unique(pairs[order], axis=0, return_index=True)
     return unique, scores[order][first]
 
 
 def _depth(passes: tuple[tuple[Seen, Seen], tuple[Seen, Seen]]) -> PairDepth:
-    """Each view's depth from the pass in which it came first."""
+    """Return the depth of each view from the pass with this view first."""
     return PairDepth(passes[0][0].depth(), passes[1][1].depth())

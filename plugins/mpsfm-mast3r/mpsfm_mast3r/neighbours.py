@@ -1,4 +1,4 @@
-"""Reciprocal nearest neighbours of unit descriptors."""
+"""Reciprocal nearest neighbors of unit descriptors."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import numpy as np
 from mpsfm_core.data import Float32, Int64
 
 _BLOCK = 1 << 24
-"""Similarities computed at once: 64 MB."""
+"""Number of similarities computed together: 64 MB."""
 _ROUNDS = 10
-"""As in MASt3R; nearly all searches end after three."""
+"""Maximum number of iterations [MASt3R]; nearly all searches converge in three."""
 
 
 def nearest(queries: Float32, base: Float32) -> Int64:
-    """Row of ``base`` (m, d) with the largest dot product, for each query (n, d)."""
+    """Find the row of ``base`` (m, d) with the largest dot product for each query (n, d)."""
     step = max(1, _BLOCK // max(len(base), 1))
     blocks = [
         (queries[start : start + step] @ base.T).argmax(axis=1)
@@ -23,10 +23,10 @@ def nearest(queries: Float32, base: Float32) -> Int64:
 
 
 def reciprocal(a: Float32, b: Float32, start: Int64) -> Int64:
-    """Pairs (m, 2) of rows that are each other's nearest, found from rows ``start`` of ``a``.
+    """Find pairs (m, 2) of rows that are mutual nearest neighbors, from rows ``start`` of ``a``.
 
-    From a row to its nearest, back to the nearest of that, and on until it stays (Leroy et al.,
-    ECCV 2024, fast reciprocal matching).
+    Iterate from a row to its nearest neighbor and back until the pair is stable (fast reciprocal
+    matching, Leroy et al., ECCV 2024).
     """
     found = [np.empty((0, 2), dtype=np.int64)]
     current = start
@@ -42,7 +42,7 @@ def reciprocal(a: Float32, b: Float32, start: Int64) -> Int64:
 
 
 def mutual(similarity: Float32) -> Int64:
-    """Pairs (m, 2) of a row and a column of a matrix that are each other's largest entry."""
+    """Find pairs (m, 2) of row and column that are each other's largest entry of a matrix."""
     if not similarity.size:
         return np.empty((0, 2), dtype=np.int64)
     there, back = similarity.argmax(axis=1), similarity.argmax(axis=0)

@@ -1,4 +1,4 @@
-"""The two-view network: what it says of each of two views."""
+"""Two-view network: points, descriptors and confidences of both views."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _TENSORS = ("pts3d", "conf", "desc", "desc_conf")
 
 @dataclass(frozen=True)
 class Seen:
-    """One view as a pass of the network sees it, on its canvas (h, w).
+    """Outputs of one pass for one view, on its canvas (h, w).
 
-    ``points``: (h, w, 3), in the camera frame of the pass's first view. ``certainty``: (h, w),
-    1 and more. ``descriptors``: (h * w, d), unit. ``match_certainty``: (h * w,), positive.
+    ``points``: (h, w, 3), in the camera frame of the first view. ``certainty``: (h, w), >= 1.
+    ``descriptors``: (h * w, d), unit. ``match_certainty``: (h * w,), positive.
     """
 
     view: View
@@ -38,20 +38,22 @@ class Seen:
     match_certainty: Float32
 
     def depth(self) -> DepthPrior:
-        """z of the first view of a pass, invalid at the border that was cut off; the std is
-        ``1 / certainty`` metres (reference)."""
+        """Return the depth of the first view, invalid at cropped borders.
+
+        The std is ``1 / certainty`` meters [reference].
+        """
         z = self.canvas.cut(self.points[..., 2:])[..., 0]
         certainty = self.canvas.cut(self.certainty[..., None])[..., 0]
         return DepthPrior.from_arrays(z, 1 / certainty.astype(np.float64) ** 2)
 
     def positions(self, cells: Int64) -> Float64:
-        """Pixels (n, 2) of the view for rows of the descriptors."""
+        """Return pixels (n, 2) of the view for rows of the descriptors."""
         rows, columns = np.divmod(cells, self.canvas.size[0])
         xy = np.stack([columns, rows], axis=-1) + 0.5
         return self.canvas.to_view(xy, self.view.camera.size)
 
     def cells(self, xy: Float64) -> Int64:
-        """Rows of the descriptors for pixels (n, 2) of the view, -1 where it was cut off."""
+        """Return rows of the descriptors for pixels (n, 2) of the view, -1 in cropped borders."""
         placed = np.floor(self.canvas.from_view(xy, self.view.camera.size)).astype(np.int64)
         width, height = self.canvas.size
         inside = ((placed >= 0) & (placed < (width, height))).all(axis=1)
@@ -59,15 +61,12 @@ class Seen:
 
     @property
     def pixel_size(self) -> float:
-        """Longer side of a canvas pixel, in pixels of the view."""
+        """Return the longer side of a canvas pixel, in pixels of the view."""
         return max(v / i for v, i in zip(self.view.camera.size, self.canvas.image, strict=True))
 
 
 class PairNetwork(ABC):
-    """MASt3R, whatever runs it: one answer to two images.
-
-    ``size``: longer side of the images.
-    """
+    """Interface of MASt3R; ``size`` is the longer side of the images."""
 
     def __init__(self, size: int) -> None:
         self._rule = ImageInput(
@@ -80,11 +79,15 @@ class PairNetwork(ABC):
 
     @abstractmethod
     def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
-        """Of images (1, 3, h, w), RGB in [-1, 1]: points (h, w, 3) in the frame of the first,
-        certainty (h, w), descriptors (h, w, d) and their certainty (h, w), of either."""
+        """Run the network on two images (1, 3, h, w), RGB in [-1, 1].
+
+        Returns:
+            For each image: points (h, w, 3) in the frame of the first, confidence (h, w),
+            descriptors (h, w, d) and their confidence (h, w).
+        """
 
     def both(self, view_a: View, view_b: View) -> tuple[tuple[Seen, Seen], tuple[Seen, Seen]]:
-        """``(a, b)`` of the pass with a as first view, and of the pass with b as first view."""
+        """Run both passes: ``(a, b)`` with a first, and ``(a, b)`` with b first."""
         backward = self._run(view_b, view_a)
         return self._run(view_a, view_b), (backward[1], backward[0])
 
@@ -104,7 +107,7 @@ class OnnxPairNetwork(PairNetwork):
     """MASt3R as an ONNX model.
 
     Inputs ``img1``, ``img2``; outputs ``pts3d_1`` (1, h, w, 3), ``conf_1`` (1, h, w), ``desc_1``
-    (1, h, w, d), ``desc_conf_1`` (1, h, w), and the same of the second view.
+    (1, h, w, d), ``desc_conf_1`` (1, h, w), and the same for the second view.
     """
 
     def __init__(self, options: Mast3rOptions, context: ProviderContext) -> None:
@@ -114,7 +117,7 @@ class OnnxPairNetwork(PairNetwork):
         self._model.require(("img1", "img2"), self._outputs, "MASt3R")
 
     def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
-        """See :class:`PairNetwork`."""
+        """Run the ONNX model; see :class:`PairNetwork`."""
         feed = {"img1": first, "img2": second}
         tensors = [tensor[0] for tensor in self._model.run(feed, self._outputs)]
         return tensors[:4], tensors[4:]

@@ -1,4 +1,4 @@
-"""What a user can set; "reference" is the published system's value. Imports nothing heavy."""
+"""Options of the matchers; imports nothing heavy. "reference" is the authors' implementation."""
 
 from __future__ import annotations
 
@@ -8,42 +8,42 @@ from mpsfm_core import Options
 
 
 class FileOptions(Options):
-    """The network's file."""
+    """File of the network."""
 
     model: str = "export:mast3r"
-    """Path or URI of the ONNX file; by default what ``mpsfm models export mast3r`` made."""
+    """Path or URI of the ONNX file; default: the output of ``mpsfm models export mast3r``."""
     sha256: str | None = None
     """Expected hash of ``model``."""
 
 
 class SizeOptions(Options):
-    """What the network sees."""
+    """Size of the network input."""
 
     size: int = Field(512, ge=16)
-    """Longer side of the views as the network sees them, enlarged if need be (reference)."""
+    """Longer side of the network input in pixels; small views are enlarged. [reference]"""
 
 
 class DenseSearch(SizeOptions):
-    """Matches of free positions."""
+    """Options of dense matching."""
 
     subsample: int = Field(8, ge=1)
-    """The search for reciprocal neighbours starts at every so many pixels (reference)."""
+    """Step in pixels of the start positions of the reciprocal search. [reference]"""
 
 
 class SparseSearch(SizeOptions):
-    """Matches of given keypoints."""
+    """Options of matching at keypoints."""
 
     min_similarity: float = Field(0.85, ge=-1, le=1)
-    """Smallest cosine of the descriptors of a match (reference)."""
+    """Minimum cosine of the descriptors of a match. [reference]"""
 
 
 class Mast3rOptions(FileOptions, SizeOptions):
-    """Of either matcher."""
+    """Options of both matchers."""
 
 
 class DenseOptions(Mast3rOptions, DenseSearch):
-    """Of ``mast3r``."""
+    """Options of ``mast3r``."""
 
 
 class SparseOptions(Mast3rOptions, SparseSearch):
-    """Of ``mast3r-sparse``."""
+    """Options of ``mast3r-sparse``."""

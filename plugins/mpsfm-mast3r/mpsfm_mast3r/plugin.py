@@ -1,4 +1,4 @@
-"""Announces the providers. Imports neither onnxruntime nor OpenCV."""
+"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LICENSE = "CC-BY-NC-SA-4.0"
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """The same network, with free positions and with given keypoints."""
+    """Register the dense and the sparse matcher."""
     return [
         _spec("mast3r", "dense", DenseOptions, "MASt3R: dense matches and depth of both views"),
         _spec("mast3r-sparse", "sparse", SparseOptions, "MASt3R at keypoints of any detector"),
@@ -21,7 +21,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
 
 @hookimpl
 def mpsfm_exports() -> dict[str, ModelExport]:
-    """From the authors' code and checkpoint."""
+    """Register the export from the authors' code and checkpoint."""
     return {
         "mast3r": ModelExport(
             script="mpsfm_mast3r.export",

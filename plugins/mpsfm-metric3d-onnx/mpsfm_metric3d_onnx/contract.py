@@ -1,4 +1,4 @@
-"""How the contract kit tests the providers without weights."""
+"""Contract setup: a stand-in network without weights."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpsfm_metric3d_onnx.provider import describe
 
 
 def setup(folder: Path) -> ContractSetup:
-    """An export with confidence that reads painted views."""
+    """Write an export with confidence that decodes painted views."""
     model = stand_in(describe(Metric3dOptions(weights="", confidence=True)), folder)
     return ContractSetup(
         options={"weights": str(model), "confidence": True}, truth_source="painted"

@@ -1,5 +1,7 @@
-"""Metric3D v2 as ONNX with all that it says, by its authors' code; run as a program, see
-:mod:`mpsfm_core.providers.model_export`."""
+"""Export of Metric3D v2 with all outputs to ONNX, with its authors' code.
+
+Runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ from mono.model.decode_heads.RAFTDepthNormalDPTDecoder5 import (  # noqa: E402
 )
 
 SIZE = 616, 1064
-"""Rows and columns that the authors give the network; the file has no others."""
+"""Rows and columns of the network input; the file supports no other size. [authors]"""
 _MEAN, _STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 _MODELS = {
     "": hubconf.metric3d_vit_small,
@@ -42,11 +44,11 @@ _LEFT = {
     ConvTransposeLoRA: torch.nn.ConvTranspose2d,
     LoRALinear: torch.nn.Linear,
 }
-"""These leave their weights as memory is found, for a checkpoint to fill."""
+"""Classes that leave their weights uninitialized, for a checkpoint to fill."""
 
 
 class Named(torch.nn.Module):
-    """As the authors' metric3d_onnx_export.py, with all outputs, named as in public exports."""
+    """Module with all outputs, named as in the public exports (metric3d_onnx_export.py)."""
 
     def __init__(self, model: torch.nn.Module) -> None:
         super().__init__()
@@ -55,6 +57,7 @@ class Named(torch.nn.Module):
         self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1))
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Run the network."""
         normalised = (image - self.mean) / self.std
         depth, confidence, found = self.model.inference({"input": normalised})
         normal = found["prediction_normal"]
@@ -62,7 +65,7 @@ class Named(torch.nn.Module):
 
 
 def network(size: str) -> Named:
-    """The authors' network on the CPU, which their code has no place for."""
+    """Create the authors' network on the CPU, which their code does not support."""
     linspace, grid = torch.linspace, RAFTDepthNormalDPT5.create_mesh_grid
 
     def here(*values: Any, device: Any = None, **options: Any) -> torch.Tensor:
@@ -81,7 +84,7 @@ def network(size: str) -> Named:
 
 
 def export(job: ExportJob, model: Named) -> None:
-    """Images of the one size, 0 to 255."""
+    """Export the network for images of the fixed size, values 0 to 255."""
     given = [{"pixel_values": torch.rand(1, 3, *SIZE) * 255} for _ in range(2)]
     outputs = ["predicted_depth", "predicted_normal", "normal_confidence", "confidence"]
     job.export(model, given, outputs)

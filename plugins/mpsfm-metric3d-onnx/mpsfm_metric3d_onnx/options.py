@@ -1,4 +1,4 @@
-"""The sizes of the network: weights, options, calibration. Imports nothing heavy."""
+"""Weights, options and calibration of each size; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 WEIGHTS_LICENSE = "CC0-1.0 (export; the authors name none for their weights)"
 
 RELATIVE_STD_ALONE = 0.08
-"""Share of depth for exports without confidence: about what the reference declares for networks
-that have none (0.079 and 0.0875). Not measured; fit it on data of yours."""
+"""Std relative to depth for exports without confidence.
+
+[assumed from the reference values 0.079 and 0.0875 of other networks]
+"""
 
 
 def _file(repository: str, name: str) -> WeightsFile:
@@ -28,33 +30,34 @@ _GIANT2 = tuple(
 
 
 class Metric3dOptions(Options):
-    """What the sizes share."""
+    """Options of all sizes."""
 
     weights: str
     """Path or URI of the ONNX file."""
     companions: tuple[str, ...] = ()
-    """URIs of further files of its folder, for models with external data."""
+    """URIs of further files in its folder, for models with external data."""
     sha256: str | None = None
     """Expected hash of ``weights``."""
     confidence: bool = False
-    """Whether the file has the output ``confidence``, which the public exports lack: depth then
-    has a variance, and the reference's calibration applies."""
+    """True if the file has the output ``confidence``: depth then has a variance, and the
+    calibration of the reference applies. The public exports lack it.
+    """
 
 
 class SmallOptions(Metric3dOptions):
-    """ViT-small."""
+    """Options of ViT-small."""
 
     weights: str = _SMALL.uri
 
 
 class LargeOptions(Metric3dOptions):
-    """ViT-large."""
+    """Options of ViT-large."""
 
     weights: str = _LARGE.uri
 
 
 class Giant2Options(Metric3dOptions):
-    """ViT-giant2."""
+    """Options of ViT-giant2."""
 
     weights: str = _GIANT2[0].uri
     companions: tuple[str, ...] = (_GIANT2[1].uri,)
@@ -62,7 +65,7 @@ class Giant2Options(Metric3dOptions):
 
 @dataclass(frozen=True)
 class Size:
-    """One size of the network; ``calibration`` is the reference's, for exports with confidence."""
+    """One size of the network; ``calibration`` is for exports with confidence [reference]."""
 
     name: str
     options: type[Metric3dOptions]
@@ -70,13 +73,13 @@ class Size:
     calibration: DepthCalibration
 
     def files(self, options: Metric3dOptions) -> tuple[WeightsFile, ...]:
-        """The files that these options mean."""
+        """Return the files of these options."""
         companions = (WeightsFile(uri, license=WEIGHTS_LICENSE) for uri in options.companions)
         return (*companions, *weights_from_option("weights", *self.weights)(options))
 
     @property
     def calibration_alone(self) -> DepthCalibration:
-        """For exports without confidence."""
+        """Return the calibration for exports without confidence."""
         return self.calibration.model_copy(update={"relative_std": RELATIVE_STD_ALONE})
 
 

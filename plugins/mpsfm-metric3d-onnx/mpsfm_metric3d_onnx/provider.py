@@ -12,21 +12,21 @@ from mpsfm_metric3d_onnx.options import Metric3dOptions
 
 
 class Metric3dDepth(DescribedJoint):
-    """Metric depth and, in the same pass, normals."""
+    """Provider of metric depth and, in the same pass, normals."""
 
     def __init__(self, options: Metric3dOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context)
 
 
 class Metric3dNormals(DescribedNormals):
-    """Normals with their angular variance."""
+    """Provider of normals with angular variance."""
 
     def __init__(self, options: Metric3dOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context)
 
 
 def describe(options: Metric3dOptions) -> Description:
-    """The description of the network that the options name."""
+    """Return the description of the network for these options."""
     general = load_description(str(Path(__file__).with_name("description.yaml")))
     weights = Weights(uri=options.weights, sha256=options.sha256, companions=options.companions)
     update: dict[str, object] = {"weights": weights}

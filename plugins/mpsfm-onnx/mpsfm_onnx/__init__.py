@@ -1,1 +1,1 @@
-"""Any depth or normal network in an ONNX file, described in YAML, as an MP-SfM provider."""
+"""Depth and normal networks in ONNX files, described in YAML."""

@@ -1,4 +1,4 @@
-"""From a view to the network's canvas and back: resizing, padding, and undoing both exactly."""
+"""Geometry between a view and the network input: resize, pad, crop, and their exact inverse."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
 
 @dataclass(frozen=True)
 class Canvas:
-    """Where the resized image lies on the network's input, all in pixels.
+    """Position of the resized image on the network input, in pixels.
 
-    ``size``: of the canvas; ``image``: of the resized image; ``offset``: of its upper left corner,
-    negative where the canvas crops it. Each is ``(width, height)``.
+    ``size``: of the input; ``image``: of the resized image; ``offset``: of its upper left corner,
+    negative if the input crops it. Each is ``(width, height)``.
     """
 
     size: tuple[int, int]
@@ -32,7 +32,7 @@ class Canvas:
 
     @classmethod
     def plan(cls, rule: FixedSize | SideSize, view: tuple[int, int]) -> Canvas:
-        """The canvas for a view of ``(width, height)`` pixels."""
+        """Plan the canvas for a view of ``(width, height)`` pixels."""
         if isinstance(rule, FixedSize):
             size = (rule.width, rule.height)
             scale = min(s / v for s, v in zip(size, view, strict=True))
@@ -58,7 +58,7 @@ class Canvas:
         return cls(size, image, (left, top))
 
     def paint(self, image: UInt8, rule: ImageInput) -> NDArray[Any]:
-        """The input tensor with its batch dimension, for an (H, W, 3) RGB image."""
+        """Create the input tensor with its batch dimension from an (H, W, 3) RGB image."""
         rgb = np.empty((self.size[1], self.size[0], 3), dtype=np.float32)
         rgb[:] = rule.pad_value
         (to_x, from_x), (to_y, from_y) = (self._overlap(axis) for axis in (0, 1))
@@ -71,11 +71,11 @@ class Canvas:
         return np.ascontiguousarray(values[None])
 
     def cut(self, planes: Float32) -> Float32:
-        """The part of an output (h, w, c) that shows the view; the output covers the canvas.
+        """Cut the part of an output (h, w, c) that covers the view; the output covers the canvas.
 
-        The result covers the view exactly; it is NaN where the canvas cropped the view. Where the
-        image's border does not fall between two output pixels, it is sampled bilinearly at
-        half-pixel-correct positions.
+        The result covers the view exactly and is NaN where the canvas cropped the view. If the
+        image border is not between two output pixels, it is sampled bilinearly with half-pixel
+        offsets.
         """
         height, width = planes.shape[:2]
         scale = (width / self.size[0], height / self.size[1])
@@ -100,21 +100,21 @@ class Canvas:
         return np.stack(sampled, axis=-1).astype(np.float32)
 
     def camera(self, camera: PinholeCamera) -> PinholeCamera:
-        """The view's camera in pixels of the canvas."""
+        """Return the camera of the view in pixels of the canvas."""
         resized = camera.resized(*self.image)
         (width, height), (x, y) = self.size, self.offset
         return PinholeCamera(width, height, resized.fx, resized.fy, resized.cx + x, resized.cy + y)
 
     def from_view(self, xy: Float64, view: tuple[int, int]) -> Float64:
-        """Pixels (n, 2) of the view of a size as pixels of the canvas."""
+        """Convert pixels (n, 2) of a view of the given size to pixels of the canvas."""
         return scale_pixels(xy, view, self.image) + self.offset
 
     def to_view(self, xy: Float64, view: tuple[int, int]) -> Float64:
-        """Pixels (n, 2) of the canvas as pixels of the view of a size."""
+        """Convert pixels (n, 2) of the canvas to pixels of a view of the given size."""
         return scale_pixels(xy - np.array(self.offset, dtype=np.float64), self.image, view)
 
     def _overlap(self, axis: int) -> tuple[slice, slice]:
-        """Where the image lies along an axis (0: x): pixels of the canvas, and of the image."""
+        """Compute the range of the image along an axis, in canvas and image pixels."""
         start = max(self.offset[axis], 0)
         stop = min(self.offset[axis] + self.image[axis], self.size[axis])
         return slice(start, stop), slice(start - self.offset[axis], stop - self.offset[axis])

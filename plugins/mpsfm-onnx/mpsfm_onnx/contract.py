@@ -1,5 +1,4 @@
-"""How the contract kit tests described networks without weights: stand-ins that read what is
-painted into the views, with the tensors of a description."""
+"""Contract setups: stand-ins that decode painted views, with their descriptions."""
 
 from __future__ import annotations
 
@@ -72,29 +71,31 @@ moge (float[1,3,h,w] image, int64 num_tokens) => (
 
 
 def setup(folder: Path) -> ContractSetup:
-    """A network with a canonical camera, padding, a confidence and a concentration."""
+    """Write a network with canonical camera, padding, confidence and concentration."""
     return ContractSetup(options=_tiny(folder), truth_source="painted")
 
 
 def moge(folder: Path) -> ContractSetup:
-    """A network with the tensors of MoGe-2's published file."""
+    """Write a network with the tensors of MoGe-2's published file."""
     return ContractSetup(
         options={"weights": str(moge_stand_in(folder / "moge.onnx"))}, truth_source="none"
     )
 
 
 def moge_stand_in(path: Path) -> Path:
-    """A model with the inputs and outputs of MoGe-2's published file: what is brighter is farther
-    away, 2 to 4 m, seen by a camera whose focal length is the image's width."""
+    """Create a model with inputs and outputs of MoGe-2's published file.
+
+    Brighter pixels are farther away (2 to 4 m); the focal length is the image width.
+    """
     return save_model(_MOGE, path, half=0.5, none=0.0, whole=1.0, rows=2, columns=3, metres=[2.0])
 
 
 def stand_in(description: Description, folder: Path) -> Path:
-    """A model that gives painted views their depth and normals, through a description with named
-    input, NCHW tensors, ``output: depth`` and an uncertainty of the normals; where no depth is
-    painted is not valid.
+    """Create a model that decodes depth and normals of painted views, and its description.
 
-    A canonical camera has the focal length of the kit's main example on the network's input.
+    The description has a named input, NCHW tensors, ``output: depth`` and an uncertainty of the
+    normals. Pixels without painted depth are invalid. A canonical camera has the focal length of
+    the main test example on the network input.
     """
     outputs, rule = description.outputs, description.input
     weights, bias = _unnormalised(rule)
@@ -127,7 +128,7 @@ def stand_in(description: Description, folder: Path) -> Path:
 
 
 class _Graph:
-    """An ONNX graph of one image (1, 3, h, w)."""
+    """ONNX graph of one image (1, 3, h, w)."""
 
     def __init__(self, image: str) -> None:
         self.image = image
@@ -135,19 +136,19 @@ class _Graph:
         self._arrays: list[onnx.TensorProto] = []
 
     def array(self, values: ArrayLike) -> str:
-        """A constant tensor, float32 or int64; returns its name."""
+        """Add a constant tensor, float32 or int64; return its name."""
         array, name = np.asarray(values), f"array_{len(self._arrays)}"
         dtype = np.int64 if np.issubdtype(array.dtype, np.integer) else np.float32
         self._arrays.append(numpy_helper.from_array(array.astype(dtype), name))
         return name
 
     def add(self, kind: str, *inputs: str, to: str | tuple[str, ...], **attributes: Any) -> None:
-        """A node."""
+        """Add a node."""
         outputs = (to,) if isinstance(to, str) else to
         self._nodes.append(helper.make_node(kind, inputs, outputs, **attributes))
 
     def save(self, outputs: Sequence[str], intrinsics: str | None, path: Path) -> Path:
-        """Write the model; ``intrinsics``: an input (1, 3, 3) that nothing reads."""
+        """Write the model; ``intrinsics`` names an unused input (1, 3, 3)."""
         flat = TensorProto.FLOAT
         inputs = [helper.make_tensor_value_info(self.image, flat, [1, 3, "h", "w"])]
         if intrinsics is not None:
@@ -167,7 +168,7 @@ def _tiny(folder: Path) -> dict[str, str]:
 
 
 def _unnormalised(rule: ImageInput) -> tuple[Float64, Float64]:
-    """The layer that reads painted pixels, for values as the network gets them."""
+    """Create the layer that decodes painted pixels from normalized values."""
     weights, bias = decoder()
     if rule.channels == "BGR":
         weights = weights[:, ::-1]

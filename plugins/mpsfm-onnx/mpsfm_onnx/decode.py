@@ -1,4 +1,4 @@
-"""What a network's numbers mean: depth, its uncertainty, normals and theirs."""
+"""Conversion of network outputs to depth, normals and their variances."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ from mpsfm_onnx.description import (
 )
 
 _GRID = np.arange(64)
-"""Of pixels that tell the shift (MoGe: 64 x 64)."""
+"""Side in pixels of the grid for the estimation of the shift. [MoGe: 64]"""
 _GAUSS_NEWTON_STEPS = 20
 _SMALLEST_RELATIVE_STD = 1e-4
-"""A network that is perfectly sure still needs a positive variance; calibration has its floor."""
+"""Minimum std relative to depth, because a variance must be positive; calibration has its own
+floor.
+"""
 
 
 def planes(output: NDArray[Any], layout: Layout) -> Float32:
-    """An output tensor of one image as (h, w, c) float32; a missing channel axis is added."""
+    """Convert an output tensor of one image to (h, w, c) float32; add a missing channel axis."""
     array = np.asarray(output, dtype=np.float32)
     if array.ndim == 4 or (array.ndim == 3 and array.shape[0] == 1):
         array = array[0]
@@ -44,14 +46,19 @@ def decode_depth(
     std_rule: ConfidenceOutput | None = None,
     valid: Bool | None = None,
 ) -> DepthPrior:
-    """Depth and its variance.
+    """Decode depth and its variance.
 
     Args:
-        value: (h, w, c), the depth tensor. rule: what it means.
-        camera: of the view, that ``value`` covers.
-        factor: what the network's depth and std are multiplied by: for the focal length, the unit.
-        std, std_rule: the (h, w) uncertainty tensor and what it means.
-        valid: (h, w), pixels that the network itself calls valid.
+        value: The depth tensor, (h, w, c).
+        rule: Meaning of the depth tensor.
+        camera: Camera of the view that ``value`` covers.
+        factor: Factor for depth and std: focal length and unit.
+        std: The uncertainty tensor, (h, w), or None.
+        std_rule: Meaning of the uncertainty tensor.
+        valid: Mask (h, w) of the network, or None.
+
+    Returns:
+        The depth prior on the grid of the network.
     """
     depth = _network_depth(value, rule, camera, valid)
     usable = np.isfinite(depth) & (depth > rule.valid_min)
@@ -68,7 +75,7 @@ def decode_depth(
 def _network_depth(
     value: Float32, rule: DepthOutput, camera: PinholeCamera, valid: Bool | None
 ) -> Float64:
-    """Depth (h, w) in the network's unit; NaN or infinite where it has no meaning."""
+    """Compute depth (h, w) in units of the network; NaN or infinite if undefined."""
     height, width = value.shape[:2]
     xy = rays(camera.resized(width, height), pixel_centers(width, height))[..., :2]
     quantity = value[..., rule.channel].astype(np.float64) * rule.scale + rule.shift
@@ -87,12 +94,11 @@ def _network_depth(
 
 
 def z_shift(points: Float64, xy: Float64, valid: Bool | None = None) -> float:
-    """What z of points (h, w, 3) lacks, given the rays ``(x, y, 1)`` they must lie on.
+    """Estimate the unknown shift of z of points (h, w, 3) on given rays ``(x, y, 1)``.
 
-    The shift t minimises the reprojection error ``sum |(x_i, y_i) / (z_i + t) - xy_i|^2`` over a
-    grid of 64 x 64 pixels, as MoGe's own inference does: by Gauss-Newton, from the minimum of
-    ``sum |(x_i, y_i) - xy_i (z_i + t)|^2 / z_i^2``, which is the same but for the shift in its
-    weight.
+    The shift t minimizes the reprojection error ``sum |(x_i, y_i) / (z_i + t) - xy_i|^2`` over a
+    grid of 64 x 64 pixels (MoGe) by Gauss-Newton. The initial value minimizes ``sum |(x_i, y_i) -
+    xy_i (z_i + t)|^2 / z_i^2``.
     """
     usable = np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
     if valid is not None:
@@ -116,7 +122,7 @@ def z_shift(points: Float64, xy: Float64, valid: Bool | None = None) -> float:
 
 
 def _step(miss: Float64, slope: Float64) -> float:
-    """Of one unknown that ``miss`` falls with by ``slope``."""
+    """Compute the Gauss-Newton step for residual ``miss`` and Jacobian ``slope``."""
     return float((miss * slope).sum() / max((slope**2).sum(), 1e-12))
 
 
@@ -139,10 +145,10 @@ def decode_normals(
     std: Float64 | None = None,
     valid: Bool | None = None,
 ) -> NormalPrior:
-    """Normals from (h, w, 3 or more), and their variance from the (h, w) angular std in rad.
+    """Decode normals (h, w, 3 or more), and their variance from the (h, w) angular std in rad.
 
-    Pixels whose normal does not face the ``camera`` of the view are invalid, as are those that
-    the network itself does not call ``valid``.
+    Pixels are invalid if the normal does not face the ``camera``, or if the network's ``valid``
+    mask excludes them.
     """
     variance = None if std is None else std**2
     normals = value[..., :3] * np.array(rule.axes, dtype=np.float32)
@@ -150,19 +156,18 @@ def decode_normals(
 
 
 def angular_std(value: Float32, rule: KappaOutput) -> Float64:
-    """Std of normals about each axis in rad, (h, w), from the tensor of their uncertainty."""
+    """Compute the std of normals about each axis in rad, (h, w), from the uncertainty tensor."""
     tensor = value[..., rule.channel].astype(np.float64)
     return expected_angle(tensor) if rule.output == "kappa" else np.maximum(tensor, 0)
 
 
 def expected_angle(kappa: Float64) -> Float64:
-    """Mean angle in rad between a normal and the predicted one, for concentration ``kappa``.
+    """Compute the mean angular error in rad of a normal with concentration ``kappa``.
 
-    Of the density ``(k^2 + 1) exp(-k a) / (2 pi (1 + exp(-k pi)))`` over the sphere (Bae et al.,
-    ICCV 2021, as DSINE and Metric3D v2 use it): ``2k / (k^2 + 1) + pi e / (1 + e)`` with
-    ``e = exp(-k pi)``. Its square serves as the variance along one tangent direction (reference);
-    that is 4 / k^2 for large k where the density has 3 / k^2: 15 % too large a std, on the
-    cautious side.
+    The density over the sphere is ``(k^2 + 1) exp(-k a) / (2 pi (1 + exp(-k pi)))`` (Bae et al.,
+    ICCV 2021; DSINE and Metric3D v2). Its mean angle is ``2k / (k^2 + 1) + pi e / (1 + e)`` with
+    ``e = exp(-k pi)``. The square serves as variance along one tangent direction [reference]; for
+    large k this overestimates the std by 15 %.
     """
     k = np.maximum(kappa, 0)
     tail = np.exp(-k * np.pi)

@@ -1,7 +1,7 @@
-"""The description of a network: what its tensors are called and what they mean.
+"""Description of a network: names and meaning of its tensors.
 
-A description is a YAML file with the fields of :class:`Description`. The shipped ones lie in
-``descriptions/``; their names are the files' names.
+A description is a YAML file with the fields of :class:`Description`. Shipped descriptions are in
+``descriptions/``; the file name is the name of the description.
 """
 
 from __future__ import annotations
@@ -25,135 +25,143 @@ Sign = Literal[-1, 1]
 
 
 class FixedSize(Options):
-    """A canvas of one size. A model whose file fixes another one has that."""
+    """Network input of one size; the fixed size of a model file has priority."""
 
     mode: Literal["fixed"]
     width: int = Field(gt=0)
     height: int = Field(gt=0)
     fit: Literal["stretch", "pad"] = "stretch"
-    """``stretch`` changes the aspect ratio; ``pad`` keeps it and puts the image in the middle."""
+    """``stretch`` changes the aspect ratio; ``pad`` keeps it and centers the image."""
     rounding: Literal["nearest", "down"] = "nearest"
-    """Of the sides of an image that keeps its aspect ratio."""
+    """Rounding of the sides of an image that keeps its aspect ratio."""
 
 
 class SideSize(Options):
-    """A canvas that follows the image's shape."""
+    """Network input with the aspect ratio of the image."""
 
     mode: Literal["longest", "shortest"]
     side: int = Field(gt=0)
     """Length in pixels of the longer or the shorter side."""
     multiple_of: int = Field(1, gt=0)
-    """Both sides of the canvas are multiples of it."""
+    """Both sides of the network input are multiples of this."""
     fit: Literal["stretch", "pad", "crop"] = "stretch"
-    """To the nearest multiples by stretching, to the next ones by padding, or to the ones before
-    by cutting the border off, where the view then gets no prediction."""
+    """``stretch`` to the nearest multiples, ``pad`` to the next ones, or ``crop`` to the previous
+    ones; cropped borders of the view have no prediction.
+    """
     enlarge: bool = True
-    """Whether small images are enlarged."""
+    """Enlarge small images."""
 
 
 class IntrinsicsInput(Options):
-    """The tensor of the calibration matrix (1, 3, 3) of the image as it lies on the input."""
+    """Tensor of the calibration matrix (1, 3, 3) of the image on the network input."""
 
     name: str
     first_pixel: float = Field(0.5, ge=0, le=0.5)
-    """Where the network has the centre of the first pixel."""
+    """Coordinate of the center of the first pixel in the convention of the network."""
 
 
 class ImageInput(Options):
-    """The tensor of the image: ``(value * scale - mean) / std`` of values in 0..255, rounded
-    where the model wants integers."""
+    """Image tensor: ``(value * scale - mean) / std`` of values in 0..255.
+
+    The result is rounded for integer types.
+    """
 
     name: str | None = None
-    """None: the model's first input."""
+    """Name of the tensor; null: the first input of the model."""
     layout: Layout = "NCHW"
     channels: Literal["RGB", "BGR"] = "RGB"
     scale: float = 1.0
     mean: Triple = (0.0, 0.0, 0.0)
     std: Triple = (1.0, 1.0, 1.0)
-    """Both in the order of ``channels``."""
+    """Mean and std in the order of ``channels``."""
     pad_value: Triple = (0.0, 0.0, 0.0)
-    """RGB in 0..255, before normalisation."""
+    """RGB in 0..255, before normalization."""
     interpolation: Literal["linear", "area", "cubic", "smooth-cubic", "lanczos"] = "area"
-    """``area`` averages when shrinking and is linear when enlarging. ``linear`` and ``cubic`` take
-    the nearest pixels alone, as OpenCV does; ``smooth-cubic`` and ``lanczos`` average when
-    shrinking, as Pillow does, and are cubic when enlarging."""
+    """``area`` averages when shrinking and is linear when enlarging. ``linear`` and ``cubic`` do
+    not average, as in OpenCV. ``smooth-cubic`` and ``lanczos`` average when shrinking, as in
+    Pillow, and are cubic when enlarging.
+    """
     size: Annotated[FixedSize | SideSize, Field(discriminator="mode")]
     intrinsics: IntrinsicsInput | None = None
-    """For networks that are told the camera."""
+    """Tensor of the intrinsics, for networks that use them."""
     rays: str | None = None
-    """For those that are told it by the tensor of unit rays (1, 3, h, w) through the centres of
-    the input's pixels."""
+    """Tensor of the unit rays (1, 3, h, w) through the pixel centers of the input."""
     constants: dict[str, float] = Field(default_factory=dict)
-    """Further inputs that always have one value."""
+    """Further inputs with a constant value."""
 
 
 class DepthOutput(Options):
-    """The tensor that depth comes from; ``v = value * scale + shift`` is its quantity."""
+    """Depth tensor; its quantity is ``v = value * scale + shift``."""
 
     name: str
     output: Literal["depth", "disparity", "log-depth", "ray-length", "points"] = "depth"
     """``depth``, ``disparity``, ``log-depth``: depth is ``v``, ``1 / v`` or ``exp(v)``.
-    ``ray-length``: ``v`` is the distance to the camera. ``points``: three channels x, y, z whose z
-    lacks a shift, which the known camera tells. Pixels where ``v <= 0`` are invalid, except for
-    log-depth."""
+    ``ray-length``: ``v`` is the distance to the camera. ``points``: channels x, y, z with an
+    unknown shift of z, which is estimated from the known camera. Pixels with ``v <= 0`` are
+    invalid, except for log-depth.
+    """
     channel: int = Field(0, ge=0)
-    """Of the tensor, for all but ``points``."""
+    """Channel of the tensor, except for ``points``."""
     scale: float = 1.0
     shift: float = 0.0
-    """Turn the network's unit into metres (or 1/m), or an affine disparity into a positive one."""
+    """Scale and shift convert the unit of the network to meters (or 1/m), or an affine disparity to
+    a positive one.
+    """
     metric: bool
-    """Whether depth then is in metres (with ``canonical_focal``: after that correction)."""
+    """True if depth is in meters, after the correction by ``canonical_focal``."""
     canonical_focal: float | None = Field(None, gt=0)
-    """Focal length in input pixels for which the network predicts metres: its depth is multiplied
-    by ``focal / canonical_focal``, with the focal length of the resized image."""
+    """Focal length in input pixels for which the network predicts meters: depth is multiplied by
+    ``focal / canonical_focal``, with the focal length of the resized image.
+    """
     assumed_focal: str | None = None
-    """The tensor with the horizontal focal length in input pixels that the network guessed: its
-    depth is multiplied by ``focal / assumed_focal``."""
+    """Tensor with the horizontal focal length in input pixels that the network estimated: depth is
+    multiplied by ``focal / assumed_focal``.
+    """
     multiplier: str | None = None
-    """The tensor with a number that turns depth into metres."""
+    """Tensor with a factor that converts depth to meters."""
     valid_min: float = Field(0.0, ge=0)
     valid_max: float | None = Field(None, gt=0)
-    """Range of depth in which the network is right, before the canonical correction."""
+    """Valid range of depth before the canonical correction."""
 
 
 class ConfidenceOutput(Options):
-    """The tensor that the network's own uncertainty of depth comes from."""
+    """Tensor of the depth uncertainty."""
 
     name: str
     output: Literal["confidence", "std", "variance", "exp-std"]
     """``confidence`` c in [0, 1]: std = depth * (1 - c) (Metric3D). ``std``, ``variance`` and
-    ``exp-std``, whose logarithm is the std: in the unit of the depth tensor, before the canonical
-    correction."""
+    ``exp-std`` (log of the std): in the unit of the depth tensor, before the canonical correction.
+    """
 
 
 class MaskOutput(Options):
-    """The tensor that says where depth and normals are valid."""
+    """Tensor of the validity of depth and normals."""
 
     name: str
     minimum: float = 0.5
-    """Valid above it."""
+    """Threshold above which a pixel is valid."""
 
 
 class NormalsOutput(Options):
-    """The tensor of the surface normals; its first three channels are x, y, z."""
+    """Tensor of the normals; its first three channels are x, y, z."""
 
     name: str
     axes: tuple[Sign, Sign, Sign] = (1, 1, 1)
-    """Signs that turn the network's axes into x right, y down, z forward."""
+    """Signs that convert the axes of the network to x right, y down, z forward."""
 
 
 class KappaOutput(Options):
-    """The tensor that the normals' angular variance comes from."""
+    """Tensor of the angular uncertainty of normals."""
 
     name: str
     output: Literal["kappa", "angle"] = "kappa"
-    """``kappa``: the concentration of DSINE and Metric3D. ``angle``: std about each axis, rad."""
+    """``kappa``: concentration as in DSINE and Metric3D. ``angle``: std about each axis in rad."""
     channel: int = Field(0, ge=0)
-    """3 if it is the fourth channel of the normals."""
+    """Channel of the tensor; 3 if it is the fourth channel of the normals."""
 
 
 class Outputs(Options):
-    """What the network predicts: depth, normals, or both."""
+    """Outputs of the network: depth, normals, or both."""
 
     layout: Layout = "NCHW"
     depth: DepthOutput | None = None
@@ -163,12 +171,12 @@ class Outputs(Options):
     mask: MaskOutput | None = None
 
     def names(self) -> set[str]:
-        """Tensors that a model must have."""
+        """Return the names of the tensors that a model must have."""
         described = [self.depth, self.normals, self.kappa, self.mask, self.confidence]
         return {tensor.name for tensor in described if tensor} | self.numbers()
 
     def numbers(self) -> set[str]:
-        """Tensors that are one number and no map."""
+        """Return the names of the tensors with a single number."""
         found = (self.depth.assumed_focal, self.depth.multiplier) if self.depth else ()
         return {name for name in found if name}
 
@@ -184,35 +192,39 @@ class Outputs(Options):
 
 
 class Weights(Options):
-    """Where the model can be downloaded."""
+    """Download address of the model."""
 
     uri: str
     sha256: str | None = None
     size: int | None = None
-    """In bytes, where it is known."""
+    """Size in bytes, if known."""
     companions: tuple[str, ...] = ()
     """Further URIs of the same folder, for models with external data."""
 
 
 class Description(Options):
-    """A network in an ONNX file."""
+    """Description of a network in an ONNX file."""
 
     name: str
     summary: str = ""
     license: str = "unknown"
-    """Of the weights."""
+    """License of the weights."""
     weights: Weights | None = None
-    """None: there is no public file; the user names a local one."""
+    """Public file; null: the user names a local file."""
     input: ImageInput
     outputs: Outputs
     calibration: DepthCalibration = DepthCalibration()
     normals_calibration: NormalCalibration = NormalCalibration()
 
     def files(self, model: str | None = None, sha256: str | None = None) -> tuple[WeightsFile, ...]:
-        """The files to load, the model last: ``model`` with its hash, else the public ones.
+        """Return the files to load, the model last.
+
+        Args:
+            model: Path or URI of the user's file, or None for the public one.
+            sha256: Expected hash of ``model``.
 
         Raises:
-            WeightsError: there is no public file.
+            WeightsError: There is no public file.
         """
         if model is not None:
             return (WeightsFile(model, sha256, self.license),)
@@ -227,16 +239,15 @@ class Description(Options):
 
 
 def shipped_descriptions() -> list[str]:
-    """Names of the descriptions that come with this package."""
+    """Return the names of the shipped descriptions."""
     return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
 
 
 def load_description(name: str) -> Description:
-    """A shipped description by name, or one from a YAML file.
+    """Load a shipped description by name, or one from a YAML file.
 
     Raises:
-        ConfigError: there is none of that name, or the file breaks a rule; the message gives
-            file and key.
+        ConfigError: The name is unknown, or the file is invalid; the message names file and key.
     """
     path = Path(name).expanduser()
     if path.suffix not in (".yaml", ".yml"):

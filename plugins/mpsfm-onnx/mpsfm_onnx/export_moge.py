@@ -1,5 +1,7 @@
-"""MoGe-2 with normals as ONNX, by its authors' code; run as a program, see
-:mod:`mpsfm_core.providers.model_export`."""
+"""Export of MoGe-2 with normals to ONNX, with its authors' code.
+
+Runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ def _head(channels: int) -> dict[str, Any]:
 
 
 def small_with_normals() -> dict[str, Any]:
-    """What the constructor is given for the published ViT-S with normals."""
+    """Return the constructor arguments of the published ViT-S with normals."""
     return {
         "encoder": {
             "backbone": "dinov2_vits14",
@@ -54,7 +56,7 @@ def small_with_normals() -> dict[str, Any]:
 
 
 def export(job: ExportJob, model: torch.nn.Module) -> None:
-    """Images of any size, and how many tokens they are made to."""
+    """Export the network for images of any size and a number of tokens."""
     model.onnx_compatible_mode = True
     tokens = torch.tensor(TOKENS)
     given = [{"image": torch.rand(1, 3, *size), "num_tokens": tokens} for size in _SIDES]
@@ -63,7 +65,7 @@ def export(job: ExportJob, model: torch.nn.Module) -> None:
 
 
 def main() -> None:
-    """Export the network of the checkpoint, which says its own architecture."""
+    """Export the network of the checkpoint, which contains its architecture."""
     job = ExportJob.from_arguments()
     if job.weights is None:
         export(job, MoGeModel(**small_with_normals()))

@@ -1,5 +1,7 @@
-"""UniDepth V2 as ONNX, told the camera, by its authors' code; run as a program, see
-:mod:`mpsfm_core.providers.model_export`."""
+"""Export of UniDepth V2 with camera input to ONNX, with its authors' code.
+
+Runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from mpsfm_core.providers.model_export.author_script import ExportJob
 
 
 def _unused(name: str, **has: Any) -> None:
-    """A module that their code imports and of which nothing else is called here."""
+    """Create an empty module for an import of the authors' code that is not used here."""
     module = sys.modules[name] = ModuleType(name)
     module.__dict__.update(has)
 
@@ -38,12 +40,12 @@ from unidepth.models.unidepthv2.export import UniDepthV2ONNXcam  # noqa: E402
 from unidepth.utils.camera import Pinhole  # noqa: E402
 
 SIZE = 462, 630
-"""Rows and columns: the default of the authors' export; the file has no others."""
+"""Rows and columns of the network input; the file supports no other size. [authors' default]"""
 _MODELS = {"": "l", "small": "s", "base": "b", "large": "l"}
 
 
 def network(size: str) -> UniDepthV2ONNXcam:
-    """The authors' network as their export has it."""
+    """Create the authors' network as in their export."""
     name = f"config_v2_vit{_MODELS[size]}14.json"
     config = json.loads(Path("configs", name).read_text(encoding="utf-8"))
     config["training"]["export"] = True
@@ -51,7 +53,7 @@ def network(size: str) -> UniDepthV2ONNXcam:
 
 
 def export(job: ExportJob, model: UniDepthV2ONNXcam) -> None:
-    """Images of the one size, and the unit rays that their pixels see."""
+    """Export the network for images of the fixed size, with the unit rays of their pixels."""
     given = []
     for focal in (400.0, 700.0):
         matrix = torch.tensor([[focal, 0, SIZE[1] / 2], [0, focal, SIZE[0] / 2], [0, 0, 1]])
@@ -62,7 +64,7 @@ def export(job: ExportJob, model: UniDepthV2ONNXcam) -> None:
 
 
 def _linspace(start: float, end: float, steps: int, **_: Any) -> torch.Tensor:
-    """A constant, where the exporter makes float64 of it and all that follows."""
+    """Create a float32 constant; the exporter would create float64."""
     return torch.tensor(np.linspace(start, end, steps), dtype=torch.float32)
 
 

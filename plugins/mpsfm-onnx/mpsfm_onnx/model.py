@@ -27,13 +27,13 @@ _DTYPES: Mapping[str, type[np.generic]] = {
 
 
 class Model:
-    """An inference session: on the GPU if the context says so and onnxruntime can, else the CPU.
+    """Inference session, on the GPU if the context requests it and onnxruntime supports it.
 
-    ``inputs``, ``outputs``: names of the tensors, in the model's order. ``shapes``: of the inputs;
-    an axis of any length is no number.
+    ``inputs``, ``outputs``: names of the tensors in the order of the model. ``shapes``: shapes of
+    the inputs; dynamic axes are not numbers.
 
     Raises:
-        WeightsError: the file is no ONNX model.
+        WeightsError: The file is not an ONNX model.
     """
 
     def __init__(self, path: Path, context: ProviderContext) -> None:
@@ -46,12 +46,15 @@ class Model:
         self.outputs = tuple(tensor.name for tensor in self._session.get_outputs())
 
     def require(self, inputs: Iterable[str], outputs: Iterable[str], what: str) -> None:
-        """Check that the model has exactly these inputs, and at least these outputs.
+        """Check that the model has exactly these inputs and at least these outputs.
 
-        ``what`` wants them, in words, for the error.
+        Args:
+            inputs: Names of all inputs.
+            outputs: Names of the required outputs.
+            what: Description of the network for the error message.
 
         Raises:
-            ConfigError: it has other ones.
+            ConfigError: The model has other tensors.
         """
         inputs, outputs = sorted(set(inputs)), sorted(set(outputs))
         if inputs != sorted(self.inputs) or not set(outputs) <= set(self.outputs):
@@ -61,7 +64,7 @@ class Model:
             )
 
     def run(self, feed: Mapping[str, Any], outputs: Sequence[str]) -> list[NDArray[Any]]:
-        """The named outputs; what is fed gets the dtype that the model wants, rounded to it."""
+        """Run the model; inputs are cast (and rounded) to the dtypes of the model."""
         tensors = {name: self._cast(value, self._dtypes[name]) for name, value in feed.items()}
         results: list[NDArray[Any]] = self._session.run(list(outputs), tensors)
         return results

@@ -17,8 +17,10 @@ from mpsfm_onnx.model import Model
 
 @dataclass(frozen=True)
 class Answer:
-    """What a network says of a view: maps (h, w, c) that cover it, and single numbers, by name;
-    ``canvas``: where the view was placed on the network's input."""
+    """Outputs for a view: maps (h, w, c) that cover it, and single numbers, by name.
+
+    ``canvas``: position of the view on the network input.
+    """
 
     maps: dict[str, Float32]
     numbers: dict[str, float]
@@ -26,13 +28,15 @@ class Answer:
 
 
 class Network:
-    """A network by its description.
+    """Network with its description.
 
-    ``weights``: path or URI of the ONNX file, None for the description's; ``sha256``: its hash.
+    Args:
+        weights: Path or URI of the ONNX file; None: file of the description.
+        sha256: Expected hash of ``weights``.
 
     Raises:
-        ConfigError: the model does not have the tensors of its description.
-        WeightsError: the file is missing, or is no ONNX model.
+        ConfigError: The model does not have the tensors of its description.
+        WeightsError: The file is missing, or is not an ONNX model.
     """
 
     def __init__(
@@ -77,7 +81,7 @@ class Network:
 
 
 def _own_size(rule: ImageInput, shape: tuple[object, ...]) -> FixedSize | SideSize:
-    """The rule of a description, with the size that the input of a model has if it is fixed."""
+    """Return the size rule of a description; a fixed input size has priority."""
     height, width = shape[2:4] if rule.layout == "NCHW" else shape[1:3]
     if isinstance(rule.size, FixedSize) and isinstance(height, int) and isinstance(width, int):
         return rule.size.model_copy(update={"width": width, "height": height})
@@ -85,14 +89,14 @@ def _own_size(rule: ImageInput, shape: tuple[object, ...]) -> FixedSize | SideSi
 
 
 def _unit_rays(camera: PinholeCamera) -> Float64:
-    """Directions (1, 3, h, w) through the centres of a camera's pixels."""
+    """Compute directions (1, 3, h, w) through the pixel centers of a camera."""
     through = rays(camera, pixel_centers(*camera.size))
     unit: Float64 = through / np.linalg.norm(through, axis=-1, keepdims=True)
     return unit.transpose(2, 0, 1)[np.newaxis]
 
 
 def _matrix(camera: PinholeCamera, rule: IntrinsicsInput) -> Float64:
-    """The calibration matrix (1, 3, 3) in the network's pixels."""
+    """Compute the calibration matrix (1, 3, 3) in the pixel convention of the network."""
     matrix = camera.matrix
     matrix[:2, 2] -= 0.5 - rule.first_pixel
     return matrix[np.newaxis]

@@ -1,4 +1,4 @@
-"""Announces the providers. Does not import onnxruntime."""
+"""Registration of the providers; does not import onnxruntime."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MOGE_ACCURACY = "not measured by us; std of depth declared as 8 %"
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Depth, normals, and networks with both, chosen by one name for either kind."""
+    """Register depth, normals, and networks with both."""
     return [
         _spec(
             "depth",
@@ -46,7 +46,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
 
 @hookimpl
 def mpsfm_exports() -> dict[str, ModelExport]:
-    """From the authors' code and checkpoint."""
+    """Register the exports from the authors' code and checkpoints."""
     return {
         "moge": ModelExport(
             script="mpsfm_onnx.export_moge",
@@ -69,7 +69,7 @@ def mpsfm_exports() -> dict[str, ModelExport]:
 def mpsfm_calibration(
     kind: str, provider: str, options: BaseModel | None
 ) -> DepthCalibration | NormalCalibration | None:
-    """The uncertainty that the chosen description declares."""
+    """Return the calibration that the chosen description declares."""
     if isinstance(options, Moge2Options):
         description = load_description(MOGE_2)
     elif provider in ("onnx", "onnx-joint") and isinstance(options, OnnxOptions):

@@ -1,6 +1,6 @@
 """Described networks as depth and normals providers.
 
-The ``Described...`` classes are for plugins that bring a description of their own.
+The ``Described...`` classes are for plugins with a description of their own.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from mpsfm_onnx.options import MOGE_2, Moge2Options, OnnxOptions
 
 
 class DescribedDepth:
-    """Depth, with the network's variance if it gives one.
+    """Provider of depth, with the variance of the network if it predicts one.
 
-    ``weights``, ``sha256``: the ONNX file, None for the description's.
+    Args:
+        weights: Path or URI of the ONNX file; None: file of the description.
+        sha256: Expected hash of ``weights``.
     """
 
     def __init__(
@@ -37,12 +39,11 @@ class DescribedDepth:
         self._network = Network(description, context, weights, sha256)
 
     def predict(self, view: View) -> DepthPrior:
-        """Depth on the network's own grid."""
+        """Predict depth on the grid of the network."""
         return self._depth(view, self._network.run(view))
 
     def estimate_focal(self, view: View) -> float | None:
-        """The horizontal focal length that the network guesses, in pixels of the view; None for a
-        network that does not say."""
+        """Estimate the horizontal focal length in pixels of the view, or return None."""
         if self._rule.assumed_focal is None:
             return None
         answer = self._network.run(view)
@@ -64,9 +65,11 @@ class DescribedDepth:
 
 
 class DescribedNormals:
-    """Normals, with the network's variance if it gives one.
+    """Provider of normals, with the variance of the network if it predicts one.
 
-    ``weights``, ``sha256``: the ONNX file, None for the description's.
+    Args:
+        weights: Path or URI of the ONNX file; None: file of the description.
+        sha256: Expected hash of ``weights``.
     """
 
     def __init__(
@@ -80,13 +83,13 @@ class DescribedNormals:
         self._network = Network(description, context, weights, sha256)
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """Normals on the network's own grid; ``depth`` is not used."""
+        """Predict normals on the grid of the network; ``depth`` is not used."""
         outputs = self._network.description.outputs
         return _normals(view, self._network.run(view), outputs, self._rule)
 
 
 class DescribedJoint(DescribedDepth):
-    """Depth and normals in one pass."""
+    """Provider of depth and normals in one pass."""
 
     def __init__(
         self,
@@ -99,14 +102,14 @@ class DescribedJoint(DescribedDepth):
         super().__init__(description, context, weights, sha256)
 
     def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
-        """Both priors on the network's own grid."""
+        """Predict both priors on the grid of the network."""
         answer = self._network.run(view)
         outputs = self._network.description.outputs
         return self._depth(view, answer), _normals(view, answer, outputs, self._normals_rule)
 
 
 class OnnxDepth(DescribedDepth):
-    """Depth of the network that the options describe."""
+    """Depth of the network in the options."""
 
     def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
         description = load_description(options.description)
@@ -128,7 +131,7 @@ class Moge2Normals(DescribedNormals):
 
 
 class OnnxNormals(DescribedNormals):
-    """Normals of the network that the options describe."""
+    """Normals of the network in the options."""
 
     def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
         description = load_description(options.description)
@@ -136,7 +139,7 @@ class OnnxNormals(DescribedNormals):
 
 
 class OnnxJoint(DescribedJoint):
-    """Depth and normals of the network that the options describe."""
+    """Depth and normals of the network in the options."""
 
     def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
         description = load_description(options.description)
@@ -156,8 +159,7 @@ def _mask(outputs: Outputs, answer: Answer) -> Bool | None:
 
 
 def _factor(rule: DepthOutput, answer: Answer, camera: PinholeCamera) -> float:
-    """What the network's depth is multiplied by: for the focal length of the resized image, and
-    for the network's own scale."""
+    """Compute the depth factor: focal length of the resized image, and scale of the network."""
     resized, factor = camera.resized(*answer.canvas.image), 1.0
     if rule.canonical_focal is not None:
         sides = zip(answer.canvas.image, camera.size, strict=True)

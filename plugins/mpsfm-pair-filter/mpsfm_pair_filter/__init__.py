@@ -1,1 +1,1 @@
-"""A filter of image pairs by scores from a file."""
+"""Filter of image pairs by scores from a file."""

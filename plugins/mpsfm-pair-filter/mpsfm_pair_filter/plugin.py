@@ -1,4 +1,4 @@
-"""The hook: leaves out pairs that somebody else's classifier calls different places."""
+"""Hook that removes pairs with a low score of an external classifier."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from mpsfm_core import hookimpl
 from mpsfm_core.data.errors import InputError
 
 SCORES_VARIABLE = "MPSFM_PAIR_SCORES"
-"""Environment variable: CSV file with image, image, score; without it every pair is kept."""
+"""Environment variable with a CSV file of image, image, score; unset: all pairs are kept."""
 THRESHOLD_VARIABLE = "MPSFM_PAIR_MIN_SCORE"
-"""Environment variable: pairs that score lower are left out."""
+"""Environment variable with the minimum score of a pair."""
 DEFAULT_THRESHOLD = 0.8
-"""Probability that Doppelgangers (Cai et al., ICCV 2023) asks for before COLMAP."""
+"""Minimum probability of a pair. [Doppelgangers, Cai et al., ICCV 2023]"""
 
 Pair = tuple[str, str]
 
 
 @hookimpl
 def mpsfm_filter_pairs(pairs: Sequence[Pair]) -> Sequence[Pair] | None:
-    """The pairs whose score reaches the threshold, and those that have none."""
+    """Return the pairs whose score reaches the threshold, and those without a score."""
     path = os.environ.get(SCORES_VARIABLE)
     if not path:
         return None
@@ -33,10 +33,10 @@ def mpsfm_filter_pairs(pairs: Sequence[Pair]) -> Sequence[Pair] | None:
 
 
 def read_scores(path: Path) -> Mapping[frozenset[str], float]:
-    """Scores by the two names, in any order; a pair that is there twice has its lower score.
+    """Read scores by pairs of names, in any order; duplicates keep the lower score.
 
     Raises:
-        InputError: the file cannot be read, or a line has no two names and a number.
+        InputError: The file cannot be read, or a line does not have two names and a number.
     """
     scores: dict[frozenset[str], float] = {}
     try:

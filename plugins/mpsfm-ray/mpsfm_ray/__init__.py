@@ -1,1 +1,1 @@
-"""Runs the extraction on workers of Ray."""
+"""Extraction on the workers of a Ray cluster."""

@@ -1,4 +1,4 @@
-"""An executor on the workers of a Ray cluster."""
+"""Executor on the workers of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -12,23 +12,29 @@ from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.data.options import Options, SettingsError, parse_settings
 
 MAX_TASKS = 50_000
-"""Beyond, a task has several items (our choice)."""
+"""Maximum number of tasks per step; more items are grouped. [ours]"""
 
 
 class RayOptions(Options):
-    """Where the workers are."""
+    """Address and number of the workers."""
 
     address: str | None = None
-    """Of the cluster, ``auto`` or ``ray://HOST:10001``; null starts workers on this machine."""
+    """Address of the cluster, ``auto`` or ``ray://HOST:10001``; null starts workers on this
+    machine.
+    """
     workers: int | None = Field(None, ge=1)
-    """On this machine: processes, null for one a core."""
+    """Number of processes on this machine; null: one per core."""
 
 
 class RayExecutor:
-    """Puts a stage's step into the object store once, and runs the items as tasks."""
+    """Executor that stores a step in the object store once, and runs the items as tasks."""
 
     def __init__(self, options: Mapping[str, Any]) -> None:
-        """Raises ConfigError when options are wrong or the cluster does not answer."""
+        """Connect to the cluster, or start workers on this machine.
+
+        Raises:
+            ConfigError: The options are wrong or the cluster does not answer.
+        """
         try:
             checked = parse_settings(RayOptions, options, ("runtime", "executor_options"))
         except SettingsError as error:
@@ -48,7 +54,7 @@ class RayExecutor:
             raise ConfigError(f"no Ray workers at {where}: {error}") from error
 
     def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
-        """As :meth:`mpsfm_core.providers.Executor.run`."""
+        """Run a step on items; see :meth:`mpsfm_core.providers.Executor.run`."""
         size = 1 + len(items) // MAX_TASKS
         parts = [list(items[n : n + size]) for n in range(0, len(items), size)]
         shared = ray.put(step)
@@ -68,7 +74,7 @@ class RayExecutor:
                 ray.cancel(reference)
 
     def close(self) -> None:
-        """End the connection, and the workers that were started for it."""
+        """Close the connection and stop the workers that were started for it."""
         if self._own:
             ray.shutdown()
 

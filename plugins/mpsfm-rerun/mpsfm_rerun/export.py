@@ -17,10 +17,7 @@ from mpsfm_rerun.viewer import RerunViewer
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write ``scene.rrd``.
-
-    Photos and depth maps are in it as far as they are to be had: a COLMAP model alone has none.
-    """
+    """Write ``scene.rrd``, with photos and depth maps if available."""
     scene, _ = scene_from_model(source.model)
     images = tuple(_with_depth(source, image) for image in scene.images)
     if source.summary or source.photos is None:
@@ -33,6 +30,6 @@ def write(source: ExportSource, folder: Path) -> None:
 
 
 def _with_depth(source: ExportSource, image: PosedImage) -> PosedImage:
-    """With its refined depth, and the camera of that."""
+    """Add the refined depth of an image and the camera of its map."""
     maps = source.maps(image.name)
     return image if maps is None else replace(image, camera=maps.camera, depth=maps.depth)

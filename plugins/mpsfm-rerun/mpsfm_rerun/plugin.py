@@ -1,4 +1,4 @@
-"""Names the viewer and the format; rerun is imported when one is wanted."""
+"""Registration of the viewer and the export format; imports rerun when it is used."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from mpsfm_core.providers import ExportFormat
 
 @hookimpl
 def mpsfm_viewers() -> Mapping[str, str]:
-    """``mpsfm view DIR --viewer rerun``, ``mpsfm reconstruct ... --viewer rerun``."""
+    """Register the viewer for ``mpsfm view DIR --viewer rerun`` and ``mpsfm reconstruct``."""
     return {"rerun": "mpsfm_rerun.viewer:RerunViewer"}
 
 
 @hookimpl
 def mpsfm_export_formats() -> Sequence[ExportFormat]:
-    """``mpsfm export DIR --to rerun``."""
+    """Register the format of ``mpsfm export DIR --to rerun``."""
     return [
         ExportFormat(
             "rerun",

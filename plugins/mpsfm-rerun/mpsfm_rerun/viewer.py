@@ -1,4 +1,4 @@
-"""A recording in which the reconstruction grows, image by image."""
+"""Recording of a growing reconstruction, image by image."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ TIMELINE = "step"
 
 
 class RerunViewer:
-    """Writes ``OUTPUT/scene.rrd``; each scene is a step of the timeline ``step``.
+    """Viewer that writes ``OUTPUT/scene.rrd``; each scene is a step of the timeline ``step``.
 
-    ``z_is_up``: of the world; else y is down, as in the first camera.
+    ``z_is_up``: orientation of the world; otherwise y is down, as in the first camera.
     """
 
     def __init__(self, output: Path, pictures: Pictures, z_is_up: bool = False) -> None:
@@ -41,21 +41,21 @@ class RerunViewer:
 
     @hookimpl
     def mpsfm_scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """A step of the recording."""
+        """Record the scene as a step."""
         self.show(scene())
 
     @hookimpl
     def mpsfm_notice(self, text: str) -> None:
-        """Into the log of the recording."""
+        """Record a message in the log."""
         self._recording.log("log", rerun.TextLog(text))
 
     @hookimpl
     def mpsfm_image_rejected(self, name: str, text: str) -> None:
-        """Into the log of the recording."""
+        """Record a rejected image in the log."""
         self._recording.log("log", rerun.TextLog(f"{name}: {text}", level=rerun.TextLogLevel.WARN))
 
     def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
-        """The next step. Depth is shown as points of the world, or beside ``cloud`` as maps."""
+        """Record the next step, with depth as points, or as maps if there is a ``cloud``."""
         self._step += 1
         self._recording.set_time(TIMELINE, sequence=self._step)
         names = {image.name for image in scene.images}
@@ -75,7 +75,7 @@ class RerunViewer:
         return f"open it with: rerun {self.path}"
 
     def wait(self) -> None:
-        """There is a file to open."""
+        """Print the path of the file; there is nothing to wait for."""
 
     def _log_image(self, image: PosedImage, *, as_points: bool) -> None:
         place, camera = _place(image.name), image.camera
@@ -108,7 +108,7 @@ class RerunViewer:
 
 
 def _depth_image(depth: DepthPrior) -> rerun.DepthImage:
-    """In steps of 16 bits, 0 where it is not certain."""
+    """Convert depth to 16 bits, 0 where it is uncertain."""
     shown = np.where(select_certain_pixels(depth), depth.depth, 0.0)
     steps = np.iinfo(np.uint16).max / max(float(shown.max()), 1e-12)
     return rerun.DepthImage(np.round(shown * steps).astype(np.uint16), meter=steps)
@@ -119,5 +119,5 @@ def _place(name: str) -> str:
 
 
 def _key(name: str) -> str:
-    """An image name as one part of an entity path."""
+    """Convert an image name to one part of an entity path."""
     return str(rerun.escape_entity_path_part(name))

@@ -1,1 +1,1 @@
-"""Global image descriptors, by a network or without weights."""
+"""Global image descriptors, from a network or without weights."""

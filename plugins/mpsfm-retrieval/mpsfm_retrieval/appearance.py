@@ -1,4 +1,4 @@
-"""A global descriptor without weights: which local features and which colours a view has."""
+"""Global descriptor without weights, from local features and colors."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from mpsfm_retrieval.options import AppearanceOptions
 
 _SIFT_DIMENSIONS = 128
 _BINS = (4, 16, 16)
-"""Of lightness, and of both colour axes of CIELAB."""
+"""Number of bins of lightness, and of both color axes of CIELAB."""
 
 
 class Appearance:
-    """The mean of random Fourier features of the SIFT descriptors, and a colour histogram.
+    """Mean of random Fourier features of the SIFT descriptors, and a color histogram.
 
     The dot product of two such means approximates the mean of ``exp(-sharpness |x - y|^2)`` over
-    all pairs of descriptors (Rahimi and Recht, 2007): the share of features that two views have in
-    common, without a vocabulary. The random features come from the context's seed.
+    all pairs of descriptors (Rahimi and Recht, 2007), without a vocabulary. The context's seed
+    determines the random features.
     """
 
     def __init__(self, options: AppearanceOptions, context: ProviderContext) -> None:
@@ -30,16 +30,16 @@ class Appearance:
             max_keypoints=options.max_keypoints, resize=options.resize, first_octave=0
         )
         self._sift = Sift(sift, context)
-        self._colour_share = options.colour_share
+        self._color_share = options.color_share
         rng = np.random.default_rng(context.seed)
         scale = np.sqrt(2 * options.sharpness)
         self._frequencies = scale * rng.normal(size=(_SIFT_DIMENSIONS, options.dimensions))
         self._phases = rng.uniform(0, 2 * np.pi, options.dimensions)
 
     def describe(self, view: View) -> Float32:
-        """Unit vector (dimensions + 1024,); shorter for a view without any feature."""
-        colours = np.sqrt(self._colour_share) * _colours(view)
-        local = np.sqrt(1 - self._colour_share) * self._local(view)
+        """Compute a unit vector (dimensions + 1024,); shorter for a view without features."""
+        colours = np.sqrt(self._color_share) * _colours(view)
+        local = np.sqrt(1 - self._color_share) * self._local(view)
         return np.concatenate([local, colours]).astype(np.float32)
 
     def _local(self, view: View) -> Float64:
@@ -53,7 +53,7 @@ class Appearance:
 
 
 def _colours(view: View) -> Float64:
-    """Square root of the histogram of the colours that may be used, unit."""
+    """Compute the square root of the color histogram inside the mask, as a unit vector."""
     lab = cv2.cvtColor(view.image, cv2.COLOR_RGB2LAB)
     pixels = lab.reshape(-1, 3) if view.mask is None else lab[view.mask]
     cells = pixels.astype(np.int64) * _BINS // 256

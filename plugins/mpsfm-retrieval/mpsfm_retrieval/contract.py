@@ -1,5 +1,4 @@
-"""How the contract kit tests the network without weights: a stand-in that describes the colours
-of a coarse grid."""
+"""Contract setup: a stand-in that describes the colors of a coarse grid."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ coarse (float[b,3,h,w] image) => (float[b,d] descriptor) {
 
 
 def network(folder: Path) -> ContractSetup:
-    """As EigenPlaces, with a fixed size."""
+    """Write a stand-in with a fixed input size, like EigenPlaces."""
     model = save_model(_COARSE, folder / "coarse.onnx")
     return ContractSetup(
         options={"model": str(model), "network": "eigenplaces"}, truth_source="image"

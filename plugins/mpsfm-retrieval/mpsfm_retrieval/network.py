@@ -1,4 +1,4 @@
-"""Global descriptors by a network."""
+"""Global descriptors from a network."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _INPUTS = {
 
 
 class GlobalNetwork:
-    """A network with one image as input, whose first output describes it.
+    """Network with one image as input and a descriptor as first output.
 
-    The output may be a vector (1, d); tokens (1, t, d), of which the first is taken; or a map
-    (1, d, h, w), which is averaged. The descriptor is made unit.
+    The output is a vector (1, d), tokens (1, t, d) of which the first is used, or a map (1, d, h,
+    w) that is averaged. The descriptor is normalized.
     """
 
     def __init__(self, options: NetworkOptions, context: ProviderContext) -> None:
@@ -45,7 +45,7 @@ class GlobalNetwork:
         self._rule = _INPUTS[options.network]
 
     def describe(self, view: View) -> Float32:
-        """Unit vector (d,)."""
+        """Compute the unit descriptor (d,) of a view."""
         canvas = Canvas.plan(self._rule.size, view.camera.size)
         feed = {self._image: canvas.paint(view.image, self._rule)}
         output = self._model.run(feed, [self._output])[0][0].astype(np.float32)

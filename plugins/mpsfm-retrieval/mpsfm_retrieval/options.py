@@ -1,4 +1,4 @@
-"""What a user can set, and the default weights. Imports nothing heavy."""
+"""Options and default weights; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -15,27 +15,29 @@ DINOV2 = WeightsFile(
 
 
 class NetworkOptions(Options):
-    """A network in an ONNX file that describes a whole image."""
+    """Options of a network in an ONNX file."""
 
     model: str = DINOV2.uri
-    """Path or URI; the default is for ``dinov2``, other networks need their own file."""
+    """Path or URI; the default file is for ``dinov2``."""
     network: Literal["dinov2", "eigenplaces", "netvlad"] = "dinov2"
-    """How it wants the image, see the README."""
+    """Preprocessing of the image, see the README."""
     sha256: str | None = None
     """Expected hash of ``model``."""
 
 
 class AppearanceOptions(Options):
-    """Local features and colours without weights (all defaults ours: the best of those tried for
-    recall on a HoloLens room and a rendered kitchen, see the README)."""
+    """Options of the descriptor without weights.
+
+    All defaults are tuned on two scenes, see the README. [ours]
+    """
 
     max_keypoints: int = Field(2000, gt=0)
-    """SIFT features; the largest are kept."""
+    """Number of SIFT features; the largest are kept."""
     resize: int = Field(640, ge=32)
-    """Longer side in pixels at which they are detected, never enlarged."""
+    """Longer side for detection in pixels, never enlarged."""
     dimensions: int = Field(4096, ge=16)
-    """Random features of the mean of the local descriptors."""
+    """Number of random Fourier features."""
     sharpness: float = Field(15.0, gt=0)
-    """Two unit descriptors x, y count as ``exp(-sharpness |x - y|^2)`` the same."""
-    colour_share: float = Field(0.3, ge=0, lt=1)
-    """Weight of the colours; the rest is the local descriptors'."""
+    """Parameter of the kernel ``exp(-sharpness |x - y|^2)`` of two unit descriptors."""
+    color_share: float = Field(0.3, ge=0, lt=1)
+    """Weight of the color histogram; the local descriptors have the rest."""

@@ -1,4 +1,4 @@
-"""Announces the providers. Imports neither onnxruntime nor OpenCV."""
+"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mpsfm_retrieval.options import DINOV2, AppearanceOptions, NetworkOptions
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """A network, and what goes without one."""
+    """Register a network, and a descriptor without weights."""
     return [
         ProviderSpec(
             kind="retrieval",

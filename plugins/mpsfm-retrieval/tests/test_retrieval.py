@@ -79,7 +79,7 @@ class TestAppearance:
         """Cosine of two means of random features, and of the exact kernel's means."""
         first, second = textured(0), textured(0)
         second[:, 160:] = textured(1)[:, 160:]
-        options = AppearanceOptions(dimensions=50_000, colour_share=0, max_keypoints=60)
+        options = AppearanceOptions(dimensions=50_000, color_share=0, max_keypoints=60)
         views = [view_of(image) for image in (first, second)]
         vectors = [Appearance(options, context).describe(view) for view in views]
         sift = Sift(SiftOptions(max_keypoints=60, resize=640, first_octave=0), context)

@@ -1,5 +1,4 @@
-"""How the contract kit tests the matchers without weights: a stand-in that really matches, by the
-pixels around each pixel of a coarse grid."""
+"""Contract setup: a stand-in that matches by patches on a coarse grid."""
 
 from __future__ import annotations
 
@@ -50,14 +49,14 @@ roma (float[b,3,h,w] im_A, float[b,3,h,w] im_B) => (
 
 
 def dense(folder: Path) -> ContractSetup:
-    """Symmetric, with every position of the coarse grid."""
+    """Write a symmetric stand-in, and use every position of its grid."""
     return ContractSetup(
         options={**_stand_in(folder), "cell": 1, "min_certainty": 0.5}, truth_source="image"
     )
 
 
 def sparse(folder: Path) -> ContractSetup:
-    """The coarse grid needs a wider reach than RoMa's sub-pixel warp."""
+    """Write the same stand-in with a larger snap distance for its coarse grid."""
     return ContractSetup(
         options={**_stand_in(folder), "snap_px": 3.0, "min_certainty": 0.5}, truth_source="image"
     )

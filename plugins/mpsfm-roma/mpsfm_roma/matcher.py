@@ -1,4 +1,4 @@
-"""RoMa as a dense and as a sparse matcher."""
+"""RoMa as a dense and a sparse matcher."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mpsfm_roma.options import DenseSearch, SparseSearch
 
 
 class DenseMatcher:
-    """The certain parts of the warp, thinned out."""
+    """Matcher that subsamples the certain parts of the warp."""
 
     network: ClassVar[Callable[..., WarpNetwork]] = OnnxWarpNetwork
 
@@ -38,7 +38,7 @@ class DenseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Matches from a to b and, from a symmetric model, from b to a."""
+        """Return matches from a to b and, for a symmetric model, from b to a."""
         there, back = self._network.warps(view_a, view_b)
         xy_a, xy_b, scores = self._thinned(there)
         if back is not None:
@@ -48,7 +48,7 @@ class DenseMatcher:
         return PairMatches(dense=DenseMatches(xy_a, xy_b, scores))
 
     def _thinned(self, warp: Warp) -> tuple[Float64, Float64, Float32]:
-        """Positions in the view and in the other, and scores, of the best match of each cell."""
+        """Select the best match of each cell: positions in both views, and scores."""
         rows, columns = _best_of_cells(warp.certainty, self._cell)
         scores = warp.certainty[rows, columns]
         sure = scores > self._min_certainty
@@ -57,7 +57,7 @@ class DenseMatcher:
 
 
 class SparseMatcher:
-    """Keypoints that the warp sends near to each other."""
+    """Matcher of keypoints that the warp maps close to each other."""
 
     network: ClassVar[Callable[..., WarpNetwork]] = OnnxWarpNetwork
 
@@ -72,7 +72,7 @@ class SparseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """The most certain ones first, each keypoint once."""
+        """Match keypoints one-to-one, the most certain first."""
         features_a, features_b = require_features(
             "roma-sparse matches keypoints", features_a, features_b
         )
@@ -86,8 +86,10 @@ class SparseMatcher:
         return PairMatches(sparse=SparseMatches.from_best_scores(pairs, scores))
 
     def _snapped(self, warp: Warp, xy: Float64, others: Float64) -> tuple[Int64, Float32]:
-        """Pairs (m, 2) of a keypoint and the other view's nearest to where the warp sends it, if
-        that is near and no other keypoint is sent nearer to it."""
+        """Find pairs (m, 2) of a keypoint and the nearest keypoint to its warped position.
+
+        A pair is kept if the distance is small and no other keypoint is warped closer.
+        """
         if not (len(xy) and len(others)):
             return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.float32)
         target, certainty = warp.at(xy)
@@ -101,7 +103,7 @@ class SparseMatcher:
 
 
 def _best_of_cells(certainty: Float32, cell: int) -> tuple[Int64, Int64]:
-    """Row and column of the largest value of each square of ``cell`` x ``cell``."""
+    """Find row and column of the largest value of each square of ``cell`` x ``cell``."""
     height, width = certainty.shape
     down, across = -(-height // cell), -(-width // cell)
     padded = np.full((down * cell, across * cell), -1, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""The warp between two views."""
+"""Dense warp between two views."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from mpsfm_roma.options import RomaOptions
 
 @dataclass(frozen=True)
 class Warp:
-    """Where the pixels of one view lie in the other.
+    """Positions of the pixels of one view in the other view.
 
     ``target``: (h, w, 2), pixels of the other view, on a grid that covers the view of ``size``.
-    ``certainty``: (h, w) in [0, 1], 0 where the target is outside of the other view.
+    ``certainty``: (h, w) in [0, 1], 0 if the target is outside the other view.
     """
 
     size: tuple[int, int]
@@ -31,13 +31,13 @@ class Warp:
     certainty: Float32
 
     def source(self, rows: Int64, columns: Int64) -> Float64:
-        """Pixels (n, 2) of the view for cells of the grid."""
+        """Return pixels (n, 2) of the view for cells of the grid."""
         height, width = self.certainty.shape
         xy = np.stack([columns, rows], axis=-1).astype(np.float64) + 0.5
         return scale_pixels(xy, (width, height), self.size)
 
     def at(self, xy: Float64) -> tuple[Float64, Float64]:
-        """Target (n, 2) and certainty (n,) at pixels (n, 2) of the view, bilinear."""
+        """Interpolate target (n, 2) and certainty (n,) at pixels (n, 2) of the view."""
         height, width = self.certainty.shape
         grid = scale_pixels(xy, self.size, (width, height))
         everywhere: Bool = np.ones((height, width), dtype=np.bool_)
@@ -47,17 +47,20 @@ class Warp:
 
 
 class WarpNetwork(ABC):
-    """RoMa, whatever runs it."""
+    """Interface of RoMa."""
 
     @abstractmethod
     def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
-        """As of RoMa's ``match``: the warp (h, w, 4), positions ``x_a, y_a, x_b, y_b`` in [-1, 1]
-        of which the first two are a grid; its certainty (h, w); and whether it is symmetric: the
-        warp of the second view is to the right of the first one's, with the last two as the
-        grid."""
+        """Run the network on two images, as RoMa's ``match``.
+
+        Returns:
+            The warp (h, w, 4) with positions ``x_a, y_a, x_b, y_b`` in [-1, 1], the first two on a
+            grid; its certainty (h, w); and if it is symmetric. A symmetric warp has the warp of the
+            second view in its right half, with the last two on the grid.
+        """
 
     def warps(self, view_a: View, view_b: View) -> tuple[Warp, Warp | None]:
-        """The warp from a to b and, from a symmetric model, the one from b to a."""
+        """Compute the warp from a to b and, for a symmetric model, from b to a."""
         warp, certainty, symmetric = self.answer(view_a, view_b)
         half = warp.shape[1] // 2 if symmetric else warp.shape[1]
         there = _warp(view_a, view_b, warp[:, :half, 2:], certainty[:, :half])
@@ -69,8 +72,8 @@ class WarpNetwork(ABC):
 class OnnxWarpNetwork(WarpNetwork):
     """RoMa as an ONNX model.
 
-    Inputs: two images (1, 3, height, width), normalised as for ImageNet. Outputs, with or without
-    a batch dimension: the warp and its certainty.
+    Inputs: two images (1, 3, height, width), ImageNet-normalized. Outputs, with or without a batch
+    dimension: warp and certainty.
     """
 
     def __init__(self, options: RomaOptions, context: ProviderContext) -> None:
@@ -86,7 +89,7 @@ class OnnxWarpNetwork(WarpNetwork):
         )
 
     def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
-        """See :class:`WarpNetwork`."""
+        """Run the ONNX model; see :class:`WarpNetwork`."""
         images = (
             Canvas.plan(self._rule.size, v.camera.size).paint(v.image, self._rule)
             for v in (view_a, view_b)

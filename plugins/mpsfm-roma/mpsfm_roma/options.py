@@ -1,4 +1,4 @@
-"""What a user can set; "reference" is the published system's value. Imports nothing heavy."""
+"""Options of the matchers; imports nothing heavy. "reference" is the authors' implementation."""
 
 from __future__ import annotations
 
@@ -8,44 +8,45 @@ from mpsfm_core import Options
 
 
 class RomaOptions(Options):
-    """The network."""
+    """Options of the network."""
 
     model: str
-    """Path or URI of the ONNX file (the README says how it is made)."""
+    """Path or URI of the ONNX file, see the README."""
     sha256: str | None = None
     """Expected hash of ``model``."""
     height: int = Field(672, ge=14, multiple_of=14)
-    """Rows of the network's input; views are stretched to it (reference: coarse resolution)."""
+    """Rows of the network input; views are stretched. [reference: coarse resolution]"""
     width: int = Field(672, ge=14, multiple_of=14)
-    """Columns of the network's input."""
+    """Columns of the network input."""
     inputs: tuple[str, str] = ("im_A", "im_B")
-    """Names of the images' tensors."""
+    """Names of the image tensors."""
     outputs: tuple[str, str] = ("warp", "certainty")
-    """Names of the tensors of the warp and of its certainty."""
+    """Names of the tensors of warp and certainty."""
 
 
 class DenseSearch(Options):
-    """Matches of free positions."""
+    """Options of dense matching."""
 
     cell: int = Field(4, ge=1)
-    """Of each square of so many warp pixels only the most certain match is given: the core keeps
-    one in a radius of 8 pixels of the view anyway, and matches are stored."""
+    """Side in warp pixels of the cells with one match each. The core keeps one match within 8
+    pixels of the view, so a smaller value only stores more.
+    """
     min_certainty: float = Field(0.05, ge=0, lt=1)
-    """Less certain matches are not given (RoMa's own threshold)."""
+    """Minimum certainty of a match. [RoMa]"""
 
 
 class SparseSearch(Options):
-    """Matches of given keypoints."""
+    """Options of matching at keypoints."""
 
     snap_px: float = Field(2.0, gt=0)
-    """Farthest that a keypoint may be from where the warp sends another one (reference)."""
+    """Maximum distance in pixels between a keypoint and a warped keypoint. [reference]"""
     min_certainty: float = Field(0.05, ge=0, lt=1)
-    """Smallest certainty of the warp at a keypoint (RoMa's own threshold)."""
+    """Minimum certainty of the warp at a keypoint. [RoMa]"""
 
 
 class DenseOptions(RomaOptions, DenseSearch):
-    """Of ``roma``."""
+    """Options of ``roma``."""
 
 
 class SparseOptions(RomaOptions, SparseSearch):
-    """Of ``roma-sparse``."""
+    """Options of ``roma-sparse``."""

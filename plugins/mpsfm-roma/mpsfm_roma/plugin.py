@@ -1,4 +1,4 @@
-"""Announces the providers. Imports neither onnxruntime nor OpenCV."""
+"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mpsfm_roma.options import DenseOptions, SparseOptions
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """The same network, with free positions and with given keypoints."""
+    """Register the dense and the sparse matcher."""
     return [
         _spec("roma", "dense", DenseOptions, "RoMa: dense matches of a warp"),
         _spec("roma-sparse", "sparse", SparseOptions, "RoMa's warp at keypoints of any detector"),

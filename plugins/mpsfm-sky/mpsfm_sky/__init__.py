@@ -1,1 +1,1 @@
-"""Sky masks, by a network or without weights."""
+"""Sky masks, from a network or without weights."""

@@ -1,4 +1,4 @@
-"""How the contract kit tests the masks without weights."""
+"""Contract setups without weights."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ sky (float[b,3,h,w] image) => (float[b,1,h,w] d0)
     d0 = Max (above, zero)
 }
 """
-"""1 where the red of a painted view, which is its depth, is 0."""
+"""1 where the red channel of a painted view (its depth) is 0."""
 
 
 def network(folder: Path) -> ContractSetup:
-    """The network's stand-in takes for sky what has no depth painted."""
+    """Write a stand-in that masks pixels without painted depth."""
     path = save_model(_PAINTED_SKY, folder / "sky.onnx")
     return ContractSetup(
         options={"model": str(path), "network": "skysegsmall"}, truth_source="painted"
@@ -29,5 +29,5 @@ def network(folder: Path) -> ContractSetup:
 
 
 def simple(folder: Path) -> ContractSetup:
-    """It sees the blue sky of the textured views."""
+    """Use the blue sky of the textured views."""
     return ContractSetup(truth_source="image")

@@ -1,4 +1,4 @@
-"""Sky by a segmentation network."""
+"""Sky mask from a segmentation network."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _INPUTS = {
 
 
 class SkyNetwork:
-    """A network with one image as input, whose first output is the probability of sky.
+    """Network with one image as input and the probability of sky as first output.
 
-    The reference stretches the output of every image to 0..1 first, which calls the likeliest
-    pixels of an image without sky sky; here the probability is taken as it is.
+    The reference stretches each output to 0..1, which finds sky in images without sky; the
+    probability is used without stretching here.
     """
 
     def __init__(self, options: SkyOptions, context: ProviderContext) -> None:
@@ -38,7 +38,7 @@ class SkyNetwork:
         self._threshold = options.threshold
 
     def mask(self, view: View) -> Bool:
-        """True where there is no sky."""
+        """Predict a mask that is False on sky."""
         canvas = Canvas.plan(self._rule.size, view.camera.size)
         feed = {self._image: canvas.paint(view.image, self._rule)}
         sky = planes(self._model.run(feed, [self._sky])[0], "NCHW")[..., 0]

@@ -1,4 +1,4 @@
-"""What a user can set. Imports nothing heavy."""
+"""Options of the providers; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -9,34 +9,36 @@ from pydantic import Field
 from mpsfm_core import Options, WeightsFile
 
 SKYSEG = WeightsFile("hf://JianyuanWang/skyseg@main/skyseg.onnx", license="MIT")
-"""The reference's network, from where the authors of VGGT take it; its hash is recorded."""
+"""Network of the reference, from the source that VGGT's authors use; its hash is recorded."""
 
 
 class SkyOptions(Options):
-    """A sky segmentation network in an ONNX file."""
+    """Options of a sky segmentation network in an ONNX file."""
 
     model: str = SKYSEG.uri
     """Path or URI."""
     network: Literal["skyseg", "skysegsmall"] = "skyseg"
-    """How it wants the image: ``skyseg`` 320 x 320, normalised (the reference's); ``skysegsmall``
-    384 x 384 with values in 0..1, normalised inside."""
+    """Preprocessing: ``skyseg`` 320 x 320, normalized [reference]; ``skysegsmall`` 384 x 384, 0..1.
+    """
     sha256: str | None = None
     """Expected hash of ``model``."""
     threshold: float = Field(0.5, gt=0, lt=1)
-    """Pixels that are more probably sky are not used (reference)."""
+    """Sky probability above which a pixel is masked. [reference]"""
 
 
 class SimpleSkyOptions(Options):
-    """Smooth, bright or blue regions at the upper border (all defaults ours, chosen on the photos
-    that the README names)."""
+    """Options of the rule-based mask.
+
+    All defaults are tuned on the photos of the README. [ours]
+    """
 
     brightness: float = Field(0.6, ge=0, le=1)
-    """Mean of the channels from which on a pixel that is not warm may be sky."""
+    """Minimum mean of the channels of bright sky."""
     warmth: float = Field(0.05, ge=0, le=1)
-    """How much more red than blue it may have."""
+    """Maximum red minus blue of bright sky."""
     blueness: float = Field(0.1, ge=0, le=1)
-    """How much more blue than red makes a darker pixel sky."""
+    """Minimum blue minus red of darker sky."""
     roughness: float = Field(0.02, gt=0)
-    """Largest step of brightness to a neighbour, on an image of 256 pixels."""
+    """Maximum brightness step to a neighbor, in an image of 256 pixels."""
     min_share: float = Field(0.005, ge=0, le=1)
-    """Regions smaller than this share of the image are no sky."""
+    """Minimum area of a sky region as a share of the image."""

@@ -1,4 +1,4 @@
-"""Announces the providers. Imports neither onnxruntime nor OpenCV."""
+"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mpsfm_sky.options import SKYSEG, SimpleSkyOptions, SkyOptions
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """A network, and a rule of thumb."""
+    """Register a network and a rule-based mask."""
     return [
         ProviderSpec(
             kind="mask",

@@ -1,4 +1,4 @@
-"""Sky without a network: smooth, bright or blue, and open to above."""
+"""Sky mask without a network: smooth, bright or blue regions at the upper border."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from mpsfm_sky.options import SimpleSkyOptions
 
 _LONGER_SIDE = 256
 _CLEARANCE = 3
-"""Kernel that parts the sky from what only touches it."""
+"""Kernel size of the erosion that separates sky from adjacent regions."""
 
 
 class SimpleSky:
-    """Regions at the upper border that look like sky. White walls and ceilings do, too."""
+    """Mask of regions at the upper border that resemble sky; white walls do as well."""
 
     def __init__(self, options: SimpleSkyOptions, context: ProviderContext) -> None:
         self._options = options
 
     def mask(self, view: View) -> Bool:
-        """True where there is no sky."""
+        """Compute a mask that is False on sky."""
         factor = min(1.0, _LONGER_SIDE / max(view.camera.size))
         width, height = (max(1, round(side * factor)) for side in view.camera.size)
         likely = self._likely(resize_map(view.image, width, height))
@@ -38,7 +38,7 @@ class SimpleSky:
         return keep
 
     def _likely(self, rgb: Float32) -> UInt8:
-        """1 for pixels that may be sky, of an RGB image of 0..255."""
+        """Compute 1 for pixels of an RGB image (0..255) that may be sky."""
         options = self._options
         red, _, blue = np.moveaxis(rgb / 255, -1, 0)
         gray = rgb.mean(axis=-1) / 255

@@ -1,1 +1,1 @@
-"""Models of the Hugging Face Hub that the library transformers runs, as MP-SfM providers."""
+"""Models of the Hugging Face Hub that the library transformers runs."""

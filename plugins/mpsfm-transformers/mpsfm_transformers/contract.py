@@ -1,5 +1,7 @@
-"""How the contract kit tests the providers without published weights: on tiny models of the same
-families with random ones. They predict and match, and it means nothing."""
+"""Contract setups: tiny models of the real families with random weights.
+
+Their answers are valid but not accurate.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +15,14 @@ from mpsfm_transformers import stand_in
 
 
 def transformers(folder: Path) -> ContractSetup:
-    """Depth Pro, which depends on the focal length and tells it."""
+    """Write a tiny Depth Pro, which uses and estimates the focal length."""
     return ContractSetup(
         options={"model": str(stand_in.depth_pro(folder / "depth_pro"))}, truth_source="none"
     )
 
 
 def prompt_depth_anything(folder: Path) -> ContractSetup:
-    """The sensor sees the truth, coarsely."""
+    """Write a tiny model, and coarse true depth maps as sensor data."""
 
     def write_depth(example: Example) -> None:
         path = (folder / "sensor" / example.view.name).with_suffix(".npy")
@@ -34,33 +36,33 @@ def prompt_depth_anything(folder: Path) -> ContractSetup:
 
 
 def superpoint_hub(folder: Path) -> ContractSetup:
-    """A detector that finds something everywhere."""
+    """Write a detector that finds keypoints everywhere."""
     model = stand_in.superpoint(folder / "superpoint")
     return ContractSetup(options={"model": str(model), "max_keypoints": 300}, truth_source="none")
 
 
 def lightglue_superpoint_hub(folder: Path) -> ContractSetup:
-    """For descriptors of SuperPoint."""
+    """Write a matcher for descriptors of SuperPoint."""
     return ContractSetup(
         options={"model": str(stand_in.lightglue(folder / "lightglue"))}, truth_source="none"
     )
 
 
 def superglue(folder: Path) -> ContractSetup:
-    """For descriptors of SuperPoint."""
+    """Write a matcher for descriptors of SuperPoint."""
     return ContractSetup(
         options={"model": str(stand_in.superglue(folder / "superglue"))}, truth_source="none"
     )
 
 
 def efficient_loftr(folder: Path) -> ContractSetup:
-    """On small images."""
+    """Write a matcher for small images."""
     model = stand_in.efficient_loftr(folder / "efficient_loftr")
     return ContractSetup(options={"model": str(model), "resize": 128}, truth_source="none")
 
 
 def dino(folder: Path) -> ContractSetup:
-    """A few random layers still tell a room from another."""
+    """Write a few random layers, which suffice to distinguish two scenes."""
     return ContractSetup(
         options={"model": str(stand_in.dino(folder / "dino"))}, truth_source="none"
     )

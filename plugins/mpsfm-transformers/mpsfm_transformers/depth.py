@@ -1,4 +1,4 @@
-"""Depth by any model that ``AutoModelForDepthEstimation`` loads."""
+"""Depth from any model that ``AutoModelForDepthEstimation`` loads."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from mpsfm_transformers.placement import Preparation, preparation_for
 
 _PROMPTED = "prompt_depth_anything"
 _FARTHEST_M = 250.0
-"""Of Depth Pro (reference)."""
+"""Maximum depth of Depth Pro in meters. [reference]"""
 _NO_SPREAD_M = 1e-6
-"""What the library adds to one value of a prompt without any spread, which cannot be normalised."""
+"""Offset that is added to one pixel of a constant prompt, which the library cannot normalize."""
 
 _METRIC = ("glpn", "zoedepth", "tipsv2_dpt")
-"""Families of models that predict metres."""
+"""Families of models that predict meters."""
 
 
 class HubDepth:
-    """Depth on the network's own grid."""
+    """Provider of depth on the grid of the network."""
 
     def __init__(self, options: DepthOptions, context: ProviderContext) -> None:
         self._model = LoadedModel(AutoModelForDepthEstimation, options, context)
@@ -45,7 +45,7 @@ class HubDepth:
         self._by_focal = config.model_type == "depth_pro"
 
     def predict(self, view: View) -> DepthPrior:
-        """Depth; of Depth Pro for the focal length of the view's camera."""
+        """Predict depth; Depth Pro uses the focal length of the view's camera."""
         value, _ = self._run(view)
         if self._by_focal:
             inverse = value.astype(np.float64) * (view.camera.width / view.camera.fx)
@@ -55,8 +55,7 @@ class HubDepth:
         return DepthPrior.from_arrays(value, metric=self._metric)
 
     def estimate_focal(self, view: View) -> float | None:
-        """The horizontal focal length that Depth Pro guesses, in pixels of the view; None of
-        models that do not say."""
+        """Estimate the horizontal focal length in pixels of the view; None except for Depth Pro."""
         if not self._by_focal:
             return None
         angle = self._run(view)[1]
@@ -65,7 +64,7 @@ class HubDepth:
         return 0.5 * view.camera.width / float(np.tan(0.5 * np.radians(angle)))
 
     def _run(self, view: View) -> tuple[Float32, float | None]:
-        """The network's map of the view, and the angle of view in degrees if it says."""
+        """Run the network on a view; return its map, and the angle of view in degrees or None."""
         prepared = self._preparation(view)
         with inference():
             found = self._model.network(pixel_values=prepared.pixels.to(self._model.device))
@@ -75,7 +74,7 @@ class HubDepth:
 
 
 class PromptDepth:
-    """Prompt Depth Anything: the sensor's depth with the detail of the photo."""
+    """Prompt Depth Anything: sensor depth with the detail of the photo."""
 
     def __init__(self, options: PromptOptions, context: ProviderContext) -> None:
         self._model = LoadedModel(AutoModelForDepthEstimation, options, context)
@@ -92,7 +91,7 @@ class PromptDepth:
         self._preparation: Preparation = preparation_for(self._model)
 
     def predict(self, view: View) -> DepthPrior:
-        """Metric depth; nothing is valid where the sensor saw nothing at all."""
+        """Predict metric depth; all pixels are invalid if the sensor has no depth."""
         sensor = self._sensor.predict(view)
         if not sensor.valid.any():
             return sensor
@@ -105,11 +104,12 @@ class PromptDepth:
 
 
 def meaning(config: Any, options: DepthOptions) -> tuple[Output, bool]:
-    """What a model predicts, and whether in metres: as the options say, else the table of known
-    models, else its configuration.
+    """Determine the output of a model and if it is metric.
+
+    The options have priority over the table of known models and the model configuration.
 
     Raises:
-        ConfigError: its family predicts something else than depth.
+        ConfigError: The model family does not predict depth.
     """
     family = config.model_type
     if family == "chmv2":
@@ -133,7 +133,7 @@ def _inverse(inverse: Float64, metric: bool, smallest: float = 0.0) -> DepthPrio
 
 
 def _without_holes(sensor: DepthPrior) -> Float32:
-    """Each invalid pixel with the value of the nearest valid one; never the same everywhere."""
+    """Fill invalid pixels with the nearest valid value; the result is never constant."""
     nearest = distance_transform_edt(~sensor.valid, return_distances=False, return_indices=True)
     filled: Float32 = sensor.depth[tuple(nearest)]
     if filled.min() == filled.max():

@@ -13,11 +13,11 @@ from mpsfm_transformers.hub import LoadedModel
 from mpsfm_transformers.options import SuperPointOptions
 
 _CELL = 8
-"""The network's scores are of cells of 8 x 8 pixels."""
+"""The network scores cells of 8 x 8 pixels."""
 
 
 class SuperPointFeatures:
-    """Keypoints where the network is surest; their pixels have integers for centres there."""
+    """SuperPoint; its pixel centers are integers."""
 
     def __init__(self, options: SuperPointOptions, context: ProviderContext) -> None:
         config: dict[str, float] = {"max_keypoints": -1}  # a mask may take some away
@@ -27,9 +27,9 @@ class SuperPointFeatures:
         self._options = options
 
     def extract(self, view: View) -> Features:
-        """The strongest keypoints inside of the view's mask, best first.
+        """Extract the strongest keypoints inside the mask, best first.
 
-        ``std_px`` is 1, or the size of a pixel of the resized image if that is more.
+        ``std_px`` is 1, or the pixel size of the resized image if larger.
         """
         size = network_size(view, self._options.resize, _CELL)
         with inference():

@@ -1,4 +1,4 @@
-"""From options to a loaded model: safetensors and configuration only, no code of a repository."""
+"""Loading of models: safetensors and configuration only, no code of a repository."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from mpsfm_transformers.options import CONFIG, FILES, PROCESSOR, WEIGHTS, HubOpt
 
 
 class LoadedModel:
-    """A model in evaluation mode on the context's device, in float32.
+    """Model in evaluation mode on the context's device, in float32.
 
-    ``network``: the module, made by ``family.from_pretrained``. ``preprocessor``: the content of
-    ``preprocessor_config.json``. ``folder()``: the files in one folder, for as long as needed.
+    ``network``: the module of ``family.from_pretrained``. ``preprocessor``: the content of
+    ``preprocessor_config.json``. ``folder()``: the files in one folder.
 
     Raises:
-        WeightsError: a file is missing or damaged, is for another family of models, or wants code
-            of its repository to be run.
+        WeightsError: A file is missing or damaged, belongs to another family, or requires code of
+            its repository.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class LoadedModel:
 
     @contextmanager
     def folder(self) -> Iterator[Path]:
-        """A folder in which the files have their own names."""
+        """Provide a folder in which the files have their original names."""
         with ExitStack() as stack:
             folder = self._paths[0].parent
             if any(path != folder / name for path, name in zip(self._paths, FILES, strict=True)):
@@ -72,7 +72,7 @@ class LoadedModel:
             yield folder
 
     def processor(self, family: Any) -> Any:
-        """The model's own image processor, on PIL (torchvision is not needed)."""
+        """Return the image processor of the model, its PIL version (no torchvision)."""
         with self.folder() as folder, _explained(self._name), quiet():
             return family.from_pretrained(
                 folder, local_files_only=True, backend="pil", trust_remote_code=False
@@ -81,7 +81,7 @@ class LoadedModel:
 
 @contextmanager
 def _explained(model: str) -> Iterator[None]:
-    """What goes wrong inside of the library, as one error of ours."""
+    """Convert errors of the library to one error of MP-SfM."""
     try:
         yield
     except Exception as error:  # its errors share no base class
@@ -93,7 +93,7 @@ def _explained(model: str) -> Iterator[None]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """No progress bars and advice of the library in somebody's terminal."""
+    """Disable progress bars and advice of the library."""
     level, bars = hub_logging.get_verbosity(), hub_logging.is_progress_bar_enabled()
     hub_logging.set_verbosity_error()
     hub_logging.disable_progress_bar()

@@ -15,13 +15,15 @@ from mpsfm_transformers.options import EfficientLoftrOptions
 
 _MULTIPLE = 32
 _STD_NETWORK_PX = 0.5
-"""Localisation noise in network pixels (reference: half that of sparse keypoints)."""
+"""Keypoint noise in network pixels. [reference: half of the noise of sparse keypoints]"""
 
 
 class _Paired(EfficientLoFTRForKeypointMatching):  # type: ignore[misc]  # is untyped
-    """The library's class lists the partners of the cells of either image, each in the order of the
-    other image's cells, and refines and returns them as if both lists had one order (5.23): right
-    only where no two matches cross. Here both are in the order of the first image's cells."""
+    """Efficient LoFTR with a corrected pairing of its matches.
+
+    The library (5.23) lists the matched cells of both images in different orders, and pairs them as
+    if the orders were the same. Here both lists follow the cells of the first image.
+    """
 
     def _get_matches_from_scores(self, scores: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         indices, certainty = super()._get_matches_from_scores(scores)
@@ -32,11 +34,7 @@ class _Paired(EfficientLoFTRForKeypointMatching):  # type: ignore[misc]  # is un
 
 
 class EfficientLoftrMatcher:
-    """Matches in COLMAP's frame: as of LoFTR, its training projected the corners of pixels, so
-    nothing is added to its positions.
-
-    Both views lie in the upper left corner of a canvas that holds either.
-    """
+    """Matcher with positions in COLMAP's pixels; both views share one canvas, at its upper left."""
 
     def __init__(self, options: EfficientLoftrOptions, context: ProviderContext) -> None:
         config = {}
@@ -52,7 +50,7 @@ class EfficientLoftrMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Matches of cells of both views, refined; each with its coarse score."""
+        """Match cells of both views with subpixel refinement; the score is the coarse score."""
         views = (view_a, view_b)
         sizes = [network_size(view, self._longest, _MULTIPLE) for view in views]
         canvas = max(width for width, _ in sizes), max(height for _, height in sizes)
@@ -79,7 +77,7 @@ class EfficientLoftrMatcher:
     def _pair(
         self, views: tuple[View, View], sizes: list[tuple[int, int]], canvas: tuple[int, int]
     ) -> torch.Tensor:
-        """Both views, (1, 2, 3, h, w)."""
+        """Stack both views to (1, 2, 3, h, w)."""
         images = torch.zeros(1, 2, 3, canvas[1], canvas[0], device=self._model.device)
         for side, (view, (width, height)) in enumerate(zip(views, sizes, strict=True)):
             images[0, side, :, :height, :width] = gray_image(

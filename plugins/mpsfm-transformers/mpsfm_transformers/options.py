@@ -1,4 +1,4 @@
-"""What a user can set, and what is known of models by name. Imports nothing heavy."""
+"""Options and the table of known models; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ FILES = (CONFIG, PROCESSOR, WEIGHTS)
 Output = Literal["depth", "disparity"]
 
 METRIC = DepthCalibration(std_scale=1.0, relative_std=0.079)
-"""Reference, for Depth Anything V2 of size L on Virtual KITTI; others have not been measured."""
+"""Calibration of metric models. [reference, for Depth Anything V2 of size L on Virtual KITTI]"""
 DEPTH_PRO = DepthCalibration(std_scale=1.0, relative_std=0.0875)
-"""Reference."""
+"""Calibration of Depth Pro. [reference]"""
 RELATIVE = DepthCalibration(std_scale=1.0, relative_std=0.16, shift_space="disparity")
-"""A guess: twice the metric networks', for the shift that inverse depth lacks; fit it."""
+"""Calibration of relative models, twice that of metric ones because of the unknown shift. [assumed]
+"""
 
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of the models whose name fits ``pattern``.
+    """Known properties of models whose name matches ``pattern``.
 
-    ``license``: of the weights, from their model card. ``output``, ``metric``: only where the
-    model's ``config.json`` does not say.
+    ``license``: license of the weights, from their model card. ``output``, ``metric``: only if the
+    model's ``config.json`` does not define them.
     """
 
     pattern: str
@@ -59,44 +60,45 @@ KNOWN = (
     Known("facebook/dinov2-*", "Apache-2.0"),
     Known("facebook/dinov3-*", "DINOv3 License"),
 )
-"""The first that fits counts."""
+"""Table of known models; the first match counts."""
 
 
 def known(model: str) -> Known:
-    """What is known of a model by its name."""
+    """Look up the known properties of a model by its name."""
     name = model.partition("@")[0]
     unknown = Known("*", "of the chosen model, see its card", RELATIVE)
     return next((entry for entry in KNOWN if fnmatch(name, entry.pattern)), unknown)
 
 
 class HubOptions(Options):
-    """A model of the Hub, or a folder with one.
+    """Options of a model of the Hub, or of a folder with a model.
 
-    The files are ``config.json``, ``preprocessor_config.json`` and safetensors; nothing else of a
-    repository is read, and none of its code is run.
+    Only ``config.json``, ``preprocessor_config.json`` and safetensors are read; no code of a
+    repository is executed.
     """
 
     model: str
-    """``ORG/NAME@REVISION``; a folder; or ``ORG/NAME``, whose first download is recorded by its
-    hash, so that another version is refused later."""
+    """``ORG/NAME@REVISION``, a folder, or ``ORG/NAME``. Without a revision the hash of the first
+    download is recorded, and another version is refused later.
+    """
     sha256: str | None = None
     """Expected hash of ``model.safetensors``."""
 
     @property
     def folder(self) -> Path | None:
-        """The folder with the model, None for one of the Hub."""
+        """Return the folder with the model, or None for a model of the Hub."""
         path = Path(self.model).expanduser()
         return path if path.is_dir() or self.model.startswith((".", "/", "~")) else None
 
     def uris(self) -> tuple[str, ...]:
-        """Where :data:`FILES` are."""
+        """Return the addresses of :data:`FILES`."""
         if self.folder is not None:
             return tuple(str(self.folder / name) for name in FILES)
         repository, _, revision = self.model.partition("@")
         return tuple(f"hf://{repository}@{revision or 'main'}/{name}" for name in FILES)
 
     def files(self) -> tuple[WeightsFile, ...]:
-        """:data:`FILES`, as a run has to find or fetch them."""
+        """Return :data:`FILES` as weights to locate or download."""
         license = known(self.model).license
         hashes = (None, None, self.sha256)
         return tuple(
@@ -106,82 +108,82 @@ class HubOptions(Options):
 
 
 class DepthOptions(HubOptions):
-    """Any model for depth estimation."""
+    """Options of models for depth estimation."""
 
     model: str = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
     output: Output | None = None
-    """What the model predicts; null asks its ``config.json`` and the table of known models."""
+    """Output of the model; null: from ``config.json`` and the table of known models."""
     metric: bool | None = None
-    """Whether that is in metres; null as above."""
+    """True if the output is in meters; null: as for ``output``."""
 
 
 class PromptOptions(HubOptions):
-    """Prompt Depth Anything (CVPR 2025): a network that refines the depth of a sensor."""
+    """Options of Prompt Depth Anything (CVPR 2025), which refines sensor depth."""
 
     model: str = "depth-anything/prompt-depth-anything-vits-hf"
     directory: Path
-    """Folder with the sensor's depth maps, read as by ``files``; holes are filled from beside
-    them for the network."""
+    """Folder with the depth maps of the sensor, as for ``files``; holes are filled for the network.
+    """
     suffix: str | None = None
-    """Of the maps' names, as of ``files``."""
+    """Suffix of the file names, as for ``files``."""
     scale: float = Field(1.0, gt=0)
-    """Metres per stored unit: 0.001 for millimetres."""
+    """Meters per stored unit: 0.001 for millimeters."""
 
 
 class SuperPointOptions(HubOptions):
-    """SuperPoint (2018), 256 dimensions."""
+    """Options of SuperPoint (2018), 256 dimensions."""
 
     model: str = "magic-leap-community/superpoint"
     max_keypoints: int = Field(6000, gt=0)
-    """The strongest are kept (reference)."""
+    """Number of keypoints with the highest score to keep. [reference]"""
     resize: int | None = Field(1600, ge=32)
-    """Longer side in pixels at which to detect, never enlarged (reference); null keeps the
-    view's."""
+    """Longer side for detection in pixels, never enlarged; null: the size of the view. [reference]
+    """
     detection_threshold: float | None = Field(None, ge=0, lt=1)
-    """Score to exceed; null for the model's own (0.005 of the published one)."""
+    """Minimum score; null: the threshold of the model (0.005 for the published one)."""
 
 
 class SparseOptions(HubOptions):
-    """What LightGlue and SuperGlue share."""
+    """Options of LightGlue and SuperGlue."""
 
     min_score: float | None = Field(None, ge=0, lt=1)
-    """Smallest score of a match; null for the model's own."""
+    """Minimum score of a match; null: the threshold of the model."""
 
 
 class LightGlueOptions(SparseOptions):
-    """LightGlue (ICCV 2023)."""
+    """Options of LightGlue (ICCV 2023)."""
 
     model: str = "ETH-CVG/lightglue_superpoint"
     depth_confidence: float = Field(-1.0, le=1)
-    """Stop early above this share of confident points; -1 never (reference setting)."""
+    """Stop early above this share of confident points; -1: never. [reference]"""
     width_confidence: float = Field(-1.0, le=1)
-    """Drop points that are this certainly unmatchable; -1 never (reference setting)."""
+    """Drop points that are unmatchable with this confidence; -1: never. [reference]"""
 
 
 class SuperGlueOptions(SparseOptions):
-    """SuperGlue (CVPR 2020)."""
+    """Options of SuperGlue (CVPR 2020)."""
 
     model: str = "magic-leap-community/superglue_outdoor"
 
 
 class EfficientLoftrOptions(HubOptions):
-    """Efficient LoFTR (CVPR 2024)."""
+    """Options of Efficient LoFTR (CVPR 2024)."""
 
     model: str = "zju-community/efficientloftr"
     resize: int = Field(1184, ge=64)
-    """Longer side in pixels, never enlarged (published evaluation on MegaDepth)."""
+    """Longer side in pixels, never enlarged. [published evaluation on MegaDepth]"""
     min_score: float | None = Field(None, ge=0, lt=1)
-    """Smallest score of a coarse match; null for the model's own."""
+    """Minimum score of a coarse match; null: the threshold of the model."""
 
 
 class DinoOptions(HubOptions):
-    """DINOv2 and DINOv3 and what is built as they are."""
+    """Options of DINOv2, DINOv3 and models of the same architecture."""
 
     model: str = "facebook/dinov2-small"
     resize: int = Field(336, ge=32)
-    """Longer side in pixels (as ``global-onnx``: the whole view, not the centre of it)."""
+    """Longer side in pixels; the whole view is used, not its center."""
 
 
 def hub_files(options: HubOptions) -> tuple[WeightsFile, ...]:
-    """For ``ProviderSpec.weights``."""
+    """Return the weights for ``ProviderSpec.weights``."""
     return options.files()

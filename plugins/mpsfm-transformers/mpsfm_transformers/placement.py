@@ -1,8 +1,8 @@
-"""Views as depth networks see them, and which part of their answer is of the view.
+"""Position of a view on the input of a depth network.
 
-The model's own image processor prepares the view. Where it pads, or aligns the centres of corner
-pixels when it resizes, the network's map covers more or less than the view; :meth:`Prepared.cut`
-gives the part that covers it exactly.
+The model's image processor prepares the view. If it pads, or aligns corner pixels when it resizes,
+the output covers more or less than the view; :meth:`Prepared.cut` returns the part that covers it
+exactly.
 """
 
 from __future__ import annotations
@@ -21,24 +21,27 @@ from mpsfm_core.geometry import pixel_centers, resize_map, sample_bilinear
 from mpsfm_transformers.hub import LoadedModel
 
 _SMALLEST_SIDE = 32
-"""Processors round sides down to multiples of up to 32."""
+"""Minimum side in pixels; processors round sides down to multiples of up to 32."""
 _LARGEST_RATIO = 16
-"""Of the sides: what is thinner would vanish when a processor makes it small."""
+"""Maximum aspect ratio; a thinner image could get a side of 0 pixels."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """``pixels``: the network's input (1, 3, h, w). ``start``, ``extent``: where the view lies on
-    it, ``(x, y)`` in its pixels (centre of the first at 0.5)."""
+    """Network input and the position of the view on it.
+
+    ``pixels``: (1, 3, h, w). ``start``, ``extent``: position and size of the view, ``(x, y)`` in
+    input pixels (first pixel at 0.5).
+    """
 
     pixels: torch.Tensor
     start: Float64
     extent: Float64
     aligned: bool = False
-    """Whether the network's map lies on the input with aligned centres of the corner pixels."""
+    """True if the output grid is aligned with the corner pixel centers of the input."""
 
     def cut(self, value: Float32) -> Float32:
-        """The part of a map (h, w) of the network that covers the view."""
+        """Cut the part of an output map (h, w) that covers the view."""
         have = np.array(value.shape[::-1], dtype=np.float64)
         size = np.array(tuple(self.pixels.shape[:-3:-1]), dtype=np.float64)
         if self.aligned:
@@ -58,7 +61,7 @@ Preparation = Callable[[View], Prepared]
 
 
 def preparation_for(model: LoadedModel) -> Preparation:
-    """How the model wants its views."""
+    """Return the preparation of views for a model."""
     if model.network.config.model_type == "depth_pro":
         return _DepthProPreparation(model.preprocessor)
     processor = model.processor(AutoImageProcessor)
@@ -68,7 +71,7 @@ def preparation_for(model: LoadedModel) -> Preparation:
 
 
 class _ByProcessor:
-    """Stretched to the network's size, maybe padded on all sides alike."""
+    """Preparation by stretching to the network size, with optional symmetric padding."""
 
     def __init__(self, processor: Any) -> None:
         self._processor = processor
@@ -92,7 +95,7 @@ class _ByProcessor:
 
 
 class _ZoePreparation(_ByProcessor):
-    """Padded by reflection before it is resized with aligned corners, as ZoeDepth was trained."""
+    """Preparation of ZoeDepth: reflection padding, then resizing with aligned corners."""
 
     def __call__(self, view: View) -> Prepared:
         image = _robust(view)
@@ -105,8 +108,7 @@ class _ZoePreparation(_ByProcessor):
 
 
 class _DepthProPreparation:
-    """What the library's processor does, which needs torchvision: normalise, then stretch without
-    smoothing."""
+    """Preparation of Depth Pro without torchvision: normalize, then stretch without smoothing."""
 
     def __init__(self, settings: dict[str, Any]) -> None:
         self._size = settings["size"]["height"], settings["size"]["width"]
@@ -123,7 +125,7 @@ class _DepthProPreparation:
 
 
 def _robust(view: View) -> Any:
-    """The image, enlarged where it is so small or thin that a processor would make it vanish."""
+    """Enlarge an image that is too small or thin for an image processor."""
     longest = max(view.camera.size)
     smallest = max(_SMALLEST_SIDE, -(-longest // _LARGEST_RATIO))
     size = tuple(max(side, smallest) for side in view.camera.size)

@@ -1,4 +1,4 @@
-"""Announces the providers. Imports neither torch nor transformers."""
+"""Registration of the providers; imports neither torch nor transformers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _OF_THE_MODEL = "of the chosen model"
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Depth by any model, features, matchers, retrieval."""
+    """Register depth, features, matchers and retrieval."""
     return [
         _spec(
             "depth",
@@ -88,7 +88,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
 def mpsfm_calibration(
     kind: str, provider: str, options: BaseModel | None
 ) -> DepthCalibration | NormalCalibration | None:
-    """The uncertainty that is declared for the chosen model."""
+    """Return the calibration of the chosen model."""
     if isinstance(options, opt.PromptOptions):
         return opt.METRIC
     if isinstance(options, opt.DepthOptions):

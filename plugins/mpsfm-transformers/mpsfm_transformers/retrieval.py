@@ -14,14 +14,14 @@ from mpsfm_transformers.options import DinoOptions
 
 
 class Dino:
-    """The class token, made unit."""
+    """Provider of the normalized class token."""
 
     def __init__(self, options: DinoOptions, context: ProviderContext) -> None:
         self._model = LoadedModel(AutoModel, options, context)
         self._longest = options.resize
 
     def describe(self, view: View) -> Float32:
-        """Unit vector (d,)."""
+        """Compute the unit descriptor (d,) of a view."""
         patch: int = self._model.network.config.patch_size
         size = network_size(view, self._longest, patch)
         image = color_image(view, size, self._model.device)

@@ -1,7 +1,7 @@
 """LightGlue and SuperGlue as sparse matchers.
 
-The library's models detect, describe and match in one pass. Here keypoints are given: a module that
-hands them on takes the detector's place, and the model runs as it is.
+The models of the library detect, describe and match in one pass. A module that returns given
+keypoints replaces their detector.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mpsfm_transformers.options import LightGlueOptions, SparseOptions, SuperGlu
 
 
 class _Given(nn.Module):
-    """Stands where the detector was: gives the keypoints of two images that are set."""
+    """Replacement of the detector that returns the given keypoints of two images."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -34,7 +34,7 @@ class _Given(nn.Module):
 
 
 class GivenKeypointsMatcher:
-    """Mutual matches of given keypoints with their scores."""
+    """Matcher of given keypoints."""
 
     name = ""
 
@@ -53,10 +53,10 @@ class GivenKeypointsMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Matches with their confidence.
+        """Match features of two views; returns mutual matches with their confidence as score.
 
         Raises:
-            ProviderError: the descriptors are not of the family this network was trained for.
+            ProviderError: The descriptors do not have the dimension of this network.
         """
         features = require_features(f"{self.name} matches features", features_a, features_b)
         for view, one in zip((view_a, view_b), features, strict=True):
@@ -84,7 +84,10 @@ class GivenKeypointsMatcher:
     def _tensors(
         self, views: tuple[View, View], features: tuple[Features, Features]
     ) -> tuple[torch.Tensor, ...]:
-        """Keypoints relative to the first view's size, scores, descriptors and mask."""
+        """Create tensors of keypoints, scores, descriptors and mask.
+
+        Keypoints are relative to the size of the first view.
+        """
         count = max(map(len, features))
         keypoints = np.zeros((2, count, 2), dtype=np.float32)
         scores = np.zeros((2, count), dtype=np.float32)
@@ -101,7 +104,7 @@ class GivenKeypointsMatcher:
 
 
 class LightGlueMatcher(GivenKeypointsMatcher):
-    """LightGlue."""
+    """LightGlue with given keypoints."""
 
     name = "LightGlue"
 
@@ -116,7 +119,7 @@ class LightGlueMatcher(GivenKeypointsMatcher):
 
 
 class SuperGlueMatcher(GivenKeypointsMatcher):
-    """SuperGlue."""
+    """SuperGlue with given keypoints."""
 
     name = "SuperGlue"
 
@@ -128,9 +131,11 @@ class SuperGlueMatcher(GivenKeypointsMatcher):
 
 
 def _as_in(xy: Float64, view: View, first: View) -> Float64:
-    """Pixels of a view moved to where, in the first view, the network normalises them to the same
-    numbers: it knows one size for both, and takes half of the longer side for 1. Centres of its
-    pixels are integers."""
+    """Move pixels of a view such that normalization by the size of the first view is correct.
+
+    The network uses one image size for both views, half of the longer side as unit, and integer
+    pixel centers.
+    """
     own, other = np.array(view.camera.size), np.array(first.camera.size)
     moved: Float64 = (xy - 0.5 - own / 2) * (other.max() / own.max()) + other / 2
     return moved

@@ -1,5 +1,4 @@
-"""Models of the real families, very small and with random weights, as ``save_pretrained`` writes
-them: for tests, and to see what a family does without downloading gigabytes."""
+"""Tiny models of the real families with random weights, in the format of ``save_pretrained``."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ _ANGLE_DEG = 60.0
 
 
 def dinov2(side: int = 56, **settings: Any) -> hf.Dinov2Config:
-    """A DINOv2 backbone of four layers for images of this side."""
+    """Create a DINOv2 backbone of four layers."""
     return hf.Dinov2Config(
         hidden_size=16,
         num_hidden_layers=4,
@@ -48,14 +47,14 @@ _STRETCHED = {
 
 
 def depth_anything(folder: Path, **settings: Any) -> Path:
-    """Depth Anything V2, metric up to 20 m unless the settings say otherwise."""
+    """Save Depth Anything V2, metric up to 20 m by default."""
     settings = {"depth_estimation_type": "metric", "max_depth": 20, **settings}
     config = hf.DepthAnythingConfig(backbone_config=_taps(), **_ANYTHING, **settings)
     return _save(hf.DepthAnythingForDepthEstimation, config, folder, _STRETCHED)
 
 
 def prompt_depth_anything(folder: Path) -> Path:
-    """Prompt Depth Anything."""
+    """Save Prompt Depth Anything."""
     config = hf.PromptDepthAnythingConfig(
         backbone_config=_taps(), depth_estimation_type="metric", max_depth=1, **_ANYTHING
     )
@@ -64,7 +63,7 @@ def prompt_depth_anything(folder: Path) -> Path:
 
 
 def dpt(folder: Path) -> Path:
-    """DPT on a plain transformer."""
+    """Save DPT with a plain transformer."""
     config = hf.DPTConfig(
         hidden_size=16,
         num_hidden_layers=4,
@@ -79,7 +78,7 @@ def dpt(folder: Path) -> Path:
 
 
 def dpt_dinov2(folder: Path) -> Path:
-    """DPT on DINOv2, which is given the image as it is, padded to multiples of 14."""
+    """Save DPT with DINOv2; its images are padded to multiples of 14."""
     backbone = dinov2(out_indices=[1, 2, 3, 4], reshape_hidden_states=False)
     config = hf.DPTConfig(backbone_config=backbone, use_bias_in_fusion_residual=False, **_DPT_HEAD)
     processor = {
@@ -94,7 +93,7 @@ def dpt_dinov2(folder: Path) -> Path:
 
 
 def zoedepth(folder: Path) -> Path:
-    """ZoeDepth on BEiT."""
+    """Save ZoeDepth with BEiT."""
     backbone = hf.BeitConfig(
         hidden_size=16,
         num_hidden_layers=4,
@@ -124,7 +123,7 @@ def zoedepth(folder: Path) -> Path:
 
 
 def depth_pro(folder: Path) -> Path:
-    """Depth Pro with its head for the angle of view; images of 112 x 112."""
+    """Save Depth Pro with its head for the angle of view; images of 112 x 112."""
     encoder = dinov2(28)
     config = hf.DepthProConfig(
         fusion_hidden_size=16,
@@ -150,7 +149,7 @@ def depth_pro(folder: Path) -> Path:
 
 
 def glpn(folder: Path) -> Path:
-    """GLPN, up to 10 m."""
+    """Save GLPN, up to 10 m."""
     config = hf.GLPNConfig(
         depths=[1, 1, 1, 1],
         hidden_sizes=[8, 8, 16, 16],
@@ -162,7 +161,7 @@ def glpn(folder: Path) -> Path:
 
 
 def superpoint_config(**settings: Any) -> hf.SuperPointConfig:
-    """A thin SuperPoint with descriptors of 32 dimensions."""
+    """Create the configuration of a small SuperPoint with 32-dimensional descriptors."""
     settings = {"keypoint_threshold": 0.0, **settings}
     return hf.SuperPointConfig(
         encoder_hidden_sizes=[8, 8, 8, 8],
@@ -173,13 +172,13 @@ def superpoint_config(**settings: Any) -> hf.SuperPointConfig:
 
 
 def superpoint(folder: Path, **settings: Any) -> Path:
-    """SuperPoint."""
+    """Save SuperPoint."""
     config = superpoint_config(**settings)
     return _save(hf.SuperPointForKeypointDetection, config, folder, {"do_resize": True})
 
 
 def lightglue(folder: Path, dimension: int = 32) -> Path:
-    """LightGlue for features of this dimension."""
+    """Save LightGlue for features of this dimension."""
     config = hf.LightGlueConfig(
         keypoint_detector_config=hf.SuperPointConfig(
             encoder_hidden_sizes=[8, 8, 8, 8],
@@ -197,7 +196,7 @@ def lightglue(folder: Path, dimension: int = 32) -> Path:
 
 
 def superglue(folder: Path, dimension: int = 32) -> Path:
-    """SuperGlue for features of this dimension."""
+    """Save SuperGlue for features of this dimension."""
     config = hf.SuperGlueConfig(
         keypoint_detector_config=hf.SuperPointConfig(
             encoder_hidden_sizes=[8, 8, 8, 8],
@@ -214,7 +213,7 @@ def superglue(folder: Path, dimension: int = 32) -> Path:
 
 
 def efficient_loftr(folder: Path) -> Path:
-    """Efficient LoFTR, which calls everything a match."""
+    """Save Efficient LoFTR with a threshold that accepts all matches."""
     config = hf.EfficientLoFTRConfig(
         stage_num_blocks=[1, 1, 1, 1],
         out_features=[16, 16, 32, 64],
@@ -230,13 +229,13 @@ def efficient_loftr(folder: Path) -> Path:
 
 
 def dino(folder: Path) -> Path:
-    """DINOv2."""
+    """Save DINOv2."""
     processor = {"image_mean": _MEAN, "image_std": _STD}
     return _save(hf.Dinov2Model, dinov2(), folder, processor)
 
 
 def dinov3(folder: Path) -> Path:
-    """DINOv3."""
+    """Save DINOv3."""
     config = hf.DINOv3ViTConfig(
         hidden_size=16,
         num_hidden_layers=2,
@@ -266,10 +265,10 @@ def _save(
     processor: dict[str, Any],
     noise: tuple[int, ...] | None = None,
 ) -> Path:
-    """Random weights of this family as they are published, in a folder.
+    """Save random weights of a family in the published format.
 
-    ``noise``: shape of noise that batch normalisation takes its statistics from, without which deep
-    random layers see the same everywhere.
+    ``noise``: shape of the input that initializes the batch normalization statistics, without which
+    the output of deep random layers is constant.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with torch.random.fork_rng(), quiet():

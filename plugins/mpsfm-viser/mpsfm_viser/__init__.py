@@ -1,1 +1,1 @@
-"""Reconstructions in the browser, by viser."""
+"""Reconstructions in the browser, with viser."""

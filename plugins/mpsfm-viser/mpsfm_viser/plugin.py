@@ -1,4 +1,4 @@
-"""Names the viewer; viser is imported when it is wanted."""
+"""Registration of the viewer; imports viser when it is used."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from mpsfm_core import hookimpl
 
 @hookimpl
 def mpsfm_viewers() -> Mapping[str, str]:
-    """``mpsfm view DIR``, ``mpsfm reconstruct ... --viewer viser``."""
+    """Register the viewer for ``mpsfm view DIR`` and ``mpsfm reconstruct ... --viewer viser``."""
     return {"viser": "mpsfm_viser.viewer:ViserViewer"}

@@ -1,4 +1,4 @@
-"""A page that shows the scene as it is now, served on this machine."""
+"""Page that shows the current scene, served on this machine."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from mpsfm_core.geometry import camera_center
 from mpsfm_core.report.viewing import ColoredPoints, Pictures, unproject_depth_map
 
 PORT_VARIABLE = "MPSFM_VIEWER_PORT"
-"""Environment variable: where the page is served; if it is taken, the next free one."""
+"""Environment variable with the port of the page; the next free port if it is taken."""
 HOST_VARIABLE = "MPSFM_VIEWER_HOST"
-"""Environment variable: 0.0.0.0 lets other machines look; by default this one alone can."""
+"""Environment variable with the host; 0.0.0.0 allows access from other machines."""
 _LEAST_SECONDS = 1.0
-"""Between two scenes during a run: a scene takes a moment to send (ours)."""
+"""Minimum seconds between two scenes during a run. [ours]"""
 _NEW, _OLD = (255, 122, 26), (31, 157, 107)
 
 
 class ViserViewer:
-    """Cameras as frustums with their photos, depth maps as points, and sparse points.
+    """Viewer of camera frustums with photos, depth maps as points, and sparse points.
 
-    ``output``: of the run; nothing is written there.
+    ``output``: output folder of the run; nothing is written there.
     """
 
     def __init__(self, output: Path, pictures: Pictures) -> None:
@@ -56,12 +56,12 @@ class ViserViewer:
 
     @property
     def address(self) -> str:
-        """Of the page."""
+        """Return the address of the page."""
         return f"http://localhost:{self.server.get_port()}"
 
     @hookimpl
     def mpsfm_scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """Show it, unless the last one is very recent."""
+        """Show the scene, except if the last one is very recent."""
         now = time.monotonic()
         if now - self._last >= _LEAST_SECONDS:
             self._last = now
@@ -69,18 +69,18 @@ class ViserViewer:
 
     @hookimpl
     def mpsfm_stage_started(self, stage: str, total: int | None) -> None:
-        """Say what goes on while there is nothing to see yet."""
+        """Show the name of the stage until there is a scene."""
         if not self._shown:
             self._state.content = f"{stage} ..."
 
     @hookimpl
     def mpsfm_stage_progress(self, stage: str, done: int, total: int) -> None:
-        """Say how far it is."""
+        """Show the progress of the stage."""
         if not self._shown:
             self._state.content = f"{stage}: {done} of {total}"
 
     def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
-        """Replace what is shown; ``cloud`` is shown instead of the depth maps."""
+        """Replace the scene; ``cloud`` is shown instead of the depth maps."""
         with self._lock, self.server.atomic():
             self._unit = _unit(scene)
             while self.clouds:
@@ -108,11 +108,11 @@ class ViserViewer:
             self._resize()
 
     def finish(self) -> str:
-        """The page stays until the program ends."""
+        """Keep the page open until the program ends."""
         return f"{self.address} shows it"
 
     def wait(self) -> None:
-        """Until Ctrl-C."""
+        """Wait until Ctrl-C."""
         threading.Event().wait()
 
     def _frustum(self, image: PosedImage) -> viser.CameraFrustumHandle:
@@ -131,7 +131,7 @@ class ViserViewer:
 
         @handle.on_click
         def _(event: viser.SceneNodePointerEvent[viser.CameraFrustumHandle]) -> None:
-            """Look through it."""
+            """Move the viewer's camera to this frustum."""
             event.client.camera.wxyz = handle.wxyz
             event.client.camera.position = handle.position
 
@@ -160,7 +160,7 @@ class ViserViewer:
 
 
 def _unit(scene: SceneState) -> float:
-    """How large the scene is: median distance of what it holds from its middle."""
+    """Compute the size of the scene: median distance of its content from the center."""
     centers = [camera_center(image.rotation, image.translation) for image in scene.images]
     places = np.array([*scene.points[:: max(1, len(scene.points) // 2000)], *centers])
     if not len(places):
@@ -170,5 +170,5 @@ def _unit(scene: SceneState) -> float:
 
 
 def _key(name: str) -> str:
-    """An image name as one level of the tree of nodes."""
+    """Convert an image name to one level of the scene tree."""
     return quote(name, safe="")

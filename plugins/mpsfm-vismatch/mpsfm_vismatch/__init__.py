@@ -1,1 +1,1 @@
-"""The matchers of vismatch, a collection of matching networks in torch."""
+"""Matchers of vismatch, a collection of matching networks in torch."""

@@ -1,4 +1,4 @@
-"""A network of the collection by name."""
+"""Access to the networks of the collection by name."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from mpsfm_core.providers.torch_runtime import use_threads
 
 
 def load(name: str, context: ProviderContext, max_keypoints: int = 2048) -> Any:
-    """The matcher of a name, or of a class as ``package.module:Class``, on the context's device.
+    """Load a matcher by name, or a class ``package.module:Class``, on the context's device.
 
-    The collection gets weights by itself and keeps them where its sources do (the Hub's cache,
-    torch's). Raises :class:`~mpsfm_core.data.errors.ConfigError` for what it does not know.
+    The collection downloads weights to the caches of the Hub and of torch.
+
+    Raises:
+        ConfigError: The name is unknown.
     """
     use_threads(context)
     if ":" in name:
@@ -31,7 +33,7 @@ def load(name: str, context: ProviderContext, max_keypoints: int = 2048) -> Any:
 
 
 def at_home(matcher: Any) -> AbstractContextManager[Any]:
-    """While this lasts, the code of a matcher of the collection finds what it imports."""
+    """Provide the import path that the code of a matcher expects."""
     home = type(matcher).__module__
     if not home.startswith("vismatch."):
         return nullcontext()
@@ -42,7 +44,7 @@ def at_home(matcher: Any) -> AbstractContextManager[Any]:
 
 
 def part(matcher: Any, name: str, *attributes: str) -> Any:
-    """The inner network, which matchers of the collection call this or that."""
+    """Return the inner network of a matcher, whose attribute name differs between matchers."""
     for attribute in attributes:
         if hasattr(matcher, attribute):
             return getattr(matcher, attribute)

@@ -1,4 +1,4 @@
-"""MASt3R's authors' network in the place of an ONNX file."""
+"""MASt3R in torch instead of an ONNX file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mpsfm_vismatch.collection import at_home, load, part
 
 
 class TorchPairNetwork(PairNetwork):
-    """The network itself, called with both views."""
+    """The authors' network, called with both views."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
         super().__init__(options.size)
@@ -24,7 +24,7 @@ class TorchPairNetwork(PairNetwork):
         self._device = context.device
 
     def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
-        """See :class:`~mpsfm_mast3r.network.PairNetwork`."""
+        """Run the network; see :class:`~mpsfm_mast3r.network.PairNetwork`."""
         views = [
             {
                 "img": torch.from_numpy(image).to(self._device),
@@ -46,12 +46,12 @@ def _tensors(answer: dict[str, torch.Tensor], points: str) -> Tensors:
 
 
 class DenseMatcher(mast3r.DenseMatcher):
-    """See :class:`mpsfm_mast3r.matcher.DenseMatcher`."""
+    """Dense matcher; see :class:`mpsfm_mast3r.matcher.DenseMatcher`."""
 
     network = TorchPairNetwork
 
 
 class SparseMatcher(mast3r.SparseMatcher):
-    """See :class:`mpsfm_mast3r.matcher.SparseMatcher`."""
+    """Sparse matcher; see :class:`mpsfm_mast3r.matcher.SparseMatcher`."""
 
     network = TorchPairNetwork

@@ -1,4 +1,4 @@
-"""Any network of the collection: the positions that it matches, or keypoints that are near them."""
+"""Dense and sparse matchers with any network of the collection."""
 
 from __future__ import annotations
 
@@ -22,17 +22,20 @@ from mpsfm_vismatch.collection import load
 from mpsfm_vismatch.options import CollectionOptions, SnapOptions
 
 _STD_DETECTED_PX, _STD_DENSE_PX = 1.0, 0.5
-"""Localisation noise in pixels of the image that was shown (reference)."""
+"""Keypoint noise in pixels of the resized image. [reference]"""
 _OF_CORNERS = ("roma", "redimatch", "gim-dkm", "loftr", "xoftr", "aspanformer", "matchformer")
 _OF_CORNERS += ("topicfm", "edm", "matchanything", "dedode", "steerers", "loma")
-"""Parts of the names of networks whose positions are parts of an image's width and height, or
-that were trained on such: as COLMAP's. All others count from the centre of the first pixel."""
+"""Name parts of networks with positions relative to image width and height, as COLMAP's pixels. All
+others have the first pixel at (0, 0).
+"""
 _OF_OPENCV = ("sift", "doghardnet-lightglue")
-"""OpenCV's SIFT doubles the image so that its positions are a quarter of a pixel less."""
+"""Name parts of OpenCV's SIFT, which doubles the image: its positions are a quarter pixel too
+small.
+"""
 
 
 class DenseMatcher:
-    """All that the network matches, each as certain as it says; 1 where it does not say."""
+    """Matcher that returns all matches of the network, with score 1 if it has none."""
 
     def __init__(self, options: CollectionOptions, context: ProviderContext) -> None:
         self._matcher = load(options.network, context, options.max_keypoints)
@@ -47,7 +50,7 @@ class DenseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Matches of free positions."""
+        """Match two views without keypoints."""
         return PairMatches(dense=self._matched(view_a, view_b))
 
     def _matched(self, *views: View) -> DenseMatches:
@@ -72,7 +75,7 @@ class DenseMatcher:
         )
 
     def _shown(self, view: View) -> torch.Tensor:
-        """(3, h, w) float32, RGB in [0, 1]."""
+        """Resize a view to (3, h, w) float32, RGB in [0, 1]."""
         scale = min(1.0, (self._resize or np.inf) / max(view.camera.size))
         width, height = (max(1, round(side * scale)) for side in view.camera.size)
         image = resize_map(view.image, width, height) / np.float32(255)
@@ -84,7 +87,7 @@ class DenseMatcher:
 
 
 def _first_pixel(network: str) -> float:
-    """What the centre of the first pixel is in COLMAP's count, less what it is in the network's."""
+    """Compute the offset from the network's pixels to COLMAP's pixels."""
     if any(part in network for part in _OF_OPENCV):
         return 0.25
     of_corners = any(part in network for part in _OF_CORNERS)
@@ -92,7 +95,7 @@ def _first_pixel(network: str) -> float:
 
 
 class SparseMatcher(DenseMatcher):
-    """Keypoints that are near to both positions of a match."""
+    """Matcher of keypoints that are close to both positions of a match."""
 
     def __init__(self, options: SnapOptions, context: ProviderContext) -> None:
         super().__init__(options, context)
@@ -105,7 +108,7 @@ class SparseMatcher(DenseMatcher):
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """The most certain ones first, each keypoint once."""
+        """Match keypoints one-to-one, the most certain first."""
         given = require_features("vismatch-sparse matches keypoints", features_a, features_b)
         found = self._matched(view_a, view_b)
         nearest = np.empty((len(found), 2), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""What a user can set. Imports nothing heavy."""
+"""Options of the matchers; imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -10,51 +10,52 @@ from mpsfm_core import Options
 
 
 class CollectionOptions(Options):
-    """A network of the collection, shown views of its own or the given size."""
+    """Options of a network of the collection."""
 
     network: str = "superpoint-lightglue"
-    """Name in the collection (``vismatch.available_models``), or a matcher class of one's own with
-    its interface as ``package.module:Class``."""
+    """Name in the collection (``vismatch.available_models``), or a matcher class with the same
+    interface, ``package.module:Class``.
+    """
     max_keypoints: int = Field(2048, ge=1)
-    """Largest number of keypoints, or of samples of a warp, that the network is asked for."""
+    """Maximum number of keypoints, or of samples of a warp."""
     resize: int | None = Field(1024, ge=32)
-    """Longest side of the views as the network is given them, never enlarged; None for all pixels.
-    Dense networks scale them to a size of their own."""
+    """Longest side of the views in pixels, never enlarged; null: full size. Dense networks resize
+    again.
+    """
 
 
 class SnapOptions(CollectionOptions):
-    """Matches of given keypoints."""
+    """Options of matching at keypoints."""
 
     snap_px: float = Field(2.0, gt=0)
-    """Farthest that a keypoint may be from a position that the network matched (RoMa's
-    reference)."""
+    """Maximum distance in pixels between a keypoint and a matched position. [RoMa reference]"""
 
 
 class RomaNetwork(Options):
-    """RoMa or a network of its making."""
+    """Name of RoMa or a variant."""
 
     network: str = "roma"
-    """``roma``, ``minima-roma``, ``redimatch``, ``redimatch-indoor``; or a class of one's own."""
+    """``roma``, ``minima-roma``, ``redimatch``, ``redimatch-indoor``, or a matcher class."""
 
 
 class RomaDenseOptions(RomaNetwork, roma.DenseSearch):
-    """Of ``vismatch-roma``."""
+    """Options of ``vismatch-roma``."""
 
 
 class RomaSparseOptions(RomaNetwork, roma.SparseSearch):
-    """Of ``vismatch-roma-sparse``."""
+    """Options of ``vismatch-roma-sparse``."""
 
 
 class Mast3rNetwork(Options):
-    """MASt3R."""
+    """Name of MASt3R."""
 
     network: str = "master"
-    """The collection's name of it; or a class of one's own."""
+    """Name in the collection, or a matcher class."""
 
 
 class Mast3rDenseOptions(Mast3rNetwork, mast3r.DenseSearch):
-    """Of ``vismatch-mast3r``."""
+    """Options of ``vismatch-mast3r``."""
 
 
 class Mast3rSparseOptions(Mast3rNetwork, mast3r.SparseSearch):
-    """Of ``vismatch-mast3r-sparse``."""
+    """Options of ``vismatch-mast3r-sparse``."""

@@ -1,4 +1,4 @@
-"""RoMa's authors' network in the place of an ONNX file."""
+"""RoMa in torch instead of an ONNX file."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mpsfm_vismatch.options import RomaNetwork
 
 
 class TorchWarpNetwork(WarpNetwork):
-    """Its own ``match``, with its own resizing and both its passes.
+    """The authors' ``match``, with its resizing and both passes.
 
-    The images go through files, since it opens them a second time at the size of its second pass.
+    The images are written to files, because it opens them again for the second pass.
     """
 
     def __init__(self, options: RomaNetwork, context: ProviderContext) -> None:
@@ -30,7 +30,7 @@ class TorchWarpNetwork(WarpNetwork):
         self._device = context.device
 
     def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
-        """See :class:`~mpsfm_roma.network.WarpNetwork`."""
+        """Run the network; see :class:`~mpsfm_roma.network.WarpNetwork`."""
         with tempfile.TemporaryDirectory(prefix="mpsfm-") as folder, inference():
             paths = []
             for side, view in zip("ab", (view_a, view_b), strict=True):
@@ -43,12 +43,12 @@ class TorchWarpNetwork(WarpNetwork):
 
 
 class DenseMatcher(roma.DenseMatcher):
-    """See :class:`mpsfm_roma.matcher.DenseMatcher`."""
+    """Dense matcher; see :class:`mpsfm_roma.matcher.DenseMatcher`."""
 
     network = TorchWarpNetwork
 
 
 class SparseMatcher(roma.SparseMatcher):
-    """See :class:`mpsfm_roma.matcher.SparseMatcher`."""
+    """Sparse matcher; see :class:`mpsfm_roma.matcher.SparseMatcher`."""
 
     network = TorchWarpNetwork

@@ -1,4 +1,4 @@
-"""RoMa's own architecture with seeded random weights: to compare what runs it, without weights."""
+"""RoMa's architecture with seeded random weights, for comparisons without published weights."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import torch
 from mpsfm_vismatch.collection import at_home
 
 COARSE, FINE = 560, 280
-"""Sides of the images of either pass; the published ones are 560 and 864. With another one than 560
-in the first pass versions of the authors' code disagree about the reach of its refinement."""
+"""Sides of the images of both passes; the published ones are 560 and 864. For a first pass other
+than 560, versions of the authors' code differ in the refinement radius.
+"""
 
 
 def network(roma_outdoor: Callable[..., Any], device: str = "cpu") -> Any:
-    """What the authors' function makes, of whatever version of their code: each tensor is drawn by
-    its own name."""
+    """Create the authors' network with weights that are drawn by the name of each tensor."""
     options = {"coarse_res": COARSE, "upsample_res": FINE, "use_custom_corr": False}
     known = inspect.signature(roma_outdoor).parameters
     with patch.object(torch.nn.Module, "load_state_dict"):  # there is nothing to load
@@ -41,7 +41,7 @@ def network(roma_outdoor: Callable[..., Any], device: str = "cpu") -> Any:
 
 
 class Matcher:
-    """As the collection's, whose copy of the authors' code it runs, at home where that is."""
+    """Matcher with the interface of the collection, which runs its copy of the authors' code."""
 
     __module__ = "vismatch.im_models.roma"
 

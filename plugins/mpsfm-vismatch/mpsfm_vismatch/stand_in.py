@@ -1,5 +1,4 @@
-"""Small matchers with the interface of the collection's, and no weights: they match by the pixels
-around each pixel."""
+"""Small matchers with the interface of the collection, without weights: they compare patches."""
 
 from __future__ import annotations
 
@@ -12,17 +11,20 @@ from torch.nn.functional import normalize, unfold
 
 _SIDE, _REACH = 5, 3
 _STEP = 3
-"""Of the positions that :class:`Matching` looks for: odd, as they would all be rounded to one side
-in an image of half the size."""
+"""Step of the positions of :class:`Matching`; odd, because even ones round to one side in a
+half-size image.
+"""
 _GRID = (42, 56)
 """Rows and columns of the warp."""
 _FLAT = 0.05
-"""Contrast of what is as much noise as it is texture."""
+"""Contrast at which noise and texture are equal."""
 
 
 def _described(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Unit descriptors (h * w, d) of an image (1, 3, h, w), less long in flat regions, and the
-    contrast (h * w,)."""
+    """Compute patch descriptors (h * w, d) of an image (1, 3, h, w), and their contrast (h * w,).
+
+    Descriptors are unit vectors, and shorter in flat regions.
+    """
     around = unfold(image, _SIDE, dilation=_REACH, padding=_SIDE // 2 * _REACH)[0].T
     around = around - around.mean(dim=1, keepdim=True)
     contrast = around.norm(dim=1) + _FLAT
@@ -30,7 +32,7 @@ def _described(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class Warping:
-    """As RoMa's matcher; it is its own network."""
+    """Stand-in for RoMa's matcher, which is its own network."""
 
     symmetric = True
 
@@ -38,7 +40,7 @@ class Warping:
         self.roma_model = self
 
     def match(self, path_a: str, path_b: str, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-        """Warp and certainty of a coarse grid, both ways."""
+        """Compute warp and certainty of a coarse grid in both directions."""
         height, width = _GRID
         a, b = (_described(_opened(path, (width, height)))[0] for path in (path_a, path_b))
         similarity = a @ b.T
@@ -54,14 +56,14 @@ class Warping:
 
 
 class Pointing:
-    """As MASt3R's matcher; points are its colours, moved away from the camera."""
+    """Stand-in for MASt3R's matcher; points are colors, moved in front of the camera."""
 
     def __init__(self, device: str = "cpu", max_num_keypoints: int = 2048) -> None:
         self.model = torch.nn.Module()
         self.model.forward = self.forward  # type: ignore[method-assign]
 
     def forward(self, *views: dict[str, Any]) -> list[dict[str, torch.Tensor]]:
-        """Of both views."""
+        """Compute points, descriptors and confidences of both views."""
         answers = []
         for view, name in zip(views, ("pts3d", "pts3d_in_other_view"), strict=True):
             image = view["img"]
@@ -79,14 +81,13 @@ class Pointing:
 
 
 class Matching:
-    """As any matcher: mutual neighbours of a grid of positions, which it gives as counted from the
-    centre of the first pixel."""
+    """Stand-in for any matcher: mutual nearest neighbors on a grid, first pixel at (0, 0)."""
 
     def __init__(self, device: str = "cpu", max_num_keypoints: int = 2048) -> None:
         self._most = max_num_keypoints
 
     def __call__(self, image_a: torch.Tensor, image_b: torch.Tensor) -> dict[str, Any]:
-        """The collection's dictionary."""
+        """Match two images; return the dictionary of the collection."""
         a, b = (_described(image[None])[0] for image in (image_a, image_b))
         width = image_a.shape[2]
         columns, rows = torch.meshgrid(
