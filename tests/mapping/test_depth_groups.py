@@ -1,4 +1,4 @@
-"""Images whose depth has one unit: they share a scale, and poses that come along only propose."""
+"""Depth groups: images of one group share a scale, and network poses are hypotheses."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ POSES = arc_poses(4, 14.0)
 def in_units(
     groups: Sequence[int | None], poses: Sequence[Float64] | None = None
 ) -> MappingProblem:
-    """Views of the room whose depth is in the unit of their group, with a little noise."""
+    """Return images of the room whose depth has the unit of their group, with some noise."""
     noise = SyntheticNoise(keypoints_px=0.5, depth=0.02)
     problem = make_mapping_problem(
         room_scene(), CAMERA, POSES[: len(groups)], noise=noise, declared_depth_std=0.02
@@ -51,7 +51,7 @@ def in_units(
 
 
 @pytest.mark.parametrize("global_initialization", [True, False])
-def test_images_of_a_group_share_their_scale(global_initialization: bool) -> None:
+def test_images_of_depth_group_share_scale(global_initialization: bool) -> None:
     options = MapperOptions()
     initialization = options.initialization.model_copy(
         update={"global_initialization": global_initialization}
@@ -66,28 +66,30 @@ def test_images_of_a_group_share_their_scale(global_initialization: bool) -> Non
     assert scales[0] / scales[2] == pytest.approx(UNITS[1] / UNITS[0], rel=0.02)
 
 
-def test_without_groups_each_image_has_its_own_scale() -> None:
+def test_images_without_depth_group_have_own_scales() -> None:
     mapper = Mapper(in_units([None] * 3), MapperOptions(), NullMappingEvents())
     mapper.reconstruct_component()
     assert len({depth_map.scale for depth_map in mapper.component.scene.maps}) == 3
 
 
 def proposals(problem: MappingProblem, reference: int = 0, image: int = 1) -> list[PoseHypothesis]:
-    """What the network proposes beside a reference that is in place at a scale of its own."""
+    """Return the hypotheses from network poses, with one registered reference image."""
     scene = Scene(problem)
     scene.register(reference, POSES[reference][:, :3], POSES[reference][:, 3])
     scene.maps[reference].set_scale(1 / UNITS[problem.images[reference].depth_group or 0])
     options = RegistrationOptions()
-    found = find_correspondences(scene, image, [reference], options)
+    correspondences = find_correspondences(scene, image, [reference], options)
     made = [
         estimate()
-        for estimate in PoseHypothesisGenerator(scene, image, found, options, 0).generate_from_all()
+        for estimate in PoseHypothesisGenerator(
+            scene, image, correspondences, options, 0
+        ).generate_from_all()
     ]
     return [h for h in made if h is not None and h.source == "multi-view network"]
 
 
-def test_a_pose_is_proposed_at_the_scale_of_the_group() -> None:
-    """In a frame of the group's own, and in its unit."""
+def test_network_pose_is_scaled_to_depth_group() -> None:
+    """The network poses have their own frame and unit."""
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     own_frame = [np.column_stack([pose[:, :3] @ turn, pose[:, 3]]) for pose in POSES]
     (found,) = proposals(in_units([1, 1], own_frame))
@@ -95,18 +97,18 @@ def test_a_pose_is_proposed_at_the_scale_of_the_group() -> None:
     np.testing.assert_allclose(found.translation, POSES[1][:, 3], atol=1e-9)
 
 
-def test_between_groups_nothing_is_proposed() -> None:
+def test_network_pose_between_depth_groups_is_ignored() -> None:
     assert not proposals(in_units([0, 1], POSES))
 
 
-def test_a_wrong_proposal_decides_nothing() -> None:
-    """The pose that the matches support is taken, whatever the network says."""
+def test_wrong_network_pose_is_outvoted_by_matches() -> None:
+    """The pose with the most support is selected, not the pose of the network."""
     wrong = [POSES[0], POSES[3], POSES[2], POSES[1]]
     problem = in_units([0, 0, 0, 0], wrong)
     scene = Scene(problem)
     scene.register(0, POSES[0][:, :3], POSES[0][:, 3])
     scene.maps[0].set_scale(1.0)
     options = RegistrationOptions()
-    found = find_correspondences(scene, 1, [0], options)
-    best = estimate_candidate_poses(scene, 1, found, options, seed=0, attempt=0)[0]
+    correspondences = find_correspondences(scene, 1, [0], options)
+    best = estimate_candidate_poses(scene, 1, correspondences, options, seed=0, attempt=0)[0]
     assert rotation_angle_deg(best.rotation @ POSES[1][:, :3].T) < 1.0

@@ -1,4 +1,4 @@
-"""Matches count by the scores that the matcher gives them."""
+"""Match scores as weights of correspondences and keypoints."""
 
 from __future__ import annotations
 
@@ -23,9 +23,11 @@ CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 POSES = arc_poses(3, 14.0)
 
 
-def problem_with_doubtful_matches(seed: int = 0) -> MappingProblem:
-    """Each match sees a point of its own. Of four keypoints three are off by 2 px (standard
-    deviation), and their matches have a low score."""
+def problem_with_inaccurate_matches(seed: int = 0) -> MappingProblem:
+    """Return a problem with two-view tracks and low scores of inaccurate matches.
+
+    Three of four keypoints have noise of 2 px (standard deviation), and their matches a low score.
+    """
     problem = make_mapping_problem(
         room_scene(),
         CAMERA,
@@ -35,24 +37,25 @@ def problem_with_doubtful_matches(seed: int = 0) -> MappingProblem:
         seed=seed,
     )
     rng = np.random.default_rng(seed)
-    doubtful = [np.arange(len(image.keypoints)) % 4 > 0 for image in problem.images]
+    inaccurate = [np.arange(len(image.keypoints)) % 4 > 0 for image in problem.images]
     images = []
-    for image, off in zip(problem.images, doubtful, strict=True):
+    for image, off in zip(problem.images, inaccurate, strict=True):
         keypoints = image.keypoints.copy()
         keypoints[off] += rng.normal(0, 2, (off.sum(), 2))
         images.append(replace(image, keypoints=keypoints, keypoint_std_px=1.0))
     pairs = []
     for pair in problem.pairs:
         off = (
-            doubtful[pair.image_a][pair.matches[:, 0]] | doubtful[pair.image_b][pair.matches[:, 1]]
+            inaccurate[pair.image_a][pair.matches[:, 0]]
+            | inaccurate[pair.image_b][pair.matches[:, 1]]
         )
         pairs.append(replace(pair, scores=np.where(off, 0.1, 1.0).astype(np.float32)))
     return MappingProblem(tuple(images), tuple(pairs))
 
 
 def pose_errors_deg(problem: MappingProblem, *, weigh_by_score: bool) -> list[float]:
-    """Of the views after the first, relative to it."""
-    # with the same loss whatever the noise: it would make up for a part of what weights do
+    """Return rotation and direction errors of all images relative to the first."""
+    # A measured keypoint noise would compensate a part of the weights.
     refinement = {"measure_keypoint_noise": False}
     options = {"weigh_by_score": weigh_by_score, "refinement": refinement}
     result = reconstruct(problem, MapperOptions.model_validate(options))
@@ -69,18 +72,18 @@ def pose_errors_deg(problem: MappingProblem, *, weigh_by_score: bool) -> list[fl
     return errors
 
 
-def test_matches_that_the_matcher_doubts_hardly_bend_the_poses() -> None:
+def test_match_scores_reduce_pose_errors() -> None:
     weighted: list[float] = []
-    alike: list[float] = []
+    unweighted: list[float] = []
     for seed in range(12):
-        problem = problem_with_doubtful_matches(seed)
+        problem = problem_with_inaccurate_matches(seed)
         weighted += pose_errors_deg(problem, weigh_by_score=True)
-        alike += pose_errors_deg(problem, weigh_by_score=False)
-    assert np.mean(weighted) < 0.75 * np.mean(alike)
+        unweighted += pose_errors_deg(problem, weigh_by_score=False)
+    assert np.mean(weighted) < 0.75 * np.mean(unweighted)
 
 
-def test_keypoints_weigh_by_their_best_match_relative_to_the_mean() -> None:
-    problem = problem_with_doubtful_matches()
+def test_keypoint_weight_is_best_score_relative_to_mean() -> None:
+    problem = problem_with_inaccurate_matches()
     graph = CorrespondenceGraph(problem)
     best = np.zeros(len(graph.image_of))
     for pair in problem.pairs:
@@ -91,7 +94,7 @@ def test_keypoints_weigh_by_their_best_match_relative_to_the_mean() -> None:
     np.testing.assert_allclose(graph.keypoint_weight, best / mean, rtol=1e-6)
 
 
-def test_adjusted_keypoints_weigh_by_what_is_left_of_their_variance() -> None:
+def test_adjusted_keypoints_are_weighted_by_variance() -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, POSES)
     factor = np.ones(problem.num_keypoints(1))
     factor[::2] = 0.25
@@ -108,7 +111,7 @@ def test_adjusted_keypoints_weigh_by_what_is_left_of_their_variance() -> None:
 
 
 @pytest.mark.parametrize("score", [0.0, 0.3, 1.0])
-def test_equal_scores_are_as_good_as_none(score: float) -> None:
+def test_equal_scores_give_unit_weights(score: float) -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, POSES)
     equal = MappingProblem(
         problem.images,
@@ -118,25 +121,27 @@ def test_equal_scores_are_as_good_as_none(score: float) -> None:
         ),
     )
     weighted = CorrespondenceGraph(equal)
-    alike = CorrespondenceGraph(equal, weigh_by_score=False)
+    unweighted = CorrespondenceGraph(equal, weigh_by_score=False)
     assert (weighted.score >= MIN_SCORE).all()
-    np.testing.assert_allclose(weighted.keypoint_weight, alike.keypoint_weight, rtol=1e-6)
+    np.testing.assert_allclose(weighted.keypoint_weight, unweighted.keypoint_weight, rtol=1e-6)
 
 
-def test_support_and_inlier_share_count_scores_and_inliers_count_matches() -> None:
+def test_support_and_inlier_ratio_are_weighted_and_num_inliers_is_not() -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, POSES)
     scene = Scene(problem)
     count = 10
     keypoints = np.arange(count) + scene.graph.offsets[1]
-    points = scene.rays(keypoints) * 2.0  # view 1 is at the origin and sees them where they are
-    points[6:, 0] += 1.0  # but for the last four
+    points = scene.rays(keypoints) * 2.0  # image 1 is at the origin, so the residuals are 0
+    points[6:, 0] += 1.0  # outliers
     scores = np.where(np.arange(count) < 6, 0.9, 0.1)
     references, known = np.zeros(count, dtype=np.int64), np.ones(count, dtype=np.bool_)
-    found = PoseCorrespondences(
+    correspondences = PoseCorrespondences(
         keypoints, keypoints, points, points, points, references, known, scores
     )
     options = RegistrationOptions(depth_deviations=1e6)
-    pose = score_pose(scene, found, PoseHypothesis(np.eye(3), np.zeros(3), "PnP"), options)
+    pose = score_pose(
+        scene, correspondences, PoseHypothesis(np.eye(3), np.zeros(3), "PnP"), options
+    )
     assert pose.num_inliers == 6
     assert pose.support == pytest.approx(5.4)
     assert pose.inlier_ratio == pytest.approx(5.4 / 5.8)

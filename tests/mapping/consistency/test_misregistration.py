@@ -1,4 +1,4 @@
-"""Images that fewer matches hold where they are than would hold them elsewhere."""
+"""Misregistration: detection by minimum cuts, and re-registration."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def symmetric(n: int, entries: dict[tuple[int, int], int]) -> Int64:
     return matrix
 
 
-def holds(
+def detect(
     matches: Int64, explained: Int64, registered: Bool, monkeypatch: pytest.MonkeyPatch
 ) -> list[Misregistration]:
-    """Of a scene of which nothing but that is known."""
+    """Detect misregistrations in a scene given by its match counts alone."""
 
     def mask(images: Int64) -> Bool:
         return np.isin(np.arange(len(matches)), images)
@@ -47,50 +47,54 @@ def holds(
     return detect_misregistrations(scene, 30)  # type: ignore[arg-type]
 
 
-def test_a_pair_that_has_more_matches_than_hold_it_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    """0, 1 and 2 stand together, 3 and 4 beside 2 by false matches; 3 belongs beside 0."""
+def test_pair_with_more_matches_than_minimum_cut_is_detected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """False matches register images 3 and 4 next to image 2; correct matches connect 3 to 0."""
     explained = symmetric(5, {(0, 1): 200, (1, 2): 200, (3, 4): 300, (2, 3): 40, (2, 4): 30})
     matches = explained + symmetric(5, {(0, 3): 150, (1, 4): 90})
-    (hold,) = holds(matches, explained, np.ones(5, np.bool_), monkeypatch)
-    assert hold.images == (3, 4)
-    assert hold.margin == 150 - 70
-    assert hold.supporting_pairs.tolist() == [[3, 2], [4, 2]]
+    (detected,) = detect(matches, explained, np.ones(5, np.bool_), monkeypatch)
+    assert detected.images == (3, 4)
+    assert detected.margin == 150 - 70
+    assert detected.supporting_pairs.tolist() == [[3, 2], [4, 2]]
 
 
-def test_matches_that_are_fewer_than_what_holds_are_not_heard(
+def test_pair_with_fewer_matches_than_minimum_cut_is_ignored(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     explained = symmetric(4, {(0, 1): 200, (1, 2): 90, (0, 3): 80, (2, 3): 80})
     matches = explained + symmetric(4, {(0, 2): 160, (1, 3): 25})
-    assert holds(matches, explained, np.ones(4, np.bool_), monkeypatch) == []
+    assert detect(matches, explained, np.ones(4, np.bool_), monkeypatch) == []
 
 
-def test_an_image_that_two_want_beside_them_stands_against_both(
+def test_unregistered_image_separates_two_images_that_it_matches(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """4 could not be registered: 0 and 3 cannot both be where they are."""
+    """Image 4 is not registered and matches 0 and 3, so both poses cannot be correct."""
     explained = symmetric(5, {(0, 1): 200, (1, 2): 200, (2, 3): 60})
     matches = explained + symmetric(5, {(0, 4): 100, (3, 4): 120})
     registered = np.array([True, True, True, True, False])
-    (hold,) = holds(matches, explained, registered, monkeypatch)
-    assert (hold.images, hold.margin) == ((3,), 40)
+    (detected,) = detect(matches, explained, registered, monkeypatch)
+    assert (detected.images, detected.margin) == ((3,), 40)
 
 
-def test_an_image_that_all_its_pairs_together_outweigh(monkeypatch: pytest.MonkeyPatch) -> None:
-    """6 stands beside 0 to 2 by false matches; no pair alone has more than these."""
-    together = {(a, b): 200 for a in range(6) for b in range(a)}
-    explained = symmetric(7, together | {(6, 0): 100, (6, 1): 100, (6, 2): 100})
+def test_image_whose_pairs_together_contradict_it_is_detected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """False matches register image 6 next to 0 to 2; no single pair outweighs them."""
+    correct = {(a, b): 200 for a in range(6) for b in range(a)}
+    explained = symmetric(7, correct | {(6, 0): 100, (6, 1): 100, (6, 2): 100})
     everything = np.ones(7, np.bool_)
-    torn = {(6, 3): 170, (6, 4): 170, (6, 5): 170}
-    (hold,) = holds(explained + symmetric(7, torn), explained, everything, monkeypatch)
-    assert (hold.images, hold.margin) == ((6,), 510 - 300)
-    assert hold.supporting_pairs.tolist() == [[6, 0], [6, 1], [6, 2]]
+    unexplained = {(6, 3): 170, (6, 4): 170, (6, 5): 170}
+    (detected,) = detect(explained + symmetric(7, unexplained), explained, everything, monkeypatch)
+    assert (detected.images, detected.margin) == ((6,), 510 - 300)
+    assert detected.supporting_pairs.tolist() == [[6, 0], [6, 1], [6, 2]]
 
-    torn = {(6, 3): 120, (6, 4): 120, (6, 5): 120}  # more, but not clearly
-    assert holds(explained + symmetric(7, torn), explained, everything, monkeypatch) == []
+    unexplained = {(6, 3): 120, (6, 4): 120, (6, 5): 120}  # more, but not significantly
+    assert detect(explained + symmetric(7, unexplained), explained, everything, monkeypatch) == []
 
 
-def test_widest_ways_are_those_of_all_ways() -> None:
+def test_widest_paths_equal_floyd_warshall() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         upper = np.triu(rng.integers(0, 9, (7, 7)) * (rng.random((7, 7)) < 0.5), 1)
@@ -104,17 +108,17 @@ def test_widest_ways_are_those_of_all_ways() -> None:
 
 
 @pytest.fixture
-def group() -> Component:
-    """All of an exact scene is registered."""
+def component() -> Component:
+    """Return a component with all images of a noise-free scene registered."""
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(5, 14.0))
     mapper = Mapper(problem, MapperOptions(), NullMappingEvents())
     mapper.reconstruct_component()
     return mapper.component
 
 
-def misplace(group: Component, image: int) -> None:
-    """Turn a camera, with ten points left."""
-    scene = group.scene
+def misplace(component: Component, image: int) -> None:
+    """Rotate a camera and remove all but ten of its observations."""
+    scene = component.scene
     turn = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
     scene.rotations[image] = turn @ scene.rotations[image]
     scene.translations[image] = turn @ scene.translations[image]
@@ -123,34 +127,34 @@ def misplace(group: Component, image: int) -> None:
     scene.tracks.remove_observations(seen[10:])
 
 
-def test_an_image_comes_to_where_more_matches_tie_it(group: Component) -> None:
-    assert detect_misregistrations(group.scene, 30) == []
-    right = group.scene.rotations.copy()
-    misplace(group, 4)
-    assert [hold.images for hold in detect_misregistrations(group.scene, 30)] == [(4,)]
-    group.reregister_images(np.ones(5, np.bool_))
-    assert group.scene.registered.all()
-    assert rotation_angle_deg(group.scene.rotations @ right.transpose(0, 2, 1)).max() < 0.1
-    matches, explained = count_pair_matches(group.scene)
+def test_misregistered_image_is_reregistered_at_correct_pose(component: Component) -> None:
+    assert detect_misregistrations(component.scene, 30) == []
+    right = component.scene.rotations.copy()
+    misplace(component, 4)
+    assert [group.images for group in detect_misregistrations(component.scene, 30)] == [(4,)]
+    component.reregister_images(np.ones(5, np.bool_))
+    assert component.scene.registered.all()
+    assert rotation_angle_deg(component.scene.rotations @ right.transpose(0, 2, 1)).max() < 0.1
+    matches, explained = count_pair_matches(component.scene)
     assert explained[4].sum() > 0.8 * matches[4].sum()
 
 
-def test_an_image_that_nothing_else_holds_stays(
-    group: Component, monkeypatch: pytest.MonkeyPatch
+def test_failed_reregistration_restores_scene(
+    component: Component, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    misplace(group, 4)
-    before, noise = group.scene.snapshot(), group.refiner.noise
-    monkeypatch.setattr(group, "grow", lambda available, *, wide: None)
-    group.reregister_images(np.ones(5, np.bool_))
-    after = group.scene.snapshot()
+    misplace(component, 4)
+    before, noise = component.scene.snapshot(), component.refiner.noise
+    monkeypatch.setattr(component, "grow", lambda available, *, wide: None)
+    component.reregister_images(np.ones(5, np.bool_))
+    after = component.scene.snapshot()
     np.testing.assert_array_equal(after.rotations, before.rotations)
     np.testing.assert_array_equal(after.point_of, before.point_of)
     assert after.registered.all()
-    assert group.refiner.noise == noise
+    assert component.refiner.noise == noise
 
 
 @pytest.mark.parametrize(("known", "moves"), [("start", False), ("guess", True)])
-def test_images_that_came_with_a_pose_stay_unless_it_is_a_guess(known: str, moves: bool) -> None:
+def test_image_with_known_pose_is_reregistered_only_if_guess(known: str, moves: bool) -> None:
     poses = arc_poses(5, 14.0)
     problem = make_mapping_problem(room_scene(), CAMERA, poses)
     named = zip(problem.images, poses, strict=True)

@@ -1,4 +1,4 @@
-"""Pairs beside depth: look-alikes are refuted, right pairs are not."""
+"""Pair consistency: depth contradicts look-alike pairs but not correct ones."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def checker(problem: MappingProblem, kind: type[Check]) -> Check:
     return kind(AbsolutePoseEstimator(scene, refiner, options), options)
 
 
-def test_right_pairs_are_allowed_and_many_look_alikes_are_not() -> None:
-    """Views of twin rooms, of which the pieces that differ tell."""
+def test_check_pair_accepts_correct_pairs_and_rejects_look_alikes() -> None:
+    """Twin rooms look alike except for some objects."""
     case = make_twin_room_problem(0)
     check, false = checker(case.problem, PairConsistencyCheck), np.array(case.false)
     shares = np.array([check.check_pair(pair).support_ratio for pair in case.problem.pairs])
@@ -42,20 +42,23 @@ def test_right_pairs_are_allowed_and_many_look_alikes_are_not() -> None:
     assert (shares[false] == 0).mean() > 0.5
 
 
-class Judged(PairConsistencyCheck):
-    """With verdicts that are given, by images."""
+class FixedResults(PairConsistencyCheck):
+    """Returns given results by image pair."""
 
-    verdicts: Mapping[tuple[int, int], PairConsistency]
+    results: Mapping[tuple[int, int], PairConsistency]
 
     def check_pair(self, pair: VerifiedPair) -> PairConsistency:
-        return self.verdicts[pair.image_a, pair.image_b]
+        return self.results[pair.image_a, pair.image_b]
 
 
 def reweighted_problem(
     counts: Sequence[int], share: float, turn_deg: float
 ) -> tuple[MappingProblem, MappingProblem]:
-    """Three images, and what is left of them: pairs 0-1 and 1-2, which depth allows, and 0-2 with
-    a share and turned against them. ``counts``: matches of the pairs 0-1, 0-2 and 1-2."""
+    """Return a problem of three images and its reweighted version.
+
+    Pairs 0-1 and 1-2 are consistent. Pair 0-2 has the given support ratio, and its rotation differs
+    from that of the others by ``turn_deg``. ``counts``: matches of the pairs 0-1, 0-2 and 1-2.
+    """
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
     pairs = [
         replace(pair, matches=pair.matches[:count], scores=pair.scores[:count])
@@ -63,9 +66,9 @@ def reweighted_problem(
     ]
     problem = replace(problem, pairs=tuple(pairs))
     assert [len(pair) for pair in pairs] == list(counts)
-    check = checker(problem, Judged)
+    check = checker(problem, FixedResults)
     turn: Float64 = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
-    check.verdicts = {
+    check.results = {
         (0, 1): PairConsistency(pairs[0].rotation, 1.0),
         (0, 2): PairConsistency(turn @ pairs[2].rotation @ pairs[0].rotation, share),
         (1, 2): PairConsistency(pairs[2].rotation, 1.0),
@@ -73,7 +76,7 @@ def reweighted_problem(
     return problem, check.reweight_pairs(problem, np.ones(3, dtype=np.bool_))
 
 
-def test_what_depth_and_other_pairs_refute_does_not_count() -> None:
+def test_pair_that_depth_and_consistent_pairs_contradict_is_removed() -> None:
     problem, left = reweighted_problem([60, 50, 60], share=0.0, turn_deg=90.0)
     assert left.pairs == (problem.pairs[0], problem.pairs[2])
 
@@ -81,33 +84,33 @@ def test_what_depth_and_other_pairs_refute_does_not_count() -> None:
 @pytest.mark.parametrize(
     ("counts", "turn_deg"),
     [([60, 50, 60], 10.0), ([60, 70, 60], 90.0), ([60, 40, 20], 90.0), ([60, 20, 60], 90.0)],
-    ids=["others say the same", "tied by fewer", "tied by too few to register", "has too few"],
+    ids=["same rotation", "fewer matches", "too few consistent matches", "too few own matches"],
 )
-def test_a_pair_that_depth_alone_refutes_stays(counts: list[int], turn_deg: float) -> None:
+def test_pair_that_only_depth_contradicts_stays(counts: list[int], turn_deg: float) -> None:
     problem, left = reweighted_problem(counts, share=0.0, turn_deg=turn_deg)
     assert left.pairs == problem.pairs
 
 
-def test_matches_count_as_far_as_an_allowed_pose_is_supported() -> None:
+def test_match_scores_are_multiplied_by_support_ratio() -> None:
     problem, left = reweighted_problem([60, 50, 60], share=0.5, turn_deg=90.0)
     assert [len(pair) for pair in left.pairs] == [60, 50, 60]
     np.testing.assert_allclose(left.pairs[1].scores, 0.5 * problem.pairs[1].scores)
     assert left.pairs[0] is problem.pairs[0]
 
 
-def test_only_pairs_of_images_that_are_left_are_asked() -> None:
-    """What lies in groups before is settled, and may be most of what there is."""
+def test_only_pairs_of_candidate_images_are_checked() -> None:
+    """Images of earlier components are settled and may be the majority."""
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
-    check = checker(problem, Judged)
-    check.verdicts = {(1, 2): PairConsistency(np.eye(3), 0.5)}
+    check = checker(problem, FixedResults)
+    check.results = {(1, 2): PairConsistency(np.eye(3), 0.5)}
     left = check.reweight_pairs(problem, np.array([False, True, True]))
     assert left.pairs[:2] == problem.pairs[:2]
     np.testing.assert_allclose(left.pairs[2].scores, 0.5 * problem.pairs[2].scores)
 
 
-def test_well_connected_images_need_no_check(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_globally_initialized_images_need_no_pair_check(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(self: PairConsistencyCheck, problem: MappingProblem, left: Bool) -> MappingProblem:
-        raise AssertionError("not to be asked")
+        raise AssertionError("must not be called")
 
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(4, 10.0))
     monkeypatch.setattr(PairConsistencyCheck, "reweight_pairs", refuse)

@@ -1,4 +1,4 @@
-"""The depth check: what counts as a contradiction, which explanation holds, twin rooms."""
+"""Depth consistency: violations, their explanations by depth errors, and twin rooms."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SMALL = PinholeCamera(40, 30, 40.0, 40.0, 20.0, 15.0)
 def posed_scene(
     maps: list[Float32], poses: list[Float64], camera: PinholeCamera, std: float = 0.01
 ) -> Scene:
-    """Registered views with given depth and no keypoints."""
+    """Return a scene of registered images with given depth and no keypoints."""
     images = []
     for number, depth in enumerate(maps):
         normals = np.zeros((*depth.shape, 3), np.float32)
@@ -74,12 +74,12 @@ def between(scene: Scene, a: int, b: int, **settings: float) -> float:
     return DepthConsistencyCheck(scene, OPTIONS).measure_violation_ratio(a, b, **settings)
 
 
-def test_a_surface_in_seen_empty_space_is_a_violation_and_one_behind_is_not() -> None:
-    """A box that only one view sees before the wall contradicts; the wall behind the box not."""
+def test_surface_in_empty_space_is_violation_and_occluded_one_is_not() -> None:
+    """A box that one image sees in front of the wall is a violation, the wall behind it is not."""
     near = wall(4.0)
     near[10:20, 10:25] = 2.0
     scene = posed_scene([near, wall(4.0)], [HERE, HERE], SMALL)
-    box = 5 * 7 / (15 * 20)  # of every second pixel either way
+    box = 5 * 7 / (15 * 20)  # every second pixel in both directions
     assert between(scene, 0, 1) == pytest.approx(box)
     assert between(scene, 1, 0) == pytest.approx(box)
     check = DepthConsistencyCheck(scene, OPTIONS).check_image(0)
@@ -87,8 +87,8 @@ def test_a_surface_in_seen_empty_space_is_a_violation_and_one_behind_is_not() ->
     assert check.ratio == pytest.approx(box)
 
 
-def test_what_a_far_view_sees_in_few_pixels_counts_as_few() -> None:
-    """What fills one picture is small for a view ten metres behind, which sees past it."""
+def test_by_target_area_weights_violations_by_projected_area() -> None:
+    """What fills one image has few pixels in an image ten meters behind."""
     behind = np.eye(3, 4)
     behind[2, 3] = 10.0
     scene = posed_scene([wall(1.0), wall(20.0)], [HERE, behind], SMALL)
@@ -98,8 +98,8 @@ def test_what_a_far_view_sees_in_few_pixels_counts_as_few() -> None:
     assert not check.find_conflicting_images([0, 1], OPTIONS.max_violations)
 
 
-def test_an_occluded_surface_is_no_violation() -> None:
-    """What the second view sees beside a box lies behind the box for the first."""
+def test_occluded_surface_is_no_violation() -> None:
+    """The box in the first image hides what the second image sees next to it."""
     rooms = make_twin_rooms()
     poses, _ = make_twin_room_poses(0)
     grid = CAMERA.resized(160, 120)
@@ -109,30 +109,30 @@ def test_an_occluded_surface_is_no_violation() -> None:
 
 
 @pytest.mark.parametrize(("gap", "contradicts"), [(0.03, False), (0.10, True)])
-def test_small_gaps_are_inaccuracy(gap: float, contradicts: bool) -> None:
+def test_gap_below_min_gap_is_no_violation(gap: float, contradicts: bool) -> None:
     scene = posed_scene([wall(4.0), wall(4.0 * (1 - gap))], [HERE, HERE], SMALL, std=0.001)
     assert (between(scene, 0, 1) > 0.5) == contradicts
 
 
-def test_uncertain_depth_contradicts_nothing() -> None:
+def test_large_depth_std_gives_no_violation() -> None:
     scene = posed_scene([wall(4.0), wall(3.0)], [HERE, HERE], SMALL, std=0.03)
     assert between(scene, 0, 1) > 0.5
     assert between(scene, 0, 1, std_factor=4.0) == 0
 
 
 @pytest.mark.parametrize(("gap", "contradicts"), [(0.34, False), (0.40, True)])
-def test_errors_of_both_views_count(gap: float, contradicts: bool) -> None:
-    """On one line of sight with std s in both, a gap g has the likelihood exp(-g^2 / 4 s^2) / 2^.5:
-    that of ``max_deviation`` at 3.63 s."""
+def test_errors_of_both_images_explain_gap(gap: float, contradicts: bool) -> None:
+    """On one ray with std s in both images, a gap g has the likelihood exp(-g^2 / 4 s^2) / 2^.5.
+
+    It equals the likelihood of ``max_deviation`` at g = 3.63 s.
+    """
     scene = posed_scene([wall(4.0), wall(4.0 * np.exp(-gap))], [HERE, HERE], SMALL, std=0.1)
     assert (between(scene, 0, 1) > 0.5) == contradicts
 
 
 @pytest.mark.parametrize(("std", "contradicts"), [(0.06, False), (0.01, True)])
-def test_an_error_of_depth_is_a_shift_to_the_side_for_a_view_at_a_right_angle(
-    std: float, contradicts: bool
-) -> None:
-    """A pillar that one view has 12 % too far lies beside its place in the other, before a wall."""
+def test_depth_error_explains_lateral_shift_at_right_angle(std: float, contradicts: bool) -> None:
+    """A pillar that is 12 % too far in one image is shifted sideways in the other."""
     hall = AnalyticScene((Box((0.0, 0.0, 1.5), (8.0, 8.0, 1.5)), Box((0.0, 0.0, 1.5), (1, 1, 1.5))))
     poses = [look_at((-5.0, 0.0, 1.5), (0, 0, 1.5)), look_at((0.0, -5.0, 1.5), (0, 0, 1.5))]
     grid = SMALL.resized(160, 120)
@@ -142,20 +142,22 @@ def test_an_error_of_depth_is_a_shift_to_the_side_for_a_view_at_a_right_angle(
     assert (between(scene, 0, 1) > OPTIONS.max_violations) == contradicts
 
 
-def test_an_error_that_takes_a_pixel_past_an_edge_explains_no_more_than_it_is_likely() -> None:
-    """Beside an edge of what a second view sees, errors of 2.025 std and more do, one of 2.7 not:
-    with its weight of 0.007 it is less likely than one in 38."""
+def test_error_past_depth_edge_counts_by_its_likelihood() -> None:
+    """Errors of 2.025 std move pixels past a depth edge and explain them; those of 2.7 std do not.
+
+    The weight of an error of 2.7 std is 0.007, below the limit of 1 in 38.
+    """
     aside = np.eye(3, 4)
     aside[0, 3] = 1.0
     near, far = np.full((2, 120, 160), [[[4.0]], [[40.0]]], np.float32)
-    far[:, 120:] = 0  # not known
+    far[:, 120:] = 0  # unknown
     scene = posed_scene([near, far], [HERE, aside], SMALL.resized(160, 120), std=0.2)
-    lands = np.arange(1, 160, 2) + 0.5 + 40 * np.exp(2.025 * 0.2)  # columns that are carried over
+    lands = np.arange(1, 160, 2) + 0.5 + 40 * np.exp(2.025 * 0.2)  # compared columns
     assert between(scene, 0, 1) == pytest.approx((lands < 120).mean())
 
 
 def hall_at_truth(errors: PriorErrors) -> Scene:
-    """Views of a hall with their tracks and scaled priors."""
+    """Return the images of a hall at their true poses, with tracks and scaled priors."""
     problem, truth, _ = make_hall_problem(16, errors)
     scene = Scene(problem)
     for image, pose in enumerate(truth.values()):
@@ -166,21 +168,21 @@ def hall_at_truth(errors: PriorErrors) -> Scene:
 
 
 def worst(scene: Scene, *, weigh_evidence: bool) -> Float64:
-    """(n,) largest share of contradicting pixels of each image."""
+    """Return (n,) the largest violation ratio of each image."""
     options = OPTIONS.model_copy(update={"weigh_evidence": weigh_evidence})
     check = DepthConsistencyCheck(scene, options)
     return np.array([check.check_image(i).ratio for i in range(scene.num_images)])
 
 
-def test_what_points_deny_is_the_fault_of_the_prior() -> None:
-    """Unrefined priors that are off by 20 % in a tenth of their area refute no right pose."""
+def test_prior_contradicted_by_points_gives_no_violation() -> None:
+    """Priors with an error of 20 % in a tenth of their area contradict no correct pose."""
     scene = hall_at_truth(LOCALLY_BIASED_PRIORS)
     assert (worst(scene, weigh_evidence=False) > OPTIONS.max_violations).sum() >= 2
     assert (worst(scene, weigh_evidence=True) < OPTIONS.max_violations).all()
 
 
-def test_what_points_confirm_or_leave_open_is_the_fault_of_the_pose() -> None:
-    """Views of one twin room stand in the other, beside right priors; their tracks go along."""
+def test_misplaced_image_with_own_tracks_is_violation() -> None:
+    """Images of one twin room are registered in the other, with the tracks that result there."""
     case = make_twin_room_problem(1, keypoint_noise_px=0.2)
     scene = Scene(case.problem)
     for image, pose in enumerate(case.poses):
@@ -205,15 +207,15 @@ def test_what_points_confirm_or_leave_open_is_the_fault_of_the_pose() -> None:
     assert np.mean(wrong) >= 0.75
 
 
-def test_views_that_look_elsewhere_do_not_overlap() -> None:
+def test_images_facing_away_do_not_overlap() -> None:
     back = np.column_stack([np.diag([-1.0, 1.0, -1.0]), np.zeros(3)])
     scene = posed_scene([wall(3.0)] * 3, [HERE, back, HERE], SMALL)
     assert find_overlapping_images(scene, 0, 5) == [2]
     assert DepthConsistencyCheck(scene, OPTIONS).check_image(1).other_image == -1
 
 
-def test_the_thinned_map_is_where_the_map_is() -> None:
-    """A view against itself from a step aside, at full and at a third of the resolution."""
+def test_subsampled_map_is_aligned_with_full_map() -> None:
+    """An image agrees with itself at full and at a third of the resolution."""
     rooms = make_twin_rooms()
     pose = make_twin_room_poses(0)[0][0]
     maps = [rooms.render(CAMERA.resized(480, 360), pose).depth] * 2
@@ -223,8 +225,8 @@ def test_the_thinned_map_is_where_the_map_is() -> None:
     assert DepthConsistencyCheck(scene, whole).measure_violation_ratio(0, 1) == 0
 
 
-def test_a_view_in_the_twin_room_is_told_by_what_differs() -> None:
-    """Most views of the second room contradict the first; in their own place none does."""
+def test_image_in_twin_room_is_violation_and_in_own_room_is_not() -> None:
+    """Most images of the second room contradict the first room, and none contradicts its own."""
     rooms = make_twin_rooms()
     poses, room = make_twin_room_poses(1)
     maps = [rooms.render(CAMERA.resized(160, 120), pose).depth for pose in poses]
@@ -244,8 +246,8 @@ def test_a_view_in_the_twin_room_is_told_by_what_differs() -> None:
     assert np.mean(wrong) >= 0.75
 
 
-def test_what_a_quarter_of_the_pixels_tells_is_what_all_of_them_do() -> None:
-    """Of views in their room and in its twin: the same side of the limit, some by fewer pixels."""
+def test_quarter_of_pixels_decides_like_all_pixels() -> None:
+    """The ratio is on the same side of the limit for images in their room and in its twin."""
     rooms = make_twin_rooms()
     poses, room = make_twin_room_poses(1)
     maps = [rooms.render(CAMERA.resized(160, 120), pose).depth for pose in poses]
@@ -262,7 +264,7 @@ def test_what_a_quarter_of_the_pixels_tells_is_what_all_of_them_do() -> None:
     assert np.abs(every - enough).max() < 0.1
 
 
-def test_the_image_with_most_conflicts_goes() -> None:
+def test_find_conflicting_images_removes_image_with_most_conflicts() -> None:
     scene = posed_scene([wall(4.0), wall(4.0), wall(2.0), wall(4.0)], [HERE] * 4, SMALL)
     images = scene.registered_images()
     removed = DepthConsistencyCheck(scene, OPTIONS).find_conflicting_images(

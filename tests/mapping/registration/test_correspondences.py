@@ -1,4 +1,4 @@
-"""Matches of keypoints whose depth is unknown: their rays count."""
+"""Pose correspondences of keypoints with unknown depth."""
 
 from __future__ import annotations
 
@@ -36,12 +36,11 @@ STRIPS: Mapping[str, Part] = {
     "top": (slice(30), slice(None)),
     "bottom": (slice(-30, None), slice(None)),
 }
-"""A quarter of a map of 160 x 120."""
+"""Parts of a depth map of 160 x 120 pixels, each a quarter of it."""
 
 
 def scene_with_depth_in(part: Part, seed: int = 0) -> Scene:
-    """Two views, the first of them in place; depth is known in a part of either alone, and how
-    they lie to each other is not."""
+    """Return two images, the first registered, with depth in one part and no relative pose."""
     noise = SyntheticNoise(keypoints_px=0.7, depth=0.01)
     problem = make_mapping_problem(room_scene(), CAMERA, POSES, noise=noise, seed=seed)
     images = []
@@ -58,64 +57,68 @@ def scene_with_depth_in(part: Part, seed: int = 0) -> Scene:
     return scene
 
 
-def error_deg(scene: Scene, found: PoseCorrespondences) -> float:
-    """Of the best pose that the matches give."""
-    best = estimate_candidate_poses(scene, 1, found, OPTIONS, seed=0, attempt=0)[0]
+def error_deg(scene: Scene, correspondences: PoseCorrespondences) -> float:
+    """Return the rotation error of the best pose."""
+    best = estimate_candidate_poses(scene, 1, correspondences, OPTIONS, seed=0, attempt=0)[0]
     return float(rotation_angle_deg(best.rotation @ TRUTH.rotation.T))
 
 
-def test_a_ray_reaches_from_the_nearest_to_the_farthest_depth_that_its_view_knows() -> None:
+def test_unknown_depth_spans_known_depth_range_of_image() -> None:
     scene = scene_with_depth_in(LEFT_HALF)
-    found = find_correspondences(scene, 1, [0], OPTIONS)
+    correspondences = find_correspondences(scene, 1, [0], OPTIONS)
     depth_map = scene.maps[0]
-    rows = found.matched_keypoints - scene.graph.offsets[0]
-    np.testing.assert_array_equal(found.depth_known, depth_map.keypoint_valid[rows])
-    rays = ~found.depth_known
+    rows = correspondences.matched_keypoints - scene.graph.offsets[0]
+    np.testing.assert_array_equal(correspondences.depth_known, depth_map.keypoint_valid[rows])
+    rays = ~correspondences.depth_known
     assert 20 < rays.sum() < len(rays) - 20
     known = depth_map.at_keypoints()[depth_map.keypoint_valid]
-    for ends, depth in ((found.near_points, known.min()), (found.far_points, known.max())):
-        errors_px, z = scene.project(found.matched_keypoints[rays], ends[rays])
+    for ends, depth in (
+        (correspondences.near_points, known.min()),
+        (correspondences.far_points, known.max()),
+    ):
+        errors_px, z = scene.project(correspondences.matched_keypoints[rays], ends[rays])
         np.testing.assert_allclose(z, depth)
         assert errors_px.max() < 1e-9, "on the ray of the keypoint"
 
 
-def test_rays_count_half() -> None:
+def test_matches_of_unknown_depth_have_half_weight() -> None:
     scene = scene_with_depth_in(LEFT_HALF)
-    found = find_correspondences(scene, 1, [0], OPTIONS)
+    correspondences = find_correspondences(scene, 1, [0], OPTIONS)
     everywhere = find_correspondences(scene_with_depth_in(EVERYWHERE), 1, [0], OPTIONS)
-    np.testing.assert_array_equal(found.keypoints, everywhere.keypoints)
+    np.testing.assert_array_equal(correspondences.keypoints, everywhere.keypoints)
     np.testing.assert_array_equal(
-        found.depth_weights, np.where(found.depth_known, 1.0, RAY_MATCH_WEIGHT)
+        correspondences.depth_weights, np.where(correspondences.depth_known, 1.0, RAY_MATCH_WEIGHT)
     )
     np.testing.assert_allclose(
-        found.weights / found.depth_weights, everywhere.weights / everywhere.depth_weights
+        correspondences.weights / correspondences.depth_weights,
+        everywhere.weights / everywhere.depth_weights,
     )
-    pose = score_pose(scene, found, TRUTH, OPTIONS)
-    alone = score_pose(scene, found.select(found.depth_known), TRUTH, OPTIONS)
-    rays = score_pose(scene, found.select(~found.depth_known), TRUTH, OPTIONS)
-    assert rays.num_inliers >= 0.4 * RAY_MATCH_WEIGHT * (~found.depth_known).sum()
-    assert rays.num_inliers <= RAY_MATCH_WEIGHT * (~found.depth_known).sum()
+    pose = score_pose(scene, correspondences, TRUTH, OPTIONS)
+    alone = score_pose(scene, correspondences.select(correspondences.depth_known), TRUTH, OPTIONS)
+    rays = score_pose(scene, correspondences.select(~correspondences.depth_known), TRUTH, OPTIONS)
+    assert rays.num_inliers >= 0.4 * RAY_MATCH_WEIGHT * (~correspondences.depth_known).sum()
+    assert rays.num_inliers <= RAY_MATCH_WEIGHT * (~correspondences.depth_known).sum()
     assert alone.num_inliers <= pose.num_inliers <= alone.num_inliers + rays.num_inliers + 1
 
 
-def test_where_a_view_knows_no_depth_there_is_nothing_to_go_by() -> None:
+def test_image_without_depth_gives_no_correspondences() -> None:
     scene = scene_with_depth_in(NOWHERE)
     assert not len(find_correspondences(scene, 1, [0], OPTIONS).keypoints)
 
 
-def test_without_lifting_rays_do_not_count() -> None:
+def test_without_lifting_untriangulated_matches_are_ignored() -> None:
     scene = scene_with_depth_in(LEFT_HALF)
     options = RegistrationOptions(lifting=False)
     assert not len(find_correspondences(scene, 1, [0], options).keypoints)
 
 
-def test_rays_pin_down_what_a_strip_of_known_depth_leaves_loose() -> None:
+def test_matches_of_unknown_depth_reduce_rotation_error() -> None:
     with_rays, without = [], []
     for part in STRIPS.values():
         for seed in range(3):
             scene = scene_with_depth_in(part, seed)
-            found = find_correspondences(scene, 1, [0], OPTIONS)
-            assert 0.15 < found.depth_known.mean() < 0.35
-            with_rays.append(error_deg(scene, found))
-            without.append(error_deg(scene, found.select(found.depth_known)))
+            correspondences = find_correspondences(scene, 1, [0], OPTIONS)
+            assert 0.15 < correspondences.depth_known.mean() < 0.35
+            with_rays.append(error_deg(scene, correspondences))
+            without.append(error_deg(scene, correspondences.select(correspondences.depth_known)))
     assert np.mean(with_rays) < 0.75 * np.mean(without)

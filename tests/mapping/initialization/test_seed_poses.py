@@ -1,4 +1,4 @@
-"""A reconstruction as the start of another with more matches."""
+"""Seed poses: a reconstruction initializes another one with more matches."""
 
 from __future__ import annotations
 
@@ -27,12 +27,14 @@ def problem() -> MappingProblem:
 
 @pytest.fixture(scope="module")
 def mapped(problem: MappingProblem) -> MappingResult:
-    """By four of the five images."""
+    """Reconstruct four of the five images."""
     return reconstruct(problem.subset([image.name for image in problem.images[:4]]))
 
 
-def in_part(mapping: MappingResult, ids: list[list[int]], **changes: object) -> MappingResult:
-    """The result with other points: for each image the point of each keypoint."""
+def with_point_ids(
+    mapping: MappingResult, ids: list[list[int]], **changes: object
+) -> MappingResult:
+    """Return the result with other points: ``ids`` has the point of each keypoint per image."""
     images = tuple(
         replace(image, point_ids=np.array(own, dtype=np.int64), **changes)
         for image, own in zip(mapping.reconstructions[0].images, ids, strict=True)
@@ -41,19 +43,21 @@ def in_part(mapping: MappingResult, ids: list[list[int]], **changes: object) -> 
     return MappingResult((part,), MappingReport())
 
 
-def test_points_that_three_images_see_hold(mapped: MappingResult) -> None:
+def test_select_seed_images_requires_multi_view_points(mapped: MappingResult) -> None:
     ids = [[0, 1, -1, 0], [1, 0, 2], [0, -1, 2, 3], [1, 3]]
-    few = in_part(mapped, ids)
+    few = with_point_ids(mapped, ids)
     assert few.reconstructions[0].num_multi_view_points().tolist() == [2, 2, 1, 1]
     assert [image.index for image in select_seed_images(few, 2)] == [0, 1]
-    assert not select_seed_images(in_part(mapped, ids, confirmed=False), 1)
+    assert not select_seed_images(with_point_ids(mapped, ids, confirmed=False), 1)
     assert not select_seed_images(MappingResult((), MappingReport()), 1)
 
 
-def test_it_goes_on_in_metres(problem: MappingProblem, mapped: MappingResult) -> None:
-    held = select_seed_images(mapped, 30)
-    assert len(held) == 4
-    tenth = [replace(image, translation=image.translation / 10) for image in held]
+def test_reconstruct_from_seed_poses_is_metric(
+    problem: MappingProblem, mapped: MappingResult
+) -> None:
+    seeds = select_seed_images(mapped, 30)
+    assert len(seeds) == 4
+    tenth = [replace(image, translation=image.translation / 10) for image in seeds]
     guess = MapperOptions(known_poses="guess")
     (found,) = reconstruct(apply_seed_poses(problem, tenth), guess).reconstructions
     assert found.metric is not None and found.metric.trusted
@@ -68,7 +72,7 @@ def test_it_goes_on_in_metres(problem: MappingProblem, mapped: MappingResult) ->
         assert apart == pytest.approx(truth, rel=0.02)
 
 
-def test_refined_focal_lengths_are_those_of_all_images_of_a_camera(
+def test_apply_seed_poses_shares_refined_focal_length(
     problem: MappingProblem, mapped: MappingResult
 ) -> None:
     refined = replace(CAMERA, fx=540.0, fy=540.0)

@@ -1,4 +1,4 @@
-"""Images that nothing confirms, placed where their matches fit best."""
+"""Tentative registration of images that no verification confirms."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COMPLETE = MapperOptions(register_tentatively=True)
 
 
 def with_few_matches(problem: MappingProblem, weak: tuple[int, int]) -> MappingProblem:
-    """The problem with no more than eight matches of one pair."""
+    """Return the problem with at most eight matches of one pair."""
     pairs = tuple(
         replace(pair, matches=pair.matches[:8], scores=pair.scores[:8])
         if (pair.image_a, pair.image_b) == weak
@@ -34,7 +34,7 @@ def with_few_matches(problem: MappingProblem, weak: tuple[int, int]) -> MappingP
 
 @pytest.fixture(scope="module", params=[True, False], ids=["metric", "up to scale"])
 def problem(request: pytest.FixtureRequest) -> MappingProblem:
-    """Three images, two that eight matches hold to them, and one without matches."""
+    """Three connected images, two connected to them by eight matches, and one without matches."""
     whole = with_few_matches(make_mapping_problem(room_scene(), CAMERA, POSES, links=LINKS), (1, 2))
     images = tuple(
         replace(image, depth=replace(image.depth, metric=request.param)) for image in whole.images
@@ -42,28 +42,28 @@ def problem(request: pytest.FixtureRequest) -> MappingProblem:
     return replace(whole, images=images)
 
 
-def turns_deg(images: list[RegisteredImage]) -> Float64:
-    """How far each camera is turned from where it should be, beside the third."""
+def rotation_errors_deg(images: list[RegisteredImage]) -> Float64:
+    """Return the rotation errors relative to the third image."""
     truth = np.array([POSES[image.index][:, :3] @ POSES[2][:, :3].T for image in images])
     (third,) = (image for image in images if image.index == 2)
     found = np.array([image.rotation @ third.rotation.T for image in images])
     return rotation_angle_deg(found @ truth.transpose(0, 2, 1))
 
 
-def test_few_matches_place_an_image_and_those_beyond_it(problem: MappingProblem) -> None:
+def test_image_with_few_matches_and_its_component_are_registered(problem: MappingProblem) -> None:
     plain, complete = reconstruct(problem), reconstruct(problem, COMPLETE)
     assert [len(model.images) for model in plain.reconstructions] == [3, 2]
     best, other = complete.reconstructions
-    assert [image.index for image in other.images] == [0, 1], "their own group stays"
+    assert [image.index for image in other.images] == [0, 1], "the smaller component stays"
     assert {image.index: image.confirmed for image in best.images} == {
         **dict.fromkeys([0, 1], False),
         **dict.fromkeys([2, 3, 4], True),
     }
-    assert turns_deg(list(best.images)).max() < 1.0
-    assert list(complete.report.image_reasons) == ["view_5.png"], "no match places it"
+    assert rotation_errors_deg(list(best.images)).max() < 1.0
+    assert list(complete.report.image_reasons) == ["view_5.png"], "has no matches"
 
 
-def test_a_group_is_placed_as_a_whole(problem: MappingProblem) -> None:
+def test_component_keeps_its_relative_poses_and_scales(problem: MappingProblem) -> None:
     best, group = reconstruct(problem, COMPLETE).reconstructions
     placed = [image for image in best.images if not image.confirmed]
     (turn, step), (own_turn, own_step) = (
@@ -76,7 +76,7 @@ def test_a_group_is_placed_as_a_whole(problem: MappingProblem) -> None:
     assert placed[1].scale == pytest.approx(ratio * group.images[1].scale)
 
 
-def test_what_is_confirmed_does_not_change(problem: MappingProblem) -> None:
+def test_confirmed_images_and_points_stay_unchanged(problem: MappingProblem) -> None:
     (plain, _), (complete, _) = (
         reconstruct(problem, options).reconstructions for options in (MapperOptions(), COMPLETE)
     )
@@ -89,13 +89,13 @@ def test_what_is_confirmed_does_not_change(problem: MappingProblem) -> None:
     assert all((image.point_ids == -1).all() for image in guessed)
 
 
-def test_scales_of_placed_images_fit_the_others(problem: MappingProblem) -> None:
+def test_scales_of_tentative_images_agree_with_confirmed_ones(problem: MappingProblem) -> None:
     best = reconstruct(problem, COMPLETE).reconstructions[0]
     scales = np.array([image.scale for image in best.images])
     assert np.allclose(scales, np.median(scales), rtol=0.03)
 
 
-def test_a_complete_reconstruction_stays_as_it_is() -> None:
+def test_complete_reconstruction_stays_unchanged() -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, POSES[:3])
     best = reconstruct(problem, COMPLETE).reconstructions[0]
     assert len(best.images) == 3

@@ -1,4 +1,4 @@
-"""The first two images: either may lend its depth, and few matches will do in the end."""
+"""Initial pair: reference image, relaxed thresholds, and ranking."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ POSES = arc_poses(2, 14.0)
 
 
 def pair_problem(matches: int | None = None) -> MappingProblem:
-    """Two views, of whose matches only some are left."""
+    """Return a problem of two images with the first matches only."""
     problem = make_mapping_problem(room_scene(), CAMERA, POSES)
     (pair,) = problem.pairs
     return replace(
@@ -35,7 +35,7 @@ def pair_problem(matches: int | None = None) -> MappingProblem:
 
 
 def without_depth(problem: MappingProblem, image: int, columns: slice) -> MappingProblem:
-    """The problem with a part of an image's depth unknown."""
+    """Return the problem with unknown depth in some columns of an image."""
     images = list(problem.images)
     valid: Bool = images[image].depth.valid.copy()
     valid[:, columns] = False
@@ -44,7 +44,7 @@ def without_depth(problem: MappingProblem, image: int, columns: slice) -> Mappin
 
 
 def error_deg(result: MappingResult) -> float:
-    """Of the pose of the second image beside the first."""
+    """Return the error of the relative pose: rotation or direction, whichever is larger."""
     a, b = result.reconstructions[0].images
     rotation = b.rotation @ a.rotation.T
     translation = b.translation - rotation @ a.translation
@@ -55,12 +55,12 @@ def error_deg(result: MappingResult) -> float:
 
 
 @pytest.mark.parametrize("image", [0, 1])
-def test_the_image_with_more_depth_carries_the_other(image: int) -> None:
+def test_image_with_more_depth_is_reference(image: int) -> None:
     problem = without_depth(pair_problem(), image, slice(10, None))
     assert error_deg(reconstruct(problem)) < 0.1
 
 
-def test_few_matches_start_when_nothing_better_does() -> None:
+def test_pair_with_few_matches_initializes_at_relaxed_thresholds() -> None:
     assert error_deg(reconstruct(pair_problem(15))) < 1.0
     strict = MapperOptions.model_validate({"registration": {"max_relaxations": 0}})
     result = reconstruct(pair_problem(15), strict)
@@ -69,12 +69,12 @@ def test_few_matches_start_when_nothing_better_does() -> None:
     assert reason.values["min_inliers"] == 30
 
 
-def test_without_lifting_rays_make_the_start() -> None:
+def test_without_lifting_verified_pose_initializes() -> None:
     options = MapperOptions.model_validate({"registration": {"lifting": False}})
     assert error_deg(reconstruct(pair_problem(), options)) < 0.1
 
 
-def test_images_that_do_not_fit_are_not_started_with() -> None:
+def test_pair_with_wrong_matches_is_rejected() -> None:
     problem = pair_problem()
     (pair,) = problem.pairs
     shuffled = np.random.default_rng(0).permutation(pair.matches[:, 1])
@@ -83,7 +83,7 @@ def test_images_that_do_not_fit_are_not_started_with() -> None:
     assert not reconstruct(wrong).reconstructions
 
 
-def test_the_best_supported_of_the_largest_pairs_comes_first() -> None:
+def test_rank_pairs_orders_largest_pairs_by_support() -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
     rng = np.random.default_rng(0)
     pairs = list(problem.pairs)

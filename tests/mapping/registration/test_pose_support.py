@@ -1,4 +1,4 @@
-"""What matches say of a pose, and the pose that they support most."""
+"""Support of a pose by its correspondences, and its maximization."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OPTIONS = RegistrationOptions()
 
 @pytest.fixture
 def scene() -> Scene:
-    """The first two of three views stand at their true poses."""
+    """Two of three images are registered at their true poses."""
     problem = make_mapping_problem(
         room_scene(), CAMERA, POSES, noise=SyntheticNoise(keypoints_px=0.3)
     )
@@ -39,8 +39,8 @@ def scene() -> Scene:
 
 
 @pytest.fixture
-def found(scene: Scene) -> PoseCorrespondences:
-    """Every fifth match is wrong: its keypoint belongs to that of another match."""
+def correspondences(scene: Scene) -> PoseCorrespondences:
+    """Every fifth correspondence is wrong: it has the keypoint of another one."""
     right = find_correspondences(scene, NEW, list(range(NEW)), OPTIONS)
     assert len(right.keypoints) > 50
     keypoints = right.keypoints.copy()
@@ -48,49 +48,53 @@ def found(scene: Scene) -> PoseCorrespondences:
     return right._replace(keypoints=keypoints)
 
 
-def off_by(degrees: float) -> tuple[Float64, Float64]:
-    """The true pose of the new view, turned about its own centre."""
+def perturbed_pose(degrees: float) -> tuple[Float64, Float64]:
+    """Return the true pose of the new image, rotated about its center."""
     turn = Rotation.from_euler("xyz", [degrees, -degrees, degrees], degrees=True).as_matrix()
     return turn @ POSES[NEW][:, :3], turn @ POSES[NEW][:, 3]
 
 
-def rated(scene: Scene, found: PoseCorrespondences, degrees: float) -> ScoredPose:
-    return score_pose(scene, found, PoseHypothesis(*off_by(degrees), "PnP"), OPTIONS)
+def rated(scene: Scene, correspondences: PoseCorrespondences, degrees: float) -> ScoredPose:
+    return score_pose(
+        scene, correspondences, PoseHypothesis(*perturbed_pose(degrees), "PnP"), OPTIONS
+    )
 
 
 @pytest.mark.parametrize("degrees", [0.3, 1.5])
-def test_a_pose_moves_to_where_matches_support_it_most(
-    scene: Scene, found: PoseCorrespondences, degrees: float
+def test_maximize_support_from_perturbed_pose_reaches_true_pose(
+    scene: Scene, correspondences: PoseCorrespondences, degrees: float
 ) -> None:
-    start = rated(scene, found, degrees)
-    improved = maximize_support(scene, found, start, OPTIONS)
-    assert improved.support >= 0.99 * rated(scene, found, 0.0).support > start.support
+    start = rated(scene, correspondences, degrees)
+    improved = maximize_support(scene, correspondences, start, OPTIONS)
+    assert improved.support >= 0.99 * rated(scene, correspondences, 0.0).support > start.support
     assert rotation_angle_deg(improved.rotation @ POSES[NEW][:, :3].T) < 0.1
     assert improved.source == "PnP"
     assert 0.75 < improved.inlier_ratio < 0.85, "one in five is wrong"
 
 
-def test_without_matches_it_stays(scene: Scene, found: PoseCorrespondences) -> None:
-    none = found.select(np.zeros(len(found.keypoints), dtype=np.bool_))
+def test_maximize_support_without_correspondences_returns_pose(
+    scene: Scene, correspondences: PoseCorrespondences
+) -> None:
+    none = correspondences.select(np.zeros(len(correspondences.keypoints), dtype=np.bool_))
     start = rated(scene, none, 1.0)
     assert start.support == start.num_inliers == start.inlier_ratio == 0
     assert maximize_support(scene, none, start, OPTIONS) is start
 
 
-def test_a_depth_that_denies_the_new_images_prior_is_no_support(
-    scene: Scene, found: PoseCorrespondences
+def test_score_pose_with_inconsistent_depth_counts_fewer_inliers(
+    scene: Scene, correspondences: PoseCorrespondences
 ) -> None:
-    """Halving the distance to every third point leaves its pixel in place, but not its depth."""
+    """Halving the distance to every third point changes its depth but not its projection."""
     center = -POSES[NEW][:, :3].T @ POSES[NEW][:, 3]
-    nearer = np.arange(len(found.keypoints)) % 3 == 0
+    nearer = np.arange(len(correspondences.keypoints)) % 3 == 0
 
     def moved(points: Float64) -> Float64:
         return np.where(nearer[:, None], center + 0.5 * (points - center), points)
 
-    wrong = found._replace(
-        points=moved(found.points),
-        near_points=moved(found.near_points),
-        far_points=moved(found.far_points),
+    wrong = correspondences._replace(
+        points=moved(correspondences.points),
+        near_points=moved(correspondences.near_points),
+        far_points=moved(correspondences.far_points),
     )
-    before, after = rated(scene, found, 0.0), rated(scene, wrong, 0.0)
+    before, after = rated(scene, correspondences, 0.0), rated(scene, wrong, 0.0)
     assert after.num_inliers <= 0.75 * before.num_inliers

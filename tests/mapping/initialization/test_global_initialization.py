@@ -1,4 +1,4 @@
-"""All images placed at once, and when that does not hold."""
+"""Global initialization: accuracy, robustness, and fallback to an initial pair."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def place(problem: MappingProblem, left: Float64 | None = None) -> GlobalPoses |
 
 
 def worst_deg(placed: GlobalPoses, hall: HallProblem) -> float:
-    """Largest error of a placed pair in degrees, robustly: of nine tenths."""
+    """Return the 0.9 quantile of the relative pose errors in degrees."""
     names = [hall.problem.images[image].name for image in placed.images]
     poses = zip(names, zip(placed.rotations, placed.translations, strict=True), strict=True)
     truth = {name: hall.truth[name] for name in names}
     return float(np.quantile(pose_errors_deg(dict(poses), truth, CONVENTIONS["paper"]), 0.9))
 
 
-def test_all_views_are_placed_near_their_poses(hall: HallProblem) -> None:
+def test_estimate_global_poses_registers_all_images_near_truth(hall: HallProblem) -> None:
     placed = place(hall.problem)
     assert placed is not None
     assert len(placed.images) >= VIEWS - 2
@@ -54,17 +54,17 @@ def test_all_views_are_placed_near_their_poses(hall: HallProblem) -> None:
     assert np.log(placed.scales).std() < 0.1
 
 
-def test_a_wrong_pair_is_outvoted(hall: HallProblem) -> None:
+def test_wrong_pair_is_removed(hall: HallProblem) -> None:
     problem = hall.problem
     turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     wrong = replace(problem.pairs[0], rotation=turn @ problem.pairs[0].rotation)
-    spoilt = MappingProblem(problem.images, (wrong, *problem.pairs[1:]))
-    placed = place(spoilt)
+    corrupted = MappingProblem(problem.images, (wrong, *problem.pairs[1:]))
+    placed = place(corrupted)
     assert placed is not None
     assert worst_deg(placed, hall) < 3
 
 
-def test_images_that_may_not_be_placed_are_left_out(hall: HallProblem) -> None:
+def test_images_that_are_no_candidates_are_left_out(hall: HallProblem) -> None:
     left = np.ones(VIEWS, dtype=np.bool_)
     left[3] = False
     placed = place(hall.problem, left)
@@ -72,13 +72,13 @@ def test_images_that_may_not_be_placed_are_left_out(hall: HallProblem) -> None:
     assert 3 not in placed.images
 
 
-def test_a_chain_of_pairs_is_not_placed(hall: HallProblem) -> None:
+def test_chain_of_pairs_returns_none(hall: HallProblem) -> None:
     chain = [p for p in hall.problem.pairs if p.image_b == p.image_a + 1]
     assert place(MappingProblem(hall.problem.images, tuple(chain))) is None
 
 
-def test_a_bridge_holds_nothing(hall: HallProblem) -> None:
-    """The larger of two groups is placed that a single pair holds together."""
+def test_bridge_separates_components_and_largest_is_returned(hall: HallProblem) -> None:
+    """A single pair connects two components; the larger one is returned."""
     problem = hall.problem
     first = [p for p in problem.pairs if p.image_b < 10]
     second = [p for p in problem.pairs if p.image_a >= 10]
@@ -90,7 +90,7 @@ def test_a_bridge_holds_nothing(hall: HallProblem) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_links_on_cycles_are_those_that_can_be_spared(seed: int) -> None:
+def test_find_cycle_edges_returns_edges_that_are_no_bridges(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count = 20
     possible = np.stack(np.triu_indices(count, 1), axis=1)
@@ -108,8 +108,8 @@ def test_links_on_cycles_are_those_that_can_be_spared(seed: int) -> None:
     assert find_cycle_edges(links[:, 0], links[:, 1], count).tolist() == spared
 
 
-def test_pairs_whose_points_the_prior_bends_weigh_less(hall: HallProblem) -> None:
-    """Two of three pairs of an image turn it by 12 degrees, which bends what it sees."""
+def test_pairs_that_contradict_depth_have_low_weight(hall: HallProblem) -> None:
+    """Two of three pairs of an image have a rotation error of 12 degrees."""
     problem, image = hall.problem, 5
     tilt = Rotation.from_rotvec([0.0, np.radians(12.0), 0.0]).as_matrix()
     pairs = []
@@ -126,7 +126,7 @@ def test_pairs_whose_points_the_prior_bends_weigh_less(hall: HallProblem) -> Non
     assert worst_deg(placed, hall) < 3
 
 
-def test_values_agree_with_most_differences() -> None:
+def test_average_differences_with_outlier_recovers_values() -> None:
     rng = np.random.default_rng(0)
     truth = rng.normal(size=(6, 3))
     a, b = (np.array(ends) for ends in np.tril_indices(6, -1))
@@ -136,8 +136,8 @@ def test_values_agree_with_most_differences() -> None:
     np.testing.assert_allclose(found, truth - truth.mean(axis=0), atol=1e-3)
 
 
-def test_rotations_agree_with_those_that_agree() -> None:
-    """A third of the links are wrong, and have fewer matches; the others are off by a degree."""
+def test_average_rotations_with_outliers_recovers_rotations() -> None:
+    """A third of the pairs are wrong with fewer matches; the others have an error of 1 degree."""
     rng = np.random.default_rng(0)
     count = 16
     truth = Rotation.random(count, rng).as_matrix()
@@ -152,7 +152,7 @@ def test_rotations_agree_with_those_that_agree() -> None:
     assert off.max() < 2.5
 
 
-def test_mapping_starts_from_all_images_and_ends_as_well_as_from_a_pair(hall: HallProblem) -> None:
+def test_global_initialization_is_as_accurate_as_initial_pair(hall: HallProblem) -> None:
     errors = {}
     for at_once in (True, False):
         options = MapperOptions.model_validate(
@@ -167,7 +167,7 @@ def test_mapping_starts_from_all_images_and_ends_as_well_as_from_a_pair(hall: Ha
     assert errors[True] < 1.1 * errors[False]
 
 
-def test_matches_that_no_points_explain_make_it_start_from_a_pair(hall: HallProblem) -> None:
+def test_unexplained_matches_fall_back_to_initial_pair(hall: HallProblem) -> None:
     rng = np.random.default_rng(0)
     pairs = []
     for pair in hall.problem.pairs:
