@@ -201,7 +201,7 @@ def test_a_file_of_a_later_version_is_refused_or_made_anew(name: str, golden: Pa
     if FILES[name].anew is not None:
         assert FILES[name].read(golden) == FILES[name].anew
         return
-    with pytest.raises(InputError, match=r"is of format 999, of a newer mpsfm-core") as caught:
+    with pytest.raises(InputError, match=r"is of format 999, written by a newer mpsfm-core") as caught:
         FILES[name].read(golden)
     assert Path(FILES[name].path).name in str(caught.value)
 
@@ -278,7 +278,7 @@ def test_an_exchange_touches_nothing_outside(key: str, name: object, tmp_path: P
     (tmp_path / "old.txt").write_text("the user's own")
     plan = {"entries": [], "new": [], key: [name]}
     (scratch / "ready.json").write_text(json.dumps(plan))
-    with pytest.raises(InputError, match=r"no run of ours left this .*; remove .*mpsfm-x"):
+    with pytest.raises(InputError, match=r"not written by mpsfm .*; remove .*mpsfm-x"):
         exchange_in(output)
     assert (tmp_path / "old.txt").is_file()
 
@@ -290,7 +290,7 @@ def test_an_exchange_follows_no_link(tmp_path: Path) -> None:
     (photos / "a.png").touch()
     (output / ".mpsfm-x" / "new").symlink_to(photos)
     (output / ".mpsfm-x" / "ready.json").write_text('{"entries": [], "new": ["a.png"]}')
-    with pytest.raises(InputError, match="leads elsewhere"):
+    with pytest.raises(InputError, match="symbolic link"):
         exchange_in(output)
     (output / ".mpsfm-x" / "ready.json").unlink()
     (output / ".mpsfm-y").symlink_to(photos)

@@ -1,12 +1,17 @@
-"""Types that cross a package boundary: frozen, validated containers of numpy arrays.
+"""Immutable, validated data classes that cross package boundaries.
 
 Providers take and return these types, and the mapper takes a :class:`MappingProblem`. Constructors
 check shape, dtype and range, raise :class:`~mpsfm_core.data.errors.DataError`, and store arrays as
 read-only views.
 
-Conventions: camera x right, y down, z forward; depth is z; normals are unit vectors in the camera
-frame that face the camera (``n . ray < 0``); pixels follow COLMAP (the centre of the first pixel is
-(0.5, 0.5)); uncertainty is a variance.
+Conventions:
+
+* Camera frame: x right, y down, z forward.
+* Depth is z, in meters if ``metric``.
+* Normals are unit vectors in the camera frame that face the camera (``n . ray < 0``).
+* Pixels follow COLMAP: the center of the first pixel is (0.5, 0.5).
+* Transforms are ``b_from_a``; the pose of an image is ``cam_from_world``.
+* Uncertainty is a variance unless the name contains ``std``.
 """
 
 from mpsfm_core.data.arrays import Bool, Float32, Float64, Int64, Pose, UInt8
@@ -35,10 +40,10 @@ __all__ = [
     "Features",
     "Float32",
     "Float64",
-    "MultiViewPrior",
     "Int64",
     "MappingImage",
     "MappingProblem",
+    "MultiViewPrior",
     "NormalPrior",
     "PairDepth",
     "PairMatches",

@@ -1,4 +1,4 @@
-"""Array types of the package, and the checks that data classes run on their arrays."""
+"""Array types, and checks of shape, dtype and range for data classes."""
 
 from __future__ import annotations
 
@@ -15,36 +15,52 @@ Int64 = NDArray[np.int64]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 Pose = tuple[Float64, Float64]
-"""Rotation (3, 3) and translation (3,) float64: ``y = R x + t``; of an image ``cam_from_world``."""
+"""Rotation (3, 3) and translation (3,) float64 of ``y = R x + t``; ``cam_from_world`` of an
+image."""
 
 
 def require_array(owner: object, name: str, dtype: Any, shape: tuple[int | None, ...]) -> None:
+    """Check dtype and shape of an array attribute and replace the attribute by a read-only view.
+
+    Args:
+        owner: Data class instance.
+        name: Name of the attribute.
+        dtype: Required dtype.
+        shape: Required shape; None accepts any size.
+
+    Raises:
+        DataError: The attribute is no array, or its dtype or shape is wrong.
+    """
     value = getattr(owner, name)
     if not isinstance(value, np.ndarray):
         raise DataError(name, f"must be a numpy array, got {type(value).__name__}")
     if value.dtype != np.dtype(dtype):
         raise DataError(name, f"must have dtype {np.dtype(dtype)}, got {value.dtype}")
     matches = value.ndim == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, value.shape, strict=False)
+        required is None or required == size
+        for required, size in zip(shape, value.shape, strict=False)
     )
     if not matches:
-        wanted = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
-        raise DataError(name, f"must have shape {wanted}, got {value.shape}")
+        required_shape = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
+        raise DataError(name, f"must have shape {required_shape}, got {value.shape}")
     view = value.view()
     view.flags.writeable = False
     object.__setattr__(owner, name, view)
 
 
 def require_finite(owner: object, name: str) -> None:
+    """Raise :class:`DataError` if an array attribute has NaN or infinite values."""
     if not np.isfinite(getattr(owner, name)).all():
         raise DataError(name, "must be finite")
 
 
 def require_positive_where_valid(values: Float32, valid: Bool, name: str) -> None:
+    """Raise :class:`DataError` if a valid value is not positive."""
     if ((values <= 0) & valid).any():
         raise DataError(name, "must be positive where valid")
 
 
 def require_unit_interval(values: Float32, name: str) -> None:
+    """Raise :class:`DataError` if a value is outside [0, 1]."""
     if values.size and not (values.min() >= 0 and values.max() <= 1):
         raise DataError(name, "must lie in [0, 1]")

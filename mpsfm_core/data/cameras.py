@@ -14,17 +14,20 @@ from mpsfm_core.data.errors import DataError
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """Intrinsics of an undistorted view: size in pixels, focal lengths and principal point.
-
-    ``cx, cy`` are in COLMAP pixels: the image centre of a W x H view is ``(W / 2, H / 2)``.
-    """
+    """Intrinsics of an undistorted view (COLMAP's PINHOLE model)."""
 
     width: int
+    """Columns in pixels."""
     height: int
+    """Rows in pixels."""
     fx: float
+    """Focal length along x in pixels."""
     fy: float
+    """Focal length along y in pixels."""
     cx: float
+    """Principal point in COLMAP pixels; the center of a W x H view is ``(W / 2, H / 2)``."""
     cy: float
+    """Principal point along y in COLMAP pixels."""
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -36,14 +39,14 @@ class PinholeCamera:
 
     @property
     def matrix(self) -> Float64:
-        """The 3 x 3 calibration matrix K, float64."""
+        """Calibration matrix K, (3, 3) float64."""
         return np.array(
             [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=np.float64
         )
 
     @property
     def params(self) -> Float64:
-        """``(fx, fy, cx, cy)``, float64 (4,)."""
+        """``(fx, fy, cx, cy)``, (4,) float64."""
         return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64)
 
     @property
@@ -52,24 +55,23 @@ class PinholeCamera:
         return self.width, self.height
 
     def resized(self, width: int, height: int) -> PinholeCamera:
-        """The same camera on a grid of another size (exact in the (0.5, 0.5) convention)."""
+        """Return the camera for a grid of another size; exact because pixel centers are at 0.5."""
         sx, sy = width / self.width, height / self.height
         return PinholeCamera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One undistorted image as a provider sees it.
-
-    ``name``: path of the original image below the images folder, with forward slashes.
-    ``image``: (H, W, 3) uint8, RGB. ``mask``: (H, W) bool, True where the pixel may be used
-    (False: outside of the undistorted area or masked by the user), or None for all True.
-    """
+    """Undistorted image, the input of a provider."""
 
     name: str
+    """Path of the original image below the images folder, with forward slashes."""
     image: UInt8
+    """(H, W, 3) uint8 RGB."""
     camera: PinholeCamera
+    """Intrinsics of the view."""
     mask: Bool | None = None
+    """(H, W) bool, False outside the undistorted area and where the user masked; None: all True."""
 
     def __post_init__(self) -> None:
         height, width = self.camera.height, self.camera.width
@@ -79,11 +81,20 @@ class View:
 
 
 def dot_with_rays(camera: PinholeCamera, normals: NDArray[Any]) -> Float64:
-    """Dot products (h, w) of a map of vectors (h, w, 3) that covers the camera's view, on a grid
-    of any size, with the unit rays through its pixels: negative where a normal faces the camera."""
+    """Compute dot products of normals with the unit rays through their pixels.
+
+    A negative product means that the normal faces the camera.
+
+    Args:
+        camera: Intrinsics of the view.
+        normals: (h, w, 3) normals in the camera frame, on a grid of any size over the whole view.
+
+    Returns:
+        (h, w) float64.
+    """
     height, width = normals.shape[:2]
     grid = camera.resized(width, height)
     x = (np.arange(width) + 0.5 - grid.cx) / grid.fx
     y = ((np.arange(height) + 0.5 - grid.cy) / grid.fy)[:, None]
-    along: Float64 = normals[..., 0] * x + normals[..., 1] * y + normals[..., 2]
-    return along / np.sqrt(1 + x**2 + y**2)
+    dot: Float64 = normals[..., 0] * x + normals[..., 1] * y + normals[..., 2]
+    return dot / np.sqrt(1 + x**2 + y**2)

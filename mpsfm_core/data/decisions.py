@@ -107,6 +107,34 @@ class CameraReason(ReasonCode):
     """The refined value is no plausible focal length."""
 
 
+class GpsReason(ReasonCode):
+    """Why a reconstruction is not aligned with the GPS positions of its images."""
+
+    TOO_FEW_POSITIONS = ("too-few-positions", "num_positions", "min_positions")
+    TOO_LITTLE_SPREAD = ("too-little-spread", "spread_m", "std_m")
+    INCONSISTENT = ("inconsistent",)
+    """No similarity transform fits the positions."""
+    FEW_INLIERS = ("few-inliers", "num_inliers", "num_positions")
+
+
+class DoubtReason(ReasonCode):
+    """Why a reconstruction may be wrong although its images are registered."""
+
+    UNEXPLAINED_PAIRS = ("unexplained-pairs", "num_pairs", "image_a", "image_b", "num_matches")
+    """Verified pairs whose images share hardly any point in the model."""
+    DISCONNECTED = ("disconnected", "num_parts", "num_images")
+    """Parts of the model share no points; number of images outside of the largest part."""
+    LOW_PARALLAX = ("low-parallax", "angle_deg")
+    """The rays of most points are nearly parallel, so the depth priors alone give the depth."""
+    FEW_POINTS = ("few-points", "num_images", "min_points")
+    """Images that see few points."""
+    FEW_EXPLAINED_MATCHES = ("few-explained-matches", "num_images", "min_ratio")
+    """Images whose matches the model mostly leaves unexplained."""
+    GPS_MISFIT = ("gps-misfit", "num_inliers", "num_positions")
+    UNKNOWN_FOCAL_LENGTH = ("unknown-focal-length", "num_images")
+    """Guessed focal lengths that bundle adjustment did not refine."""
+
+
 @dataclass(frozen=True)
 class Reason:
     """One reason: a code and the values of its fields."""

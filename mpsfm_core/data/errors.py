@@ -1,4 +1,17 @@
-"""The errors a user can meet. Each message says what is wrong, where, and what to do."""
+"""Exceptions of the package; each message states what is wrong, where, and the next step.
+
+MpsfmError
+  InputError                 exit code 2
+    ConfigError
+      SettingsError          (mpsfm_core.data.options)
+    ProviderError
+    WeightsError
+  DataError                  also a ValueError
+  ProviderOutputError
+  ProviderRunError
+  OutputError
+  ReconstructionError        exit code 3
+"""
 
 from __future__ import annotations
 
@@ -8,37 +21,41 @@ from typing import Any
 
 
 class MpsfmError(Exception):
-    """Base of every error raised on purpose; ``exit_code`` is what the command line returns."""
+    """Base class of all errors that the package raises on purpose."""
 
     exit_code = 1
+    """Exit code of the command line."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # as it is, whatever its constructor asks for: it may come from another process
-        return _restored, (type(self), self.args, self.__dict__)
+        # Constructors take other arguments than `args`, and errors cross process boundaries.
+        return _restore_error, (type(self), self.args, self.__dict__)
 
 
 class InputError(MpsfmError):
-    """The user's input is wrong: images, intrinsics, configuration, weights, options."""
+    """Error in the user's input: images, intrinsics, configuration, weights or options."""
 
     exit_code = 2
+    """Exit code of the command line."""
 
 
 class ConfigError(InputError):
-    """A configuration key, value or name is wrong; the message gives file and YAML path."""
+    """Wrong configuration key, value or name; the message gives file and YAML path."""
 
 
 class ProviderError(InputError):
-    """A provider cannot be found, imported or constructed."""
+    """Provider that cannot be found, imported or constructed."""
 
 
 class WeightsError(InputError):
-    """Weights are missing, cannot be fetched, or do not have the expected hash."""
+    """Weights that are missing, cannot be downloaded, or do not have the expected hash."""
 
 
 class DataError(MpsfmError, ValueError):
-    """A value breaks a rule of the boundary types in :mod:`mpsfm_core.data`.
+    """Value that violates a rule of the data classes in :mod:`mpsfm_core.data`.
 
-    ``field`` names the offending field, ``rule`` the rule in words.
+    Attributes:
+        field: Name of the field.
+        rule: The violated rule.
     """
 
     def __init__(self, field: str, rule: str) -> None:
@@ -48,9 +65,13 @@ class DataError(MpsfmError, ValueError):
 
 
 class ProviderOutputError(MpsfmError):
-    """A provider returned something that breaks the contract.
+    """Output of a provider that violates the contract.
 
-    The message names provider, image, field and rule, so that the plugin's author can act on it.
+    Attributes:
+        provider: Name of the provider.
+        image: Name of the image.
+        field: Name of the field.
+        rule: The violated rule.
     """
 
     def __init__(self, provider: str, image: str, field: str, rule: str) -> None:
@@ -62,36 +83,44 @@ class ProviderOutputError(MpsfmError):
 
 
 class ProviderRunError(MpsfmError):
-    """A provider failed on an image; the message names both, the cause is chained."""
+    """Exception of a provider on an image; the message names both, and the cause is chained."""
 
 
 class OutputError(MpsfmError):
-    """Results cannot be written: the disk is full or fails. Earlier results are unchanged."""
+    """Results that cannot be written because the disk is full or fails.
+
+    Earlier results are unchanged.
+    """
 
 
 class ReconstructionError(MpsfmError):
-    """The input is fine, but no reconstruction was possible.
+    """Failed reconstruction of valid input.
 
-    ``summary``: what ``summary.json`` says, with the reasons for each image and pair.
+    Attributes:
+        summary: Content of `summary.json`, with the reasons for each image and pair.
     """
 
     exit_code = 3
+    """Exit code of the command line."""
 
     def __init__(self, message: str, summary: Mapping[str, Any] | None = None) -> None:
         super().__init__(message)
         self.summary = dict(summary or {})
 
 
-def _restored(kind: type[MpsfmError], args: tuple[Any, ...], state: dict[str, Any]) -> MpsfmError:
+def _restore_error(
+    kind: type[MpsfmError], args: tuple[Any, ...], state: dict[str, Any]
+) -> MpsfmError:
+    """Recreate a pickled error without its constructor."""
     error = kind.__new__(kind, *args)
     error.__dict__.update(state)
     return error
 
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str:
-    """What to append to "unknown NAME": the nearest candidate, or all when none is near."""
+    """Return a suffix for "unknown NAME" messages: the closest candidate, or all candidates."""
     known = sorted(set(candidates))
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    if near:
-        return f"; did you mean {near[0]!r}?"
+    closest = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    if closest:
+        return f"; did you mean {closest[0]!r}?"
     return f"; valid are: {', '.join(known)}" if known else ""

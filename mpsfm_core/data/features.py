@@ -22,18 +22,18 @@ from mpsfm_core.data.priors import PairDepth
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Sparse local features of one view.
-
-    ``keypoints``: (n, 2) float64, COLMAP pixels of the view. ``descriptors``: (n, d) float32.
-    ``scores``: (n,) float32 detection scores, higher is better, or None. ``scales``: (n,) float32
-    keypoint scales in pixels, or None. ``std_px``: localisation noise of a keypoint in pixels.
-    """
+    """Sparse local features of one view."""
 
     keypoints: Float64
+    """(n, 2) float64, COLMAP pixels of the view."""
     descriptors: Float32
+    """(n, d) float32."""
     scores: Float32 | None = None
+    """(n,) float32 detection scores, higher is better; None if unknown."""
     scales: Float32 | None = None
+    """(n,) float32 keypoint scales in pixels; None if unknown."""
     std_px: float = 1.0
+    """Std of the localization noise of a keypoint in pixels."""
 
     def __post_init__(self) -> None:
         require_array(self, "keypoints", np.float64, (None, 2))
@@ -54,14 +54,12 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class SparseMatches:
-    """Matches between the features of two views.
-
-    ``indices``: (m, 2) int64, rows of the two feature sets, each used at most once.
-    ``scores``: (m,) float32 in [0, 1], confidence of each match; mapping weighs matches by it.
-    """
+    """Matches between the features of two views."""
 
     indices: Int64
+    """(m, 2) int64 rows of the two feature sets; each feature occurs at most once."""
     scores: Float32
+    """(m,) float32 confidence in [0, 1]; the mapper weights matches by the score."""
 
     def __post_init__(self) -> None:
         require_array(self, "indices", np.int64, (None, 2))
@@ -75,13 +73,23 @@ class SparseMatches:
 
     @classmethod
     def from_arrays(cls, indices: NDArray[Any], scores: NDArray[Any]) -> SparseMatches:
-        """Build from raw arrays of any number type; scores are clipped to [0, 1]."""
-        certain = np.clip(scores, 0, 1).astype(np.float32)
-        return cls(indices.astype(np.int64), certain)
+        """Build matches from raw arrays.
+
+        Args:
+            indices: (m, 2) rows of the two feature sets, any number type.
+            scores: (m,) scores, clipped to [0, 1].
+        """
+        clipped = np.clip(scores, 0, 1).astype(np.float32)
+        return cls(indices.astype(np.int64), clipped)
 
     @classmethod
     def from_best_scores(cls, indices: NDArray[Any], scores: NDArray[Any]) -> SparseMatches:
-        """As :meth:`from_arrays`; of several matches of one feature the most certain stays."""
+        """Build one-to-one matches from raw arrays; the match with the best score wins.
+
+        Args:
+            indices: (m, 2) rows of the two feature sets; features may repeat.
+            scores: (m,) scores, clipped to [0, 1].
+        """
         order = np.argsort(-scores, kind="stable")
         for column in (0, 1):
             order = order[np.sort(np.unique(indices[order, column], return_index=True)[1])]
@@ -93,16 +101,16 @@ class SparseMatches:
 
 @dataclass(frozen=True, eq=False)
 class DenseMatches:
-    """Matches between free positions of two views (no detector involved).
-
-    ``points_a``, ``points_b``: (m, 2) float64, COLMAP pixels of the two views. ``scores``: (m,)
-    float32 in [0, 1]. ``std_px``: localisation noise of a match in pixels.
-    """
+    """Matches between positions of two views, without keypoints."""
 
     points_a: Float64
+    """(m, 2) float64, COLMAP pixels of the first view."""
     points_b: Float64
+    """(m, 2) float64, COLMAP pixels of the second view."""
     scores: Float32
+    """(m,) float32 confidence in [0, 1]."""
     std_px: float = 1.0
+    """Std of the localization noise of a match in pixels."""
 
     def __post_init__(self) -> None:
         require_array(self, "points_a", np.float64, (None, 2))
@@ -118,11 +126,14 @@ class DenseMatches:
 
 @dataclass(frozen=True, eq=False)
 class PairMatches:
-    """What a matcher returns for two views: sparse or dense matches or both, maybe depth."""
+    """Output of a matcher for two views: sparse or dense matches, or both."""
 
     sparse: SparseMatches | None = None
+    """Matches between features."""
     dense: DenseMatches | None = None
+    """Matches between positions."""
     depth: PairDepth | None = None
+    """Depth of both views, if the matcher predicts depth."""
 
     def __post_init__(self) -> None:
         if self.sparse is None and self.dense is None:

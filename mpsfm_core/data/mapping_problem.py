@@ -1,4 +1,4 @@
-"""The input of the mapper, and the scene state that viewers see."""
+"""Input of the mapper, and the scene state for viewers."""
 
 from __future__ import annotations
 
@@ -22,31 +22,34 @@ from mpsfm_core.data.priors import DepthPrior, NormalPrior
 
 @dataclass(frozen=True, eq=False)
 class MappingImage:
-    """One image as the mapper sees it.
-
-    ``keypoints``: (n, 2) float64, COLMAP pixels of the undistorted camera; dense matches add
-    theirs behind the sparse ones. ``depth`` has a variance; ``depth`` and ``normals`` share one
-    grid. ``keypoint_std_px``: localisation noise of keypoints as they were found, by which wrong
-    matches are told from right ones. ``keypoint_std_factor``: (n,) float64, > 0, what adjustment
-    left of it in each keypoint, None for all of it. ``focal_known``: False when the focal length is
-    a guess that bundle adjustment may refine; images of equal camera then share it.
-    ``known_pose``: ``cam_from_world``, when the user brought one. ``depth_group``: images of equal
-    number have depth in one unit, so that they share one scale; None for a scale of its own.
-    ``proposed_pose``: ``cam_from_group`` for a frame that the images of the group share, lengths in
-    the unit of their depth.
-    """
+    """Image with keypoints and priors, the input of the mapper."""
 
     name: str
+    """Path of the image below the images folder, with forward slashes."""
     camera: PinholeCamera
+    """Intrinsics of the undistorted view."""
     keypoints: Float64
+    """(n, 2) float64, COLMAP pixels of the undistorted view; sparse keypoints, then dense ones."""
     depth: DepthPrior
+    """Depth prior with variance, on the grid of the normals."""
     normals: NormalPrior
+    """Normal prior with variance, on the grid of the depth."""
     keypoint_std_px: float = 1.0
+    """Std of the detector's localization noise in pixels; scales the inlier thresholds."""
     keypoint_std_factor: Float64 | None = None
+    """(n,) float64 > 0, std of each keypoint after adjustment relative to ``keypoint_std_px``.
+
+    None: 1 for all."""
     focal_known: bool = True
+    """False if the focal length is a guess for bundle adjustment to refine.
+
+    Images with equal intrinsics then share the focal length."""
     known_pose: Pose | None = None
+    """``cam_from_world`` of the user."""
     depth_group: int | None = None
+    """Images of equal group have depth in one unit and share its scale; None: a scale per image."""
     proposed_pose: Pose | None = None
+    """``cam_from_group`` of a multi-view network, lengths in the unit of the group's depth."""
 
     def __post_init__(self) -> None:
         require_array(self, "keypoints", np.float64, (None, 2))
@@ -64,45 +67,48 @@ class MappingImage:
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image that has a place, as viewers see it.
-
-    ``rotation`` (3, 3), ``translation`` (3,) float64: ``cam_from_world``. ``depth``: in world
-    units on a grid of any size that covers the view, None where there is none.
-    """
+    """Registered image, for viewers."""
 
     name: str
+    """Path of the image below the images folder, with forward slashes."""
     camera: PinholeCamera
+    """Intrinsics of the undistorted view."""
     rotation: Float64
+    """(3, 3) float64 rotation of ``cam_from_world``."""
     translation: Float64
+    """(3,) float64 translation of ``cam_from_world``, world units."""
     depth: DepthPrior | None = None
+    """Depth map in world units on a grid of any size over the whole view; None without depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneState:
-    """What is reconstructed so far. ``points``: (p, 3) float64, world units."""
+    """Intermediate reconstruction, for viewers."""
 
     images: tuple[PosedImage, ...]
+    """Registered images."""
     points: Float64
+    """(p, 3) float64 3D points, world frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class VerifiedPair:
-    """Geometrically verified matches of two images.
-
-    ``image_a < image_b``: positions in :attr:`MappingProblem.images`. ``matches``: (m, 2) int64
-    keypoint rows, all inliers. ``scores``: (m,) float32 in [0, 1]. ``rotation`` (3, 3) and
-    ``translation`` (3,) float64: ``cam_b_from_cam_a`` up to the translation's length, from the
-    essential matrix or homography. ``calibrated``: the pair's configuration has parallax and
-    known intrinsics (COLMAP's CALIBRATED), else planar, panoramic or uncalibrated.
-    """
+    """Geometrically verified matches of two images."""
 
     image_a: int
+    """Index in :attr:`MappingProblem.images`, below ``image_b``."""
     image_b: int
+    """Index in :attr:`MappingProblem.images`."""
     matches: Int64
+    """(m, 2) int64 keypoint rows, inliers only."""
     scores: Float32
+    """(m,) float32 confidence in [0, 1]."""
     rotation: Float64
+    """(3, 3) float64 rotation of ``cam_b_from_cam_a``, from the essential matrix or homography."""
     translation: Float64
+    """(3,) float64 translation of ``cam_b_from_cam_a``, up to scale."""
     calibrated: bool = True
+    """True for COLMAP's CALIBRATED configuration; False if planar, panoramic or uncalibrated."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.image_a < self.image_b:
@@ -119,10 +125,12 @@ class VerifiedPair:
 
 @dataclass(frozen=True, eq=False)
 class MappingProblem:
-    """Everything the mapper needs: images with priors, and verified pairs between them."""
+    """Complete input of the mapper."""
 
     images: tuple[MappingImage, ...]
+    """Images with keypoints and priors."""
     pairs: tuple[VerifiedPair, ...] = field(default=())
+    """Verified pairs of images."""
 
     def __post_init__(self) -> None:
         for pair in self.pairs:
@@ -134,21 +142,21 @@ class MappingProblem:
                     raise DataError("pairs", f"matches exceed the keypoints of image {image}")
 
     def num_keypoints(self, image: int) -> int:
-        """Number of keypoints of an image."""
+        """Return the number of keypoints of an image."""
         return len(self.images[image].keypoints)
 
     def subset(self, names: list[str]) -> MappingProblem:
-        """The problem restricted to the named images, in the order they have here."""
-        keep = [i for i, image in enumerate(self.images) if image.name in set(names)]
-        position = {old: new for new, old in enumerate(keep)}
+        """Return the problem restricted to the named images, in unchanged order."""
+        indices = [i for i, image in enumerate(self.images) if image.name in set(names)]
+        position = {old: new for new, old in enumerate(indices)}
         pairs = tuple(
             replace(pair, image_a=position[pair.image_a], image_b=position[pair.image_b])
             for pair in self.pairs
             if pair.image_a in position and pair.image_b in position
         )
-        return MappingProblem(tuple(self.images[i] for i in keep), pairs)
+        return MappingProblem(tuple(self.images[i] for i in indices), pairs)
 
     def with_poses(self, poses: Mapping[str, Pose]) -> MappingProblem:
-        """The problem with these poses, by name, as known; other images have none."""
+        """Return the problem with known poses by image name; the other images have none."""
         images = (replace(image, known_pose=poses.get(image.name)) for image in self.images)
         return replace(self, images=tuple(images))

@@ -16,7 +16,7 @@ from mpsfm_core.data.errors import ConfigError, did_you_mean
 
 
 class Options(BaseModel):
-    """Immutable settings; unknown keys are errors; each field has a default and its source."""
+    """Base class of immutable options; unknown keys are errors."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", protected_namespaces=(), ser_json_inf_nan="constants"
@@ -34,23 +34,30 @@ def expert(default: Any, **constraints: Any) -> Any:
 
 
 SettingPath = tuple[str | int, ...]
+"""Path of a setting in a configuration: keys and list indices."""
 
 
 @dataclass(frozen=True)
 class SettingProblem:
-    """One wrong setting: its path (``("depth", "options", "scale")``) and what is wrong."""
+    """Wrong setting."""
 
     path: SettingPath
+    """Path, such as ``("depth", "options", "scale")``."""
     text: str
+    """What is wrong."""
     missing: bool = False
-    """Whether a required setting is absent."""
+    """True if a required setting is absent."""
 
     def __str__(self) -> str:
         return f"{dotted(self.path)}: {self.text}" if self.path else self.text
 
 
 class SettingsError(ConfigError):
-    """Settings that their options class refuses."""
+    """Settings that their options class rejects.
+
+    Attributes:
+        problems: All wrong settings.
+    """
 
     def __init__(self, problems: tuple[SettingProblem, ...]) -> None:
         super().__init__("; ".join(map(str, problems)))
@@ -63,14 +70,20 @@ AnyModel = TypeVar("AnyModel", bound=BaseModel)
 def parse_settings(
     model: type[AnyModel], values: Mapping[str, Any], path: SettingPath = ()
 ) -> AnyModel:
-    """Validate ``values`` as ``model``.
+    """Validate settings with an options class.
 
-    Raises :class:`SettingsError`, whose message gives for each problem the path (below ``path``),
-    what is wrong and, for an unknown key, the nearest valid one.
+    Args:
+        model: Options class.
+        values: Settings by key.
+        path: Path of the settings in the configuration, for messages.
+
+    Raises:
+        SettingsError: Some settings are wrong. The message gives path and problem of each, and the
+            closest valid key for an unknown key.
     """
     try:
         return model.model_validate(dict(values))
-    except SettingsError as error:  # of a model that is checked in another environment
+    except SettingsError as error:  # from a provider of another environment
         raise SettingsError(
             tuple(replace(problem, path=(*path, *problem.path)) for problem in error.problems)
         ) from error
@@ -85,16 +98,17 @@ def parse_settings(
 
 
 def dotted(path: SettingPath) -> str:
-    """``("masks", 0, "use")`` as a user writes it: ``masks.0.use``."""
+    """Format a setting path as a user writes the path, such as ``masks.0.use``."""
     return ".".join(map(str, path))
 
 
 def _keys(details: ErrorDetails) -> SettingPath:
-    """The location without the union tags pydantic adds, e.g. ``dict[str,any]``."""
+    """Return the location of an error without pydantic's union tags such as ``dict[str,any]``."""
     return tuple(part for part in details["loc"] if isinstance(part, int) or "[" not in part)
 
 
 def _explain(model: type[BaseModel], details: ErrorDetails) -> str:
+    """Describe a pydantic error for users."""
     if details["type"] == "missing":
         return "is required"
     if details["type"] == "extra_forbidden":
@@ -106,7 +120,7 @@ def _explain(model: type[BaseModel], details: ErrorDetails) -> str:
 
 
 def _fields_at(model: type[BaseModel], path: SettingPath) -> list[str]:
-    """Keys that are valid at ``path`` below ``model``."""
+    """Return the valid keys at a path below a model."""
     current = [model]
     for part in path:
         if isinstance(part, int):
@@ -117,6 +131,7 @@ def _fields_at(model: type[BaseModel], path: SettingPath) -> list[str]:
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the models in a type annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for argument in get_args(annotation):

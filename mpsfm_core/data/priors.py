@@ -20,23 +20,26 @@ from mpsfm_core.data.cameras import PinholeCamera, dot_with_rays
 from mpsfm_core.data.errors import DataError
 
 UNIT_NORMAL_TOLERANCE = 1e-3
-"""Allowed deviation of a normal's length from 1 (float16 storage keeps about 5e-4)."""
+"""Maximum deviation of a normal's length from 1; rounding to float16 is about 5e-4."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthPrior:
-    """A depth map with its uncertainty on a grid of any size that covers the whole view.
+    """Depth map with variance, on a grid of any size over the whole view.
 
-    ``depth``: (h, w) float32, z along the optical axis, > 0 where valid; metres if ``metric``,
-    else in an unknown unit. ``variance``: (h, w) float32 in depth units squared, > 0 where valid,
-    or None when the network gives none (a calibration then declares it). ``valid``: (h, w) bool.
     Values at invalid pixels are finite and meaningless.
     """
 
     depth: Float32
+    """(h, w) float32 z-depth, > 0 where valid; meters if ``metric``, else an unknown unit."""
     variance: Float32 | None
+    """(h, w) float32 variance in depth units squared, > 0 where valid.
+
+    None if the network predicts no variance; a calibration then declares the variance."""
     valid: Bool
+    """(h, w) bool, True where depth is valid."""
     metric: bool = True
+    """True if the unit is meters."""
 
     def __post_init__(self) -> None:
         require_array(self, "depth", np.float32, (None, None))
@@ -58,7 +61,14 @@ class DepthPrior:
         *,
         metric: bool = True,
     ) -> DepthPrior:
-        """Build from raw arrays: pixels that are not finite and positive become invalid (0)."""
+        """Build a prior from raw arrays; pixels that are not finite and positive become invalid.
+
+        Args:
+            depth: (h, w) depth, any number type.
+            variance: (h, w) variance in depth units squared, or None.
+            valid: (h, w) mask, or None for all True.
+            metric: True if the unit is meters.
+        """
         depth = np.asarray(depth, dtype=np.float32)
         usable = np.isfinite(depth) & (depth > 0)
         if valid is not None:
@@ -71,24 +81,27 @@ class DepthPrior:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """``(rows, columns)`` of the map's grid."""
+        """(rows, columns) of the map."""
         return self.depth.shape[0], self.depth.shape[1]
 
 
 @dataclass(frozen=True, eq=False)
 class NormalPrior:
-    """A surface normal map with its uncertainty on a grid of any size that covers the view.
+    """Surface normal map with variance, on a grid of any size over the whole view.
 
-    ``normals``: (h, w, 3) float32, unit, camera frame, where valid. They face the camera: their
-    dot product with the ray through the pixel is negative (off the axis ``n_z`` may be positive,
-    as on a floor at the lower border). The constructor knows no camera, so the validator checks
-    that. ``variance``: (h, w) float32, rad^2, the angular variance along each of the two tangent
-    directions, > 0 where valid, or None when the network gives none. ``valid``: (h, w) bool.
+    Normals face the camera: the dot product with the ray through the pixel is negative. Off the
+    optical axis ``n_z`` may be positive, for example on a floor. The constructor has no camera, so
+    :mod:`mpsfm_core.providers.validation` checks the facing.
     """
 
     normals: Float32
+    """(h, w, 3) float32, unit length where valid, camera frame."""
     variance: Float32 | None
+    """(h, w) float32 angular variance in rad^2 along each tangent direction, > 0 where valid.
+
+    None if the network predicts no variance."""
     valid: Bool
+    """(h, w) bool, True where the normal is valid."""
 
     def __post_init__(self) -> None:
         require_array(self, "normals", np.float32, (None, None, 3))
@@ -112,8 +125,17 @@ class NormalPrior:
         *,
         camera: PinholeCamera | None = None,
     ) -> NormalPrior:
-        """Build from raw arrays: normalises lengths; pixels that are not finite or have no length
-        become invalid (0), and with the view's ``camera`` those that do not face it."""
+        """Build a prior from raw arrays and normalize lengths.
+
+        Pixels that are not finite or have no length become invalid, and with a camera also normals
+        that do not face the camera.
+
+        Args:
+            normals: (h, w, 3) normals in the camera frame, any number type and length.
+            variance: (h, w) angular variance in rad^2, or None.
+            valid: (h, w) mask, or None for all True.
+            camera: Intrinsics of the view, to check the facing.
+        """
         raw = np.asarray(normals, dtype=np.float32)
         finite = np.where(np.isfinite(raw).all(axis=-1, keepdims=True), raw, np.float32(0))
         length = np.linalg.norm(finite, axis=-1)
@@ -131,32 +153,33 @@ class NormalPrior:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """``(rows, columns)`` of the map's grid."""
+        """(rows, columns) of the map."""
         return self.normals.shape[0], self.normals.shape[1]
 
 
 @dataclass(frozen=True, eq=False)
 class PairDepth:
-    """Depth of both views of a pair as a two-view network sees it (MASt3R-style)."""
+    """Depth of both views of a pair from a two-view network such as MASt3R."""
 
     depth_a: DepthPrior
+    """Depth of the first view."""
     depth_b: DepthPrior
+    """Depth of the second view."""
 
 
 @dataclass(frozen=True, eq=False)
 class MultiViewPrior:
-    """What a multi-view network sees in a group of n views: all of it in one frame and one unit.
+    """Output of a multi-view network for a group of n views, in one frame and one unit.
 
-    ``depth``: one prior a view, in the order of the views. They share one unit: metres if
-    ``metric``, else an unknown one. ``poses``: (n, 3, 4) float64, ``cam_from_group`` of each view
-    for a frame of the group's own, lengths in the unit of depth; or None. ``intrinsics``: (n, 4)
-    float64, fx, fy, cx, cy in COLMAP pixels of each view, or None. Both are proposals, which
-    matches judge.
+    Poses and intrinsics are proposals; verified matches decide about their use.
     """
 
     depth: tuple[DepthPrior, ...]
+    """n depth priors in the order of the views, in one unit; meters if ``metric``."""
     poses: Float64 | None = None
+    """(n, 3, 4) float64 ``cam_from_group``, lengths in the unit of depth; None if not predicted."""
     intrinsics: Float64 | None = None
+    """(n, 4) float64 fx, fy, cx, cy in COLMAP pixels of each view; None if not predicted."""
 
     def __post_init__(self) -> None:
         count = len(self.depth)

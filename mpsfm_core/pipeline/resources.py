@@ -1,9 +1,9 @@
-"""Memory and disk that a run takes: predicted before the first photo is decoded, measured after.
+"""Memory and disk of a run: estimated before decoding, measured afterwards.
 
-The prediction is for photos that all end in one group, which takes most memory; in several, each
-has a cloud of its own, which takes more disk. Its terms are what the code keeps a pixel, where that
-can be said, else read off the peaks of resident memory of each stage (``summary.json``): of runs
-with 5, 24 and 60 rendered photos, CPython 3.11 on Linux. docs/robustness.md has the errors.
+The memory of a run is a fixed part, the caches, and the largest of its three memory-hungry stages:
+extraction, dense depth and results. Constants are bytes per pixel of arrays that the code keeps,
+or were read from the peak resident memory of a stage (CPython 3.11 on Linux,
+[tuned: benchmarks.resources]). The estimate assumes one component, which needs most memory.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import shutil
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from glob import escape
@@ -23,88 +23,84 @@ from mpsfm_core.config import Config
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.dense_view import dense_grid_size
 from mpsfm_core.extraction.active_provider import worker_count
-from mpsfm_core.extraction.features import CACHED_BYTES as CACHED_FEATURES
-from mpsfm_core.extraction.matching.keypoint_adjustment import CACHED_BYTES as CACHED_GREY
+from mpsfm_core.extraction.features import CACHED_BYTES as CACHED_FEATURE_BYTES
+from mpsfm_core.extraction.matching.keypoint_adjustment import CACHED_BYTES as CACHED_GRAY_BYTES
 from mpsfm_core.extraction.priors.prior_maps import integration_grid
-from mpsfm_core.inputs.images import CACHED_BYTES as CACHED_VIEWS
+from mpsfm_core.inputs.images import CACHED_BYTES as CACHED_VIEW_BYTES
 from mpsfm_core.providers import ProviderSpec, WeightsFile
+from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.weights import WeightStore
-from mpsfm_core.support.disk_arrays import IN_MEMORY
+from mpsfm_core.support.control_groups import ControlGroups
+from mpsfm_core.support.disk_arrays import MEMORY_LIMIT
+from mpsfm_core.support.threads import count_cores
 
 TOLERANCE = 1.3
-"""The prediction is to be off by less than this factor."""
+"""Largest factor between an estimate and the measured value."""
 
 _MB = float(1 << 20)
-_PROGRAM_MB = 265.0
-"""Interpreter and libraries (232), what the first photos bring with them (25), the report (8)."""
+_PROGRAM_MB = 320.0
+"""Interpreter, libraries and compiled kernels."""
 _TORCH_MB = 250.0
-"""More where a provider's library is torch, once (estimated)."""
-_COMPILED_MB = 54.0
-"""Compiled kernels of mapping and what loads them."""
-_WORKER_BYTES = 350.0
-"""A pixel of the photo that a worker has in hand: SIFT's pyramid of the doubled image."""
-_WEIGHTS = 2.0
-"""Times the size of its file a network is in memory, in each worker: in ONNX Runtime 1.7 (MoGe-2
-ViT-S, 98 MB) and 1.8 (DSINE, 339 MB). While it is loaded it may be more, 4.3 for DSINE."""
-_WORKING, _MOST_WORKING_MB = 3.0, 320.0
-"""Times that size what it computes with, and how much at most: 317 MB for MoGe-2 with 1800 tokens
-and for DSINE at 1024 x 683, which is 3.2 and 0.9 times their size."""
+"""Additional memory if a provider needs torch."""
+_VIEW_BYTES = 3.0
+"""A pixel of a cached view: RGB."""
+_GRAY_BYTES = 4.0
+"""A pixel of a cached gray image of keypoint adjustment: float32."""
+_DECODE_BYTES = 9.0
+"""A pixel of a view while it is decoded: file, RGB and undistorted copies."""
+_DETECTOR_BYTES = 280.0
+"""A pixel that a detector sees: SIFT's Gaussian and gradient pyramids of the doubled image."""
+_NETWORK_RATIO = 2.0
+"""Memory of a loaded network over the size of its weights file."""
+_ACTIVATION_RATIO, _MAX_ACTIVATION_MB = 3.0, 320.0
+"""Activations of a network over the size of its weights file, and their limit."""
 _PRIOR_BYTES = 106.0
-"""A pixel of the prior maps: depth and normals with variances (26), and what mapping adds (80)."""
-_DENSE_BYTES = 12.0
-"""A pixel of the dense stage: the final map (9), and what was found (11) as far as it does not fit
-into what earlier stages left free."""
-_DENSE_KEPT_BYTES = 20.0
-"""Both, all of it, for what is on disk where it is too much."""
+"""A pixel of the prior maps: depth and normals with variances, and what the mapper adds."""
 _DENSE_WORKER_BYTES = 320.0
-"""A pixel of the photo that a worker matches: 11 labels, each of a byte from 5 views and of 6
-arrays of 4 bytes. On the coarse grid it may be 700, in what earlier stages left free."""
-_RESULT_BYTES = 4.6
-"""A pixel of the final depth maps: whether it is certain (1); number and votes of those that become
-points (9 for 0.4)."""
+"""A pixel of a view in stereo matching: the cost volume of 11 labels and its aggregation."""
+_DENSE_MAP_BYTES = 20.0
+"""A pixel of a dense depth map with its variance and support."""
+_FUSION_BYTES = 4.6
+"""A pixel of a depth map while maps are fused into a point cloud."""
 _POINT_BYTES = 120.0
-"""A point of the cloud (44), once more in parts (44), and as it is written (32)."""
-_POINTS = 0.4
-"""Of the pixels become points (0.27 to 0.46 were seen), as long as they may."""
+"""A point of the cloud: once in arrays, once in parts, once as written."""
+_POINT_RATIO = 0.4
+"""Pixels of the depth maps that become points of the cloud."""
 
 _KEYPOINT_BYTES = 544.0
-"""A keypoint with 128 values of 4 bytes, position and scale, in memory and in the cache."""
-_KEYPOINT_PIXELS = 60.0
-"""Pixels of a photo for each keypoint, at least: SIFT found one in 62 to 325 on photos of four
-scenes, 320 to 1280 wide."""
-_CACHE_MAP_MB = 0.27
-"""Depth and normals of a photo by `compact`; larger networks leave more."""
-_CACHE_PAIR_BYTES = 6_000.0
-"""Matches and two-view geometry of a pair."""
-_DENSE_CACHE_BYTES = 12.0
-"""A pixel that the dense stage found, until the run ends."""
+"""A keypoint with position, scale and 128 float32 values."""
+_PIXELS_PER_KEYPOINT = 60.0
+"""Pixels of an image per SIFT keypoint, at least."""
+_DEFAULT_MAX_KEYPOINTS = 4096
+"""Keypoints of an image if the options of the features set no limit."""
+_CACHED_PRIOR_MB = 0.27
+"""Cached depth and normals of an image."""
+_CACHED_PAIR_BYTES = 6_000.0
+"""Cached matches and two-view geometry of a pair."""
+_CACHED_DENSE_BYTES = 12.0
+"""A pixel of a dense checkpoint."""
 _WRITTEN_POINT_BYTES = 32.0
-_WRITTEN_BYTES = 7.3
-"""A pixel of the final depth maps, compressed."""
-_VIEW_BYTES = 8.0
-"""A pixel of a prior that the report is made from, compressed: 8.6 to 9.5 of photos, 2 to 4 of
-scenes without noise."""
-_PAGE_MB, _PAGE_PHOTO_MB = 2.0, 0.22
-"""The report and what it shows, once and for each photo; the model is little beside it."""
-_USUAL_KEYPOINTS = 4096
-"""Of a photo, where the options of the features do not say it."""
-_EVERY_S = 1.0
-_GROUPS = Path("/sys/fs/cgroup")
+_WRITTEN_MAP_BYTES = 7.3
+"""A pixel of a written depth map, compressed."""
+_REPORT_MAP_BYTES = 8.0
+"""A pixel of a prior that the report shows, compressed."""
+_REPORT_MB, _REPORT_IMAGE_MB = 2.0, 0.22
+"""The report page, and its pictures of one image."""
+_SAMPLING_PERIOD_S = 1.0
 
 
 @dataclass(frozen=True)
 class ResourceEstimate:
-    """Megabytes: peak of memory of the process and those it starts, cache and output folder."""
+    """Peak memory of a run with its child processes, and disk space of its cache and results."""
 
     memory_mb: float
     cache_mb: float
     output_mb: float
 
     def __str__(self) -> str:
-        """For people."""
         return (
             f"{self.memory_mb:.0f} MB of memory, {self.cache_mb:.0f} MB of cache and "
-            f"{self.output_mb:.0f} MB of results, if all photos end in one group"
+            f"{self.output_mb:.0f} MB of results, if all photos end in one model"
         )
 
 
@@ -113,107 +109,110 @@ def estimate_resources(
     config: Config,
     providers: Sequence[ProviderSpec],
     networks: Sequence[int],
+    workers: int | None = None,
 ) -> ResourceEstimate:
-    """What a run will take.
+    """Estimate memory and disk of a run.
 
-    ``sizes``: (width, height) of the undistorted views. ``providers``: those that were chosen;
-    ``networks``: bytes of each network's file, see :func:`network_bytes`.
+    Args:
+        sizes: (width, height) of the undistorted views.
+        config: The configuration, with resolved providers.
+        providers: Specifications of the chosen providers.
+        networks: Size in bytes of the weights of each network, see :func:`measure_weights`.
+        workers: Number of worker threads; default: those of ``config.runtime``.
     """
-    count, workers = len(sizes), worker_count(config.runtime)
-    pixels = [width * height for width, height in sizes]
-    grids = [integration_grid(size, config.extraction.integration_size) for size in sizes]
-    final = prior = sum(width * height for width, height in grids)
-    torch = any("torch" in spec.requires for spec in providers)
-    most = _keypoints(config)
-    features = _KEYPOINT_BYTES * sum(min(most, size / _KEYPOINT_PIXELS) for size in pixels)
-    memory = (_PROGRAM_MB + _COMPILED_MB + torch * _TORCH_MB) * _MB
-    memory += min(CACHED_VIEWS, 3 * sum(pixels)) + min(CACHED_FEATURES, features)
-    if config.adjustment.enabled:
-        memory += min(CACHED_GREY, 4 * sum(pixels))
-    memory += _PRIOR_BYTES * prior + workers * _WORKER_BYTES * max(pixels)
-    for size in networks:
-        memory += workers * (_WEIGHTS * size + min(_WORKING * size, _MOST_WORKING_MB * _MB))
-    cache = features + _CACHE_MAP_MB * _MB * count + _CACHE_PAIR_BYTES * _pairs(count, config)
-    if config.dense.enabled:
-        dense = [math.prod(dense_grid_size(size, config.dense.max_size)) for size in sizes]
-        final = sum(dense)
-        memory += min(_DENSE_BYTES * final, IN_MEMORY)
-        memory += workers * _DENSE_WORKER_BYTES * max(dense)
-        cache += _DENSE_CACHE_BYTES * final + max(0.0, _DENSE_KEPT_BYTES * final - IN_MEMORY)
-    results = config.results
-    points = results.dense_cloud * min(results.dense_max_points, _POINTS * final)
-    memory += _RESULT_BYTES * final + _POINT_BYTES * points
-    output = _WRITTEN_POINT_BYTES * points + results.depth_maps * _WRITTEN_BYTES * final
-    output += results.report * ((_PAGE_MB + _PAGE_PHOTO_MB * count) * _MB + _VIEW_BYTES * prior)
+    memory = _PROGRAM_MB * _MB + _TORCH_MB * _MB * any("torch" in p.requires for p in providers)
+    memory += _cached_bytes(sizes, config)
+    stages = (
+        _extraction_bytes(sizes, config, networks, workers or worker_count(config.runtime)),
+        _dense_bytes(sizes, config, workers or config.runtime.workers or count_cores()),
+        _result_bytes(sizes, config),
+    )
+    memory += max(stages)
+    cache, output = _cache_folder_bytes(sizes, config), _output_bytes(sizes, config)
     return ResourceEstimate(round(memory / _MB), round(cache / _MB), round(output / _MB))
 
 
-def network_bytes(file: WeightsFile, store: WeightStore) -> int:
-    """Of a network's file, with what lies beside it where it is in parts; as its publisher says
-    where it is not on this machine, 0 where nobody says it."""
+def reduce_workers(
+    estimate: Callable[[int], ResourceEstimate], workers: int, free_mb: float
+) -> int:
+    """Return the largest number of workers whose estimate fits into free memory, at least one.
+
+    Args:
+        estimate: Estimates the run for a number of workers.
+        workers: Largest number of workers.
+        free_mb: Free memory.
+    """
+    counts = range(workers, 1, -1)
+    return next((count for count in counts if estimate(count).memory_mb <= free_mb), 1)
+
+
+def measure_weights(file: WeightsFile, store: WeightStore) -> int:
+    """Return the size of a network's weights in bytes, including files of external data.
+
+    A file that is not on this machine has the size that its publisher declares, or 0.
+    """
     path = store.locate(file.uri)
     if path is None:
         return file.size or 0
     return sum(part.stat().st_size for part in path.parent.glob(f"{escape(path.name)}*"))
 
 
-def shortages(needs: ResourceEstimate, cache: Path, output: Path | None) -> list[str]:
-    """What is short, in words; empty where the run fits.
+def find_shortages(estimate: ResourceEstimate, cache: Path, output: Path | None) -> list[str]:
+    """Compare an estimate with this machine; return one warning per resource that is short.
 
     Raises:
-        InputError: it cannot fit: more than all the memory that this machine or container has, or
-            results larger than the disk has room for, by more than the prediction may be off.
+        InputError: the run cannot fit: the estimate exceeds all memory of the machine or container,
+            or the free disk space of the results, by more than :data:`TOLERANCE`.
     """
-    limit, free = memory_mb()
-    found = []
-    much = f"this run takes about {needs.memory_mb:.0f} MB of memory"
-    less = "set inputs.max_image_size or dense.max_size lower, use fewer photos"
-    if needs.memory_mb > TOLERANCE * limit:
+    total_mb, free_mb = measure_memory()
+    warnings = []
+    need = f"this run takes about {estimate.memory_mb:.0f} MB of memory"
+    remedy = "set inputs.max_image_size or dense.max_size lower, use fewer photos"
+    if estimate.memory_mb > TOLERANCE * total_mb:
         raise InputError(
-            f"{much} and {limit:.0f} MB are there: {less}, or set runtime.check_resources=false"
+            f"{need} and {total_mb:.0f} MB are there: {remedy}, "
+            f"or set runtime.check_resources=false"
         )
-    if needs.memory_mb > free:
-        found.append(f"{much} and {free:.0f} MB are free: it may fail; {less}")
-    places = {"the cache": (cache, needs.cache_mb)}
+    if estimate.memory_mb > free_mb:
+        warnings.append(f"{need} and {free_mb:.0f} MB are free: it may fail; {remedy}")
+    folders = {"the cache": (cache, estimate.cache_mb)}
     if output is not None:
-        places["the results"] = (output, needs.output_mb)
-    for what, (folder, size) in places.items():
-        room = _room_mb(folder)
-        text = f"{what} in {folder} take about {size:.0f} MB and {room:.0f} MB are free"
-        if what == "the results" and size > TOLERANCE * room:
-            raise InputError(f"{text}: make room, or set runtime.check_resources=false")
-        if sum(mb for other, mb in places.values() if _same_disk(other, folder)) > room:
-            found.append(f"{text}: it may fail where other files go there too")
-    return found
+        folders["the results"] = (output, estimate.output_mb)
+    for name, (folder, size_mb) in folders.items():
+        free_mb = _free_disk_mb(folder)
+        text = f"{name} in {folder} take about {size_mb:.0f} MB and {free_mb:.0f} MB are free"
+        if name == "the results" and size_mb > TOLERANCE * free_mb:
+            raise InputError(f"{text}: free disk space, or set runtime.check_resources=false")
+        on_same_disk = (mb for path, mb in folders.values() if _same_disk(path, folder))
+        if sum(on_same_disk) > free_mb:
+            warnings.append(f"{text}: it may fail")
+    return warnings
 
 
-def memory_mb() -> tuple[float, float]:
-    """All memory that this process may use, and what is free of it: of the machine, and of the
-    control groups (containers, job schedulers) that it is in."""
+def measure_memory(groups: ControlGroups | None = None) -> tuple[float, float]:
+    """Return total and free memory in MB that this process may use.
+
+    Args:
+        groups: Source of the limits of containers; default: the control groups of this process.
+    """
     machine = psutil.virtual_memory()
-    limits, free = [machine.total], [machine.available]
-    for folder in _control_groups():
-        with suppress(OSError, ValueError, StopIteration):
-            limit = int(_first(folder, "memory.max", "memory.limit_in_bytes"))
-            used = int(_first(folder, "memory.current", "memory.usage_in_bytes"))
-            lines = (folder / "memory.stat").read_text().splitlines()
-            files = next(int(x.split()[1]) for x in lines if x.startswith("inactive_file "))
-            limits.append(limit)
-            free.append(max(0, limit - (used - files)))  # what is cached of files is given back
-    return min(limits) / _MB, min(free) / _MB
+    limits = (groups or ControlGroups()).memory_limits()
+    total = min([machine.total, *(limit.total for limit in limits)])
+    free = min([machine.available, *(limit.free for limit in limits)])
+    return total / _MB, free / _MB
 
 
 class ChildMemoryMonitor:
-    """Memory of the processes that this one starts; its own is in the stages' records."""
+    """Measures the peak resident memory of all child processes together."""
 
     def __init__(self) -> None:
         self.peak_mb = 0.0
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Look every second while this lasts."""
+        """Sample the memory once per second inside a ``with`` block."""
         ended = threading.Event()
-        thread = threading.Thread(target=self._watch, args=(ended,), name="mpsfm memory")
+        thread = threading.Thread(target=self._sample_until, args=(ended,), name="mpsfm memory")
         thread.start()
         try:
             yield
@@ -221,65 +220,156 @@ class ChildMemoryMonitor:
             ended.set()
             thread.join()
 
-    def _watch(self, ended: threading.Event) -> None:
-        own = psutil.Process()
-        while not ended.wait(_EVERY_S):
+    def _sample_until(self, ended: threading.Event) -> None:
+        process = psutil.Process()
+        while not ended.wait(_SAMPLING_PERIOD_S):
             resident = 0
             with suppress(psutil.Error):
-                for child in own.children(recursive=True):
+                for child in process.children(recursive=True):
                     with suppress(psutil.Error):
                         resident += child.memory_info().rss
             self.peak_mb = max(self.peak_mb, resident / _MB)
 
 
-def folder_mb(folder: Path) -> float:
-    """Megabytes of the files below a folder."""
+def measure_folder_mb(folder: Path) -> float:
+    """Return the size of all files below a folder in MB."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / _MB
 
 
-def _control_groups() -> Iterator[Path]:
-    """Folders of the control groups of this process, as far up as they are seen here."""
-    with suppress(OSError):
-        for line in Path("/proc/self/cgroup").read_text().splitlines():
-            _, controllers, path = line.split(":", 2)
-            if controllers in ("", "memory"):
-                root = _GROUPS / "memory" if controllers else _GROUPS
-                own = root / path.lstrip("/")
-                yield own
-                yield from (parent for parent in own.parents if parent.is_relative_to(root))
+def _cached_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
+    """Estimate the in-memory caches of views, features and gray images."""
+    views = min(CACHED_VIEW_BYTES, _VIEW_BYTES * _num_pixels(sizes))
+    features = min(CACHED_FEATURE_BYTES, _feature_bytes(sizes, config))
+    gray = 0.0
+    if config.adjustment.enabled:
+        detected = sum(_detection_pixels(size, config) for size in sizes)
+        gray = min(CACHED_GRAY_BYTES, _GRAY_BYTES * detected)
+    return views + features + gray
 
 
-def _first(folder: Path, *names: str) -> str:
-    return next((folder / name).read_text() for name in names if (folder / name).is_file())
+def _extraction_bytes(
+    sizes: Sequence[tuple[int, int]], config: Config, networks: Sequence[int], workers: int
+) -> float:
+    """Estimate what the workers of extraction hold: a decoding, a detector or the networks."""
+    decoding = _DECODE_BYTES * max(width * height for width, height in sizes)
+    detector = _DETECTOR_BYTES * max(_detection_pixels(size, config) for size in sizes)
+    limit = _MAX_ACTIVATION_MB * _MB
+    network = sum(_NETWORK_RATIO * size + min(_ACTIVATION_RATIO * size, limit) for size in networks)
+    return min(workers, len(sizes)) * max(decoding, detector, network)
 
 
-def _room_mb(folder: Path) -> float:
-    return shutil.disk_usage(_existing(folder)).free / _MB
+def _dense_bytes(sizes: Sequence[tuple[int, int]], config: Config, workers: int) -> float:
+    """Estimate what the dense stage holds: all maps, and a cost volume per worker."""
+    if not config.dense.enabled:
+        return _PRIOR_BYTES * _num_pixels(_prior_grids(sizes, config))
+    grids = _final_grids(sizes, config)
+    cost_volume = _DENSE_WORKER_BYTES * max(width * height for width, height in grids)
+    return _map_bytes(sizes, config) + min(workers, len(sizes)) * cost_volume
 
 
-def _same_disk(a: Path, b: Path) -> bool:
-    return _existing(a).stat().st_dev == _existing(b).stat().st_dev
+def _result_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
+    """Estimate what the results hold: all maps, and the points of the cloud."""
+    fusion = _FUSION_BYTES * _num_pixels(_final_grids(sizes, config))
+    return _map_bytes(sizes, config) + fusion + _POINT_BYTES * _num_points(sizes, config)
 
 
-def _existing(folder: Path) -> Path:
-    """The folder, or the nearest above it that is there."""
-    folder = folder.resolve()
-    return next(path for path in (folder, *folder.parents) if path.exists())
+def _map_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
+    """Estimate the maps that stay in memory from mapping to the results."""
+    priors = _PRIOR_BYTES * _num_pixels(_prior_grids(sizes, config))
+    if not config.dense.enabled:
+        return priors
+    return priors + min(MEMORY_LIMIT, _DENSE_MAP_BYTES * _num_pixels(_final_grids(sizes, config)))
 
 
-def _keypoints(config: Config) -> int:
-    """Of a photo, at most."""
-    options = {} if config.features is None else config.features.options
-    return int(options.get("max_keypoints") or _USUAL_KEYPOINTS)
+def _cache_folder_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
+    size = _feature_bytes(sizes, config) + _CACHED_PRIOR_MB * _MB * len(sizes)
+    size += _CACHED_PAIR_BYTES * _max_pairs(len(sizes), config)
+    if config.dense.enabled:
+        dense = _num_pixels(_final_grids(sizes, config))
+        size += _CACHED_DENSE_BYTES * dense + max(0.0, _DENSE_MAP_BYTES * dense - MEMORY_LIMIT)
+    return size
 
 
-def _pairs(count: int, config: Config) -> int:
-    """Pairs that are matched, at most."""
-    pairs, every = config.pairs, count * (count - 1) // 2
+def _output_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
+    results = config.results
+    size = _WRITTEN_POINT_BYTES * _num_points(sizes, config)
+    if results.depth_maps:
+        size += _WRITTEN_MAP_BYTES * _num_pixels(_final_grids(sizes, config))
+    if results.report:
+        size += (_REPORT_MB + _REPORT_IMAGE_MB * len(sizes)) * _MB
+        size += _REPORT_MAP_BYTES * _num_pixels(_prior_grids(sizes, config))
+    return size
+
+
+def _num_pixels(sizes: Sequence[tuple[int, int]]) -> int:
+    return sum(width * height for width, height in sizes)
+
+
+def _prior_grids(sizes: Sequence[tuple[int, int]], config: Config) -> list[tuple[int, int]]:
+    return [integration_grid(size, config.extraction.integration_size) for size in sizes]
+
+
+def _final_grids(sizes: Sequence[tuple[int, int]], config: Config) -> list[tuple[int, int]]:
+    if not config.dense.enabled:
+        return _prior_grids(sizes, config)
+    return [dense_grid_size(size, config.dense.max_size) for size in sizes]
+
+
+def _num_points(sizes: Sequence[tuple[int, int]], config: Config) -> float:
+    if not config.results.dense_cloud:
+        return 0.0
+    points = _POINT_RATIO * _num_pixels(_final_grids(sizes, config))
+    return min(config.results.dense_max_points, points)
+
+
+def _feature_configs(config: Config) -> list[ProviderConfig]:
+    blocks = [config.features, None if config.fast_pass is None else config.fast_pass.features]
+    return [block for block in blocks if block is not None]
+
+
+def _detection_pixels(size: tuple[int, int], config: Config) -> float:
+    """Return the pixels of the largest image that a feature detector gets of a view."""
+    pixels = 0.0
+    for block in _feature_configs(config):
+        side = block.options.get("resize") or max(size)
+        ratio = min(1.0, side / max(size))
+        pixels = max(pixels, math.prod(size) * ratio**2)
+    return pixels
+
+
+def _feature_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
+    """Estimate the features of all images, without a limit of the cache."""
+    limits = [
+        int(block.options.get("max_keypoints") or _DEFAULT_MAX_KEYPOINTS)
+        for block in _feature_configs(config)
+    ]
+    limit = max(limits, default=0)
+    return _KEYPOINT_BYTES * sum(
+        min(limit, _detection_pixels(size, config) / _PIXELS_PER_KEYPOINT) for size in sizes
+    )
+
+
+def _max_pairs(num_images: int, config: Config) -> int:
+    """Return the largest number of pairs that are matched."""
+    pairs = config.pairs
     partners = {
-        "exhaustive": count,
+        "exhaustive": num_images,
         "sequential": pairs.overlap,
         "retrieval": pairs.top_k,
         "auto": pairs.partners + pairs.overlap,
     }
-    return min(every, count * partners[pairs.mode])
+    return min(num_images * (num_images - 1) // 2, num_images * partners[pairs.mode])
+
+
+def _free_disk_mb(folder: Path) -> float:
+    return shutil.disk_usage(_nearest_existing(folder)).free / _MB
+
+
+def _same_disk(a: Path, b: Path) -> bool:
+    return _nearest_existing(a).stat().st_dev == _nearest_existing(b).stat().st_dev
+
+
+def _nearest_existing(folder: Path) -> Path:
+    """Return the folder, or its nearest ancestor that exists."""
+    folder = folder.resolve()
+    return next(path for path in (folder, *folder.parents) if path.exists())

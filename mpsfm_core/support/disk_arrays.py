@@ -1,4 +1,4 @@
-"""Arrays that need not stay in memory: depth maps of many photos."""
+"""Storage of large arrays in memory-mapped temporary files."""
 
 from __future__ import annotations
 
@@ -16,27 +16,30 @@ from numpy.typing import NDArray
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T", bound=np.generic)
 
-IN_MEMORY = 2**29
-"""Bytes that are kept in memory all the same: some 80 photos of the dense stage (ours)."""
-_CHUNK = 2**26
-"""Bytes of a file, at least: a mapped file costs a descriptor, of which a process may have 1024."""
+MEMORY_LIMIT = 2**29
+"""Bytes of arrays that stay in memory, about 80 images of densification [ours]."""
+_MIN_FILE_BYTES = 2**26
+"""Minimum size of a file; a process may have only 1024 file descriptors."""
 _ALIGNMENT = 64
+"""Alignment of arrays in a file, in bytes."""
 
 
 class DiskArrays:
-    """Keeps arrays in memory up to a limit, and those that come then in unnamed temporary files.
+    """Storage that keeps arrays in memory up to a limit and then in unnamed temporary files.
 
-    Arrays on disk are mapped into memory: the system reads them when they are needed and takes
-    their memory back when it is short. The files are gone when the last array is, however the
-    process ends. On a full disk everything stays in memory. May be used by several threads.
+    Files are memory-mapped, so the operating system reads pages on demand and frees them when
+    memory is short. A file disappears with its last array or with the process. If the disk is full,
+    arrays stay in memory. The class is thread-safe.
 
-    ``folder``: where the files lie; it should be on a disk, as temporary folders of some systems
-    are not.
+    Args:
+        folder: Folder of the files. The folder should be on a disk, because the temporary folder of
+            some systems is in memory.
+        in_memory: Bytes of arrays that stay in memory.
     """
 
-    def __init__(self, folder: Path, in_memory: int = IN_MEMORY) -> None:
+    def __init__(self, folder: Path, in_memory: int = MEMORY_LIMIT) -> None:
         self._folder = folder
-        self._left = in_memory
+        self._memory_left = in_memory
         self._lock = threading.Lock()
         self._chunk: mmap.mmap | None = None
         self._chunks: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
@@ -44,49 +47,54 @@ class DiskArrays:
         self._usable = True
 
     def store(self, array: NDArray[_T]) -> NDArray[_T]:
-        """The same values, to be held instead of ``array``."""
+        """Store an array and return an array of equal values, on disk above the memory limit."""
         with self._lock:
-            if array.nbytes <= self._left:
-                self._left -= array.nbytes
+            if array.nbytes <= self._memory_left:
+                self._memory_left -= array.nbytes
                 return array
-            self._left = 0
-            place = self._place(array.nbytes)
-        if place is None:
+            self._memory_left = 0
+            allocation = self._allocate(array.nbytes)
+        if allocation is None:
             return array
-        chunk, start = place
-        kept = np.frombuffer(chunk, array.dtype, array.size, start).reshape(array.shape)
-        kept[...] = array
-        return kept
+        chunk, start = allocation
+        stored = np.frombuffer(chunk, array.dtype, array.size, start).reshape(array.shape)
+        stored[...] = array
+        return stored
 
-    def _place(self, size: int) -> tuple[mmap.mmap, int] | None:
-        """A mapped file, and where in it so many bytes are free; None if there is none."""
+    def _allocate(self, size: int) -> tuple[mmap.mmap, int] | None:
+        """Reserve bytes in a mapped file; returns (file, offset), or None without disk."""
         if not size or not self._usable:
             return None
         if self._chunk is None or self._used + size > len(self._chunk):
-            self._release()
-            self._chunk, self._used = self._new_chunk(max(size, _CHUNK)), 0
+            self._release_pages()
+            self._chunk, self._used = self._create_file(max(size, _MIN_FILE_BYTES)), 0
             if self._chunk is None:
                 return None
         start = self._used
         self._used += -(-size // _ALIGNMENT) * _ALIGNMENT
         return self._chunk, start
 
-    def _new_chunk(self, size: int) -> mmap.mmap | None:
+    def _create_file(self, size: int) -> mmap.mmap | None:
+        """Create and map an unnamed file; returns None if the disk is full or not writable."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self._folder) as file:
-                file.write(bytes(size))  # a hole could not be filled once the disk is full
+                file.write(bytes(size))  # reserve the space; a sparse file could fail later
                 file.flush()
                 chunk = mmap.mmap(file.fileno(), size)
         except OSError as error:
-            _log.warning("depth maps stay in memory: cannot write to %s: %s", self._folder, error)
+            _log.warning(
+                "cannot write temporary files to %s (%s): depth maps stay in memory",
+                self._folder,
+                error,
+            )
             self._usable = False
             return None
         self._chunks.add(chunk)
         return chunk
 
-    def _release(self) -> None:
-        """Take back the memory of what is on disk, as no array of it is needed for long."""
+    def _release_pages(self) -> None:
+        """Free the memory of mapped pages; the operating system reads them again on demand."""
         if hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
             for chunk in self._chunks:
                 chunk.madvise(mmap.MADV_DONTNEED)

@@ -1,7 +1,7 @@
-"""Every write of ours: a file or a set of results is replaced as a whole or not at all.
+"""Atomic writes: a file or a set of results is replaced completely or not at all.
 
-Whatever ends a process while it writes, what stood there before stays, or what is new is complete;
-what a killed run leaves behind is finished or taken away by the next run in the same folder.
+If a process is killed while it writes, the old content stays or the new content is complete. The
+next run in the same folder finishes or removes the remains of a killed run.
 """
 
 from __future__ import annotations
@@ -32,21 +32,28 @@ _log = logging.getLogger(__name__)
 _SCRATCH = ".mpsfm-"
 _TEMPORARY = ".tmp"
 _GRACE_S = 60.0
-"""A younger file may be one that its writer has not locked yet."""
+"""Age in seconds below which a temporary file may not be locked yet by its writer."""
 _READY = "ready.json"
+"""File of a scratch folder that lists the entries to replace; its presence commits the exchange."""
 FORMAT = 1
-"""Of what a scratch folder says of the exchange that it was made for."""
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+"""Format version of ``ready.json``."""
+_DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EINVAL, errno.ENOLCK}
+"""Errors of file systems without locks."""
 
 
 def write_file(
     path: Path, content: bytes | str | Callable[[BinaryIO], None], temporary: Path | None = None
 ) -> None:
-    """Write a file as a whole or not at all; its folder is made. Raises :class:`OSError`.
+    """Write a file atomically and create its folder.
 
-    ``content``: bytes, a text (as UTF-8), or what writes into an open file. ``temporary``: folder
-    on the same disk that holds the file until it is complete, by default its own.
+    Args:
+        path: File to write.
+        content: Bytes, a text (encoded as UTF-8), or a function that writes into an open file.
+        temporary: Folder on the same disk for the incomplete file; the folder of `path` by default.
+
+    Raises:
+        OSError: The file cannot be written.
     """
     folder = temporary or path.parent
     for needed in (folder, path.parent):
@@ -54,7 +61,7 @@ def write_file(
     unfinished = folder / f".{uuid.uuid4().hex}{_TEMPORARY}"
     try:
         with unfinished.open("xb") as file:
-            _mark_in_use(file)
+            _lock_file(file)
             if callable(content):
                 content(file)
             else:
@@ -69,28 +76,28 @@ def write_file(
 
 
 def remove_temporary_files(folder: Path) -> None:
-    """Take away what killed processes left of :func:`write_file` in its ``temporary`` folder."""
+    """Remove incomplete files of killed processes from a `temporary` folder of `write_file`."""
     for path in folder.glob(f".*{_TEMPORARY}"):
         with suppress(OSError), path.open("rb") as file:
-            if time.time() - path.stat().st_mtime > _GRACE_S and not _is_in_use(file):
+            if time.time() - path.stat().st_mtime > _GRACE_S and not _is_locked(file):
                 path.unlink()
 
 
 @contextmanager
 def lock_output_folder(output: Path) -> Iterator[None]:
-    """Have an output folder to oneself, made if need be and found writable.
+    """Create an output folder if needed, check that it is writable, and lock it.
 
-    What an earlier run that was killed left there is finished or taken away. A folder that was made
-    for nothing is gone again in the end.
+    Remains of a killed run are finished or removed. A created folder that stays empty is removed at
+    the end.
 
     Raises:
-        InputError: ``output`` cannot be a folder or cannot be written, or another run has it.
-        OutputError: the disk is full or fails.
+        InputError: `output` cannot be created or written, or another run has locked it.
+        OutputError: The disk is full or fails.
     """
-    created = _make(output)
+    created = _create_folder(output)
     try:
         with ExitStack() as stack:
-            with _explained(output):
+            with _translate_disk_errors(output):
                 if stack.enter_context(_lock(output)):
                     _clear_up(output)
                 with _scratch(output):
@@ -102,38 +109,41 @@ def lock_output_folder(output: Path) -> Iterator[None]:
 
 @contextmanager
 def replace_entries(output: Path, entries: tuple[str, ...]) -> Iterator[Path]:
-    """A scratch folder whose content takes the place of ``output``'s ``entries`` on success.
+    """Yield a scratch folder whose content replaces entries of an output folder on success.
 
-    ``entries``: names below ``output`` that belong to us. When the block ends well, the old ones
-    are taken away and what the block wrote takes their place, by renaming; nothing else in
-    ``output`` is touched. When it fails, or is interrupted, ``output`` is as it was before. When
-    the process is killed amid the renaming, the next :func:`lock_output_folder` finishes it.
+    On success the old entries are removed and the content of the scratch folder takes their place,
+    by renaming. On failure or interruption `output` is unchanged. If the process is killed while
+    renaming, the next :func:`lock_output_folder` finishes the exchange.
+
+    Args:
+        output: Output folder.
+        entries: Names in `output` that may be replaced; all others stay.
 
     Raises:
-        InputError: ``output`` cannot be a folder or cannot be written.
-        OutputError: the disk is full or fails.
+        InputError: `output` cannot be created or written.
+        OutputError: The disk is full or fails.
     """
-    created = _make(output)
+    created = _create_folder(output)
     try:
-        with _explained(output), _scratch(output) as own:
-            fresh = own / "new"
+        with _translate_disk_errors(output), _scratch(output) as scratch:
+            fresh = scratch / "new"
             fresh.mkdir()
-            (own / "old").mkdir()
+            (scratch / "old").mkdir()
             yield fresh
             _sync(fresh)
             new = sorted(entry.name for entry in fresh.iterdir())
             plan = {VERSION: FORMAT, "entries": entries, "new": new}
-            write_file(own / _READY, json.dumps(plan))
-            _swap(output, own)
+            write_file(scratch / _READY, json.dumps(plan))
+            _exchange(output, scratch)
     except BaseException:
         _remove_empty(created)
         raise
 
 
-def _swap(output: Path, own: Path) -> None:
-    """Renames only, undone in reverse when one fails; goes on where an earlier one was killed."""
-    entries, new = _plan(own)
-    fresh, old = own / "new", own / "old"
+def _exchange(output: Path, scratch: Path) -> None:
+    """Exchange entries by renaming; undo the renames on failure, resume after a kill."""
+    entries, new = _read_plan(scratch)
+    fresh, old = scratch / "new", scratch / "old"
     remaining = sorted(entry.name for entry in fresh.iterdir())
     moves = []
     if remaining == new:  # else all old entries have gone, as they go first
@@ -149,48 +159,48 @@ def _swap(output: Path, own: Path) -> None:
         for source, target in reversed(done):
             target.rename(source)
         raise
-    (own / _READY).unlink()
+    (scratch / _READY).unlink()
 
 
-def _plan(own: Path) -> tuple[list[str], list[str]]:
-    """Names that are to go from the output folder, and those that are to come.
+def _read_plan(scratch: Path) -> tuple[list[str], list[str]]:
+    """Read the names of the old and the new entries from ``ready.json``.
 
-    Raises :class:`InputError` unless we wrote it: a folder that came from elsewhere may name files
-    anywhere.
+    Raises:
+        InputError: The file is not from `replace_entries`; a foreign file could name any path.
     """
-    path = own / _READY
+    path = scratch / _READY
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         check_version(content, FORMAT, path)
         entries, new = list(content["entries"]), list(content["new"])
         if any(Path(name).name != name or name in ("", "..") for name in (*entries, *new)):
-            raise ValueError("names what is not in the folder")
-        if any((own / part).is_symlink() for part in ("new", "old")):
-            raise ValueError("leads elsewhere")
+            raise ValueError("names files outside of the folder")
+        if any((scratch / part).is_symlink() for part in ("new", "old")):
+            raise ValueError("contains a symbolic link")
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise InputError(
-            f"{path}: no run of ours left this ({error}); remove {own} if you know where it is from"
+            f"{path}: not written by mpsfm ({error}); remove {scratch} if you know where it is from"
         ) from error
     return entries, new
 
 
 def _clear_up(output: Path) -> None:
-    """Finish or take away what killed runs left; the caller is alone in the folder."""
-    for own in output.glob(f"{_SCRATCH}*"):
-        if own.is_symlink() or not own.is_dir():
-            continue  # not ours
-        if (own / _READY).is_file() and (own / "new").is_dir():
-            _log.warning("%s: finishing what a killed run was about to put in place", output)
-            _swap(output, own)
-        shutil.rmtree(own)
+    """Finish or remove the remains of killed runs; the caller holds the lock."""
+    for scratch in output.glob(f"{_SCRATCH}*"):
+        if scratch.is_symlink() or not scratch.is_dir():
+            continue  # not a scratch folder
+        if (scratch / _READY).is_file() and (scratch / "new").is_dir():
+            _log.warning("%s: finishing the results of a killed run", output)
+            _exchange(output, scratch)
+        shutil.rmtree(scratch)
 
 
 @contextmanager
 def _lock(folder: Path) -> Iterator[bool]:
-    """Lock a folder until the end of the block or of the process; yields whether that is possible.
+    """Lock a folder until the end of the block or process; yields False without locks.
 
-    The folder itself is locked, so that no file need be left in it. Some network disks and Windows
-    do not know such locks: there runs are not kept apart, and leftovers stay.
+    The folder itself is locked, so no lock file remains. Windows and some network disks do not
+    support such locks: concurrent runs are not detected there, and remains stay.
     """
     if fcntl is None:
         yield False
@@ -205,7 +215,7 @@ def _lock(folder: Path) -> Iterator[bool]:
                 if isinstance(error, BlockingIOError):
                     raise InputError(
                         f"{folder}: another run is writing its results there; wait for its end or "
-                        f"choose another output folder"
+                        "choose another output folder"
                     ) from error
                 raise
             alone = False
@@ -214,8 +224,8 @@ def _lock(folder: Path) -> Iterator[bool]:
         os.close(handle)
 
 
-def _make(output: Path) -> list[Path]:
-    """Create the folder; returns the folders that did not exist, innermost first."""
+def _create_folder(output: Path) -> list[Path]:
+    """Create a folder and return the folders that did not exist, innermost first."""
     missing = [folder for folder in (output, *output.parents) if not folder.exists()]
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -225,6 +235,7 @@ def _make(output: Path) -> list[Path]:
 
 
 def _remove_empty(folders: list[Path]) -> None:
+    """Remove those folders that are empty."""
     for folder in folders:
         with suppress(OSError):
             folder.rmdir()
@@ -232,43 +243,44 @@ def _remove_empty(folders: list[Path]) -> None:
 
 @contextmanager
 def _scratch(output: Path) -> Iterator[Path]:
-    """A temporary folder below ``output``, on the same disk."""
-    own = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=output))
+    """Yield a temporary folder below `output`, on the same disk."""
+    scratch = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=output))
     try:
-        yield own
+        yield scratch
     finally:
-        shutil.rmtree(own, ignore_errors=True)  # what stays is taken away by the next run
+        shutil.rmtree(scratch, ignore_errors=True)  # the next run removes the remains
 
 
 @contextmanager
-def _explained(output: Path) -> Iterator[None]:
-    """Errors of the disk as errors that say what to do."""
+def _translate_disk_errors(output: Path) -> Iterator[None]:
+    """Translate errors of the disk to errors with a hint for users."""
     try:
         yield
     except OSError as error:
-        what = error.strerror or str(error)
+        reason = error.strerror or str(error)
         if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-            raise InputError(f"{output}: cannot be written: {what}") from error
-        full = "the disk is full" if error.errno in _FULL else "the disk fails"
-        raise OutputError(f"{output}: {full} ({what}); earlier results are unchanged") from error
+            raise InputError(f"{output}: cannot be written: {reason}") from error
+        full = "the disk is full" if error.errno in _DISK_FULL else "the disk fails"
+        raise OutputError(f"{output}: {full} ({reason}); earlier results are unchanged") from error
 
 
 def _sync(folder: Path) -> None:
-    """Have the disk hold every file, before anything old goes."""
+    """Flush every file to disk before old entries are removed."""
     for path in folder.rglob("*"):
         if path.is_file():
             with path.open("rb") as file:
                 os.fsync(file.fileno())
 
 
-def _mark_in_use(file: BinaryIO) -> None:
+def _lock_file(file: BinaryIO) -> None:
+    """Lock a temporary file while its writer is alive."""
     if fcntl is not None:
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def _is_in_use(file: BinaryIO) -> bool:
-    """Whether a living process writes the file; yes where that cannot be told."""
+def _is_locked(file: BinaryIO) -> bool:
+    """Return True if a running process writes the file, or if locks are not supported."""
     if fcntl is None:
         return True
     try:

@@ -1,8 +1,8 @@
-"""The version of a file's format, beside its content.
+"""Format versions of files.
 
-Each format that we define has a number, in the module that reads it. It is raised when a file would
-mean something else to its readers than it did before, not when something is added. A file without a
-number is of the first version: there were none before. ``docs/formats.md`` lists all.
+The module that reads a format defines its version number. The number increases when the meaning of
+existing content changes, not when content is added. A file without a number has version 1.
+``docs/formats.md`` lists all formats.
 """
 
 from __future__ import annotations
@@ -14,26 +14,33 @@ from typing import Any
 from mpsfm_core.data.errors import InputError
 
 VERSION = "format_version"
-"""Key, or name of the array, that holds it."""
+"""Key of the version in a file, or name of its array."""
 
 
 def check_version(
     content: Mapping[str, Any], known: int, path: Path, error: type[InputError] = InputError
 ) -> int:
-    """The version of a file's content, from 1 to ``known``, the newest that can be read.
+    """Return the format version of a file's content.
 
-    Raises ``error`` when the file is newer, or its version is no number.
+    Args:
+        content: Content of the file by key.
+        known: Newest version that the caller can read.
+        path: Path of the file, for messages.
+        error: Class of the raised error.
+
+    Raises:
+        InputError: The version is newer than `known` or is no number (raised as `error`).
     """
-    found = content.get(VERSION, 1)
+    value = content.get(VERSION, 1)
     try:
-        number = int(found)
+        number = int(value)
     except (TypeError, ValueError, OverflowError):
         number = 0
     if number < 1:
-        raise error(f"{path}: its {VERSION} is {str(found)[:60]!r}, not a number from 1 on")
+        raise error(f"{path}: its {VERSION} is {str(value)[:60]!r}, not a number from 1 on")
     if number > known:
         raise error(
-            f"{path}: is of format {number}, of a newer mpsfm-core; this one reads formats up to "
-            f"{known}: pip install --upgrade mpsfm-core, or make the file anew"
+            f"{path}: is of format {number}, written by a newer mpsfm-core; this version reads "
+            f"formats up to {known}: pip install --upgrade mpsfm-core, or create the file again"
         )
     return number

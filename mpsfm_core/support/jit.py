@@ -1,9 +1,8 @@
-"""How inner loops are compiled: kernels that Python calls, and helpers that only kernels call.
+"""Numba decorators for inner loops: kernels for Python callers, helpers for kernels.
 
-Kernels are kept on disk: in ``$NUMBA_CACHE_DIR``, else beside the module, else, where the package
-cannot be written, in the user's cache. Helpers are part of the kernels that call them. A counter
-that is handed to a helper starts as ``np.int64(0)``: a literal 0 is a type of its own to numba,
-which would compile the helper for it too.
+Compiled kernels are cached in ``$NUMBA_CACHE_DIR``, next to the module, or in the user's cache if
+the package is not writable. Helpers are compiled into their kernels. Pass counters to helpers as
+``np.int64(0)``: a literal 0 has its own numba type, which would compile the helper twice.
 """
 
 from __future__ import annotations
@@ -23,15 +22,18 @@ _ALWAYS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
 def kernel(**options: Any) -> Callable[[F], F]:
-    """Decorator for a function that Python calls; ``options``: of :func:`numba.njit`.
+    """Return a decorator that compiles a function for Python callers.
 
-    The interpreter is released, and floats divide as numpy's do.
+    The compiled function releases the interpreter lock and divides floats like numpy.
+
+    Args:
+        options: Keyword arguments of :func:`numba.njit`.
     """
 
     def decorate(function: F) -> F:
         try:
             return _compiled(function, cache=True, **options)
-        except RuntimeError as error:  # no folder that could be written
+        except RuntimeError as error:  # no writable cache folder
             _warn(str(error))
             return _compiled(function, **options)
 
@@ -39,7 +41,7 @@ def kernel(**options: Any) -> Callable[[F], F]:
 
 
 def helper(**options: Any) -> Callable[[F], F]:
-    """Decorator for a function that kernels call; to Python it stays what it is."""
+    """Return a decorator that makes a Python function callable from kernels."""
     without = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     decorate: Callable[[F], F] = register_jitable(**_ALWAYS, **without, **options)
     return decorate
@@ -52,5 +54,5 @@ def _compiled(function: F, **options: Any) -> F:
 
 @cache
 def _warn(reason: str) -> None:
-    text = "compiled code cannot be kept (%s): set NUMBA_CACHE_DIR to a folder that can be written"
+    text = "cannot cache compiled code (%s): set NUMBA_CACHE_DIR to a writable folder"
     _log.warning(text, reason.split(":")[0])

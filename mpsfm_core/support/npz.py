@@ -1,4 +1,4 @@
-"""Arrays in NPZ files, read within bounds and without running anything."""
+"""Reading and writing of NPZ files, with a size limit and without pickle."""
 
 from __future__ import annotations
 
@@ -10,30 +10,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_BYTES = 4_000_000_000
-"""Of the arrays of a file, or its own size where that is more: a small file can stand for any
-number of zeros (ours: 16 bytes for each of the most pixels that a photo may have)."""
+"""Maximum size of the arrays of a file, unless the file itself is larger.
 
-
-_LEVEL = 1
-"""Of the compression: on depth maps 6, numpy's, takes twice the time to save 0.5 % (measured)."""
+A small compressed file could expand to any size; the limit is 16 bytes per pixel of the largest
+image [ours]."""
+_COMPRESSION_LEVEL = 1
+"""Level of zlib; numpy's level 6 takes twice the time on depth maps to save 0.5 %."""
 
 
 def write_npz(path: Path, **arrays: NDArray[Any]) -> None:
-    """Write arrays by name, compressed; folders are made. Raises :class:`OSError`."""
+    """Write compressed arrays by name and create the folder.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as archive:
+    with zipfile.ZipFile(
+        path, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION_LEVEL
+    ) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, array, allow_pickle=False)
 
 
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a file by name.
+    """Read the arrays of a file by name.
 
-    Raises :class:`OSError` when the file cannot be read, :class:`ValueError` when it is damaged,
-    too large, or something else.
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: The file is damaged, too large, or no NPZ file.
     """
-    with path.open("rb") as file:  # numpy leaves a damaged file open
+    with path.open("rb") as file:  # numpy does not close a damaged file
         try:
             with zipfile.ZipFile(file) as archive:
                 size = sum(entry.file_size for entry in archive.infolist())
@@ -44,5 +51,5 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
                 return {name: arrays[name] for name in arrays.files}
         except (OSError, ValueError):
             raise
-        except Exception as error:  # the readers of zip files and arrays share no base class
+        except Exception as error:  # zipfile and numpy raise unrelated exception classes
             raise ValueError(f"is damaged: {type(error).__name__}: {error}") from error

@@ -1,8 +1,8 @@
 """Number of threads of a run: its own worker threads and those of BLAS, OpenMP and OpenCV.
 
-A run sets the limit once with :func:`limit_threads`, and thread pools read it with :func:`thread_limit`.
-Providers get their number of threads from their context, because networks have thread pools of
-their own.
+A run sets the limit once with :func:`limit_threads`, and thread pools read it with
+:func:`thread_limit`. Providers get their number of threads from their context, because networks
+have thread pools of their own.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def thread_limit() -> int:
 
 
 def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Call a function on every item in :func:`thread_limit` threads; return the results in order."""
+    """Call a function on every item in parallel threads; returns the results in order."""
     with ThreadPoolExecutor(thread_limit()) as pool:
         return list(pool.map(function, items))
 
@@ -57,8 +57,8 @@ def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> l
 def limit_threads(count: int | None) -> Iterator[None]:
     """Limit the number of busy threads inside a ``with`` block.
 
-    The limit of :func:`thread_limit` applies to the calling thread, the limit of libraries to the whole
-    process. OpenCV gets one thread, because several worker threads call it at the same time.
+    The limit of :func:`thread_limit` applies to the calling thread, the limit of libraries to the
+    whole process. OpenCV gets one thread, because several worker threads call it at the same time.
 
     Args:
         count: Largest number of threads; None means one per core.

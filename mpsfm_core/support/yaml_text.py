@@ -1,4 +1,4 @@
-"""YAML as users mean it: the scalars of YAML 1.2, no silently repeated keys, line numbers.
+"""YAML 1.2 scalars, errors for repeated keys, and line numbers.
 
 PyYAML follows YAML 1.1, where ``no`` is false, ``1e-3`` a text and ``2024-01-01`` a date.
 """
@@ -26,6 +26,8 @@ _SCALARS = (
 
 
 class _Loader(yaml.SafeLoader):
+    """Loader of YAML 1.2 scalars that rejects repeated keys."""
+
     yaml_implicit_resolvers = {}  # noqa: RUF012  (PyYAML's class attribute, filled below)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
@@ -38,6 +40,8 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
+    """Dumper of YAML 1.2 scalars without aliases."""
+
     yaml_implicit_resolvers = {}  # noqa: RUF012
 
     def ignore_aliases(self, data: Any) -> bool:
@@ -52,7 +56,15 @@ for _name, _pattern, _first in _SCALARS:
 
 
 def parse_yaml(text: str, source: str) -> Any:
-    """The value of a YAML document; raises ConfigError with ``source`` and the line."""
+    """Parse a YAML document.
+
+    Args:
+        text: The document.
+        source: Name of the document, for messages.
+
+    Raises:
+        ConfigError: The document is not valid; the message gives source and line.
+    """
     try:
         return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
@@ -65,7 +77,11 @@ def parse_yaml(text: str, source: str) -> Any:
 
 
 def parse_assignment(text: str) -> dict[str, Any]:
-    """``a.b=value`` with a YAML value, as ``{"a": {"b": value}}``; raises ConfigError."""
+    """Parse ``a.b=value`` with a YAML value to ``{"a": {"b": value}}``.
+
+    Raises:
+        ConfigError: The text is no assignment, or the value is not valid YAML.
+    """
     key, equals, value = text.partition("=")
     parts = key.strip().split(".")
     source = f"--set {text}"
@@ -78,13 +94,13 @@ def parse_assignment(text: str) -> dict[str, Any]:
 
 
 def write_yaml(value: Any) -> str:
-    """A value of plain types as block-style YAML that :func:`parse_yaml` reads back the same."""
+    """Format a value of plain types as block-style YAML; inverse of :func:`parse_yaml`."""
     text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
     return text
 
 
 def find_line(text: str, path: tuple[str | int, ...]) -> int | None:
-    """Line (from 1) where the entry at ``path`` begins in a YAML text, None when it is absent."""
+    """Find the line, from 1, of the entry at a path in a YAML text; None if absent."""
     node = yaml.compose(text, Loader=_Loader)
     line = None
     for part in path:

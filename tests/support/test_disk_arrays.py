@@ -32,7 +32,7 @@ def test_values_outlive_the_memory_that_they_were_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each array fills a file, and a new file takes back the memory of those before."""
-    monkeypatch.setattr(mpsfm_core.support.disk_arrays, "_CHUNK", SIZE)
+    monkeypatch.setattr(mpsfm_core.support.disk_arrays, "_MIN_FILE_BYTES", SIZE)
     with ThreadPoolExecutor(4) as pool:
         kept = list(pool.map(DiskArrays(tmp_path, in_memory=0).store, map(array, range(12))))
     for seed, each in enumerate(kept):
