@@ -1,7 +1,7 @@
-"""``pytest --mpsfm-plugin NAME``: the contract of an installed plugin, as tests.
+"""``pytest --mpsfm-plugin NAME``: contract checks of an installed plugin as pytest items.
 
-A module of its own, outside of the package: pytest loads it at every start, wherever the core is
-installed, so it imports nothing until it is asked to.
+This module is outside of the package, because pytest imports it at every start in every environment
+with mpsfm-core. It therefore imports nothing until its option is used.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import pytest
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Two options."""
+    """Add the options ``--mpsfm-plugin`` and ``--mpsfm-options``."""
     group = parser.getgroup("mpsfm", "contract of MP-SfM plugins")
     group.addoption(
         "--mpsfm-plugin",
@@ -24,12 +24,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="options of the provider, instead of those of its stand-in without weights",
+        help="options of the provider, instead of those of its contract setup",
     )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register what collects the checks, if there is something to check."""
+    """Register the collection of checks if the command line names a plugin."""
     names = config.getoption("--mpsfm-plugin")
     if names:
         from mpsfm_core.testing.pytest_items import ContractCollection
@@ -37,4 +37,4 @@ def pytest_configure(config: pytest.Config) -> None:
         collection = ContractCollection(names, config.getoption("--mpsfm-options"))
         config.pluginmanager.register(collection, "mpsfm-contract")
         if config.args_source != pytest.Config.ArgsSource.ARGS:
-            config.args = []  # no path was named: these checks and nothing else
+            config.args = []  # no path was given: run only these checks

@@ -2,7 +2,7 @@
 
     python -m benchmarks.resources [CASE ...]
 
-Rendered photos: a walk through a make_hall, which ends in one group, or rooms that nothing joins, each a
+Rendered photos: a walk through a hall, which ends in one group, or rooms that nothing joins, each a
 group. SIFT with 1024 keypoints, exact depth of files as prior, pairs of neighbours. Prints a line
 for each case as it ends; docs/robustness.md has the table.
 """
@@ -40,7 +40,7 @@ runtime: {{workers: {workers}, cache_dir: {folder}/cache}}
 
 @dataclass(frozen=True)
 class Case:
-    """``rooms``: 0 for a make_hall. ``size``: (width, height) of the photos; ``grid``: of the priors."""
+    """``rooms``: 0 for a hall. ``size``: (width, height) of the photos; ``grid``: of the priors."""
 
     count: int
     rooms: int
@@ -61,7 +61,7 @@ class Case:
 
 CASES = {
     "room": Case(5, 1, (320, 240), 96, 1),
-    "make_hall": Case(60, 0, (320, 240), 160, 1),
+    "hall": Case(60, 0, (320, 240), 160, 1),
     "large photos": Case(24, 0, (640, 480), 256, 2),
     "many photos": Case(140, 0, (320, 240), 128, 1),
     "three rooms": Case(60, 3, (320, 240), 160, 1),

@@ -73,7 +73,7 @@ def main() -> int:
 
 
 def _missing(wanted: Mapping[str, tuple[str, str]], checkouts: Path | None) -> str:
-    """Why it cannot be compare_with_original here, or an empty text. ``wanted``: repository and commit of each
+    """Why it cannot be compared here, or an empty text. ``wanted``: repository and commit of each
     folder."""
     if checkouts is None:
         return "skipped: no --checkouts"

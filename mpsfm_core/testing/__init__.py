@@ -1,12 +1,12 @@
-"""What plugin authors and our own tests use: analytic scenes and the contract of providers.
+"""Contract kit for plugin authors: checks of providers with exact synthetic examples.
 
-A plugin's test file is::
+The test file of a plugin is::
 
     from mpsfm_core.testing import contract_tests
 
     test_contract = contract_tests("depth", "my-depth")
 
-See docs/contract.md for the checks, and :class:`ContractSetup` for how a provider is put under test.
+docs/contract.md lists the checks. :class:`ContractSetup` declares how to test a provider.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.pytest_tests import contract_tests
 
 __all__ = [
-    "ContractCase",
     "CheckFailed",
     "CheckResult",
     "CheckSkipped",
+    "ContractCase",
     "ContractSetup",
     "contract_tests",
     "run_checks",

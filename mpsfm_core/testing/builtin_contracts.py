@@ -1,4 +1,4 @@
-"""How the contracts of the built-in providers are checked."""
+"""Contract setups of the built-in providers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mpsfm_core.testing.painted_views import NORMALS_STD, RELATIVE_STD
 
 
 def depth_files(folder: Path) -> ContractSetup:
-    """Depth in metres with its variance, in an NPZ beside each view's name."""
+    """Return a setup that writes depth in meters with its variance to an NPZ file per view."""
 
     def write_truth(example: Example) -> None:
         truth = example.truth()
@@ -26,7 +26,7 @@ def depth_files(folder: Path) -> ContractSetup:
 
 
 def normal_files(folder: Path) -> ContractSetup:
-    """Normals with their variance, likewise."""
+    """Return a setup that writes normals with their variance to an NPZ file per view."""
 
     def write_truth(example: Example) -> None:
         truth = example.truth()
@@ -39,7 +39,7 @@ def normal_files(folder: Path) -> ContractSetup:
 
 
 def mask_files(folder: Path) -> ContractSetup:
-    """Masks of what has a surface, likewise."""
+    """Return a setup that writes the mask of all surfaces to an NPZ file per view."""
     return ContractSetup(
         options={"directory": folder},
         truth_source="prepared",
@@ -48,19 +48,19 @@ def mask_files(folder: Path) -> ContractSetup:
 
 
 def from_depth(folder: Path) -> ContractSetup:
-    """Is right wherever the depth it is given is right."""
+    """Return a setup without files: normals are correct where the given depth is."""
     return ContractSetup(truth_source="image")
 
 
 def depth_of_matcher(folder: Path) -> ContractSetup:
-    """Only stands for a choice in the configuration."""
-    reason = "one view has no matches: the extraction asks the matcher for its pairs instead"
+    """Return a setup in which predicting from one view is expected to fail."""
+    reason = "one view has no matches: the extraction uses the pairs of the matcher instead"
     return ContractSetup(expected_failures={"output-rules": reason})
 
 
 def depth_of_multiview(folder: Path) -> ContractSetup:
-    """Only stands for a choice in the configuration."""
-    reason = "one view is no group: the extraction asks the multi-view network instead"
+    """Return a setup in which predicting from one view is expected to fail."""
+    reason = "one view is no group: the extraction runs the multi-view network instead"
     return ContractSetup(expected_failures={"output-rules": reason})
 
 

@@ -1,4 +1,4 @@
-"""The contract: all checks of a provider, run one by one."""
+"""Contract of a provider: schedules the checks of its kind and runs them one by one."""
 
 from __future__ import annotations
 
@@ -33,6 +33,8 @@ from mpsfm_core.testing.contract_case import ContractCase, ContractSetup, load_s
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 Check = Callable[[ContractCase], str | None]
+"""A check returns nothing or a remark. It raises ``CheckFailed`` or ``CheckSkipped``."""
+
 Status = Literal["pass", "fail", "skip", "xfail"]
 SetupSource = ContractSetup | Callable[[Path], ContractSetup] | None
 
@@ -48,45 +50,45 @@ CHECKS_BY_KIND: Mapping[Kind, tuple[Check, ...]] = MappingProxyType(
         "wrapper": checks_wrapper.CHECKS,
     }
 )
-"""The checks of each kind, besides the common ones."""
+"""Checks of each kind, in addition to the common ones."""
 
 REQUIRED: tuple[Check, ...] = (check_specification, check_construction, check_output_rules)
-"""Where one of these fails, the others are skipped."""
+"""If one of these fails, all later checks are skipped: their results would mean nothing."""
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """How one check ended.
-
-    ``provider``: kind and name, ``depth/files``. ``around``: what a wrapper was put around, else
-    empty. ``message``: why it failed or was skipped, or a remark.
-    """
+    """Result of one check of one provider."""
 
     provider: str
+    """Kind and name, such as ``depth/files``."""
     around: str
+    """Kind that a wrapper under test wraps, else empty."""
     id: str
+    """Name of the check, such as ``depth-is-z``."""
     status: Status
+    """``xfail`` is a failure that the setup declares as expected."""
     message: str
+    """Reason of a failure or skip, or a remark."""
     seconds: float
+    """Run time."""
 
 
 @dataclass(frozen=True)
 class CheckTask:
-    """One check of one provider; ``around`` as in :class:`CheckResult`."""
+    """One scheduled check of one provider."""
 
     id: str
+    """Name of the check."""
     around: str
+    """Kind that a wrapper under test wraps, else empty."""
 
     def __str__(self) -> str:
         return f"{self.around}-{self.id}" if self.around else self.id
 
 
 class Contract:
-    """All checks of one provider.
-
-    ``setup``: how it is put under test, by default what its plugin says (``spec.contract``).
-    ``folder``: for the files of stand-ins. Raises :class:`~mpsfm_core.data.errors.ProviderError`
-    when there is no such provider or it is unavailable."""
+    """Runner of all checks of one provider."""
 
     def __init__(
         self,
@@ -98,32 +100,45 @@ class Contract:
         *,
         device: str = "cpu",
     ) -> None:
+        """Look up the provider without creating it.
+
+        Args:
+            registry: Registry that contains the provider.
+            kind: Kind of the provider.
+            name: Name of the provider.
+            folder: Folder for the files of stand-ins.
+            setup: Setup or contract function; by default the one of the specification.
+            device: ``"cpu"`` or ``"cuda"``.
+
+        Raises:
+            ProviderError: The provider does not exist or is unavailable.
+        """
         self.spec = registry.spec(kind, name)
         self._registry = registry
         self._folder = folder
         self._setup = setup
         self._device = device
         self._cases: dict[str, ContractCase] = {}
-        self._faults: dict[str, str] = {}
+        self._failed_required: dict[str, str] = {}
 
     @property
     def provider(self) -> str:
-        """Kind and name."""
+        """Kind and name, such as ``depth/files``."""
         return f"{self.spec.kind}/{self.spec.name}"
 
     def tasks(self) -> list[CheckTask]:
-        """The checks in the order to run them; knows them without making anything."""
+        """Return the scheduled checks in order. Creates no provider."""
         return schedule_checks(self.spec)
 
     def run(self, task: CheckTask) -> CheckResult:
-        """Run one check."""
+        """Run one check; exceptions of the provider become failures."""
         started = time.perf_counter()
         reason = ""
         try:
             case = self._case(task.around)
             reason = case.setup.expected_failures.get(task.id, "")
             status, message = self._outcome(case, task)
-        except ProviderError as error:  # there is no setup
+        except ProviderError as error:  # the setup cannot be created
             status, message = "fail", str(error)
         if reason and status == "fail":
             status, message = "xfail", f"{reason} ({message})"
@@ -135,24 +150,24 @@ class Contract:
     def _outcome(self, case: ContractCase, task: CheckTask) -> tuple[Status, str]:
         check = find_check(task.id)
         if check not in REQUIRED and check not in STANDALONE:
-            fault = self._fault(case, task.around)
-            if fault:
-                return "skip", f"{fault} fails"
+            failed_id = self._first_failed_required(case, task.around)
+            if failed_id:
+                return "skip", f"{failed_id} fails"
         try:
             return "pass", check(case) or ""
         except CheckSkipped as skipped:
             return "skip", str(skipped)
         except (CheckFailed, MpsfmError) as failed:
             return "fail", str(failed)
-        except Exception as error:  # of the provider, where it is called directly
+        except Exception as error:  # raised by a provider that the check calls directly
             return "fail", f"{type(error).__name__}: {error}"
 
-    def _fault(self, case: ContractCase, around: str) -> str:
-        """The first of the checks without which the others mean nothing that fails."""
-        if around not in self._faults:
+    def _first_failed_required(self, case: ContractCase, around: str) -> str:
+        """Return the id of the first of the :data:`REQUIRED` checks that fails, or empty."""
+        if around not in self._failed_required:
             failed = (check_id(check) for check in REQUIRED if not _passes(check, case))
-            self._faults[around] = next(failed, "")
-        return self._faults[around]
+            self._failed_required[around] = next(failed, "")
+        return self._failed_required[around]
 
     def _case(self, around: str) -> ContractCase:
         if around not in self._cases:
@@ -187,9 +202,22 @@ def run_checks(
     device: str = "cpu",
     on_result: Callable[[CheckResult], None] | None = None,
 ) -> list[CheckResult]:
-    """Run the checks of a provider, or ``only`` those with the given ids.
+    """Run the checks of a provider.
 
-    ``on_result`` is called after each check. See :class:`Contract`.
+    Args:
+        registry: Registry that contains the provider.
+        kind: Kind of the provider.
+        name: Name of the provider.
+        setup: Setup or contract function; by default the one of the specification.
+        only: Ids of the checks to run; None runs all.
+        device: ``"cpu"`` or ``"cuda"``.
+        on_result: Called after each check.
+
+    Returns:
+        Results in the order of the checks.
+
+    Raises:
+        ProviderError: The provider does not exist or is unavailable.
     """
     results = []
     with tempfile.TemporaryDirectory(prefix="mpsfm-contract-") as folder:
@@ -203,19 +231,27 @@ def run_checks(
 
 
 def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
-    """Kind and name of the providers that ``name`` means: a provider (``onnx``), one of a kind
-    (``depth/onnx``) or all of a distribution (``mpsfm-onnx``).
+    """Find the providers that a name on the command line refers to.
 
-    Raises :class:`~mpsfm_core.data.errors.InputError` when there is none, and
-    :class:`~mpsfm_core.data.errors.ProviderError` with the reason if the plugin is there and has
-    none."""
-    known = [line for line in registry.status() if line.kind != "plugin"]
-    found = [
+    Args:
+        registry: Registry to search.
+        name: Provider (``onnx``), provider of one kind (``depth/onnx``) or distribution
+            (``mpsfm-onnx``, meaning all of its providers).
+
+    Returns:
+        Kind and name of each provider.
+
+    Raises:
+        InputError: Nothing has that name.
+        ProviderError: The plugin exists but has no providers or failed to load.
+    """
+    lines = [line for line in registry.status() if line.kind != "plugin"]
+    matching = [
         (line.kind, line.name)
-        for line in known
+        for line in lines
         if name in (line.name, f"{line.kind}/{line.name}", line.distribution)
     ]
-    if not found:
+    if not matching:
         plugin = find_plugin(registry, name)
         if plugin is not None and plugin.available:
             raise ProviderError(f"{name} brings hooks and no providers to check")
@@ -223,21 +259,34 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
             raise ProviderError(f"{name} {plugin.reason}; {plugin.install_hint}")
         candidates = {n for line in registry.status() for n in (line.name, line.distribution)}
         raise InputError(f"no provider or plugin {name!r}{did_you_mean(name, candidates)}")
-    return [(kind, name) for kind, name in found if kind != "plugin"]
+    return [(kind, name) for kind, name in matching if kind != "plugin"]
 
 
 def find_plugin(registry: Registry, name: str) -> ProviderStatus | None:
-    """The plugin without providers (it brings hooks only, or fails) of this entry point or
-    distribution, if there is one."""
+    """Find a plugin without providers, which only has hooks or failed to load.
+
+    Args:
+        registry: Registry to search.
+        name: Entry point or distribution.
+
+    Returns:
+        Its status line, or None.
+    """
     plugins = (line for line in registry.status() if line.kind == "plugin")
     return next((line for line in plugins if name in (line.name, line.distribution)), None)
 
 
 def parse_setup(assignments: Sequence[str]) -> ContractSetup | None:
-    """The setup of a provider with options given as ``key=value`` (or ``a.b=value``) with YAML
-    values; None if there are none, which means what the plugin says.
+    """Parse provider options of the command line into a setup.
 
-    Raises :class:`~mpsfm_core.data.errors.InputError` for what is no assignment.
+    Args:
+        assignments: ``key=value`` or ``group.key=value`` with YAML values.
+
+    Returns:
+        Setup with these options, or None without assignments (use the plugin's own setup).
+
+    Raises:
+        InputError: A text is not an assignment.
     """
     options: dict[str, Any] = {}
     for text in assignments:
@@ -245,15 +294,15 @@ def parse_setup(assignments: Sequence[str]) -> ContractSetup | None:
         *parents, key = path.strip().split(".")
         if not (equals and key):
             raise InputError(f"{text!r} must look like key=value")
-        place = options
+        group = options
         for parent in parents:
-            place = place.setdefault(parent, {})
-        place[key] = parse_yaml(value, text)
+            group = group.setdefault(parent, {})
+        group[key] = parse_yaml(value, text)
     return ContractSetup(options=options) if options else None
 
 
 def schedule_checks(spec: ProviderSpec) -> list[CheckTask]:
-    """The checks of a provider of this specification, in the order to run them."""
+    """Return the checks that apply to a specification, in the order to run them."""
     wrapped = [kind for kind in ("depth", "normals") if f"wraps-{kind}" in spec.capabilities]
     tasks = []
     for around in (wrapped or ["depth"]) if spec.kind == "wrapper" else [""]:
@@ -265,19 +314,22 @@ def schedule_checks(spec: ProviderSpec) -> list[CheckTask]:
 
 
 def list_checks() -> list[Check]:
-    """Every check of the kit, the common ones first."""
+    """Return every check of all kinds, the common ones first."""
     special = dict.fromkeys(check for checks in CHECKS_BY_KIND.values() for check in checks)
     return [*STANDALONE, check_output_rules, *COMMON, *special]
 
 
 def find_check(id: str) -> Check:
-    """The check with an id."""
+    """Return the check with an id."""
     return next(check for check in list_checks() if check_id(check) == id)
 
 
 def parse_check_ids(ids: Collection[str]) -> set[str]:
-    """The ids as a set; raises :class:`~mpsfm_core.data.errors.InputError` for one that is no
-    check."""
+    """Return check ids as a set.
+
+    Raises:
+        InputError: An id is not the id of a check.
+    """
     known = [check_id(check) for check in list_checks()]
     for name in ids:
         if name not in known:
@@ -286,7 +338,7 @@ def parse_check_ids(ids: Collection[str]) -> set[str]:
 
 
 def check_id(check: Check) -> str:
-    """The check's name in reports: ``check_depth_is_z`` is ``depth-is-z``."""
+    """Return the id of a check: ``check_depth_is_z`` has the id ``depth-is-z``."""
     return check.__name__.removeprefix("check_").replace("_", "-")
 
 

@@ -1,4 +1,4 @@
-"""One provider under test: its setup, its instances and validated calls with synthetic examples."""
+"""One provider under test: its setup, its instances and validated calls on examples."""
 
 from __future__ import annotations
 

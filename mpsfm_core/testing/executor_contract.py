@@ -1,4 +1,4 @@
-"""What an executor has to keep to, as checks for the tests of a plugin that brings one."""
+"""Checks of executors, for the tests of a plugin that provides one."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 _CAMERA = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
 _INTRINSICS = "1: {params: [280, 280, 160, 120], images: all}"
-_COUNT = 4
+_NUM_IMAGES = 4
 
 
 @dataclass(frozen=True)
-class _Leaves:
-    """A step that leaves a file, with the number of its process, for each item."""
+class _WriteMarker:
+    """Step that writes a file per item, named after the item and the process id."""
 
     folder: Path
 
@@ -42,8 +42,8 @@ class _Leaves:
 
 
 @dataclass(frozen=True)
-class _Dies(_Leaves):
-    """A step whose first worker is lost in the middle of an item."""
+class _KillFirstWorker(_WriteMarker):
+    """Step whose first worker is killed in the middle of an item."""
 
     def __call__(self, item: int) -> None:
         if item == 3:
@@ -56,15 +56,21 @@ class _Dies(_Leaves):
         super().__call__(item)
 
 
-def _fails(item: int) -> None:
+def _fail_on_two(item: int) -> None:
+    """Step that raises for item 2."""
     if item == 2:
         raise DataError("item", "is 2")
 
 
 def check_items(executor: Executor, folder: Path) -> None:
-    """Every item is done once, by more than one process that is not this one."""
+    """Require that several worker processes run every item exactly once.
+
+    Args:
+        executor: Executor under test.
+        folder: Folder to create, visible to the workers.
+    """
     folder.mkdir()
-    assert sum(1 for _ in executor.run(_Leaves(folder), range(40))) == 40
+    assert sum(1 for _ in executor.run(_WriteMarker(folder), range(40))) == 40
     done = [path.name.split("-") for path in folder.iterdir()]
     assert sorted(int(item) for item, _ in done) == list(range(40))
     processes = {process for _, process in done}
@@ -72,56 +78,74 @@ def check_items(executor: Executor, folder: Path) -> None:
 
 
 def check_lost_worker(executor: Executor, folder: Path) -> None:
-    """What a killed worker had begun is done by another."""
+    """Require that another worker runs the item of a killed worker.
+
+    Args:
+        executor: Executor under test.
+        folder: Folder to create, visible to the workers.
+    """
     folder.mkdir()
-    assert sum(1 for _ in executor.run(_Dies(folder), range(8))) == 8
+    assert sum(1 for _ in executor.run(_KillFirstWorker(folder), range(8))) == 8
     assert (folder / "lost").exists()
     assert {path.name.split("-")[0] for path in folder.glob("*-*")} == set(map(str, range(8)))
 
 
 def check_errors(executor: Executor) -> None:
-    """An error of a step arrives as it was raised, and the executor can be used again."""
+    """Require that the exception of a step arrives unchanged and the executor stays usable."""
     try:
-        with closing(executor.run(_fails, range(4))) as run:
+        with closing(executor.run(_fail_on_two, range(4))) as run:
             for _ in run:
                 pass
     except DataError as error:
         assert (error.field, error.rule) == ("item", "is 2")
     else:
         raise AssertionError("the error did not arrive")
-    assert sum(1 for _ in executor.run(_fails, [0, 1])) == 2
+    assert sum(1 for _ in executor.run(_fail_on_two, [0, 1])) == 2
 
 
 def check_extraction(name: str, options: dict[str, Any], folder: Path) -> None:
-    """An extraction gives what threads give, bit for bit; Ctrl-C ends it, and what was done stays;
-    a worker that does not see the cache says so."""
-    _make_photos(folder)
-    here = _extract(folder, RuntimeOptions(cache_dir=folder / "here", workers=2))
+    """Require the result of threads, bit for bit, and that Ctrl-C keeps finished work.
+
+    Args:
+        name: Value of ``runtime.executor``.
+        options: Value of ``runtime.executor_options``.
+        folder: Folder to create, visible to the workers.
+    """
+    _write_images(folder)
+    local = _extract(folder, RuntimeOptions(cache_dir=folder / "local", workers=2))
     runtime = RuntimeOptions(
-        cache_dir=folder / "there", workers=2, executor=name, executor_options=options
+        cache_dir=folder / "remote", workers=2, executor=name, executor_options=options
     )
     try:
-        with _hearing_ctrl_c():
-            _extract(folder, runtime, _CtrlC())
+        with _enable_keyboard_interrupt():
+            _extract(folder, runtime, _InterruptEvents())
     except KeyboardInterrupt:
         pass
     else:
-        raise AssertionError("Ctrl-C was not heard")
-    watch = _Watch()
-    there = _extract(folder, runtime, watch)
-    assert not (found := describe_difference(here.problem, there.problem)), found
-    assert _entries(folder / "here") == _entries(folder / "there")
-    pairs = _COUNT * (_COUNT - 1) // 2
-    assert watch.done["features"] == _COUNT and watch.done["matching"] == pairs
-    used = {line["kind"]: line["computed"] for line in there.report["providers"]}
-    assert not used["matcher"], "this process matched itself"
+        raise AssertionError("Ctrl-C did not end the extraction")
+    watch = _ProgressEvents()
+    remote = _extract(folder, runtime, watch)
+    assert not (found := describe_difference(local.problem, remote.problem)), found
+    assert _read_cache(folder / "local") == _read_cache(folder / "remote")
+    pairs = _NUM_IMAGES * (_NUM_IMAGES - 1) // 2
+    assert watch.done["features"] == _NUM_IMAGES and watch.done["matching"] == pairs
+    used = {line["kind"]: line["computed"] for line in remote.report["providers"]}
+    assert not used["matcher"], "the main process matched pairs itself"
 
 
 def check_failing_provider(name: str, options: dict[str, Any], folder: Path) -> None:
-    """A provider that fails on a photo, or hangs, is asked about it once, by a worker; the rule is
-    that of threads: the run ends and names it, or goes on without the photo and lists it."""
-    _make_photos(folder)
-    with _installed(folder):
+    """Require that a provider that raises or hangs is called once per image, by a worker.
+
+    As with threads, the run either stops and names the provider, or continues without the image and
+    lists it.
+
+    Args:
+        name: Value of ``runtime.executor``.
+        options: Value of ``runtime.executor_options``.
+        folder: Folder to create, visible to the workers.
+    """
+    _write_images(folder)
+    with _install_failing_plugin(folder):
         runtime = RuntimeOptions(
             cache_dir=folder / "cache",
             workers=2,
@@ -129,41 +153,41 @@ def check_failing_provider(name: str, options: dict[str, Any], folder: Path) -> 
             executor_options=options,
         )
         try:
-            _extract(folder, runtime, depth="shaky")
+            _extract(folder, runtime, depth="failing")
         except ProviderRunError as error:
-            assert "'shaky'" in str(error)
+            assert "'failing'" in str(error)
         else:
             raise AssertionError("the provider's error did not end the run")
-        for mark in folder.glob("asked-*"):
+        for mark in folder.glob("called-*"):
             mark.unlink()
         shutil.rmtree(folder / "cache" / "extraction" / "depth", ignore_errors=True)
-        (folder / "hang").touch()  # all that takes time is in the cache now
+        (folder / "hang").touch()  # everything that takes long is in the cache now
         skipping = runtime.model_copy(update={"on_error": "skip", "timeout_s": _TIMEOUT_S})
-        found = _extract(folder, skipping, depth="shaky")
+        found = _extract(folder, skipping, depth="failing")
     reasons = found.report["failed"]
     assert list(reasons) == ["1.png", "2.png"], reasons
     assert "ZeroDivisionError" in reasons["1.png"]
     assert f"no answer within {_TIMEOUT_S:g} s" in reasons["2.png"]
     valid = [image.depth.valid.any() for image in found.problem.images]
     assert valid == [True, False, False, True]
-    asked = [path.name.split("-")[1:] for path in folder.glob("asked-*")]
+    asked = [path.name.split("-")[1:] for path in folder.glob("called-*")]
     for photo in reasons:
-        processes = [process for asked_photo, process in asked if asked_photo == photo]
+        processes = [process for called_image, process in asked if called_image == photo]
         assert len(processes) == 1 and processes[0] != str(os.getpid()), (photo, processes)
 
 
 _TIMEOUT_S = 10.0
-_SHAKY = """
+_FAILING_PLUGIN = """
 import os, time
 from pathlib import Path
 import numpy as np
 from mpsfm_core import DepthPrior, ProviderSpec, hookimpl
 
-class Shaky:
+class FailingDepth:
     def __init__(self, options, context): pass
 
     def predict(self, view):
-        Path({folder!r}, f"asked-{{view.name}}-{{os.getpid()}}").touch()
+        Path({folder!r}, f"called-{{view.name}}-{{os.getpid()}}").touch()
         if view.name == "1.png":
             raise ZeroDivisionError("in the network")
         if view.name == "2.png" and Path({folder!r}, "hang").exists():
@@ -172,19 +196,19 @@ class Shaky:
 
 @hookimpl
 def mpsfm_providers():
-    return [ProviderSpec(kind="depth", name="shaky", factory=Shaky)]
+    return [ProviderSpec(kind="depth", name="failing", factory=FailingDepth)]
 """
 
 
 @contextmanager
-def _installed(folder: Path) -> Iterator[None]:
-    """While this lasts, a plugin that fails is installed, here and for processes started here."""
-    site, name = folder / "site", "mpsfm_shaky"
+def _install_failing_plugin(folder: Path) -> Iterator[None]:
+    """Install a failing plugin for this process and for processes that it starts."""
+    site, name = folder / "site", "mpsfm_failing"
     about = site / f"{name}-1.0.dist-info"
     about.mkdir(parents=True)
-    (site / f"{name}.py").write_text(_SHAKY.format(folder=str(folder)), encoding="utf-8")
+    (site / f"{name}.py").write_text(_FAILING_PLUGIN.format(folder=str(folder)), encoding="utf-8")
     (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(f"[mpsfm.plugins]\nshaky = {name}\n")
+    (about / "entry_points.txt").write_text(f"[mpsfm.plugins]\nfailing = {name}\n")
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join([str(site), *([before] if before else [])])
     sys.path.insert(0, str(site))
@@ -199,7 +223,9 @@ def _installed(folder: Path) -> Iterator[None]:
             os.environ["PYTHONPATH"] = before
 
 
-class _Watch(NullExtractionEvents):
+class _ProgressEvents(NullExtractionEvents):
+    """Events that verify the progress of each stage."""
+
     def __init__(self) -> None:
         self.done: dict[str, int] = {}
 
@@ -209,8 +235,8 @@ class _Watch(NullExtractionEvents):
 
 
 @contextmanager
-def _hearing_ctrl_c() -> Iterator[None]:
-    """Where tests run side by side their processes are told to ignore it."""
+def _enable_keyboard_interrupt() -> Iterator[None]:
+    """Restore the default SIGINT handler, which parallel test runners may disable."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield
@@ -218,17 +244,20 @@ def _hearing_ctrl_c() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-class _CtrlC(NullExtractionEvents):
+class _InterruptEvents(NullExtractionEvents):
+    """Events that raise SIGINT as soon as matching has started."""
+
     def stage_progress(self, stage: str, done: int, total: int) -> None:
         if stage == "matching":
             signal.raise_signal(signal.SIGINT)
 
 
-def _make_photos(folder: Path) -> None:
+def _write_images(folder: Path) -> None:
+    """Write rendered images and their intrinsics."""
     photos = folder / "photos"
     photos.mkdir(parents=True)
     scene = room_scene()
-    for number, pose in enumerate(arc_poses(_COUNT, 10.0)):
+    for number, pose in enumerate(arc_poses(_NUM_IMAGES, 10.0)):
         cv2.imwrite(str(photos / f"{number}.png"), scene.render(_CAMERA, pose).rgb[..., ::-1])
     (folder / "intrinsics.yaml").write_text(_INTRINSICS, encoding="utf-8")
 
@@ -239,6 +268,7 @@ def _extract(
     events: NullExtractionEvents | None = None,
     depth: str = "flat",
 ) -> Extraction:
+    """Extract features, matches and priors of the rendered images."""
     config = Config(
         features=ProviderConfig(use="sift"),
         matcher=ProviderConfig(use="mutual-nearest"),
@@ -250,8 +280,8 @@ def _extract(
     return extract(images, config, Registry.discover(), events)
 
 
-def _entries(cache: Path) -> dict[str, bytes]:
-    """What a cache holds, without the marks of runs."""
+def _read_cache(cache: Path) -> dict[str, bytes]:
+    """Read the cached arrays, without the records of runs."""
     root = cache / "extraction"
     kinds = ("features", "matcher", "normals", "depth")
     return {
@@ -262,7 +292,7 @@ def _entries(cache: Path) -> dict[str, bytes]:
 
 
 def check_options(executor: Any) -> None:
-    """``executor(options)`` refuses what it does not know, with the place in the configuration."""
+    """Require that ``executor(options)`` rejects unknown options and names their path."""
     try:
         executor({"adress": "here"})
     except ConfigError as error:

@@ -1,4 +1,4 @@
-"""Providers that know the truth: what a wrapper under test is put around."""
+"""Depth and normals providers that return the ground truth, for tests of wrappers."""
 
 from __future__ import annotations
 
@@ -15,44 +15,47 @@ from mpsfm_core.testing.painted_views import NORMALS_STD, RELATIVE_STD, read_dep
 
 
 class GroundTruthOptions(Options):
-    """What the wrapped provider is like."""
+    """Properties of the ground-truth provider inside a wrapper."""
 
     variance: bool = True
-    """Whether it gives a variance."""
+    """Whether the prior has a variance."""
     metric: bool = True
-    """Whether its depth is called metric."""
+    """Whether the depth is declared metric."""
     scale: float = 1.0
-    """Of its depth."""
+    """Factor applied to the depth."""
 
 
 class GroundTruth:
-    """Knows the examples it was told, their mirror images, and what is painted in any other view
-    (a wrapper may cut, turn or blur what it was given)."""
+    """Ground truth of examples and of painted views.
+
+    Known examples and their mirror images are recognized by their pixels. For any other view, for
+    instance a crop that a wrapper made, the painted colors are decoded.
+    """
 
     def __init__(self) -> None:
-        self.given_depth: list[DepthPrior | None] = []
-        """The depth that came with each question about normals."""
+        self.received_depth: list[DepthPrior | None] = []
+        """Depth prior that came with each call of the normals provider."""
         self._examples: list[Example] = []
 
     def add_example(self, example: Example) -> None:
-        """Learn the truth about an example."""
+        """Add an example whose view will be recognized."""
         self._examples.append(example)
 
     def factory(self, kind: Kind) -> Callable[[GroundTruthOptions, ProviderContext], object]:
-        """The factory of a provider of this kind that asks this oracle."""
+        """Return the factory of a depth or normals provider with this ground truth."""
         make = GroundTruthDepth if kind == "depth" else GroundTruthNormals
         return lambda options, context: make(self, options)
 
-    def answer(self, view: View) -> tuple[Float64, Float64, Bool]:
-        """Depth (H, W), normals (H, W, 3) and where there is a surface."""
-        example = self._recognised(view)
+    def predict(self, view: View) -> tuple[Float64, Float64, Bool]:
+        """Return depth (H, W), normals (H, W, 3) and validity (H, W) of a view."""
+        example = self._recognize(view)
         if example is not None:
             truth = example.truth()
             return truth.depth, truth.normals, truth.valid
         depth = read_depth(view.image)
         return depth, read_normals(view.image), depth > 0
 
-    def _recognised(self, view: View) -> Example | None:
+    def _recognize(self, view: View) -> Example | None:
         for example in reversed(self._examples):
             image = example.view.image
             if image.shape == view.image.shape:
@@ -64,40 +67,44 @@ class GroundTruth:
 
 
 class GroundTruthDepth:
-    """Depth of the oracle."""
+    """Depth provider that returns the ground truth on the view's grid."""
 
-    def __init__(self, oracle: GroundTruth, options: GroundTruthOptions) -> None:
-        self._oracle = oracle
+    def __init__(self, ground_truth: GroundTruth, options: GroundTruthOptions) -> None:
+        self._ground_truth = ground_truth
         self._options = options
 
     def predict(self, view: View) -> DepthPrior:
-        """The exact depth, on the view's grid."""
-        depth, _, valid = self._oracle.answer(view)
+        """Return the true depth of a view."""
+        depth, _, valid = self._ground_truth.predict(view)
         depth = self._options.scale * depth
         variance = (RELATIVE_STD * depth) ** 2 if self._options.variance else None
         return DepthPrior.from_arrays(depth, variance, valid, metric=self._options.metric)
 
 
 class GroundTruthNormals:
-    """Normals of the oracle."""
+    """Normals provider that returns the ground truth on the view's grid."""
 
-    def __init__(self, oracle: GroundTruth, options: GroundTruthOptions) -> None:
-        self._oracle = oracle
+    def __init__(self, ground_truth: GroundTruth, options: GroundTruthOptions) -> None:
+        self._ground_truth = ground_truth
         self._options = options
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """The exact normals, on the view's grid."""
-        self._oracle.given_depth.append(depth)
-        _, normals, valid = self._oracle.answer(view)
+        """Return the true normals of a view and record the depth prior."""
+        self._ground_truth.received_depth.append(depth)
+        _, normals, valid = self._ground_truth.predict(view)
         variance = np.full(valid.shape, NORMALS_STD**2) if self._options.variance else None
         return NormalPrior.from_arrays(normals, variance, valid, camera=view.camera)
 
 
-def _spec(kind: Kind, factory: type) -> ProviderSpec:
-    return ProviderSpec(kind, "oracle", f"{__name__}:{factory.__name__}", GroundTruthOptions)
+def _make_spec(kind: Kind, factory: type) -> ProviderSpec:
+    reference = f"{__name__}:{factory.__name__}"
+    return ProviderSpec(kind, "ground-truth", reference, GroundTruthOptions)
 
 
 GROUND_TRUTH_SPECS: Mapping[Kind, ProviderSpec] = MappingProxyType(
-    {"depth": _spec("depth", GroundTruthDepth), "normals": _spec("normals", GroundTruthNormals)}
+    {
+        "depth": _make_spec("depth", GroundTruthDepth),
+        "normals": _make_spec("normals", GroundTruthNormals),
+    }
 )
-"""The specifications; a factory that asks an oracle takes the place of theirs."""
+"""Specifications by kind. The contract replaces the factory by :meth:`GroundTruth.factory`."""

@@ -1,4 +1,4 @@
-"""What a process holds on to after it has done the same again and again."""
+"""Resource usage of this process after repeated calls, to detect leaks."""
 
 from __future__ import annotations
 
@@ -12,22 +12,33 @@ import psutil
 
 
 class ProcessUsage(NamedTuple):
-    """Resident memory without what is free in it (MB, 1e6 bytes), objects that Python's collector
-    knows, open files, threads."""
+    """Resources that a process uses after garbage collection."""
 
     memory_mb: float
+    """Resident memory in MB (1e6 bytes); on Linux without freed memory."""
     objects: int
+    """Objects that Python's garbage collector tracks."""
     files: int
+    """Open file descriptors."""
     threads: int
+    """Running threads."""
 
 
 def measure_usage(run: Callable[[], object], count: int) -> Iterator[ProcessUsage]:
-    """What this process holds after each of ``count`` calls. POSIX only."""
+    """Call a function repeatedly and measure this process after each call. POSIX only.
+
+    Args:
+        run: Function without arguments.
+        count: Number of calls.
+
+    Yields:
+        Resource usage after each call.
+    """
     process = psutil.Process()
     for _ in range(count):
         run()
         gc.collect()
-        if sys.platform == "linux":  # else what is freed counts where the library keeps it
+        if sys.platform == "linux":  # glibc keeps freed memory, which would count as resident
             ctypes.CDLL(None).malloc_trim(0)
         memory = process.memory_info().rss / 1e6
         yield ProcessUsage(memory, len(gc.get_objects()), process.num_fds(), process.num_threads())

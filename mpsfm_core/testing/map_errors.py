@@ -1,4 +1,4 @@
-"""How far answers are from the truth: errors of maps, what depth really is, shifts."""
+"""Errors of depth and normal maps: deviation from the truth, ray exponent, pixel shift."""
 
 from __future__ import annotations
 
@@ -11,38 +11,55 @@ from mpsfm_core.geometry import angle_between_deg, pixel_centers
 from mpsfm_core.testing.examples import Example, TrueMaps
 from mpsfm_core.testing.outcome import CheckFailed
 
-_FEWEST = 40
-"""Pixels that a statement about a map needs."""
+_MIN_PIXELS = 40
+"""Smallest number of pixels for a statistic."""
 _OUTLIER_MADS = 5.0
 _HALF_STEP_PX = 0.5
 
 
 def error_quantile(errors: Float64) -> float:
-    """What 80 % of the errors (n,) stay below: a fault on a fifth of the map shows."""
+    """Return the 80 % quantile of absolute errors (n,).
+
+    The quantile detects a fault that affects a fifth of the map.
+    """
     return float(np.quantile(np.abs(errors), 0.8))
 
 
 class MapShift(NamedTuple):
-    """Where content of a map lies, relative to where it should: right and down, in pixels of the
-    view, at the centre; and how much that changes towards the border. ``std``: of the least
-    certain of the four."""
+    """Shift of the content of a map relative to its true position, in pixels of the view."""
 
     x: float
+    """Shift at the center, to the right."""
     y: float
+    """Shift at the center, down."""
     stretch_x: float
+    """Additional shift at the left and right border, outwards."""
     stretch_y: float
+    """Additional shift at the upper and lower border, outwards."""
     std: float
+    """Standard deviation of the least certain of the four values."""
 
     @property
     def largest(self) -> float:
-        """At the border of the view, in one direction."""
+        """Largest shift in x or y, at the border of the view."""
         return max(abs(self.x) + abs(self.stretch_x), abs(self.y) + abs(self.stretch_y))
 
 
 def select_comparable(valid: Bool, truth: TrueMaps) -> Bool:
-    """Pixels where an answer can be compared with the truth: valid and away from edges."""
+    """Select pixels that can be compared with the ground truth.
+
+    Args:
+        valid: Validity (h, w) of an answer.
+        truth: Ground truth on the same grid.
+
+    Returns:
+        Mask (h, w) of the valid pixels away from edges.
+
+    Raises:
+        CheckFailed: Too few pixels are valid.
+    """
     both = valid & truth.smooth
-    if both.sum() < min(_FEWEST, truth.smooth.sum() / 2):
+    if both.sum() < min(_MIN_PIXELS, truth.smooth.sum() / 2):
         raise CheckFailed(
             f"only {both.sum()} of {truth.smooth.sum()} pixels with a surface are valid"
         )
@@ -50,7 +67,13 @@ def select_comparable(valid: Bool, truth: TrueMaps) -> Bool:
 
 
 def log_errors(prior: DepthPrior, example: Example, *, any_scale: bool) -> Float64:
-    """``log(depth / z)`` (n,) of select_comparable pixels; less its median if any scale will do."""
+    """Return ``log(depth / z)`` (n,) of the comparable pixels.
+
+    Args:
+        prior: Predicted depth.
+        example: Example that the depth belongs to.
+        any_scale: True subtracts the median, which removes a common factor.
+    """
     truth = example.truth(prior.shape)
     where = select_comparable(prior.valid, truth)
     error: Float64 = np.log(prior.depth[where].astype(np.float64) / truth.depth[where])
@@ -58,15 +81,17 @@ def log_errors(prior: DepthPrior, example: Example, *, any_scale: bool) -> Float
 
 
 def angle_errors_deg(normals: NormalPrior, example: Example) -> Float64:
-    """Angles (n,) between the normals and the true ones, of select_comparable pixels."""
+    """Return the angles (n,) in degrees between predicted and true normals."""
     truth = example.truth(normals.shape)
     where = select_comparable(normals.valid, truth)
     return angle_between_deg(normals.normals[where].astype(np.float64), truth.normals[where])
 
 
 def estimate_ray_exponent(prior: DepthPrior, example: Example) -> float:
-    """The power of ``ray length / z`` that the depth is proportional to, besides the true z:
-    0 for depth along the axis, 1 for the length of the ray."""
+    """Estimate p of ``depth = z * (ray length / z) ** p`` by least squares.
+
+    The exponent is 0 for depth along the axis and 1 for the length of the ray.
+    """
     truth = example.truth(prior.shape)
     where = select_comparable(prior.valid, truth)
     rows, columns = prior.shape
@@ -79,21 +104,21 @@ def estimate_ray_exponent(prior: DepthPrior, example: Example) -> float:
 
 
 def estimate_depth_shift(prior: DepthPrior, example: Example) -> MapShift:
-    """By how much the depth map is shifted, from where the true depth changes."""
+    """Estimate the shift of a depth map from pixels where the true depth changes."""
     truth = example.truth(prior.shape)
     moved = [
         [example.truth(prior.shape, (s * x, s * y)).depth for s in (1, -1)]
         for x, y in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX))
     ]
-    # On a grid finer than the view half a pixel may lead beyond the border of a surface.
+    # On a grid finer than the view, half a pixel can cross the border of a surface.
     where = select_comparable(prior.valid, truth) & (np.min(moved, axis=(0, 1)) > 0)
     error = np.log(prior.depth[where].astype(np.float64) / truth.depth[where])
     slopes = [np.log(after[where] / before[where])[:, None] for after, before in moved]
-    return _shift(error[:, None], slopes, _places(prior.shape)[where])
+    return _solve_shift(error[:, None], slopes, _normalized_positions(prior.shape)[where])
 
 
 def estimate_normals_shift(prior: NormalPrior, example: Example) -> MapShift:
-    """By how much the normal map is shifted, from where the true normals turn."""
+    """Estimate the shift of a normal map from pixels where the true normals change."""
     truth = example.truth(prior.shape)
     where = select_comparable(prior.valid, truth)
     error = prior.normals[where].astype(np.float64) - truth.normals[where]
@@ -101,30 +126,37 @@ def estimate_normals_shift(prior: NormalPrior, example: Example) -> MapShift:
     for step in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX)):
         after = example.truth(prior.shape, step).normals[where]
         slopes.append(after - example.truth(prior.shape, (-step[0], -step[1])).normals[where])
-    return _shift(error, slopes, _places(prior.shape)[where])
+    return _solve_shift(error, slopes, _normalized_positions(prior.shape)[where])
 
 
-def _places(shape: tuple[int, int]) -> Float64:
-    """Where pixels lie in the map, from -1 to 1 in x and y, (h, w, 2)."""
+def _normalized_positions(shape: tuple[int, int]) -> Float64:
+    """Return the positions (h, w, 2) of pixels in x and y, from -1 to 1."""
     return pixel_centers(shape[1], shape[0]) / (shape[1] / 2, shape[0] / 2) - 1
 
 
-def _shift(error: Float64, slopes: list[Float64], places: Float64) -> MapShift:
-    """Least squares of ``error (n, k) = -slope . (shift + stretch * place) + constant``, twice:
-    the second time without outliers."""
+def _solve_shift(error: Float64, slopes: list[Float64], positions: Float64) -> MapShift:
+    """Solve ``error = -slope . (shift + stretch * position) + constant``.
+
+    Least squares with a second pass that excludes outliers.
+
+    Args:
+        error: Errors (n, k) of k channels.
+        slopes: Change of the truth per pixel in x and in y, (n, k) each.
+        positions: Positions (n, 2) from -1 to 1.
+    """
     columns = [
         *(-slope for slope in slopes),
-        *(-slope * places[:, axis : axis + 1] for axis, slope in enumerate(slopes)),
+        *(-slope * positions[:, axis : axis + 1] for axis, slope in enumerate(slopes)),
         *(np.broadcast_to(unit, error.shape) for unit in np.eye(error.shape[1])),
     ]
     design = np.stack([column.ravel() for column in columns], axis=1)
     target = error.ravel()
-    kept = np.ones(len(target), dtype=np.bool_)
+    inliers = np.ones(len(target), dtype=np.bool_)
     for _ in range(2):
-        a, b = design[kept], target[kept]
+        a, b = design[inliers], target[inliers]
         solution, _, rank, _ = np.linalg.lstsq(a, b, rcond=None)
         residual = np.abs(target - design @ solution)
-        kept = residual <= _OUTLIER_MADS * np.median(residual) + 1e-12
+        inliers = residual <= _OUTLIER_MADS * np.median(residual) + 1e-12
     if rank < design.shape[1]:
         return MapShift(0.0, 0.0, 0.0, 0.0, np.inf)
     spread = np.linalg.inv(a.T @ a).diagonal()[:4].max()

@@ -1,11 +1,11 @@
-"""How a check ends other than well."""
+"""Exceptions that end a contract check as failed or skipped."""
 
 from __future__ import annotations
 
 
 class CheckFailed(Exception):
-    """The provider breaks the contract; the message says how."""
+    """The provider violates the contract; the message describes the violation."""
 
 
 class CheckSkipped(Exception):
-    """The check has nothing to say about this provider; the message says why."""
+    """The check does not apply to this provider; the message gives the reason."""

@@ -1,4 +1,4 @@
-"""Checks as pytest items, for ``pytest --mpsfm-plugin NAME``."""
+"""Contract checks as pytest items, for ``pytest --mpsfm-plugin NAME``."""
 
 from __future__ import annotations
 
@@ -17,23 +17,25 @@ from mpsfm_core.testing.pytest_tests import report
 
 
 class ContractCollection:
-    """Adds an item for each check of each named provider to what pytest collects."""
+    """Pytest plugin that collects one item per check of each named provider."""
 
     def __init__(self, names: Sequence[str], options: Sequence[str]) -> None:
         self._names = names
         self._options = options
         self._folder = Path(tempfile.mkdtemp(prefix="mpsfm-contract-"))
 
-    @pytest.hookimpl(tryfirst=True)  # so that -k and -m choose among them too
+    @pytest.hookimpl(tryfirst=True)  # so that -k and -m also select among these items
     def pytest_collection_modifyitems(
         self, session: pytest.Session, items: list[pytest.Item]
     ) -> None:
-        """Collect without constructing any provider."""
+        """Add the checks to the collected items. Creates no provider."""
         try:
             setup = parse_setup(self._options)
             registry = Registry.discover()
-            found = [p for name in self._names for p in find_providers(registry, name)]
-            contracts = [Contract(registry, *p, self._folder, setup) for p in dict.fromkeys(found)]
+            providers = [p for name in self._names for p in find_providers(registry, name)]
+            contracts = [
+                Contract(registry, *p, self._folder, setup) for p in dict.fromkeys(providers)
+            ]
         except MpsfmError as error:
             raise pytest.UsageError(str(error)) from error
         for contract in contracts:
@@ -47,20 +49,20 @@ class ContractCollection:
                 items.append(item)
 
     def pytest_unconfigure(self) -> None:
-        """Remove the files of the stand-ins."""
+        """Remove the files of stand-ins."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
 class _Provider(pytest.Collector):
-    """The node above the checks of one provider."""
+    """Collector node that is the parent of the checks of one provider."""
 
     def collect(self) -> list[pytest.Item | pytest.Collector]:
-        """Nothing: the items are made with it."""
+        """Return nothing: the items are created together with this node."""
         return []
 
 
 class ContractItem(pytest.Item):
-    """One check."""
+    """Pytest item of one check."""
 
     def __init__(self, *, contract: Contract, task: CheckTask, **rest: Any) -> None:
         super().__init__(**rest)
@@ -68,9 +70,9 @@ class ContractItem(pytest.Item):
         self._task = task
 
     def runtest(self) -> None:
-        """Run the check."""
+        """Run the check and report its result."""
         report(self._contract.run(self._task))
 
     def reportinfo(self) -> tuple[Path, None, str]:
-        """How the check is named in reports."""
+        """Return the name of the check for reports."""
         return self.path, None, f"{self._contract.provider} {self._task}"

@@ -1,4 +1,4 @@
-"""The contract as tests of a plugin's own test file."""
+"""Contract checks as tests in a plugin's own test file."""
 
 from __future__ import annotations
 
@@ -18,12 +18,23 @@ from mpsfm_core.testing.contract import (
 def contract_tests(
     kind: Kind, name: str, setup: SetupSource = None, *, registry: Registry | None = None
 ) -> Callable[..., None]:
-    """A parametrised pytest function with one test for each check of a provider::
+    """Create a parametrized pytest function with one test per check of a provider.
+
+    Example::
 
         test_contract = contract_tests("depth", "my-depth")
 
-    ``setup``: by default what the plugin's specification says, see
-    :class:`~mpsfm_core.testing.ContractSetup`. ``registry``: by default all installed plugins.
+    Args:
+        kind: Kind of the provider.
+        name: Name of the provider.
+        setup: Setup or contract function; by default the one of the specification.
+        registry: Registry that contains the provider; by default all installed plugins.
+
+    Returns:
+        Test function for a test module.
+
+    Raises:
+        ProviderError: The provider does not exist or is unavailable.
     """
     import pytest
 
@@ -43,7 +54,7 @@ def contract_tests(
 
 
 def report(result: CheckResult) -> None:
-    """End a pytest test as the check ended."""
+    """End a pytest test with the status of a check."""
     import pytest
 
     __tracebackhide__ = True

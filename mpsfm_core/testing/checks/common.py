@@ -1,8 +1,12 @@
-"""Checks of every provider, whatever its kind.
+"""Checks that apply to every kind of provider.
 
-A check is a function of a :class:`~mpsfm_core.testing.contract_case.ContractCase`. It returns nothing or a remark,
-and raises ``CheckFailed`` or ``CheckSkipped`` with the reason. Its id is its name without
-``check_``, with dashes.
+A check is a function of a :class:`~mpsfm_core.testing.contract_case.ContractCase`. It returns
+nothing or a remark, and raises ``CheckFailed`` or ``CheckSkipped`` with the reason. Its id is its
+name without ``check_`` and with dashes. The first line of its docstring states the rule, the rest
+gives the reason or the limits of the check.
+
+Most checks use one view of 192 x 144 pixels, so that a check takes a fraction of a second with a
+small network. Answers are compared bit for bit, because the cache of a run has no tolerance either.
 """
 
 from __future__ import annotations
@@ -32,17 +36,17 @@ from mpsfm_core.testing.contract_case import ContractCase, describe_difference
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
-HEAVY = ("torch", "onnxruntime", "tensorflow", "jax", "kornia", "cv2", "scipy", "pycolmap")
-"""What listing plugins must not import: together seconds on every start."""
+HEAVY_MODULES = ("torch", "onnxruntime", "tensorflow", "jax", "kornia", "cv2", "scipy", "pycolmap")
+"""Libraries that a plugin module must not import: together they cost seconds at every start."""
 
-_CALLS = 4
-_KEPT_BYTES = 20_000
-"""A call, of what Python and numpy allocate. Ours: a view of the check has 83 kB or more, while
-caches of the interpreter grow by less than 4 kB."""
+_NUM_MEMORY_CALLS = 4
+_MAX_RETAINED_BYTES = 20_000
+"""Python and numpy memory that a call may retain. A view has at least 83 kB; caches of the
+interpreter grow by less than 4 kB."""
 
 
 def check_specification(case: ContractCase) -> str:
-    """The registry accepts the specification, and the options of the setup are valid."""
+    """Require that the registry accepts the specification and the setup's options."""
     fault, hint = find_spec_fault(case.spec)
     if fault:
         raise CheckFailed(f"the specification {fault}; {hint}")
@@ -53,25 +57,28 @@ def check_specification(case: ContractCase) -> str:
         raise CheckFailed("a wrapper has to declare 'wraps-depth' or 'wraps-normals'")
     case.registry.validate_options(case.spec.kind, case.spec.name, case.setup.options)
     if case.spec.code_license == "unknown":
-        return "code_license is not given: users will ask"
+        return "code_license is not declared; users will ask for it"
     return ""
 
 
 def check_construction(case: ContractCase) -> None:
-    """The provider can be constructed with the options of its setup."""
+    """Require that the factory constructs the provider with the setup's options."""
     assert case.provider is not None
 
 
 def check_light_import(case: ContractCase) -> None:
-    """Importing the plugin's module, as every listing does, imports no heavy library."""
-    modules = _plugin_modules(case)
+    """Require that importing the plugin's module imports no heavy library.
+
+    Every start of MP-SfM imports the modules of all plugins.
+    """
+    modules = _find_plugin_modules(case)
     if not modules:
         raise CheckSkipped("registered in this process, not by an entry point")
     script = (
         "import importlib, sys\n"
         f"import mpsfm_core.providers.registry\nbefore = set(sys.modules)\n"
         f"[importlib.import_module(name).mpsfm_providers() for name in {modules!r}]\n"
-        f"print(*sorted(set({HEAVY!r}) & (set(sys.modules) - before)))"
+        f"print(*sorted(set({HEAVY_MODULES!r}) & (set(sys.modules) - before)))"
     )
     paths = f"import sys; sys.path[:] = {sys.path!r}\n"
     run = subprocess.run([sys.executable, "-c", paths + script], capture_output=True, text=True)
@@ -82,96 +89,109 @@ def check_light_import(case: ContractCase) -> None:
 
 
 def check_output_rules(case: ContractCase) -> None:
-    """The answer passes the validator: type, dtype, shape, finite, positive, unit, inside of the
-    view, and all that the capabilities promise. Without this no other check asks anything."""
+    """Require that the answer passes the validator.
+
+    The validator checks type, dtype, shape and values, and what the capabilities promise. If this
+    check fails, all checks that call the provider are skipped.
+    """
     case.run(case.example)
 
 
 def check_deterministic(case: ContractCase) -> None:
-    """The same view gives the same answer, bit by bit, from one instance and from another: results
-    are cached, and a run with a seed can be repeated."""
+    """Require bitwise equal answers from repeated calls and from two instances.
+
+    Answers are cached, and a run with a seed must be repeatable.
+    """
     first = case.run(case.example)
-    _same(first, case.run(case.example), "asked twice")
-    _same(first, case.run(case.example, case.create_provider()), "asked a second instance")
+    _require_same(first, case.run(case.example), "in a second call")
+    _require_same(first, case.run(case.example, case.create_provider()), "of a second instance")
 
 
 def check_no_state(case: ContractCase) -> None:
-    """An answer does not depend on the views seen before: a batch, in any order, gives what single
-    views give (the interface has no batches; this is what they would have to obey)."""
+    """Require that an answer does not depend on the views of earlier calls.
+
+    A run calls providers in any order.
+    """
     others = [case.example.sized(104, 120), case.example.partner]
     alone = case.run(case.example, case.create_provider())
     for other in others:
         case.run(other)
-    _same(alone, case.run(case.example), "asked after other views")
+    _require_same(alone, case.run(case.example), "after other views")
 
 
 def check_inputs_unchanged(case: ContractCase) -> None:
-    """The view, and depth or features that come with it, are the same afterwards: other providers
-    see them too."""
+    """Require that the provider does not modify the view or its depth and features.
+
+    Other providers use the same arrays.
+    """
     example = case.example.sized(*case.example.camera.size)
     image = np.array(example.view.image)
     view = View(example.name, image, example.camera, np.ones(image.shape[:2], np.bool_))
     case.prepare(example)
-    extra = case.make_auxiliary_input(view, example)
-    before = pickle.loads(pickle.dumps((image, view.mask, extra)))
-    case.run_on_view(view, example, extra=extra)
-    for what, old, new in zip(
-        ("image", "mask", "depth or features"), before, (image, view.mask, extra), strict=True
-    ):
-        changed = describe_difference(old, new)
-        if changed:
-            raise CheckFailed(f"changes the {what} it is given: {changed}")
+    auxiliary = case.make_auxiliary_input(view, example)
+    before = pickle.loads(pickle.dumps((image, view.mask, auxiliary)))
+    case.run_on_view(view, example, auxiliary=auxiliary)
+    after = (image, view.mask, auxiliary)
+    for name, old, new in zip(("image", "mask", "depth or features"), before, after, strict=True):
+        difference = describe_difference(old, new)
+        if difference:
+            raise CheckFailed(f"changes the {name} it is given: {difference}")
 
 
 def check_name_does_not_matter(case: ContractCase) -> None:
-    """The answer does not depend on the view's name, as the cache goes by pixels; providers that
-    read files declare the capability ``uncached``."""
+    """Require that the answer does not depend on the name of the view.
+
+    The cache is keyed by pixels. Providers that read files declare the capability ``uncached``.
+    """
     if case.declares("uncached"):
         raise CheckSkipped("declares 'uncached'")
     if case.setup.prepare is not None:
-        raise CheckSkipped("is told about views by their names")
+        raise CheckSkipped("the setup prepares files by the names of views")
     expected = case.run(case.example)
     renamed = replace(case.example.view, name="another/name.jpg")
-    _same(expected, case.run_on_view(renamed, case.example), "asked about a renamed view")
+    _require_same(expected, case.run_on_view(renamed, case.example), "of a renamed view")
 
 
 def check_intrinsics_declared(case: ContractCase) -> None:
-    """The answer changes with the focal length only if the provider declares
-    ``intrinsics-aware``: otherwise the cache would return what was made for another camera."""
+    """Require ``intrinsics-aware`` if the answer depends on the focal length.
+
+    Otherwise the cache would return the answer for another camera.
+    """
     if case.declares("intrinsics-aware"):
         raise CheckSkipped("declares 'intrinsics-aware'")
     if case.declares("uncached"):
         raise CheckSkipped("declares 'uncached'")
     expected = case.run(case.example)
-    camera = replace(
-        case.example.camera, fx=1.3 * case.example.camera.fx, fy=1.3 * case.example.camera.fy
-    )
-    found = case.run_on_view(replace(case.example.view, camera=camera), case.example)
-    if isinstance(expected, NormalPrior):  # which normals face the camera depends on it, no more
-        expected, found = _valid_in_both(expected, found)
-    changed = describe_difference(expected, found)
-    if changed:
-        raise CheckFailed(f"depends on the focal length and does not declare it: {changed}")
+    camera = case.example.camera
+    longer = replace(camera, fx=1.3 * camera.fx, fy=1.3 * camera.fy)
+    answer = case.run_on_view(replace(case.example.view, camera=longer), case.example)
+    if isinstance(expected, NormalPrior):  # only the set of normals that face the camera may change
+        expected, answer = _select_valid_in_both(expected, answer)
+    difference = describe_difference(expected, answer)
+    if difference:
+        raise CheckFailed(f"depends on the focal length and does not declare it: {difference}")
 
 
 def check_threads(case: ContractCase) -> None:
-    """Two instances in two threads at once answer as they do alone: a run has one in each."""
+    """Require that two instances in two threads give the answers that each gives alone.
+
+    A run uses one instance per thread.
+    """
     examples = [case.example, case.example.sized(*case.example.camera.size).partner]
     alone = [case.run(example) for example in examples]
     instances = [case.create_provider() for _ in examples]
-    start = threading.Barrier(len(examples))
-    together: list[Any] = [None] * len(examples)
+    barrier = threading.Barrier(len(examples))
+    parallel: list[Any] = [None] * len(examples)
 
     def work(index: int) -> None:
-        start.wait()
+        barrier.wait()
         for _ in range(2):
             try:
-                together[index] = case.run(examples[index], instances[index])
+                parallel[index] = case.run(examples[index], instances[index])
             except Exception as error:
-                together[index] = error
-            if isinstance(together[index], Exception) or describe_difference(
-                alone[index], together[index]
-            ):
+                parallel[index] = error
+            answer = parallel[index]
+            if isinstance(answer, Exception) or describe_difference(alone[index], answer):
                 return
 
     threads = [threading.Thread(target=work, args=(index,)) for index in range(len(examples))]
@@ -179,30 +199,35 @@ def check_threads(case: ContractCase) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    for expected, found in zip(alone, together, strict=True):
-        if isinstance(found, Exception):
-            raise CheckFailed(f"in two threads at once: {found}") from found
-        _same(expected, found, "asked in two threads at once")
+    for expected, answer in zip(alone, parallel, strict=True):
+        if isinstance(answer, Exception):
+            raise CheckFailed(f"in two threads in parallel: {answer}") from answer
+        _require_same(expected, answer, "in two threads in parallel")
 
 
 def check_pickles(case: ContractCase) -> None:
-    """Factory, options and answers survive pickling, so that process pools can work with them."""
+    """Require that factory, options and answers can be pickled.
+
+    Process pools and other executors send them to workers.
+    """
     options = case.registry.validate_options(case.spec.kind, case.spec.name, case.setup.options)
     answer = case.run(case.example)
-    for what, value in (("factory", case.spec.factory), ("options", options), ("answer", answer)):
+    for name, value in (("factory", case.spec.factory), ("options", options), ("answer", answer)):
         try:
             copy = pickle.loads(pickle.dumps(value))
         except Exception as error:
             reason = f"{type(error).__name__}: {error}"
-            raise CheckFailed(f"its {what} cannot be pickled: {reason}") from error
-    _same(answer, copy, "pickled")
+            raise CheckFailed(f"its {name} cannot be pickled: {reason}") from error
+    _require_same(answer, copy, "after pickling")
 
 
 def check_offline(case: ContractCase) -> None:
-    """Constructing the provider and asking it opens no socket once its weights are here. Sees what
-    goes through Python's sockets; a library that makes its own is not seen."""
-    case.provider  # noqa: B018 - fetches the weights, where they are not here yet
-    with _no_sockets() as attempts:
+    """Require that construction and calls open no socket once the weights are local.
+
+    The check detects Python sockets, not those of native libraries.
+    """
+    case.provider  # noqa: B018 - downloads the weights if necessary
+    with _forbid_sockets() as attempts:
         try:
             case.run(case.example, case.create_provider())
         except Exception as error:
@@ -214,102 +239,112 @@ def check_offline(case: ContractCase) -> None:
 
 
 def check_memory_released(case: ContractCase) -> str:
-    """Views and answers are not kept: what Python and numpy allocate does not grow with the number
-    of views (the memory of native libraries is not seen)."""
-    examples = [_renamed(case.example, f"memory/{number}.png") for number in range(_CALLS + 2)]
+    """Require that allocated memory does not grow with the number of views.
+
+    The check measures memory of Python and numpy, not of native libraries.
+    """
+    num_views = _NUM_MEMORY_CALLS + 2
+    examples = [_rename_example(case.example, f"memory/{i}.png") for i in range(num_views)]
     for example in examples:
         case.prepare(example)
-    questions = [(e.view, case.make_auxiliary_input(e.view, case.example)) for e in examples]
+    inputs = [(e.view, case.make_auxiliary_input(e.view, case.example)) for e in examples]
     provider = case.create_provider()
     tracemalloc.start()
     try:
-        for view, extra in questions[:2]:
-            case.run_on_view(view, case.example, provider, extra)
+        for view, auxiliary in inputs[:2]:
+            case.run_on_view(view, case.example, provider, auxiliary)
         gc.collect()
         before = tracemalloc.get_traced_memory()[0]
-        for view, extra in questions[2:]:
-            case.run_on_view(view, case.example, provider, extra)
+        for view, auxiliary in inputs[2:]:
+            case.run_on_view(view, case.example, provider, auxiliary)
         gc.collect()
-        kept = (tracemalloc.get_traced_memory()[0] - before) / _CALLS
+        retained = (tracemalloc.get_traced_memory()[0] - before) / _NUM_MEMORY_CALLS
     finally:
         tracemalloc.stop()
-    if kept > _KEPT_BYTES:
-        raise CheckFailed(f"keeps {kept / 1000:.0f} kB of each view")
-    return f"keeps {max(kept, 0) / 1000:.1f} kB a view"
+    if retained > _MAX_RETAINED_BYTES:
+        raise CheckFailed(f"keeps {retained / 1000:.0f} kB of each view")
+    return f"keeps {max(retained, 0) / 1000:.1f} kB a view"
 
 
 def check_speed(case: ContractCase) -> str:
-    """How long it takes; never fails."""
+    """Report the time of construction and of two calls; never fails."""
     started = time.perf_counter()
     provider = case.create_provider()
     constructed = time.perf_counter()
     case.run(case.example, provider)
     first = time.perf_counter()
     case.run(case.example, provider)
-    again = time.perf_counter() - first
+    second = time.perf_counter() - first
     width, height = case.example.camera.size
-    times = (constructed - started, first - constructed, again)
+    times = (constructed - started, first - constructed, second)
     return "{:.3f} s to construct, {:.3f} s for the first and {:.3f} s for the next {} x {}".format(
         *times, width, height
     )
 
 
 def check_odd_size(case: ContractCase) -> str:
-    """A view whose sides no network likes, 149 x 107, is answered, and as well as any other."""
-    return _judged(case, case.example.sized(149, 107))
+    """Require the usual accuracy for a view of 149 x 107 pixels.
+
+    Both sides are prime, so that no network stride divides them.
+    """
+    return _run_and_compare(case, case.example.sized(149, 107))
 
 
 def check_portrait(case: ContractCase) -> str:
-    """A view that is higher than wide is answered, and as well as any other."""
+    """Require the usual accuracy for a view in portrait format."""
     width, height = case.example.camera.size
-    return _judged(case, case.example.sized(height, width))
+    return _run_and_compare(case, case.example.sized(height, width))
 
 
 def check_one_pixel(case: ContractCase) -> None:
-    """A view of one pixel gives an answer, not a crash."""
+    """Require a valid answer for a view of one pixel."""
     case.run(case.example.sized(1, 1))
 
 
 def check_thin_view(case: ContractCase) -> None:
-    """A view of 5 x 120 pixels gives an answer, not a crash."""
+    """Require a valid answer for a view of 5 x 120 pixels."""
     case.run(case.example.sized(5, 120))
 
 
 def check_grayscale(case: ContractCase) -> None:
-    """A gray photo gives an answer; it comes as three equal channels."""
+    """Require a valid answer for a grayscale image, given as three equal channels."""
     gray = np.asarray(case.example.view.image).mean(axis=-1, keepdims=True)
-    _ask_about_image(case, np.broadcast_to(gray.astype(np.uint8), case.example.view.image.shape))
+    shape = case.example.view.image.shape
+    _run_on_image(case, np.broadcast_to(gray.astype(np.uint8), shape))
 
 
 def check_sixteen_bit(case: ContractCase) -> None:
-    """A gray photo of 16 bit gives an answer; the core makes 8 bit and three channels of it."""
-    import cv2  # not at the top: pytest loads this module when it collects
+    """Require a valid answer for a 16-bit grayscale image.
+
+    The core converts the image to 8 bit and three channels.
+    """
+    import cv2  # local, because pytest loads this module when it collects tests
 
     from mpsfm_core.inputs.image_decoding import decode_rgb
     from mpsfm_core.inputs.image_header import ImageHeader
 
     wide = case.example.view.image[..., 0].astype(np.uint16) * 257
     data = cv2.imencode(".png", wide)[1].tobytes()
-    _ask_about_image(case, decode_rgb(data, ImageHeader(None, 1, {}), Path("gray16.png")))
+    _run_on_image(case, decode_rgb(data, ImageHeader(None, 1, {}), Path("gray16.png")))
 
 
 def check_flat(case: ContractCase) -> None:
-    """Black, white and gray views without any content give an answer."""
+    """Require a valid answer for black, gray and white views without texture."""
     for value in (0, 128, 255):
-        _ask_about_image(case, np.full(case.example.view.image.shape, value, np.uint8))
+        _run_on_image(case, np.full(case.example.view.image.shape, value, np.uint8))
 
 
 def check_masked(case: ContractCase) -> None:
-    """A view with a mask, partly or wholly False, gives an answer."""
-    for visible in (case.example.camera.width // 2, 0):
+    """Require a valid answer for a view whose mask is partly or completely False."""
+    for num_visible_columns in (case.example.camera.width // 2, 0):
         mask = np.zeros(case.example.view.image.shape[:2], np.bool_)
-        mask[:, :visible] = True
+        mask[:, :num_visible_columns] = True
         case.prepare(case.example)
         case.run_on_view(replace(case.example.view, mask=mask), case.example)
 
 
 STANDALONE = (check_specification, check_construction, check_light_import)
-"""Checks that ask the provider nothing."""
+"""Checks that do not call the provider."""
 
 COMMON = (
     check_deterministic,
@@ -331,16 +366,17 @@ COMMON = (
     check_flat,
     check_masked,
 )
+"""Checks that call the provider, in the order to run them."""
 
 
-def _same(expected: object, found: object, when: str) -> None:
-    changed = describe_difference(expected, found)
-    if changed:
-        raise CheckFailed(f"{when}, the answer is another: {changed}")
+def _require_same(expected: object, answer: object, when: str) -> None:
+    difference = describe_difference(expected, answer)
+    if difference:
+        raise CheckFailed(f"the answer {when} differs: {difference}")
 
 
-def _valid_in_both(first: NormalPrior, second: NormalPrior) -> tuple[object, object]:
-    """The normals and variances where both are valid."""
+def _select_valid_in_both(first: NormalPrior, second: NormalPrior) -> tuple[object, object]:
+    """Return the normals and variances of the pixels that are valid in both priors."""
     if first.shape != second.shape:
         return first, second
     where = first.valid & second.valid
@@ -349,32 +385,33 @@ def _valid_in_both(first: NormalPrior, second: NormalPrior) -> tuple[object, obj
     return a, b
 
 
-def _judged(case: ContractCase, example: Example) -> str:
+def _run_and_compare(case: ContractCase, example: Example) -> str:
     return compare_with_truth(case, example, case.run(example))
 
 
-def _ask_about_image(case: ContractCase, image: UInt8) -> None:
+def _run_on_image(case: ContractCase, image: UInt8) -> None:
     case.prepare(case.example)
-    case.run_on_view(replace(case.example.view, image=np.ascontiguousarray(image)), case.example)
+    view = replace(case.example.view, image=np.ascontiguousarray(image))
+    case.run_on_view(view, case.example)
 
 
-def _renamed(example: Example, name: str) -> Example:
+def _rename_example(example: Example, name: str) -> Example:
     renamed = replace(example, name=name)
-    # The renderings are the same: made once.
+    # Reuse the rendered images, which the name does not change.
     renamed.__dict__.update(view=replace(example.view, name=name), partner=example.partner)
     return renamed
 
 
-def _plugin_modules(case: ContractCase) -> list[str]:
-    """The modules of the entry points of the provider's distribution."""
+def _find_plugin_modules(case: ContractCase) -> list[str]:
+    """Return the entry-point modules of the provider's distribution."""
     distribution = case.registry.version(case.spec.kind, case.spec.name).partition(" ")[0]
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
     return [e.module for e in entries if e.dist is not None and e.dist.name == distribution]
 
 
 @contextmanager
-def _no_sockets() -> Iterator[list[str]]:
-    """Refuses connections and name look-ups, and lists what was tried."""
+def _forbid_sockets() -> Iterator[list[str]]:
+    """Refuse connections and name look-ups; yields the list of the addresses that were tried."""
     attempts: list[str] = []
 
     def refuse(*arguments: Any, **_: Any) -> Any:

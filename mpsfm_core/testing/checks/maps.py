@@ -1,4 +1,4 @@
-"""What the checks of maps share."""
+"""Requirements that the checks of depth and normal maps share."""
 
 from __future__ import annotations
 
@@ -16,13 +16,24 @@ from mpsfm_core.testing.examples import Example, TrueMaps
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 STD_FACTOR = 1.25
-"""Between the std found and the one reported; a std of 0.25 m taken for a variance is 2 off."""
+"""Largest ratio of measured to reported std. A std of 0.25 m instead of a variance gives 2."""
 VALIDITY_TOLERANCE = 0.05
-"""Share of pixels away from edges, for networks whose padding or blur costs some."""
+"""Ratio of wrong pixels away from edges; padding and blur of a network cost some."""
 
 
 def require_reported_std(variance: Float32, expected_std: Float64) -> str:
-    """Raise ``CheckFailed`` unless the variance is the square of what was reported."""
+    """Require that a variance is the square of the reported std.
+
+    Args:
+        variance: Variances (n,) of an answer.
+        expected_std: Reported standard deviations (n,).
+
+    Returns:
+        Remark with the ratio.
+
+    Raises:
+        CheckFailed: The median ratio of the standard deviations is outside of :data:`STD_FACTOR`.
+    """
     factor = float(np.median(np.sqrt(variance.astype(np.float64)) / expected_std))
     if 1 / STD_FACTOR < factor < STD_FACTOR:
         return f"std {factor:.3f} times the reported one"
@@ -32,20 +43,42 @@ def require_reported_std(variance: Float32, expected_std: Float64) -> str:
 
 
 def require_true_validity(valid: Bool, truth: TrueMaps) -> str:
-    """Raise ``CheckFailed`` where valid pixels show no surface, or surfaces are not valid."""
+    """Require that pixels are valid exactly where there is a surface.
+
+    Args:
+        valid: Validity (h, w) of a map.
+        truth: Ground truth on the same grid.
+
+    Returns:
+        Remark with both error ratios.
+
+    Raises:
+        CheckFailed: A ratio exceeds :data:`VALIDITY_TOLERANCE`.
+        CheckSkipped: The map is too coarse to separate surfaces from sky.
+    """
     empty, full = truth.edge_free & ~truth.valid, truth.smooth
     if not (empty.any() and full.any()):
         raise CheckSkipped("the map is too coarse to tell surfaces from sky")
     wrong, lost = float(valid[empty].mean()), float(1 - valid[full].mean())
     if wrong > VALIDITY_TOLERANCE:
-        raise CheckFailed(f"{wrong:.0%} of the pixels without any surface are called valid")
+        raise CheckFailed(f"{wrong:.0%} of the pixels without any surface are valid")
     if lost > VALIDITY_TOLERANCE:
         raise CheckFailed(f"{lost:.0%} of the pixels with a surface are not valid")
     return f"{wrong:.1%} wrongly valid, {lost:.1%} lost"
 
 
 def require_monotonic_calibration(case: ContractCase, prior: DepthPrior | NormalPrior) -> None:
-    """Raise ``CheckFailed`` if the declared calibration loses the variance or turns it round."""
+    """Require that the declared calibration keeps the variance and its order.
+
+    Args:
+        case: Provider under test.
+        prior: Its answer.
+
+    Raises:
+        CheckFailed: The calibrated variance is invalid, or does not grow with ``std_scale`` and
+        with
+            the variance of the network.
+    """
     calibration = case.calibration()
 
     def total(given: DepthPrior | NormalPrior, scale: float = 1.0) -> Float32:
@@ -67,5 +100,5 @@ def require_monotonic_calibration(case: ContractCase, prior: DepthPrior | Normal
 
 
 def swap_painted_channels(example: Example, shape: tuple[int, int]) -> NDArray[Any]:
-    """The painted image with its channels in the wrong order, on the grid of a map."""
+    """Return the painted image as BGR, resized to the grid of a map."""
     return resize_map(example.view.image[..., ::-1], shape[1], shape[0])

@@ -1,4 +1,7 @@
-"""Checks of mask providers. The masks of the examples leave out what has no surface: the sky."""
+"""Checks of mask providers.
+
+The masks of the examples exclude the sky, where there is no surface.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from mpsfm_core.testing.painted_views import read_depth
 
 
 def check_mask_polarity(case: ContractCase) -> str:
-    """True is a pixel that may be used, False one that may not."""
+    """Require True for usable pixels and False for the others."""
     case.require_truth("painted", "prepared", "image")
     answer, truth = case.run(case.example), case.example.truth()
     agreement = float((answer == truth.valid)[truth.edge_free].mean())
@@ -22,13 +25,16 @@ def check_mask_polarity(case: ContractCase) -> str:
 
 
 def check_mask_place(case: ContractCase) -> str:
-    """The mask covers the whole view at its place: it is not shifted, turned or of another part."""
+    """Require that the mask covers the whole view without a shift.
+
+    The check detects shifted, rotated and cropped masks.
+    """
     case.require_truth("painted", "prepared", "image")
     return compare_with_truth(case, case.example, case.run(case.example))
 
 
 def check_mask_channel_order(case: ContractCase) -> None:
-    """The network gets RGB, not BGR."""
+    """Require that the network receives RGB, not BGR."""
     case.require_truth("painted")
     answer, truth = case.run(case.example), case.example.truth()
     swapped = read_depth(swap_painted_channels(case.example, answer.shape)) > 0
@@ -40,7 +46,7 @@ def check_mask_channel_order(case: ContractCase) -> None:
 
 
 def check_mask_flip(case: ContractCase) -> str:
-    """The mirrored view has the mirrored mask."""
+    """Require the mirrored mask for the mirrored view."""
     answer, mirrored = case.run(case.example), case.run(case.example.mirror())
     where = case.example.truth().edge_free
     wrong = float((answer != np.asarray(mirrored)[:, ::-1])[where].mean())

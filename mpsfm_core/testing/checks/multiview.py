@@ -1,4 +1,4 @@
-"""Checks of multi-view providers; those of depth maps apply to each of theirs as well."""
+"""Checks of multi-view providers, which also have to pass the checks of depth maps."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
-TURN_TOLERANCE_DEG = 1.0
-"""Of the turn between two views. Ours: the views of the check are 4 and 8 degrees apart, so that an
-inverted or mirrored pose is off by 8 and more."""
-STEP_TOLERANCE = 0.1
-"""Of the step between two views, in terms of its length: twice what depth may be off."""
+ROTATION_TOLERANCE_DEG = 1.0
+"""Error of a relative rotation. The views are 4 and 8 degrees apart, so that an inverted or
+mirrored pose has an error of 8 degrees or more."""
+BASELINE_TOLERANCE = 0.1
+"""Relative error of a baseline: twice the tolerance of depth."""
 FOCAL_TOLERANCE = 0.1
-"""Of a focal length that the provider can know. A network's own grid instead of the view's, or one
-side for the other, makes 0.25 and more here."""
-_ENLARGED = (1.5, 2.7)
-"""Focal length at twice the size over that at the size itself, for a network that guesses."""
+"""Relative error of a known focal length. A wrong pixel grid or exchanged axes give at least
+0.25."""
+_FOCAL_RATIO_RANGE = (1.5, 2.7)
+"""Ratio of the estimated focal lengths of a view at twice the size and at its own size."""
 
 
 def check_multiview_order(case: ContractCase) -> None:
-    """The answer has the order of the views: with the views exchanged, the maps are exchanged."""
+    """Require that the maps have the order of the views."""
     case.require_truth("painted", "prepared", "image")
-    examples = _group(case)[::-1]
+    examples = _make_group(case)[::-1]
     group = case.run_on_group(*examples)
-    right = max(map(_spread, group.depth, examples))
-    if max(map(_spread, group.depth[::-1], examples)) < 0.5 * right:
+    right = max(map(_scale_free_error, group.depth, examples))
+    if max(map(_scale_free_error, group.depth[::-1], examples)) < 0.5 * right:
         raise CheckFailed("the maps come in another order than the views")
 
 
 def check_multiview_own_axis(case: ContractCase) -> str:
-    """The depth of each view is along its own optical axis, not along that of the first."""
+    """Require depth along the optical axis of each view, not of the first view."""
     case.require_truth("painted", "prepared", "image")
-    examples = _group(case)
+    examples = _make_group(case)
     group = case.run_on_group(*examples)
-    errors = list(map(_spread, group.depth, examples))
+    errors = list(map(_scale_free_error, group.depth, examples))
     if max(errors) > DEPTH_TOLERANCE:
         first = [
-            _spread_of(p, e, _z_of_first(e, examples[0], p.shape))
+            _median_free_error(p, e, _depth_from_first_view(e, examples[0], p.shape))
             for p, e in _pairs(group, examples)
         ]
         reason = ": it is z of the first view" if max(first) < 0.5 * max(errors) else ""
@@ -63,9 +63,12 @@ def check_multiview_own_axis(case: ContractCase) -> str:
 
 
 def check_multiview_one_unit(case: ContractCase) -> str:
-    """The maps of a group share one unit: the mapper gives them one scale."""
+    """Require one unit for all maps of a group.
+
+    The mapper estimates one scale per group.
+    """
     case.require_truth("painted", "prepared", "image")
-    examples = _group(case)
+    examples = _make_group(case)
     factors = _log_factors(case.run_on_group(*examples), examples)
     spread = float(np.ptp(factors))
     if spread > DEPTH_TOLERANCE:
@@ -74,47 +77,56 @@ def check_multiview_one_unit(case: ContractCase) -> str:
 
 
 def check_multiview_poses(case: ContractCase) -> str:
-    """Poses are ``cam_from_group``, of cameras that look along z with y down."""
-    poses, examples = _poses(case)
+    """Require ``cam_from_group`` poses of cameras that look along z with y down."""
+    poses, examples = _predict_poses(case)
     worst = 0.0
     for index in range(1, len(examples)):
         found, true = _relative(poses, index), _relative(_true_poses(examples), index)
-        turn = _turn(found, true)
-        if turn > TURN_TOLERANCE_DEG:
-            inverted = _turn(_relative(np.array([_inverse(p) for p in poses]), index), true)
-            reason = ": they are group_from_cam" if inverted < TURN_TOLERANCE_DEG else ""
-            raise CheckFailed(f"the turn between two views is off by {turn:.1f} degrees{reason}")
-        if angle_between_deg(found[1], true[1]) > 10 * TURN_TOLERANCE_DEG:
-            raise CheckFailed("the step from one view to the next goes another way")
-        worst = max(worst, turn)
+        rotation_error = _rotation_error_deg(found, true)
+        if rotation_error > ROTATION_TOLERANCE_DEG:
+            inverted = _rotation_error_deg(
+                _relative(np.array([_inverse(p) for p in poses]), index), true
+            )
+            reason = ": they are group_from_cam" if inverted < ROTATION_TOLERANCE_DEG else ""
+            raise CheckFailed(
+                f"the rotation between two views is off by {rotation_error:.1f} degrees{reason}"
+            )
+        if angle_between_deg(found[1], true[1]) > 10 * ROTATION_TOLERANCE_DEG:
+            raise CheckFailed("the translation between two views has another direction")
+        worst = max(worst, rotation_error)
     return f"off by {worst:.2g} degrees"
 
 
 def check_multiview_pose_unit(case: ContractCase) -> str:
-    """The lengths of poses are in the unit of depth."""
-    poses, examples = _poses(case)
+    """Require translations in the unit of depth."""
+    poses, examples = _predict_poses(case)
     unit = float(np.exp(np.median(_log_factors(case.run_on_group(*examples), examples))))
     true = _relative(_true_poses(examples), len(examples) - 1)[1]
     found = _relative(poses, len(examples) - 1)[1]
     factor = float(np.linalg.norm(found) / np.linalg.norm(true)) / unit
-    if abs(np.log(factor)) > STEP_TOLERANCE:
-        raise CheckFailed(f"steps between views are {factor:.3g} times as long as depth says")
+    if abs(np.log(factor)) > BASELINE_TOLERANCE:
+        raise CheckFailed(
+            f"translations are {factor:.3g} times as long as the unit of depth implies"
+        )
     return f"factor {factor:.3f}"
 
 
 def check_multiview_intrinsics(case: ContractCase) -> str:
-    """Intrinsics are in pixels of each view, not of the network's grid or of another view."""
+    """Require intrinsics in pixels of each view.
+
+    The check detects pixels of the network's grid or of another view.
+    """
     if not case.declares("proposes-intrinsics"):
         raise CheckSkipped("does not declare 'proposes-intrinsics'")
     width, height = case.example.camera.size
     examples = (case.example, case.example.sized(2 * width, 2 * height))
     found = case.run_on_group(*examples).intrinsics
-    assert found is not None  # the validator saw to it
+    assert found is not None  # guaranteed by the validator
     if case.truth_source == "none":
         ratio = float(found[1, 0] / found[0, 0])
-        if not _ENLARGED[0] < ratio < _ENLARGED[1]:
+        if not _FOCAL_RATIO_RANGE[0] < ratio < _FOCAL_RATIO_RANGE[1]:
             raise CheckFailed(f"the focal length grows {ratio:.2g} times in a view twice as large")
-        return "whether they are right is not known"
+        return "the true intrinsics are unknown"
     true = np.array([example.camera.params for example in examples])
     off = np.abs(np.log(np.maximum(found, 1e-12) / true)).max(axis=0)
     for name, error in zip(("fx", "fy", "cx", "cy"), off.tolist(), strict=True):
@@ -124,12 +136,15 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
 
 
 def check_multiview_alone(case: ContractCase) -> None:
-    """One view is a group too: a photo that shares nothing with others is shown alone."""
+    """Require a valid answer for a single view.
+
+    A run passes an image without overlapping images alone.
+    """
     case.run_on_group(case.example)
 
 
 def check_multiview_sizes(case: ContractCase) -> str:
-    """Views of different sizes, high ones beside wide ones, are answered, each on its place."""
+    """Require accurate answers for a group of landscape and portrait views."""
     width, height = case.example.camera.size
     examples = (
         case.example,
@@ -138,12 +153,14 @@ def check_multiview_sizes(case: ContractCase) -> str:
     )
     group = case.run_on_group(*examples)
     if case.truth_source == "none":
-        return "whether it is right is not known"
+        return "the truth is unknown"
     for prior, example in _pairs(group, examples):
-        error = _spread(prior, example)
+        error = _scale_free_error(prior, example)
         if error > DEPTH_TOLERANCE:
             size = "{} x {}".format(*example.camera.size)
-            raise CheckFailed(f"the {size} view beside others has a relative error of {error:.2g}")
+            raise CheckFailed(
+                f"the {size} view in a group of other sizes has a relative error of {error:.2g}"
+            )
         require_small_shift(
             case, example, map_errors.estimate_depth_shift(prior, example), prior.shape
         )
@@ -151,7 +168,7 @@ def check_multiview_sizes(case: ContractCase) -> str:
 
 
 CHECKS = (
-    *checks_depth.OF_MAPS,
+    *checks_depth.MAP_CHECKS,
     check_multiview_order,
     check_multiview_own_axis,
     check_multiview_one_unit,
@@ -163,27 +180,32 @@ CHECKS = (
 )
 
 
-def _group(case: ContractCase) -> tuple[Example, ...]:
+def _make_group(case: ContractCase) -> tuple[Example, ...]:
+    """Return three examples with overlapping views."""
     return case.example, case.example.partner, case.example.partner.partner
 
 
-def _pairs(group: MultiViewPrior, examples: tuple[Example, ...]) -> list[tuple[DepthPrior, Example]]:
+def _pairs(
+    group: MultiViewPrior, examples: tuple[Example, ...]
+) -> list[tuple[DepthPrior, Example]]:
+    """Pair each depth prior with its example."""
     return list(zip(group.depth, examples, strict=True))
 
 
-def _spread(prior: DepthPrior, example: Example) -> float:
-    """Relative error after one factor, of 80 % of the pixels."""
+def _scale_free_error(prior: DepthPrior, example: Example) -> float:
+    """Return the relative error of 80 % of the pixels, up to one factor."""
     return map_errors.error_quantile(map_errors.log_errors(prior, example, any_scale=True))
 
 
-def _spread_of(prior: DepthPrior, example: Example, expected: Float64) -> float:
+def _median_free_error(prior: DepthPrior, example: Example, expected: Float64) -> float:
+    """Return the relative error of 80 % of the pixels for an expected depth (h, w)."""
     where = map_errors.select_comparable(prior.valid, example.truth(prior.shape)) & (expected > 0)
     error = np.log(prior.depth[where] / expected[where])
     return map_errors.error_quantile(error - np.median(error))
 
 
-def _z_of_first(example: Example, first: Example, shape: tuple[int, int]) -> Float64:
-    """How far in front of the first view the points lie that a view sees, on a grid over it."""
+def _depth_from_first_view(example: Example, first: Example, shape: tuple[int, int]) -> Float64:
+    """Return the depth (h, w) in the first view of the points that a view sees."""
     rows, columns = shape
     grid = rays(example.camera.resized(columns, rows), pixel_centers(columns, rows))
     points = grid * example.truth(shape).depth[..., None]
@@ -193,17 +215,19 @@ def _z_of_first(example: Example, first: Example, shape: tuple[int, int]) -> Flo
 
 
 def _log_factors(group: MultiViewPrior, examples: tuple[Example, ...]) -> list[float]:
+    """Return the logarithm of the unit of each map in meters."""
     errors = [map_errors.log_errors(p, e, any_scale=False) for p, e in _pairs(group, examples)]
     return [float(np.median(error)) for error in errors]
 
 
-def _poses(case: ContractCase) -> tuple[Float64, tuple[Example, ...]]:
+def _predict_poses(case: ContractCase) -> tuple[Float64, tuple[Example, ...]]:
+    """Return the predicted poses (n, 3, 4) of a group and its examples."""
     if not case.declares("proposes-poses"):
         raise CheckSkipped("does not declare 'proposes-poses'")
     case.require_truth("prepared", "image")
-    examples = _group(case)
+    examples = _make_group(case)
     poses = case.run_on_group(*examples).poses
-    assert poses is not None  # the validator saw to it
+    assert poses is not None  # guaranteed by the validator
     return poses, examples
 
 
@@ -220,9 +244,10 @@ def _inverse(pose: Float64) -> Float64:
 
 
 def _relative(poses: Float64, index: int) -> tuple[Float64, Float64]:
-    """Of a view from the first one."""
+    """Return the pose of a view relative to the first view."""
     return compose(_split(poses[index]), invert(*_split(poses[0])))
 
 
-def _turn(a: tuple[Float64, Float64], b: tuple[Float64, Float64]) -> float:
+def _rotation_error_deg(a: tuple[Float64, Float64], b: tuple[Float64, Float64]) -> float:
+    """Return the angle in degrees between two rotations."""
     return float(rotation_angle_deg(a[0].T @ b[0]))

@@ -1,4 +1,4 @@
-"""Checks of normals providers, and of wrappers around them."""
+"""Checks of normals providers and of wrappers around them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.painted_views import NORMALS_STD, read_normals
 
 FLIP_TOLERANCE_DEG = 15.0
-"""For networks whose truth is not known."""
+"""Angle if the truth is unknown: trained networks are not exactly symmetric."""
 
 _AXES: Mapping[str, tuple[int, int, int]] = MappingProxyType(
     {
@@ -37,54 +37,63 @@ _AXES: Mapping[str, tuple[int, int, int]] = MappingProxyType(
 
 
 def check_normals_frame(case: ContractCase) -> str:
-    """Normals are in the camera frame: x right, y down, z forward; not in the world's, not in
-    OpenGL's, not with a sign or an axis exchanged."""
+    """Require normals in the camera frame: x right, y down, z forward.
+
+    The check names the mistake if a sign change or the rotation to the world frame explains it.
+    """
     case.require_truth("painted", "prepared", "image")
-    prior = _ask(case)
+    prior = _run(case)
     angle = map_errors.error_quantile(map_errors.angle_errors_deg(prior, case.example))
     if angle > NORMALS_TOLERANCE_DEG:
-        raise CheckFailed(f"normals are {angle:.0f} degrees off{_explanation(prior, case)}")
+        raise CheckFailed(f"normals are {angle:.0f} degrees off{_explain_error(prior, case)}")
     return f"angle {angle:.2f} degrees"
 
 
 def check_normals_channel_order(case: ContractCase) -> None:
-    """The network gets RGB, not BGR."""
+    """Require that the network receives RGB, not BGR."""
     case.require_truth("painted")
-    prior = _ask(case)
+    prior = _run(case)
     truth = case.example.truth(prior.shape)
     swapped = read_normals(swap_painted_channels(case.example, prior.shape))
     where = prior.valid & truth.smooth
-    angles = [_angle(prior.normals[where], values[where]) for values in (truth.normals, swapped)]
+    angles = [
+        _angle_error_deg(prior.normals[where], values[where]) for values in (truth.normals, swapped)
+    ]
     if angles[1] < angles[0]:
         raise CheckFailed("follows the channels in the order blue, green, red")
 
 
 def check_normals_pixel_convention(case: ContractCase) -> str:
-    """The value at [row, col] belongs to the pixel centre (col + 0.5, row + 0.5)."""
+    """Require that the value at [row, col] belongs to the point (col + 0.5, row + 0.5)."""
     case.require_truth("painted", "prepared", "image")
-    prior = _ask(case)
+    prior = _run(case)
     shift = map_errors.estimate_normals_shift(prior, case.example)
     return require_small_shift(case, case.example, shift, prior.shape)
 
 
 def check_normals_validity(case: ContractCase) -> str:
-    """Pixels without a surface are not valid, those with one are; for providers that can tell
-    (painted views have a normal everywhere)."""
+    """Require that pixels with a surface are valid and pixels of the sky are not.
+
+    Painted views encode a normal everywhere, so that the check needs a prepared truth.
+    """
     case.require_truth("prepared")
-    prior = _ask(case)
+    prior = _run(case)
     return require_true_validity(prior.valid, case.example.truth(prior.shape))
 
 
 def check_normals_flip(case: ContractCase) -> str:
-    """The mirrored view has the mirrored normals: mirrored in the map, and x negated."""
-    prior, mirrored = _ask(case), case.run(case.example.mirror())
+    """Require the mirrored normals for the mirrored view, with x negated.
+
+    This check also applies if the truth is unknown, with a larger tolerance.
+    """
+    prior, mirrored = _run(case), case.run(case.example.mirror())
     if prior.shape != mirrored.shape:
         raise CheckFailed(f"has shape {mirrored.shape} on the mirrored view, else {prior.shape}")
     both = prior.valid & mirrored.valid[:, ::-1] & case.example.truth(prior.shape).smooth
     if not both.any():
         raise CheckFailed("has no pixel that is valid in the view and in the mirrored one")
     back = mirrored.normals[:, ::-1] * (-1.0, 1.0, 1.0)
-    angle = _angle(prior.normals[both], back[both])
+    angle = _angle_error_deg(prior.normals[both], back[both])
     limit = FLIP_TOLERANCE_DEG if case.truth_source == "none" else NORMALS_TOLERANCE_DEG
     if angle > limit:
         raise CheckFailed(f"differs by {angle:.0f} degrees on the mirrored view")
@@ -92,7 +101,7 @@ def check_normals_flip(case: ContractCase) -> str:
 
 
 def check_normals_same_in_larger_view(case: ContractCase) -> str:
-    """The same scene with twice the pixels and twice the focal length has the same normals."""
+    """Require the same normals for twice the pixels and twice the focal length."""
     case.require_truth("painted", "prepared", "image")
     width, height = case.example.camera.size
     large = case.example.sized(2 * width, 2 * height)
@@ -103,11 +112,11 @@ def check_normals_same_in_larger_view(case: ContractCase) -> str:
 
 
 def check_normals_variance(case: ContractCase) -> str:
-    """The variance is one: the square of the angular std that the stand-in reports, in rad^2."""
+    """Require a variance: the square of the angular std of the stand-in, in rad^2."""
     case.require_truth("painted", "prepared")
     if case.spec.kind == "wrapper":
         raise CheckSkipped("a wrapper may change the variance")
-    prior = _ask(case)
+    prior = _run(case)
     if prior.variance is None:
         raise CheckSkipped("has no variance")
     where = map_errors.select_comparable(prior.valid, case.example.truth(prior.shape))
@@ -115,9 +124,11 @@ def check_normals_variance(case: ContractCase) -> str:
 
 
 def check_normals_calibration(case: ContractCase) -> None:
-    """The declared calibration gives every valid pixel a positive variance, and a larger one for a
-    larger scale of the std."""
-    require_monotonic_calibration(case, _ask(case))
+    """Require a positive variance of every valid pixel after calibration.
+
+    The variance has to grow with ``std_scale`` and with the variance of the network.
+    """
+    require_monotonic_calibration(case, _run(case))
 
 
 CHECKS = (
@@ -132,26 +143,27 @@ CHECKS = (
 )
 
 
-def _ask(case: ContractCase) -> NormalPrior:
+def _run(case: ContractCase) -> NormalPrior:
     prior: NormalPrior = case.run(case.example)
     return prior
 
 
-def _angle(found: Any, expected: Any) -> float:
+def _angle_error_deg(found: Any, expected: Any) -> float:
+    """Return the angle in degrees that 80 % of the normals stay below."""
     if not len(found):
         raise CheckFailed("has no valid normals where the truth is known")
     return map_errors.error_quantile(angle_between_deg(found.astype(np.float64), expected))
 
 
-def _explanation(prior: NormalPrior, case: ContractCase) -> str:
-    """What turns the normals into the true ones, if it is a known mistake."""
+def _explain_error(prior: NormalPrior, case: ContractCase) -> str:
+    """Name the known mistake that explains the error of the normals, or return ""."""
     truth = case.example.truth(prior.shape)
     where = prior.valid & truth.smooth
     found, expected = prior.normals[where].astype(np.float64), truth.normals[where]
     for text, signs in _AXES.items():
-        if _angle(found * signs, expected) < NORMALS_TOLERANCE_DEG:
+        if _angle_error_deg(found * signs, expected) < NORMALS_TOLERANCE_DEG:
             return f": {text}"
     camera_from_world: Float64 = case.example.pose[:, :3]
-    if _angle(found @ camera_from_world.T, expected) < NORMALS_TOLERANCE_DEG:
+    if _angle_error_deg(found @ camera_from_world.T, expected) < NORMALS_TOLERANCE_DEG:
         return ": they are in the world's frame"
     return ""

@@ -1,4 +1,4 @@
-"""Checks of retrieval providers."""
+"""Checks of image retrieval providers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpsfm_core.testing.outcome import CheckFailed
 
 
 def check_retrieval_dimension(case: ContractCase) -> str:
-    """Every view has a descriptor of the same length, as they are compared by dot products."""
+    """Require the same descriptor length for every view."""
     others = (case.example.sized(104, 120), outdoor_example("textured"))
     lengths = {len(case.run(example)) for example in (case.example, *others)}
     if len(lengths) > 1:
@@ -21,8 +21,10 @@ def check_retrieval_dimension(case: ContractCase) -> str:
 
 
 def check_retrieval_self_similarity(case: ContractCase) -> str:
-    """No view is more similar to another one than to itself, which holds for unit vectors: else
-    bright or rich views would be partners of everything."""
+    """Require that no view is more similar to another view than to itself.
+
+    Unit vectors satisfy this. Otherwise bright or detailed views would be similar to all views.
+    """
     flat = replace(case.example.view, image=np.full_like(case.example.view.image, 200))
     descriptors = np.stack(
         [
@@ -42,16 +44,18 @@ def check_retrieval_self_similarity(case: ContractCase) -> str:
 
 
 def check_retrieval_overlap(case: ContractCase) -> str:
-    """A view is more similar to the same scene from one and two steps to the side than to two
-    views of another scene."""
+    """Require a higher similarity to neighboring views than to another scene.
+
+    The neighbors show the scene from one and two steps to the side.
+    """
     case.require_truth("image", "prepared")
-    here, other = case.example, outdoor_example("textured", case.example.camera.size)
-    examples = (here.partner, here.partner.partner, other, other.partner)
-    similarity = [float(case.run(here).astype(np.float64) @ case.run(e)) for e in examples]
-    beside, elsewhere = min(similarity[:2]), max(similarity[2:])
-    if beside <= elsewhere:
-        raise CheckFailed(f"similarity {beside:.3f} to its neighbour, {elsewhere:.3f} to another")
-    return f"similarity {beside:.3f} to its neighbour, {elsewhere:.3f} to another scene"
+    example, other = case.example, outdoor_example("textured", case.example.camera.size)
+    examples = (example.partner, example.partner.partner, other, other.partner)
+    similarity = [float(case.run(example).astype(np.float64) @ case.run(e)) for e in examples]
+    neighbor, unrelated = min(similarity[:2]), max(similarity[2:])
+    if neighbor <= unrelated:
+        raise CheckFailed(f"similarity {neighbor:.3f} to its neighbour, {unrelated:.3f} to another")
+    return f"similarity {neighbor:.3f} to its neighbour, {unrelated:.3f} to another scene"
 
 
 CHECKS = (

@@ -1,7 +1,7 @@
-"""Checks of wrappers: what they do to the provider they are put around.
+"""Checks of wrappers.
 
-They are put around an oracle, which knows the truth, and have to pass all checks of the kind they
-wrap besides these.
+The wrapper is put around a provider that knows the ground truth. It has to pass these checks and
+all checks of the kind that it wraps.
 """
 
 from __future__ import annotations
@@ -13,31 +13,35 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 
 def check_wrapper_keeps_variance(case: ContractCase) -> None:
-    """Around a provider with a variance, the wrapper gives one too: it was promised to the
-    calibration."""
+    """Require a variance around a provider with a variance.
+
+    The calibration of the inner provider expects it.
+    """
     if case.run(case.example).variance is None:
         raise CheckFailed("drops the variance of the provider it wraps")
 
 
 def check_wrapper_without_variance(case: ContractCase) -> None:
-    """A provider without a variance can be wrapped too."""
+    """Require a valid answer around a provider without a variance."""
     case.run(case.example, case.create_provider(variance=False))
 
 
 def check_wrapper_keeps_unit(case: ContractCase) -> None:
-    """Depth in metres stays depth in metres, and other depth is not called metric."""
+    """Require that the wrapper keeps ``metric`` as the inner provider declares it."""
     if case.kind != "depth":
-        raise CheckSkipped("is about depth")
+        raise CheckSkipped("applies to depth only")
     for metric in (True, False):
         if case.run(case.example, case.create_provider(metric=metric)).metric != metric:
             raise CheckFailed(f"calls depth metric={not metric} that the provider calls {metric}")
 
 
 def check_wrapper_uses_the_provider(case: ContractCase) -> str:
-    """The answer follows the wrapped provider: twice the depth inside is twice the depth
-    outside."""
+    """Require that the answer follows the inner provider.
+
+    Twice the depth inside has to be twice the depth outside.
+    """
     if case.kind != "depth":
-        raise CheckSkipped("is about depth")
+        raise CheckSkipped("applies to depth only")
     once, twice = case.run(case.example), case.run(case.example, case.create_provider(scale=2.0))
     both = once.valid & twice.valid
     if not both.any():
@@ -49,9 +53,12 @@ def check_wrapper_uses_the_provider(case: ContractCase) -> str:
 
 
 def check_wrapper_hands_on_depth(case: ContractCase) -> None:
-    """A wrapper of normals hands on the depth it is given: the provider inside may need it."""
+    """Require that a wrapper of normals passes on the depth prior.
+
+    The inner provider may declare ``needs-depth``.
+    """
     if case.kind != "normals":
-        raise CheckSkipped("is about normals")
+        raise CheckSkipped("applies to normals only")
     case.run(case.example, case.create_provider())
     given = case.received_depth()
     if not given or any(depth is None for depth in given):

@@ -1,8 +1,8 @@
-"""Depth as a good monocular network predicts it, made from true depth: smooth, seeded errors.
+"""Synthetic depth of a monocular network: true depth with smooth, seeded errors.
 
-Errors of networks are no pixel noise. A map as a whole has a wrong scale, and what remains bends
-and shifts whole surfaces. Both are imitated here; the errors of an image depend on its name and
-the seed only, so that every test and benchmark that asks for them sees the same.
+Errors of networks are not pixel noise. A whole map has a wrong scale, and the rest bends and shifts
+whole surfaces. Both are imitated here. The errors of an image depend only on its name and the seed,
+so that all tests and benchmarks use the same ones.
 """
 
 from __future__ import annotations
@@ -18,36 +18,49 @@ from mpsfm_core.data import Float32, Float64
 from mpsfm_core.geometry import resize_map
 
 _GRID = 120
-"""Columns of the grid on which the field is drawn; the shorter length is 4 of them."""
+"""Number of columns of the grid of the noise field; the shorter blur has a std of 4 columns."""
 
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """A model of relative errors: ``depth * exp(scale * n + field * f(x, y))``.
+    """Relative errors of depth: ``depth * exp(scale * n + field * f(x, y))``.
 
-    ``scale``: std of the error that an image has as a whole; not part of :attr:`std`, as the scale
-    of each image is free in the mapper (s_i in the paper). ``field``: std of the field ``f``, a
-    sum of two blurred Gaussian noises. ``lengths``: stds of the blur, as shares of the map's
-    width. ``weights``: of the two, their squares sum to one.
+    ``n`` is standard normal, ``f`` the sum of two blurred Gaussian noise fields.
     """
 
     scale: float = 0.05
+    """Std of the error of a whole image. :attr:`std` excludes it, because the mapper estimates a
+    scale per image (``s_i`` in the paper)."""
     field: float = 0.05
+    """Std of the field ``f``."""
     lengths: tuple[float, float] = (1 / 8, 1 / 30)
+    """Std of the blur of both fields relative to the width of the map."""
     weights: tuple[float, float] = (0.8, 0.6)
+    """Weights of both fields; their squares sum to one."""
 
     @property
     def std(self) -> float:
-        """Relative std of a pixel after its image was given the best scale: what an honest
-        declaration says. The scale also takes the mean of the field along, so that errors are some
-        6 % smaller than declared."""
+        """Relative std of a pixel after the image has received its optimal scale.
+
+        The optimal scale also removes the mean of the field, so that errors are about 6 % smaller.
+        """
         return self.field
 
 
 def degrade_depth(
     depth: Float32, name: str, errors: DepthErrors | None = None, seed: int = 0
 ) -> Float32:
-    """A depth map (h, w) with the errors of the image ``name``; invalid zeros stay zero."""
+    """Add the errors of a monocular network to a true depth map.
+
+    Args:
+        depth: True depth (h, w); zeros are invalid and stay zero.
+        name: Name of the image, which seeds its errors.
+        errors: Model of the errors, by default :class:`DepthErrors`.
+        seed: Seed in addition to the name.
+
+    Returns:
+        Depth (h, w) with errors.
+    """
     errors = errors or DepthErrors()
     key = hashlib.sha256(name.encode()).digest()[:8]
     rng = np.random.default_rng([seed, int.from_bytes(key, "little")])
@@ -61,9 +74,12 @@ def degrade_depth(
 
 
 def _smooth_noise(rng: np.random.Generator, rows: int, blur: float) -> Float64:
-    """Blurred Gaussian noise of std 1; drawn wider than needed, as blurring sees no border so."""
+    """Return blurred Gaussian noise of std 1.
+
+    The noise is generated with a margin, so that blurring has no border effect.
+    """
     margin = math.ceil(3 * blur)
     noise = rng.normal(size=(rows + 2 * margin, _GRID + 2 * margin))
     blurred = cv2.GaussianBlur(noise, (0, 0), blur)[margin:-margin, margin:-margin]
-    # Neighbours average to this std; the sample's own would hide errors longer than the map.
+    # Std of blurred white noise. The sample std would remove errors longer than the map.
     return np.asarray(blurred * (2 * blur * math.sqrt(math.pi)))

@@ -1,7 +1,7 @@
-"""Halls with boxes, of any number of views: photo sets of the everyday kind, with many matches.
+"""Synthetic halls with boxes: image sets of any size with many matches.
 
-Views stand on a grid and turn slowly from one to the next, so that each overlaps well with those
-around it. Keypoints are noisy and some matches are wrong, as they are after verification.
+Views are on a grid and rotate slowly from one to the next, so that neighbors overlap well.
+Keypoints are noisy and some matches are wrong, as after geometric verification.
 """
 
 from __future__ import annotations
@@ -36,33 +36,33 @@ from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Box, Surface, loo
 
 CAMERA = PinholeCamera(640, 480, 420.0, 420.0, 320.0, 240.0)
 SPACING = 1.5
-"""Metres between the views of the grid."""
+"""Distance between neighboring views of the grid in meters."""
 TURN_DEG = 20.0
-"""That a view is turned from its neighbours on the grid."""
+"""Rotation between neighboring views of the grid."""
 REACH = 2.6
-"""Metres between two views up to which they are matched."""
+"""Largest distance of two matched views in meters."""
 MAX_MATCH_TURN_DEG, MAX_MATCH_ZOOM = 40.0, 1.8
-"""Between the rays of a point, and between its depths, up to which its keypoints look alike."""
+"""Largest angle between the rays of a point, and largest ratio of its distances, for a match."""
 MIN_MATCHES = 30
-"""Common points that make a pair."""
+"""Smallest number of common points of a pair."""
 
 
 @dataclass(frozen=True)
 class PriorErrors:
-    """Relative errors of depth: ``depth * exp(scale * n + f(x, y) + patch)``.
-
-    ``scale``: std of the error that an image has as a whole. ``field``: std of independent errors
-    on a grid of ``grid`` (columns, rows), interpolated by cubic splines. ``patch``: error in one
-    ellipse of the map, of either sign; ``patch_area``: its share of the map. ``declared``:
-    relative std that the prior declares.
-    """
+    """Relative errors of depth: ``depth * exp(scale * n + f(x, y) + patch)``."""
 
     scale: float = 0.0
+    """Std of the error of a whole image."""
     field: float = 0.0
+    """Std of independent errors at the nodes of a grid, interpolated by cubic splines."""
     grid: tuple[int, int] = (8, 6)
+    """Columns and rows of that grid."""
     patch: float = 0.0
+    """Relative error, of either sign, in one ellipse of the map."""
     patch_area: float = 0.1
+    """Area of the ellipse relative to the map."""
     declared: float = 0.01
+    """Relative std that the prior declares."""
 
 
 EXACT_PRIORS = PriorErrors()
@@ -76,12 +76,13 @@ QUALITIES = {
 
 
 class HallProblem(NamedTuple):
-    """A mapping problem with its true poses, ``cam_from_world`` by image name, and the numbers of
-    the surface points that the keypoints of each image belong to, (n,) each."""
+    """Synthetic mapping problem of a hall with its true solution."""
 
     problem: MappingProblem
     truth: dict[str, Pose]
+    """True ``cam_from_world`` by image name."""
     points: tuple[Int64, ...]
+    """Index of the surface point of each keypoint, (n,) per image."""
 
 
 def make_hall_problem(
@@ -94,15 +95,25 @@ def make_hall_problem(
     wrong_matches: float = 0.05,
     seed: int = 0,
 ) -> HallProblem:
-    """A make_hall with so many views, whose priors have errors.
+    """Create a mapping problem of a hall.
 
-    ``points_per_view``: surface points that each view adds; its keypoints are all points it sees.
-    ``wrong_matches``: share of the matches of each pair that join keypoints at random.
+    Args:
+        views: Number of views.
+        errors: Errors of the depth priors.
+        points_per_view: Surface points that each view adds. The keypoints of a view are all points
+            that it sees.
+        map_width: Width of the prior maps in pixels.
+        keypoint_noise_px: Std of the keypoints.
+        wrong_matches: Ratio of the matches of each pair that join keypoints at random.
+        seed: Seed of scene, points and errors.
+
+    Returns:
+        The problem with its solution.
     """
     rng = np.random.default_rng(seed)
     poses, scene = make_hall(views, rng)
     eyes = np.array([camera_center(pose[:, :3], pose[:, 3]) for pose in poses])
-    parts = [_in_sight(scene, pose) for pose in poses]
+    parts = [_remove_hidden_boxes(scene, pose) for pose in poses]
     numbers, pixels = _keypoints(parts, poses, eyes, points_per_view, rng)
     noise = SyntheticNoise(keypoints_px=keypoint_noise_px)
     images = []
@@ -112,7 +123,7 @@ def make_hall_problem(
         image = render_mapping_image(
             name, parts[i], CAMERA, pose, noisy, map_width, 0.01, 2.0, noise, rng
         )
-        depth = _with_errors(image.depth.depth, errors, rng)
+        depth = _add_depth_errors(image.depth.depth, errors, rng)
         prior = DepthPrior.from_arrays(depth, (errors.declared * depth) ** 2)
         images.append(replace(image, depth=prior))
     pairs = []
@@ -120,8 +131,8 @@ def make_hall_problem(
         _, rows_a, rows_b = np.intersect1d(numbers[a], numbers[b], return_indices=True)
         if len(rows_a) >= MIN_MATCHES:
             matches = np.stack([rows_a, rows_b], axis=1)
-            pair = _spoilt(make_verified_pair(a, b, matches, poses), wrong_matches, rng)
-            pairs.append(_estimated(pair, images[a].keypoints, images[b].keypoints))
+            pair = _corrupt_matches(make_verified_pair(a, b, matches, poses), wrong_matches, rng)
+            pairs.append(_estimate_pose(pair, images[a].keypoints, images[b].keypoints))
     truth = {
         image.name: (pose[:, :3], pose[:, 3]) for image, pose in zip(images, poses, strict=True)
     }
@@ -129,10 +140,18 @@ def make_hall_problem(
 
 
 def make_hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], AnalyticScene]:
-    """Views on a square grid, and a make_hall with boxes between them."""
+    """Create views on a square grid and a hall with boxes between them.
+
+    Args:
+        views: Number of views.
+        rng: Random generator of the boxes and of small changes of the poses.
+
+    Returns:
+        ``cam_from_world`` (3, 4) of each view, and the scene.
+    """
     side = int(np.ceil(np.sqrt(views)))
     row, column = np.divmod(np.arange(views), side)
-    # the walk turns at the end of each row, so that consecutive views are neighbours
+    # serpentine order, so that consecutive views are neighbors
     column = np.where(row % 2 == 0, column, side - 1 - column)
     eyes = SPACING * np.column_stack([column, row, np.full(views, 1.5)])
     eyes += rng.uniform(-0.1, 0.1, eyes.shape)
@@ -151,8 +170,8 @@ def make_hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], Anal
     return poses, AnalyticScene(tuple(surfaces))
 
 
-def _in_sight(scene: AnalyticScene, pose: Float64) -> AnalyticScene:
-    """The scene without the boxes that lie outside a view, which cannot be seen nor hide."""
+def _remove_hidden_boxes(scene: AnalyticScene, pose: Float64) -> AnalyticScene:
+    """Remove the boxes outside of the view frustum, which cannot be visible or occlude."""
     shell, *boxes = scene.surfaces
     centers = np.array([box.center for box in boxes if isinstance(box, Box)]).reshape(-1, 3)
     radii = np.array([np.linalg.norm(box.half_size) for box in boxes if isinstance(box, Box)])
@@ -160,8 +179,8 @@ def _in_sight(scene: AnalyticScene, pose: Float64) -> AnalyticScene:
     slope = np.array(CAMERA.size) / (2 * np.array(CAMERA.params[:2]))
     beside = np.abs(local[:, :2]) - slope * local[:, 2:]
     outside = (beside > radii[:, None] * np.hypot(1, slope)).any(axis=1) | (local[:, 2] < -radii)
-    kept = [box for box, out in zip(boxes, outside, strict=True) if not out]
-    return AnalyticScene((shell, *kept))
+    visible = [box for box, out in zip(boxes, outside, strict=True) if not out]
+    return AnalyticScene((shell, *visible))
 
 
 def _keypoints(
@@ -171,7 +190,7 @@ def _keypoints(
     points_per_view: int,
     rng: np.random.Generator,
 ) -> tuple[list[Int64], list[Float64]]:
-    """Numbers of the points that each view sees, and their pixels."""
+    """Return the indices of the points that each view sees, and their pixels."""
     size = np.array(CAMERA.size, dtype=np.float64)
     numbers: list[list[Int64]] = [[] for _ in poses]
     pixels: list[list[Float64]] = [[] for _ in poses]
@@ -180,7 +199,7 @@ def _keypoints(
         for j in map(int, np.flatnonzero(np.linalg.norm(eyes - eyes[i], axis=1) <= REACH)):
             xy, depth = project(CAMERA, poses[j], seen.points)
             visible = (depth > 0) & (xy > 0).all(axis=1) & (xy < size).all(axis=1)
-            visible &= _look_alike(seen.points - eyes[i], seen.points - eyes[j])
+            visible &= _can_match(seen.points - eyes[i], seen.points - eyes[j])
             rows = np.flatnonzero(visible)
             t, _, _ = parts[j].first_hit(eyes[j], seen.points[rows] - eyes[j])
             rows = rows[np.abs(t - 1) < 1e-6]
@@ -189,8 +208,8 @@ def _keypoints(
     return [np.concatenate(n) for n in numbers], [np.concatenate(p) for p in pixels]
 
 
-def _look_alike(rays_a: Float64, rays_b: Float64) -> Bool:
-    """Whether points look alike along rays of two views, (m, 3) each."""
+def _can_match(rays_a: Float64, rays_b: Float64) -> Bool:
+    """Return which points look similar along the rays (m, 3) of two views."""
     a, b = np.linalg.norm(rays_a, axis=1), np.linalg.norm(rays_b, axis=1)
     cosine = (rays_a * rays_b).sum(axis=1) / (a * b)
     alike: Bool = (cosine > np.cos(np.radians(MAX_MATCH_TURN_DEG))) & (
@@ -199,16 +218,16 @@ def _look_alike(rays_a: Float64, rays_b: Float64) -> Bool:
     return alike
 
 
-def _spoilt(pair: VerifiedPair, share: float, rng: np.random.Generator) -> VerifiedPair:
-    """A pair of which a share of the matches join their keypoints in another order."""
+def _corrupt_matches(pair: VerifiedPair, share: float, rng: np.random.Generator) -> VerifiedPair:
+    """Permute the second keypoints of a ratio of the matches."""
     matches = pair.matches.copy()
     wrong = rng.choice(len(matches), round(share * len(matches)), replace=False)
     matches[wrong, 1] = np.roll(matches[wrong, 1], 1)
     return replace(pair, matches=matches)
 
 
-def _estimated(pair: VerifiedPair, keypoints_a: Float64, keypoints_b: Float64) -> VerifiedPair:
-    """A pair with the relative pose that its noisy matches give."""
+def _estimate_pose(pair: VerifiedPair, keypoints_a: Float64, keypoints_b: Float64) -> VerifiedPair:
+    """Replace the relative pose of a pair by the estimate from its noisy matches."""
     camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=CAMERA.params)
     found = pycolmap.estimate_essential_matrix(
         keypoints_a[pair.matches[:, 0]],
@@ -223,10 +242,12 @@ def _estimated(pair: VerifiedPair, keypoints_a: Float64, keypoints_b: Float64) -
     return replace(pair, rotation=pose.rotation.matrix(), translation=np.array(pose.translation))
 
 
-def _with_errors(depth: Float32, errors: PriorErrors, rng: np.random.Generator) -> Float32:
-    """A map (h, w) as a network predicts it."""
+def _add_depth_errors(depth: Float32, errors: PriorErrors, rng: np.random.Generator) -> Float32:
+    """Add the errors of a network to a depth map (h, w)."""
     height, width = depth.shape
-    log_factor = errors.scale * rng.normal() + errors.field * _field(depth.shape, errors, rng)
+    log_factor = errors.scale * rng.normal() + errors.field * _draw_error_field(
+        depth.shape, errors, rng
+    )
     axes = np.sqrt(errors.patch_area / np.pi) * np.array([width, height])
     center = rng.uniform(axes, np.array([width, height]) - axes)
     sign = rng.choice([-1.0, 1.0])
@@ -237,8 +258,10 @@ def _with_errors(depth: Float32, errors: PriorErrors, rng: np.random.Generator) 
     return wrong
 
 
-def _field(shape: tuple[int, ...], errors: PriorErrors, rng: np.random.Generator) -> Float64:
-    """Independent errors of std 1 on the grid of nodes, interpolated to a map's shape (h, w)."""
+def _draw_error_field(
+    shape: tuple[int, ...], errors: PriorErrors, rng: np.random.Generator
+) -> Float64:
+    """Interpolate independent errors of std 1 from the nodes of the grid to a map (h, w)."""
     nodes = rng.normal(size=errors.grid[::-1])
     field: Float64 = cv2.resize(nodes, shape[::-1], interpolation=cv2.INTER_CUBIC)
     return field

@@ -1,4 +1,4 @@
-"""Mapping problems with a known solution, from analytic scenes."""
+"""Synthetic mapping problems with a known solution."""
 
 from __future__ import annotations
 
@@ -22,11 +22,14 @@ from mpsfm_core.testing.synthetic.scenes import AnalyticScene
 
 
 class SyntheticNoise(NamedTuple):
-    """Standard deviations: keypoints in pixels, relative depth per image and per pixel."""
+    """Standard deviations of the errors of a synthetic mapping problem."""
 
     keypoints_px: float = 0.0
+    """Keypoint error in pixels."""
     scale: float = 0.0
+    """Relative depth error of a whole image."""
     depth: float = 0.0
+    """Independent relative depth error of each pixel."""
 
 
 def make_mapping_problem(
@@ -43,12 +46,24 @@ def make_mapping_problem(
     two_view_tracks: bool = False,
     seed: int = 0,
 ) -> MappingProblem:
-    """Views of a scene with priors and verified matches.
+    """Create a mapping problem with exact poses, priors and verified matches.
 
-    ``poses``: (3, 4) ``cam_from_world`` of each view. Every view contributes
-    ``points_per_view`` surface points; a view's keypoints are all points it sees. ``links``:
-    pairs that have matches, by default all with at least 15 points in common.
-    ``two_view_tracks``: no point is matched in more than one pair.
+    Args:
+        scene: Scene to render.
+        camera: Camera of all views.
+        poses: ``cam_from_world`` (3, 4) of each view.
+        points_per_view: Surface points that each view adds. The keypoints of a view are all points
+            that it sees.
+        map_width: Width of the prior maps in pixels.
+        declared_depth_std: Relative std that the depth priors declare.
+        declared_normal_std_deg: Angular std that the normal priors declare.
+        noise: Errors of keypoints and depth, by default none.
+        links: Pairs to match, by default all; pairs with fewer than 15 common points are dropped.
+        two_view_tracks: True matches each point in at most one pair.
+        seed: Seed of points and noise.
+
+    Returns:
+        The mapping problem.
     """
     noise = noise or SyntheticNoise()
     rng = np.random.default_rng(seed)
@@ -105,7 +120,20 @@ def render_mapping_image(
     noise: SyntheticNoise,
     rng: np.random.Generator,
 ) -> MappingImage:
-    """A view of a scene with keypoints (n, 2) and the priors that noise leaves of the truth."""
+    """Render the priors of a view and add errors.
+
+    Args:
+        name: Name of the image.
+        scene: Scene to render.
+        camera: Camera of the view.
+        pose: ``cam_from_world`` (3, 4).
+        keypoints: Keypoints (n, 2) in pixels.
+        map_width: Width of the prior maps in pixels.
+        depth_std: Relative std that the depth prior declares.
+        normal_std_deg: Angular std that the normal prior declares.
+        noise: Errors of the depth.
+        rng: Random generator of the errors.
+    """
     grid = camera.resized(map_width, round(map_width * camera.height / camera.width))
     truth = scene.render(grid, pose)
     factor = np.exp(noise.scale * rng.normal() + noise.depth * rng.normal(size=truth.depth.shape))
@@ -123,7 +151,14 @@ def render_mapping_image(
 
 
 def make_verified_pair(a: int, b: int, matches: Int64, poses: Sequence[Float64]) -> VerifiedPair:
-    """Matches (m, 2) of two views with their relative pose; ``poses``: (3, 4), by view."""
+    """Return matches (m, 2) of two views as a verified pair with its true relative pose.
+
+    Args:
+        a: Index of the first view.
+        b: Index of the second view.
+        matches: Keypoint rows (m, 2).
+        poses: ``cam_from_world`` (3, 4) of each view.
+    """
     rotation = poses[b][:, :3] @ poses[a][:, :3].T
     translation = poses[b][:, 3] - rotation @ poses[a][:, 3]
     scores = np.ones(len(matches), dtype=np.float32)

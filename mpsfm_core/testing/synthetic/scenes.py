@@ -1,7 +1,7 @@
-"""Analytic scenes: exact depth, normals, colours and correspondences by casting rays.
+"""Analytic scenes: exact depth, normals, colors and correspondences by ray casting.
 
-The world is metric with z up; cameras follow the conventions of the package (x right, y down,
-z forward, pixel centres at half integers). A pose is a (3, 4) matrix `cam_from_world`.
+The world is metric with z up. Cameras follow the conventions of the package: x right, y down,
+z forward, pixel centers at half integers. A pose is a (3, 4) matrix ``cam_from_world``.
 """
 
 from __future__ import annotations
@@ -17,29 +17,36 @@ from numpy.typing import ArrayLike
 from mpsfm_core import geometry
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
 
-# Rays closer than this to a surface's plane or start count as leaving it (metres).
 _EPSILON = 1e-9
+"""Hits closer than this to the origin of a ray, in meters, are the surface that the ray leaves."""
 
 
 class Surface(Protocol):
-    """A surface that can be hit by rays."""
+    """Surface that can be intersected with rays."""
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
-        """First hits at `origin + t * direction`: t (n,), inf where missed, and normals (n, 3).
+        """Intersect rays ``origin + t * direction`` with the surface.
 
-        Normals are unit and face the origin of the ray; they are arbitrary where nothing is hit.
+        Args:
+            origin: Common origin (3,).
+            directions: Directions (n, 3) of any length.
+
+        Returns:
+            t (n,) of the first hit, inf without a hit, and unit normals (n, 3) that face the origin
+            of the ray; normals are arbitrary without a hit.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Plane:
-    """An infinite plane through `point` with any non-zero `normal`."""
+    """Infinite plane through ``point``; ``normal`` has any non-zero length."""
 
     point: tuple[float, float, float]
     normal: tuple[float, float, float]
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
+        """Intersect rays with the surface, see :meth:`Surface.intersect`."""
         normal = np.asarray(self.normal) / np.linalg.norm(self.normal)
         t = (np.asarray(self.point) - origin) @ normal / _away_from_zero(directions @ normal)
         facing = np.where(directions @ normal > 0, -1.0, 1.0)
@@ -48,13 +55,14 @@ class Plane:
 
 @dataclass(frozen=True)
 class Box:
-    """A box turned about the world's z axis; seen from inside it is a room."""
+    """Box rotated about the world's z axis. From inside it is a room."""
 
     center: tuple[float, float, float]
     half_size: tuple[float, float, float]
     yaw_deg: float = 0.0
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
+        """Intersect rays with the surface, see :meth:`Surface.intersect`."""
         cos, sin = np.cos(np.deg2rad(self.yaw_deg)), np.sin(np.deg2rad(self.yaw_deg))
         world_from_box = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         start = (origin - np.asarray(self.center)) @ world_from_box
@@ -74,8 +82,10 @@ class Box:
         return found, normals
 
     def _may_hit(self, start: Float64, rays: Float64) -> Bool:
-        """(n,) bool, rays (n, 3) from ``start``, seen from the centre, that meet the ball around
-        the box."""
+        """Return which rays (n, 3) intersect the bounding sphere of the box.
+
+        ``start`` is the origin of the rays relative to the center of the box.
+        """
         along, length = rays @ start, np.einsum("ni,ni->n", rays, rays)
         outside = start @ start - np.dot(self.half_size, self.half_size)
         meets: Bool = (outside <= 0) | ((along < 0) & (along * along >= outside * length))
@@ -84,12 +94,13 @@ class Box:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere, seen from outside or inside."""
+    """Sphere, visible from outside and inside."""
 
     center: tuple[float, float, float]
     radius: float
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
+        """Intersect rays with the surface, see :meth:`Surface.intersect`."""
         start = origin - np.asarray(self.center)
         a = np.einsum("ni,ni->n", directions, directions)
         b = directions @ start
@@ -106,13 +117,13 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Texture:
-    """A smooth random colour field of space: octaves of plane waves of random direction and phase.
+    """Random color field of space: octaves of plane waves of random direction and phase.
 
-    It repeats nowhere in practice. `footprint` band-limits it to what a pixel of that size (metres)
-    resolves, as a real sensor would, so that renderings do not alias.
+    The field does not repeat in practice. ``footprint`` band-limits it to what a pixel of that size
+    in meters resolves. Renderings do not alias for that reason.
     """
 
-    longest_wave: float = 1.2  # metres
+    longest_wave: float = 1.2  # meters
     octaves: int = 6
     waves_per_octave: int = 24
     decay: float = 0.85  # amplitude of an octave relative to the one before
@@ -120,7 +131,16 @@ class Texture:
     seed: int = 0
 
     def colors(self, points: Float64, surface: Int64, footprint: Float64) -> UInt8:
-        """RGB (n, 3) of world points (n, 3) on numbered surfaces (n,); each surface differs."""
+        """Compute the colors of surface points.
+
+        Args:
+            points: World points (n, 3).
+            surface: Index (n,) of the surface of each point; every surface has another texture.
+            footprint: Size (n,) of a pixel on the surface in meters.
+
+        Returns:
+            RGB (n, 3) uint8.
+        """
         rng = np.random.default_rng(self.seed)
         amplitudes = self.decay ** np.arange(self.octaves)
         amplitudes *= self.contrast / np.sqrt(0.5 * self.waves_per_octave * (amplitudes**2).sum())
@@ -135,33 +155,34 @@ class Texture:
             mix = rng.normal(1.0, 0.5, (self.waves_per_octave, 3))
             waves = np.sin(where @ vectors.astype(np.float32) + phase.astype(np.float32))
             # Gaussian pixel of standard deviation half a footprint, applied exactly to each wave.
-            kept = amplitude * np.exp(-0.5 * (np.pi * frequency * footprint) ** 2)
-            value += kept[:, None] * (waves @ mix.astype(np.float32))
+            attenuated = amplitude * np.exp(-0.5 * (np.pi * frequency * footprint) ** 2)
+            value += attenuated[:, None] * (waves @ mix.astype(np.float32))
         return np.round(127.5 + 127.5 * np.tanh(value)).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What a pinhole camera sees; everything is zero where no surface is.
+    """Rendered image of a pinhole camera; everything is zero without a surface.
 
-    Normals face the camera along the ray, so at grazing sight off the axis n_z can be positive.
+    Normals face the camera along the ray, so that n_z can be positive at grazing angles off the
+    axis.
     """
 
-    depth: Float32  # (h, w), metres along z
+    depth: Float32  # (h, w), meters along z
     normals: Float32  # (h, w, 3), unit, camera frame
     _colors: Callable[[], UInt8]
 
     @cached_property
     def rgb(self) -> UInt8:
-        """Colours (h, w, 3)."""
+        """RGB (h, w, 3) uint8."""
         return self._colors()
 
 
 class SurfaceSamples(NamedTuple):
-    """Surface points seen through given pixels; entries are 0 where `valid` is false."""
+    """Surface points seen at given pixels; entries are 0 where ``valid`` is false."""
 
     points: Float64  # (n, 3), world
-    depth: Float64  # (n,), metres along z
+    depth: Float64  # (n,), meters along z
     normals: Float64  # (n, 3), camera frame, facing the camera
     surface: Int64  # (n,), index into the scene's surfaces
     valid: Bool  # (n,)
@@ -177,13 +198,17 @@ class TrueCorrespondences(NamedTuple):
 
 @dataclass(frozen=True)
 class AnalyticScene:
-    """Surfaces with a texture; the nearest hit of a ray is what is seen."""
+    """Opaque surfaces with a texture."""
 
     surfaces: tuple[Surface, ...]
     texture: Texture = Texture()
 
     def first_hit(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64, Int64]:
-        """Nearest hits of rays (n, 3) from one origin (3,): t (inf if none), normals, surface."""
+        """Intersect rays (n, 3) with all surfaces.
+
+        Returns:
+            t (n,) of the nearest hit, inf without a hit; normals (n, 3); index (n,) of the surface.
+        """
         t = np.full(len(directions), np.inf)
         normals = np.zeros((len(directions), 3))
         surface = np.zeros(len(directions), np.int64)
@@ -197,7 +222,7 @@ class AnalyticScene:
     def sample(
         self, camera: PinholeCamera, cam_from_world: ArrayLike, xy: ArrayLike
     ) -> SurfaceSamples:
-        """What is seen through pixels `xy` (n, 2) of a camera."""
+        """Intersect the rays through pixels ``xy`` (n, 2) of a camera with the scene."""
         rotation, origin = _split_pose(cam_from_world)
         pixels = np.asarray(xy, np.float64).reshape(-1, 2)
         directions = geometry.rays(camera, pixels) @ rotation
@@ -208,7 +233,7 @@ class AnalyticScene:
         return SurfaceSamples(points, depth, normals @ rotation.T, surface, valid)
 
     def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
-        """Depth, normals and colours at every pixel centre."""
+        """Render depth, normals and colors at every pixel center."""
         xy = geometry.pixel_centers(camera.width, camera.height)
         seen = self.sample(camera, cam_from_world, xy)
         shape = (camera.height, camera.width)
@@ -232,7 +257,7 @@ class AnalyticScene:
         b_from_world: ArrayLike,
         xy_a: ArrayLike,
     ) -> TrueCorrespondences:
-        """Where the points seen through pixels `xy_a` (n, 2) of view a lie in view b."""
+        """Project the points seen at pixels ``xy_a`` (n, 2) of view a into view b."""
         seen = self.sample(camera_a, a_from_world, xy_a)
         xy_b, depth_b = project(camera_b, b_from_world, seen.points)
         _, origin = _split_pose(b_from_world)
@@ -245,14 +270,17 @@ class AnalyticScene:
 def project(
     camera: PinholeCamera, cam_from_world: ArrayLike, points: Float64
 ) -> tuple[Float64, Float64]:
-    """Pixels (n, 2) and depths (n,) of world points (n, 3); pixels are 0 where depth <= 0."""
+    """Project world points (n, 3) to pixels (n, 2), 0 behind the camera, and depths (n,)."""
     pose = np.asarray(cam_from_world, np.float64)
     local = geometry.transform(pose[:3, :3], pose[:3, 3], points)
     return np.nan_to_num(geometry.project(camera, local), nan=0.0), local[:, 2]
 
 
 def look_at(eye: ArrayLike, target: ArrayLike) -> Float64:
-    """`cam_from_world` (3, 4) of an upright camera at `eye` looking at `target`, not vertically."""
+    """Return ``cam_from_world`` (3, 4) of an upright camera at ``eye`` that looks at ``target``.
+
+    The viewing direction must not be vertical.
+    """
     position = np.asarray(eye, np.float64)
     forward = np.asarray(target, np.float64) - position
     forward /= np.linalg.norm(forward)
@@ -263,7 +291,7 @@ def look_at(eye: ArrayLike, target: ArrayLike) -> Float64:
 
 
 def room_scene(seed: int = 0) -> AnalyticScene:
-    """A furnished room of 6 x 5 x 2.6 m around the origin, floor at z = 0."""
+    """Return a furnished room of 6 x 5 x 2.6 m around the origin with its floor at z = 0."""
     room = Box((0.0, 0.0, 1.3), (3.0, 2.5, 1.3))
     furniture: Sequence[Surface] = (
         Box((0.6, 0.5, 0.35), (0.6, 0.4, 0.35), yaw_deg=25.0),  # table
@@ -286,9 +314,9 @@ def arc_poses(
     radius: float = 3.4,
     height: float = 1.6,
 ) -> list[Float64]:
-    """`count` poses on an arc around `target`, `step_deg` apart, all looking at it.
+    """Return poses on an arc around ``target``, ``step_deg`` apart, all looking at it.
 
-    The defaults stay inside `room_scene` up to 60 degrees to either side of the middle.
+    The defaults stay inside of :func:`room_scene` up to 60 degrees to either side of the middle.
     """
     angles = np.deg2rad(180.0 + step_deg * (np.arange(count) - (count - 1) / 2))
     eyes = np.asarray(target) + radius * np.column_stack(
@@ -299,7 +327,7 @@ def arc_poses(
 
 
 def _split_pose(cam_from_world: ArrayLike) -> tuple[Float64, Float64]:
-    """Rotation (3, 3) and the camera's centre (3,) in the world."""
+    """Return the rotation (3, 3) and the camera center (3,) in the world."""
     pose = np.asarray(cam_from_world, np.float64)
     return pose[:3, :3], geometry.camera_center(pose[:3, :3], pose[:3, 3])
 

@@ -1,8 +1,8 @@
-"""Two rooms that look alike, joined by a corridor: what fools every matcher.
+"""Synthetic twin rooms: two similar rooms joined by a corridor, which mislead all matchers.
 
-The rooms lie side by side and have the same walls, door and furniture, but for one or two pieces.
-Each view of one room matches the views of the other as if they were of one room; only the corridor
-and the pieces that differ tell the truth.
+The rooms are next to each other with the same walls, door and furniture, except for one or two
+pieces. Each view of one room matches views of the other. Only the corridor and the differing pieces
+resolve the ambiguity.
 """
 
 from __future__ import annotations
@@ -32,29 +32,28 @@ from mpsfm_core.testing.synthetic.scenes import (
 )
 
 SHIFT = np.array([5.2, 0.0, 0.0])
-"""From a point of the first room to its twin in the second, metres."""
+"""Vector in meters from a point of the first room to its twin in the second."""
 CAMERA = PinholeCamera(640, 480, 400.0, 400.0, 320.0, 240.0)
 MIN_MATCHES = 15
-"""Verified matches that make a pair (COLMAP)."""
+"""Smallest number of verified matches of a pair [COLMAP min_num_inliers]."""
 MIN_SIGHT = 0.3
-"""Metres that a view sees somewhere at least: of one that stands inside a piece of furniture all
-keypoints lie within a few pixels of the others."""
+"""Largest distance in meters that a view must see at least; excludes views inside of furniture."""
 
 
 class SymmetricProblem(NamedTuple):
-    """A mapping problem with true poses (3, 4); ``room``: 0, 1, or -1 in the corridor, per view.
-
-    ``false``: of each pair, whether it matches a view with the twin of what the other sees.
-    """
+    """Synthetic mapping problem of two similar rooms with its true solution."""
 
     problem: MappingProblem
     poses: list[Float64]
+    """True ``cam_from_world`` (3, 4) of each view."""
     room: list[int]
+    """Room of each view: 0, 1, or -1 in the corridor."""
     false: list[bool]
+    """Whether a pair matches one view with the twin of what the other view sees."""
 
 
 def make_twin_rooms() -> AnalyticScene:
-    """Rooms of 5 x 4 x 2.6 m, x in [0, 5] and [5.2, 10.2], and a corridor at y < 0."""
+    """Return two rooms of 5 x 4 x 2.6 m, at x from 0 and from 5.2, and a corridor at y < 0."""
     shell = Box((5.1, 1.2, 1.3), (5.1, 2.8, 1.3))
     walls = [
         _block((5.0, 0.0, 0.0), (5.2, 4.0, 2.6)),
@@ -79,12 +78,16 @@ def make_twin_rooms() -> AnalyticScene:
 
 
 def make_twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], list[int]]:
-    """Views around both rooms, and a walk through the corridor; each seed stands a bit elsewhere.
+    """Create views of both rooms and a walk through the corridor.
 
-    Whoever would stand inside the furniture stands in front of it.
+    Positions vary with the seed. Views that would be inside of furniture move in front of it.
+
+    Args:
+        seed: Seed of the positions.
+        per_room: Number of views per room.
 
     Returns:
-        Poses (3, 4) ``cam_from_world``, and the room of each view, -1 in the corridor.
+        ``cam_from_world`` (3, 4) of each view, and its room: 0, 1, or -1 in the corridor.
     """
     rng = np.random.default_rng(seed)
     eyes, targets, room = [], [], []
@@ -114,11 +117,11 @@ def make_twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], l
     jitter = rng.normal(0, 0.08, (2, len(eyes), 3))
     looks = zip(eyes + jitter[0], targets + jitter[1], strict=True)
     scene = make_twin_rooms()
-    return [_in_the_open(scene, eye, target) for eye, target in looks], room
+    return [_move_to_free_space(scene, eye, target) for eye, target in looks], room
 
 
-def _in_the_open(scene: AnalyticScene, eye: Float64, target: Float64) -> Float64:
-    """A view (3, 4) from where it sees further than MIN_SIGHT, nearer to its target if need be."""
+def _move_to_free_space(scene: AnalyticScene, eye: Float64, target: Float64) -> Float64:
+    """Move a view towards its target until it sees further than MIN_SIGHT."""
     pixels = pixel_centers(*CAMERA.size)[::80, ::80].reshape(-1, 2)
     step = 0.1 * (target - eye) / np.linalg.norm(target - eye)
     while True:
@@ -138,11 +141,22 @@ def make_twin_room_problem(
     map_width: int = 160,
     keypoint_noise_px: float = 0.5,
 ) -> SymmetricProblem:
-    """Views of the twin rooms with priors, and the matches that survive verification.
+    """Create a mapping problem of the twin rooms.
 
-    A keypoint matches the same point in another view as well as its twin; verification by one
-    geometry leaves the more frequent of the two. ``errors``: of the depth priors, declared
-    honestly; None: exact, declared good to 1 %.
+    A keypoint matches the same point in another view as well as its twin. Verification by one
+    geometry keeps the more frequent of the two.
+
+    Args:
+        seed: Seed of poses, points and errors.
+        errors: Errors of the depth priors, which declare the std of the errors. None: exact depth
+            that declares a relative std of 1 %.
+        per_room: Number of views per room.
+        points_per_view: Surface points that each view adds.
+        map_width: Width of the prior maps in pixels.
+        keypoint_noise_px: Std of the keypoints.
+
+    Returns:
+        The problem with its solution.
     """
     scene = make_twin_rooms()
     poses, room = make_twin_room_poses(seed, per_room)
@@ -179,7 +193,10 @@ def make_twin_room_problem(
 def _keypoints(
     scene: AnalyticScene, poses: Sequence[Float64], points_per_view: int, rng: np.random.Generator
 ) -> tuple[list[Int64], list[Float64]]:
-    """Points that each view sees: pairs of sample number and copy (-1, 0, 1), and their pixels."""
+    """Return the points that each view sees, and their pixels.
+
+    A point has a sample number and a copy (-1, 0 or 1 rooms further).
+    """
     size = np.array(CAMERA.size, dtype=np.float64)
     numbers: list[list[Int64]] = [[] for _ in poses]
     pixels: list[list[Float64]] = [[] for _ in poses]
@@ -189,7 +206,7 @@ def _keypoints(
             points = samples.points + copy * SHIFT
             twins = (samples.points[:, 1] > 0) & (points[:, 0] > 0) & (points[:, 0] < 10.2)
             for j, other in enumerate(poses):
-                xy, seen = _seen(scene, other, points)
+                xy, seen = _find_visible(scene, other, points)
                 rows = np.flatnonzero(seen & (twins | (copy == 0)))
                 label = np.full(len(rows), copy)
                 numbers[j].append(np.stack([i * points_per_view + rows, label], axis=1))
@@ -198,12 +215,12 @@ def _keypoints(
 
 
 def shift_pose(pose: Float64, shift: int) -> Float64:
-    """The pose (3, 4) of a view that stands ``shift`` rooms further back than it does."""
+    """Return the pose (3, 4) of the same view from ``shift`` rooms further back."""
     return np.column_stack([pose[:, :3], pose[:, 3] + shift * pose[:, :3] @ SHIFT])
 
 
-def _seen(scene: AnalyticScene, pose: Float64, points: Float64) -> tuple[Float64, Bool]:
-    """Pixels of world points, and whether they lie on a surface that the view sees there."""
+def _find_visible(scene: AnalyticScene, pose: Float64, points: Float64) -> tuple[Float64, Bool]:
+    """Return the pixels of world points and whether the view sees them without occlusion."""
     xy, depth = project(CAMERA, pose, points)
     origin = camera_center(pose[:, :3], pose[:, 3])
     t, _, _ = scene.first_hit(origin, points - origin)
@@ -211,7 +228,7 @@ def _seen(scene: AnalyticScene, pose: Float64, points: Float64) -> tuple[Float64
 
 
 def _matches(numbers_a: Int64, numbers_b: Int64, shift: int) -> Int64:
-    """(m, 2) keypoints of the same point, or of one point and its twin ``shift`` rooms on."""
+    """Return matches (m, 2) of equal points, or of points and their twins ``shift`` rooms on."""
     code_a = numbers_a[:, 0] * 8 + numbers_a[:, 1]
     code_b = numbers_b[:, 0] * 8 + numbers_b[:, 1] - shift
     _, rows_a, rows_b = np.intersect1d(code_a, code_b, return_indices=True)
@@ -219,7 +236,7 @@ def _matches(numbers_a: Int64, numbers_b: Int64, shift: int) -> Int64:
 
 
 def _block(low: tuple[float, float, float], high: tuple[float, float, float]) -> Box:
-    """A box by its corners."""
+    """Return a box given by two opposite corners."""
     a, b = np.array(low), np.array(high)
     middle, half = (a + b) / 2, (b - a) / 2
     return Box((middle[0], middle[1], middle[2]), (half[0], half[1], half[2]))
