@@ -1,4 +1,4 @@
-"""The configuration of a run: typed options, read from YAML files and ``--set`` overrides."""
+"""Configuration of a run: typed options from YAML files and ``--set`` overrides."""
 
 from mpsfm_core.config.loading import (
     check_provider_config,

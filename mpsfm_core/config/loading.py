@@ -1,14 +1,17 @@
-"""The configuration of a run: YAML files and ``--set`` into one checked :class:`Config`.
+"""Read YAML files and ``--set`` overrides into one checked :class:`Config`.
 
-A file may say ``extends:`` with the name of a shipped configuration or a path relative to itself.
-Mappings are merged key by key, everything else is replaced; a block whose ``use:`` changes loses
-the rest that its parent said of it, as another provider has other options, and a block that says
-``use:`` loses its parent's ``fallback:``. Where features, a
-matcher or a multi-view network are named, the parent's quick matching is lost.
+A file may extend a shipped configuration or another file with ``extends:``. Mappings merge key by
+key, and other values replace those of the parent. There are three exceptions:
 
-A block may name providers to take ``fallback``. Which of them it will be is not the
-configuration's to say: it depends on the machine, and
-:mod:`mpsfm_core.pipeline.provider_resolution` finds it out when a run starts."""
+* A block with another ``use:`` drops the other keys of its parent, because another provider has
+  other options.
+* A block with ``use:`` drops the parent's ``fallback:``.
+* Naming features, a matcher or a multi-view network drops the parent's ``fast_pass:``, because the
+  fast pass would replace them for most images.
+
+Which ``fallback:`` a run takes depends on the machine;
+:mod:`mpsfm_core.pipeline.provider_resolution` decides when a run starts.
+"""
 
 from __future__ import annotations
 
@@ -32,23 +35,23 @@ from mpsfm_core.providers.uncertainty.calibration_file import CALIBRATIONS, read
 from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.yaml_text import find_line, parse_assignment, parse_yaml
 
-_CAREFUL = ("features", "matcher", "dense_matcher", "multiview")
-"""Blocks that quick matching does not go with unasked: who names a matcher wants that one, and what
-a multi-view network is shown together is chosen by matches."""
+_REPLACE_FAST_PASS = ("features", "matcher", "dense_matcher", "multiview")
+"""Blocks whose ``use:`` drops the parent's fast pass. A multi-view network is among them because
+matches decide which images it sees together."""
 
 
 def shipped_configs() -> dict[str, Path]:
-    """The configurations that come with the package: name -> file, sorted by name."""
+    """Return the files of the shipped configurations by name, sorted."""
     package = Path(__file__).parents[1]
-    # Installed from a wheel they lie in the package, in a source tree beside it.
+    # A wheel contains them in the package, a source tree next to the package.
     folder = next(f for f in (package / "configs", package.parent / "configs") if f.is_dir())
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
 def describe_shipped() -> dict[str, str]:
-    """The shipped configurations with their descriptions."""
-    read = {name: _read_chain(path)[-1].data for name, path in shipped_configs().items()}
-    return {name: str(data.get("description", "")) for name, data in read.items()}
+    """Return the descriptions of the shipped configurations by name."""
+    data = {name: _read_chain(path)[-1].data for name, path in shipped_configs().items()}
+    return {name: str(values.get("description", "")) for name, values in data.items()}
 
 
 def load_config(
@@ -60,38 +63,48 @@ def load_config(
 ) -> Config:
     """Read, merge and check a configuration.
 
-    ``name_or_path``: a shipped name, or a YAML file (anything with a slash or ending in .yaml or
-    .yml). ``overrides``: texts ``a.b=value`` with a YAML value, applied last; list entries by
-    index. ``registry``: default ``Registry.discover()``; every backend's name and options are
-    checked against it, and the returned options have all defaults filled in. ``complete=False``
-    lets required options of backends be absent (they are null), to look at a configuration.
+    Args:
+        name_or_path: Shipped name, or a YAML file (with a slash, or ending in .yaml or .yml).
+        overrides: Texts ``a.b=value`` with a YAML value, applied last; list entries by index.
+        registry: Providers to check names and options against; default: ``Registry.discover()``.
+        complete: False allows missing required options of providers (null in the result), to show
+            a configuration.
 
-    Raises :class:`~mpsfm_core.data.errors.ConfigError` with file, line, YAML path and, for unknown
-    keys and names, the nearest valid one.
+    Returns:
+        The configuration with all defaults filled in.
+
+    Raises:
+        ConfigError: with file, line, YAML path and, for unknown keys, the nearest valid key.
     """
-    layers = _read_chain(_find(str(name_or_path), Path()))
-    # A change of provider drops the options of its block, one of the matcher quick matching: it
-    # goes before the overrides that set them.
-    last = sorted(overrides, key=lambda text: (text.startswith("fast_pass"), ".use=" not in text))
-    layers += [_Layer(f"--set {text}", parse_assignment(text)) for text in last]
+    layers = _read_chain(_find_file(str(name_or_path), Path()))
+    # Naming a provider drops options and fast pass, so it must precede overrides that set them.
+    order = sorted(overrides, key=lambda text: (text.startswith("fast_pass"), ".use=" not in text))
+    layers += [_Layer(f"--set {text}", parse_assignment(text)) for text in order]
     try:
-        config = parse_settings(Config, _merge_all(layers))
-        return _check(config, registry or Registry.discover(), layers, complete)
+        merged, warnings = _merge_all(layers)
+        config = parse_settings(Config, merged)
+        config = _check(config, registry or Registry.discover(), layers, complete)
+        return config.with_warnings(tuple(warnings))
     except SettingsError as error:
-        raise ConfigError("; ".join(_located(layers, p) for p in error.problems)) from error
+        raise ConfigError("; ".join(_locate(layers, p) for p in error.problems)) from error
 
 
 @dataclass(frozen=True)
 class _Layer:
-    """What one file or one ``--set`` says; ``text`` is the file's, ``folder`` where it lies."""
+    """Settings of one file or one ``--set``."""
 
     source: str
+    """Path of the file, or the override as the user wrote it."""
     data: Mapping[str, Any]
     text: str = ""
+    """Text of the file, to find line numbers."""
     folder: Path = Path()
+    """Folder of the file, for relative paths."""
+    shipped: bool = False
+    """Whether the file is a shipped configuration."""
 
-    def says(self, path: SettingPath) -> bool:
-        """Whether there is an entry at ``path``."""
+    def has(self, path: SettingPath) -> bool:
+        """Check whether there is an entry at a path."""
         node: Any = self.data
         for part in path:
             if isinstance(node, list) and isinstance(part, int) and part < len(node):
@@ -102,13 +115,14 @@ class _Layer:
                 return False
         return True
 
-    def place(self, path: SettingPath) -> str:
-        """``FILE:LINE`` of an entry, or the override's text."""
+    def locate(self, path: SettingPath) -> str:
+        """Return ``FILE:LINE`` of an entry, or the override."""
         line = find_line(self.text, path) if self.text else None
         return f"{self.source}:{line}" if line else self.source
 
 
-def _find(name: str, folder: Path) -> Path:
+def _find_file(name: str, folder: Path) -> Path:
+    """Return the file of a shipped name, or of a path relative to a folder."""
     if "/" in name or "\\" in name or name.endswith((".yaml", ".yml")):
         path = folder / Path(name).expanduser()
         if not path.is_file():
@@ -123,7 +137,7 @@ def _find(name: str, folder: Path) -> Path:
 
 
 def _read_chain(path: Path, children: tuple[Path, ...] = ()) -> list[_Layer]:
-    """The file's layers, the one that extends nothing first."""
+    """Read a file and the files that it extends, the base file first."""
     path = path.resolve()
     chain = (*children, path)
     if path in children:
@@ -140,45 +154,56 @@ def _read_chain(path: Path, children: tuple[Path, ...] = ()) -> list[_Layer]:
     parent = data.pop("extends", None)
     if children:
         data.pop("description", None)
-    layer = _Layer(str(path), data, text, path.parent)
+    layer = _Layer(str(path), data, text, path.parent, path in shipped_configs().values())
     if parent is None:
         return [layer]
     if not isinstance(parent, str):
         raise ConfigError(f"{path}: extends: must be a name or a path, is {parent!r}")
     try:
-        found = _find(parent, path.parent)
+        parent_path = _find_file(parent, path.parent)
     except ConfigError as error:
-        raise ConfigError(f"{layer.place(('extends',))}: extends: {error}") from error
-    return [*_read_chain(found, chain), layer]
+        raise ConfigError(f"{layer.locate(('extends',))}: extends: {error}") from error
+    return [*_read_chain(parent_path, chain), layer]
 
 
-def _merge_all(layers: Sequence[_Layer]) -> dict[str, Any]:
+def _merge_all(layers: Sequence[_Layer]) -> tuple[dict[str, Any], list[str]]:
+    """Merge the layers; return the settings, and a warning if a user drops the fast pass."""
     merged: dict[str, Any] = {}
+    warnings = []
     for layer in layers:
         try:
-            if any(layer.says((block, "use")) for block in _CAREFUL):
+            named = [block for block in _REPLACE_FAST_PASS if layer.has((block, "use"))]
+            has_fast_pass = merged.get("fast_pass") is not None
+            if named:
                 merged.pop("fast_pass", None)
+            if named and has_fast_pass and not layer.shipped and "fast_pass" not in layer.data:
+                place = layer.locate((named[0], "use"))
+                warnings.append(
+                    f"{place}: naming {' and '.join(named)} switches the fast pass off, so all "
+                    "pairs are matched with it; set fast_pass to keep it"
+                )
             merged = _merge(merged, layer.data)
         except IndexError as error:
             raise ConfigError(f"{layer.source}: {error}") from error
-    return merged
+    return merged, [] if merged.get("fast_pass") else warnings
 
 
 def _merge(base: Any, change: Any) -> Any:
+    """Merge one value of a child into the value of its parent."""
     if not isinstance(change, Mapping):
         return change
-    indices = bool(change) and all(isinstance(k, str) and k.isdigit() for k in change)
-    if indices and (base is None or isinstance(base, list)):
+    is_indexed = bool(change) and all(isinstance(k, str) and k.isdigit() for k in change)
+    if is_indexed and (base is None or isinstance(base, list)):
         return _merge_items(base or [], change)
     if not isinstance(base, Mapping) or change.get("use", base.get("use")) != base.get("use"):
         base = {}
-    elif "use" in change:  # who names a provider wants this one
+    elif "use" in change:
         base = {key: value for key, value in base.items() if key != "fallback"}
     return {**base, **{key: _merge(base.get(key), value) for key, value in change.items()}}
 
 
 def _merge_items(base: list[Any], change: Mapping[str, Any]) -> list[Any]:
-    """``--set masks.0.use=...``: replace an entry of a list, or append the next one."""
+    """Replace or append list entries by index, as in ``--set masks.0.use=sky``."""
     items = list(base)
     for key, value in change.items():
         index = int(key)
@@ -189,22 +214,21 @@ def _merge_items(base: list[Any], change: Mapping[str, Any]) -> list[Any]:
 
 
 def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complete: bool) -> Config:
-    """The configuration with the options of every backend checked and filled in.
+    """Check the options of every provider, and fill in their defaults.
 
-    Of a backend that is open one candidate must be possible; its options stay as they are given.
+    An unresolved block needs one valid candidate, and its options stay as given.
     """
     problems: list[SettingProblem] = []
     checked = config
-    for path, kind, backend in config.provider_configs():
+    for path, kind, block in config.provider_configs():
         try:
-            known = backend.model_copy(
-                update={"calibration": _calibration(path, kind, backend, layers)}
-            )
-            if known.is_unresolved:
-                _check_open(path, kind, known, registry, complete)
+            calibration = _read_calibration(path, kind, block, layers)
+            block = block.model_copy(update={"calibration": calibration})
+            if block.is_unresolved:
+                _check_candidates(path, kind, block, registry, complete)
             else:
-                known = check_provider_config(path, kind, known, registry, complete)
-            checked = checked.replaced(path, known)
+                block = check_provider_config(path, kind, block, registry, complete)
+            checked = checked.replaced(path, block)
         except SettingsError as error:
             problems += error.problems
     if not problems:
@@ -216,29 +240,29 @@ def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complet
     return checked
 
 
-def _check_open(
-    path: SettingPath, kind: Kind, backend: ProviderConfig, registry: Registry, complete: bool
+def _check_candidates(
+    path: SettingPath, kind: Kind, block: ProviderConfig, registry: Registry, complete: bool
 ) -> None:
-    """Raise if none of the candidates could be taken, whatever is on this machine later."""
-    names = (backend.use, *backend.fallback)
-    here = [name for name in names if name in registry.names(kind)]
-    known = {key for name in here for key in registry.default_options(kind, name)}
-    unknown = [key for key in backend.options if key not in known]
-    if here and unknown and SAME_NETWORK not in names:
-        places = [(*path, "options", key) for key in unknown]
-        texts = [f"unknown key{did_you_mean(key, known)}" for key in unknown]
-        raise SettingsError(tuple(map(SettingProblem, places, texts)))
+    """Raise SettingsError if no candidate of a block could ever be used."""
+    names = (block.use, *block.fallback)
+    installed = [name for name in names if name in registry.names(kind)]
+    valid_keys = {key for name in installed for key in registry.default_options(kind, name)}
+    unknown_keys = [key for key in block.options if key not in valid_keys]
+    if installed and unknown_keys and SAME_NETWORK not in names:
+        paths = [(*path, "options", key) for key in unknown_keys]
+        texts = [f"unknown key{did_you_mean(key, valid_keys)}" for key in unknown_keys]
+        raise SettingsError(tuple(map(SettingProblem, paths, texts)))
     errors = []
-    for name in here or names:
+    for name in installed or names:
         if name == SAME_NETWORK:
             return
-        candidate = backend.model_copy(update={"use": name, "fallback": ()})
+        candidate = block.model_copy(update={"use": name, "fallback": ()})
         try:
             check_provider_config(path, kind, candidate, registry, complete)
             return
         except SettingsError as error:
             errors.append(error)
-    if here:
+    if installed:
         raise errors[0]
     raise SettingsError(tuple(problem for error in errors for problem in error.problems))
 
@@ -246,48 +270,57 @@ def _check_open(
 def check_provider_config(
     path: SettingPath,
     kind: Kind,
-    backend: ProviderConfig,
+    block: ProviderConfig,
     registry: Registry,
     complete: bool = True,
 ) -> ProviderConfig:
-    """A backend that names one provider, with its options and its wrappers' filled in.
+    """Check a block with one provider; fill in its options and those of its wrappers.
 
-    ``path``: of the block, for messages. ``complete=False`` lets required options be absent.
+    Args:
+        path: Path of the block, for messages.
+        kind: Kind of the provider.
+        block: The block, without fallbacks.
+        registry: The installed providers.
+        complete: False allows missing required options.
 
-    Raises :class:`~mpsfm_core.data.options.SettingsError` when there is no such provider or
-    wrapper, or an option is wrong."""
+    Returns:
+        The block with all options.
+
+    Raises:
+        SettingsError: no such provider or wrapper, or a wrong option.
+    """
     try:
-        options = registry.validate_options(kind, backend.use, backend.options, (*path, "options"))
+        options = registry.validate_options(kind, block.use, block.options, (*path, "options"))
         filled = options.model_dump(mode="json") if options else {}
     except ProviderError as error:
         raise SettingsError((SettingProblem((*path, "use"), str(error)),)) from error
     except SettingsError as error:
         if complete or not all(problem.missing for problem in error.problems):
             raise
-        filled = registry.default_options(kind, backend.use) | backend.options
+        filled = registry.default_options(kind, block.use) | block.options
     wrap = tuple(
         check_provider_config((*path, "wrap", index), "wrapper", wrapper, registry, complete)
-        for index, wrapper in enumerate(backend.wrap)
+        for index, wrapper in enumerate(block.wrap)
     )
     for index, wrapper in enumerate(wrap):
         if f"wraps-{kind}" not in registry.spec("wrapper", wrapper.use).capabilities:
             text = f"{wrapper.use!r} does not wrap {kind} providers"
             raise SettingsError((SettingProblem((*path, "wrap", index, "use"), text),))
-    return backend.model_copy(update={"options": filled, "wrap": wrap})
+    return block.model_copy(update={"options": filled, "wrap": wrap})
 
 
-def _calibration(
-    path: SettingPath, kind: Kind, backend: ProviderConfig, layers: Sequence[_Layer]
+def _read_calibration(
+    path: SettingPath, kind: Kind, block: ProviderConfig, layers: Sequence[_Layer]
 ) -> dict[str, Any] | None:
-    """The calibration's values, read from its file if it names one."""
-    values, path = backend.calibration, (*path, "calibration")
+    """Return the values of a calibration; read its file if it names one."""
+    values, path = block.calibration, (*path, "calibration")
     if values is None:
         return None
     quantity = "depth" if kind == "multiview" else kind
     if quantity not in CALIBRATIONS:
         raise SettingsError((SettingProblem(path, f"a {kind} provider has no uncertainty"),))
     if isinstance(values, str):
-        folder = next(layer.folder for layer in reversed(layers) if layer.says(path))
+        folder = next(layer.folder for layer in reversed(layers) if layer.has(path))
         file = folder / Path(values).expanduser()
         try:
             values = dict(read_values(file, quantity))
@@ -297,12 +330,14 @@ def _calibration(
 
 
 def _missing_blocks(config: Config) -> list[SettingProblem]:
-    """Blocks that others need."""
+    """Return the blocks that other blocks need and that are missing."""
     if config.matcher is None and config.dense_matcher is None:
         return [SettingProblem(("matcher",), "a matcher or a dense_matcher is needed")]
     problems = []
     if config.fast_pass is not None and config.depth.use == FROM_MATCHER:
-        problems.append(SettingProblem(("fast_pass",), "gives no depth, as depth.use: matcher needs"))
+        problems.append(
+            SettingProblem(("fast_pass",), "gives no depth, as depth.use: matcher needs")
+        )
     if config.depth.use == FROM_MULTIVIEW and config.multiview is None:
         problems.append(SettingProblem(("multiview",), "is needed by depth.use: multiview"))
     if config.matcher is not None and config.features is None:
@@ -314,38 +349,38 @@ def _missing_blocks(config: Config) -> list[SettingProblem]:
 
 
 def combination_problems(config: Config, registry: Registry) -> list[SettingProblem]:
-    """What does not fit together in a configuration although each block is right by itself.
+    """Find blocks that are valid alone but do not fit together.
 
-    Open blocks fit for the present. The path of a problem begins with the block that should change.
+    Unresolved blocks are ignored. The path of a problem starts with the block that should change.
     """
     problems = []
-    if (alone := config.fast_pass_config()) is not None:
-        for problem in combination_problems(alone, registry):
+    if (fast_pass := config.fast_pass_config()) is not None:
+        for problem in combination_problems(fast_pass, registry):
             problems.append(SettingProblem(("fast_pass", *problem.path), problem.text))
-    settled = {
-        path[0]: registry.spec(kind, backend.use)
-        for path, kind, backend in config.provider_configs()
-        if not backend.is_unresolved
+    specs = {
+        path[0]: registry.spec(kind, block.use)
+        for path, kind, block in config.provider_configs()
+        if not block.is_unresolved
     }
     for name, capability in (("matcher", "sparse"), ("dense_matcher", "dense")):
-        if name in settled and capability not in settled[name].capabilities:
-            text = f"{settled[name].name!r} is not a {capability} matcher"
+        if name in specs and capability not in specs[name].capabilities:
+            text = f"{specs[name].name!r} is not a {capability} matcher"
             problems.append(SettingProblem((name, "use"), text))
-    if not {"matcher", "features"} <= settled.keys():
+    if not {"matcher", "features"} <= specs.keys():
         return problems
-    accepted = set(settled["matcher"].tags)
-    if accepted and not accepted & set(settled["features"].tags):
-        text = f"{settled['matcher'].name!r} matches {', '.join(sorted(accepted))} features"
-        text += f", not {settled['features'].name!r}"
+    accepted_tags = set(specs["matcher"].tags)
+    if accepted_tags and not accepted_tags & set(specs["features"].tags):
+        text = f"{specs['matcher'].name!r} matches {', '.join(sorted(accepted_tags))} features"
+        text += f", not {specs['features'].name!r}"
         problems.append(SettingProblem(("matcher", "use"), text))
     return problems
 
 
-def _located(layers: Sequence[_Layer], problem: SettingProblem) -> str:
-    """The problem with the place that caused it: the last layer that says most of its path."""
+def _locate(layers: Sequence[_Layer], problem: SettingProblem) -> str:
+    """Return the problem with its place: the last layer with the longest prefix of its path."""
     for length in range(len(problem.path), 0, -1):
         path = problem.path[:length]
         for layer in reversed(layers):
-            if layer.says(path):
-                return f"{layer.place(path)}: {problem}"
+            if layer.has(path):
+                return f"{layer.locate(path)}: {problem}"
     return f"{layers[-1].source}: {problem}"

@@ -1,4 +1,4 @@
-"""The options of a run as one immutable, typed object."""
+"""The configuration of a run as one immutable, typed object."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
-from mpsfm_core.data.options import Options, SettingPath
+from mpsfm_core.config.settings import user_settings
+from mpsfm_core.data.options import Options, SettingPath, expert
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.extraction.options import (
     AdjustmentOptions,
@@ -25,86 +26,85 @@ from mpsfm_core.support.format_versions import VERSION
 from mpsfm_core.support.yaml_text import write_yaml
 
 FORMAT = 1
-"""Of configuration files."""
+"""Format version of configuration files."""
 
 
 class RuntimeOptions(Options):
-    """Where and how a run computes; nothing here changes what it computes but the seed.
+    """Options of the computation: workers, device, cache, executor, error handling.
 
-    That is up to rounding: networks may add in another order on other devices and thread counts.
-    What is cached stands, whatever made it.
+    Only the seed changes what a run computes. Results of networks may differ by rounding between
+    devices and thread counts. Cached results stay valid for all devices.
     """
 
     workers: int | None = Field(None, ge=1)
-    """Images or pairs that the extraction works on at once, null for one a core."""
-    threads: int = Field(1, ge=1)
-    """Threads that a provider may use for each of them."""
+    """Images or pairs that extraction and the dense stage process at the same time. More workers
+    are faster and need more memory. Null uses one per core, at most four in extraction."""
+    threads: int = expert(1, ge=1)
+    """Threads of a provider per worker. If ``workers`` is null, idle cores are added."""
     seed: int = Field(0, ge=0)
-    """Seed of everything random: providers, verification, mapper, pixels of ``dense.ply``."""
+    """Seed of every random choice: providers, verification, mapper, points of ``dense.ply``."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where providers compute; ``auto`` takes a GPU when there is one."""
+    """Device of the providers; ``auto`` uses a GPU if there is one."""
     cache_dir: Path | None = None
-    """Folder of weights and extraction results, null for the platform's cache folder."""
+    """Folder of weights and extraction results; null uses the cache folder of the platform."""
     executor: str = "threads"
-    """Where features, matches and priors are computed: ``threads`` of this process, or workers that
-    a plugin reaches (``dask``, ``ray``) and that share ``cache_dir`` and the photos."""
+    """Where providers run: ``threads`` of this process, or the workers of an executor plugin
+    (``dask``, ``ray``), which share ``cache_dir`` and the images."""
     executor_options: dict[str, Any] = Field(default_factory=dict)
-    """Of the executor, as ``address``."""
+    """Options of the executor plugin, such as ``address``."""
     on_error: Literal["fail", "skip"] = "fail"
-    """A provider that fails on a photo (raises, breaks its contract, does not answer) ends the run,
-    or the run goes on without that photo, or without that pair, and says so. More than half of the
-    photos end it in any case."""
-    timeout_s: float | None = Field(1800.0, gt=0)
-    """Seconds that a provider may take for one photo or pair, null for any time."""
-    checkpoint_s: float | None = Field(10.0, ge=0)
-    """Seconds between checkpoints of the mapping, more where writing one takes long; a run that
-    was killed goes on from the last. Null writes none, and none of the dense stage either."""
-    check_resources: bool = True
-    """A run that cannot fit into memory or onto the disk ends before a photo is decoded, and one
-    that may not fit says so; off: what it takes is told and no more."""
+    """If a provider fails on an image or pair: ``fail`` ends the run, ``skip`` continues without
+    it. Failures of more than half of the images always end the run."""
+    timeout_s: float | None = expert(1800.0, gt=0)
+    """Seconds that a provider may take per image or pair; null sets no limit."""
+    checkpoint_s: float | None = expert(10.0, ge=0)
+    """Minimum seconds between checkpoints of mapping. Null writes no checkpoints, of the dense
+    stage neither."""
+    check_resources: bool = expert(True)
+    """Use fewer workers if memory is short, and refuse a run that cannot fit into memory or onto
+    the disk."""
     offline: bool = False
-    """Never download; a missing weights file is an error."""
+    """Never download; missing weights are an error."""
 
 
 class FastPass(Options):
-    """Features and a sparse matcher that cost little."""
+    """Inexpensive features and sparse matcher that run before ``features`` and ``matcher``.
+
+    Images that the fast pass constrains are not matched again with each other.
+    """
 
     features: ProviderConfig
     matcher: ProviderConfig
     min_points: int = Field(100, ge=1)
-    """An image is held in place by so many points that three images see. (COLMAP's
-    init_min_num_inliers, what it takes to begin a model. Ours: images of fountain and
-    rendered_kitchen see 321 and more; two triplets of hololens_room with 35 and 72 were wrong by 45
-    and 5 degrees where the networks are right to 2.)"""
-    partners: int = Field(15, ge=1)
-    """``pairs.partners`` of images that are matched again, where not all pairs are. (Ours, of 26 of
-    the 123 images of hololens_room: with 30, 15 and 10 partners networks match 641, 313 and 216
-    pairs, pose AUC@1/5/20 is 6.4 / 51.2 / 85.2, 7.3 / 49.6 / 85.2 and 5.1 / 54.1 / 87.5.)"""
+    """Points with at least three observations that constrain an image. Raising it matches more
+    images again. [COLMAP init_min_num_inliers]"""
+    partners: int = expert(15, ge=1)
+    """``pairs.partners`` of the images that are matched again, if not all pairs are. Raising it
+    costs time. [tuned: benchmarks.pairs]"""
 
 
 class Config(Options):
-    """Everything a run needs to know besides its images and output folder."""
+    """All settings of a run, except its images and its output folder."""
 
     description: str = ""
     """One line for ``mpsfm config list``; not inherited."""
     inputs: InputOptions = Field(default_factory=InputOptions)
     pairs: PairOptions = Field(default_factory=PairOptions)
     fast_pass: FastPass | None = None
-    """Matching that is tried first: photos that it holds in place are not given to ``features`` and
-    ``matcher`` again, pairs with others are (:mod:`mpsfm_core.pipeline.run`)."""
+    """First, inexpensive pass of matching and mapping. Null matches all pairs with ``matcher``."""
     features: ProviderConfig | None = None
     matcher: ProviderConfig | None = None
-    """Sparse matcher, needs ``features``."""
+    """Sparse matcher; needs ``features``."""
     dense_matcher: ProviderConfig | None = None
-    """Detector-free matcher, instead of the sparse one or beside it."""
+    """Detector-free matcher, instead of or in addition to the sparse matcher."""
     retrieval: ProviderConfig | None = None
     multiview: ProviderConfig | None = None
-    """Network that sees several photos at once, needed by ``depth: {use: multiview}``."""
+    """Network that predicts depth for groups of images; needed by ``depth: {use: multiview}``."""
     depth: ProviderConfig
     normals: ProviderConfig
-    """Of the depth network's own pass with ``use: same-network``, if that gives normals."""
+    """Normals; ``use: same-network`` takes those that the depth network predicts."""
     masks: tuple[ProviderConfig, ...] = ()
-    """A pixel is used when all masks allow it."""
+    """Mask providers. A pixel is used if all masks allow it."""
     verification: VerificationOptions = Field(default_factory=VerificationOptions)
     adjustment: AdjustmentOptions = Field(default_factory=AdjustmentOptions)
     extraction: ExtractionOptions = Field(default_factory=ExtractionOptions)
@@ -112,52 +112,74 @@ class Config(Options):
     dense: DenseOptions = Field(default_factory=DenseOptions)
     results: ResultOptions = Field(default_factory=ResultOptions)
     runtime: RuntimeOptions = Field(default_factory=RuntimeOptions)
+    _warnings: tuple[str, ...] = PrivateAttr(())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Effects of the configuration files that their author may not expect."""
+        return self._warnings
+
+    def with_warnings(self, warnings: tuple[str, ...]) -> Config:
+        """Return a copy of the configuration with these warnings."""
+        config = self.model_copy()
+        config._warnings = warnings
+        return config
 
     def provider_configs(self) -> Iterator[tuple[SettingPath, Kind, ProviderConfig]]:
-        """Every chosen provider: its path in the configuration, kind and block."""
+        """Yield path, kind and block of every provider, in the order of resolution."""
         if self.fast_pass is not None:
             yield ("fast_pass", "features"), "features", self.fast_pass.features
             yield ("fast_pass", "matcher"), "matcher", self.fast_pass.matcher
         for name, kind in PROVIDER_BLOCKS.items():
-            backend = getattr(self, name)
-            if backend is not None:
-                yield (name,), kind, backend
-        for index, backend in enumerate(self.masks):
-            yield ("masks", index), "mask", backend
+            block = getattr(self, name)
+            if block is not None:
+                yield (name,), kind, block
+        for index, block in enumerate(self.masks):
+            yield ("masks", index), "mask", block
 
-    def replaced(self, path: SettingPath, backend: ProviderConfig) -> Config:
-        """The configuration with another backend at a path of :meth:`provider_configs`."""
-        block, *index = path
-        value: Any = backend
-        if block == "fast_pass" and self.fast_pass is not None:
-            value = self.fast_pass.model_copy(update={str(index[0]): backend})
-        elif index:
-            value = tuple(backend if i == index[0] else b for i, b in enumerate(self.masks))
-        return self.model_copy(update={str(block): value})
+    def replaced(self, path: SettingPath, block: ProviderConfig) -> Config:
+        """Return a copy with another block at a path of :meth:`provider_configs`."""
+        name, *keys = path
+        value: Any = block
+        if name == "fast_pass" and self.fast_pass is not None:
+            value = self.fast_pass.model_copy(update={str(keys[0]): block})
+        elif keys:
+            value = tuple(block if i == keys[0] else mask for i, mask in enumerate(self.masks))
+        return self.model_copy(update={str(name): value})
 
     def fast_pass_config(self) -> Config | None:
-        """The configuration with its quick matching alone, None where it has none."""
+        """Return the configuration of the fast pass alone, or None without a fast pass."""
         if self.fast_pass is None:
             return None
-        alone = {"fast_pass": None, "dense_matcher": None, **dict(self.fast_pass)}
-        return self.model_copy(update=alone)
+        update = {"fast_pass": None, "dense_matcher": None, **dict(self.fast_pass)}
+        return self.model_copy(update=update)
 
     @property
     def has_second_pass(self) -> bool:
-        """Whether quick matching is followed by another one where it does not suffice; not where
-        the other's first choice cannot be had and the same features would be found again."""
+        """Whether ``features`` and ``matcher`` follow the fast pass.
+
+        False if ``features`` is the provider of the fast pass, because a second pass would find
+        the same features again.
+        """
         if self.fast_pass is None:
             return False
-        again = self.features is not None and self.features.use == self.fast_pass.features.use
-        return self.dense_matcher is not None or not again
+        same_features = (
+            self.features is not None and self.features.use == self.fast_pass.features.use
+        )
+        return self.dense_matcher is not None or not same_features
 
     def mapper_options(self) -> MapperOptions:
-        """The settings of the mapper, with the seed of the run."""
+        """Return the options of the mapper, with the seed of the run."""
         return MapperOptions(**dict(self.mapping), seed=self.runtime.seed)
 
-    def to_yaml(self) -> str:
-        """The configuration with all defaults; loading it gives the same configuration."""
-        return write_yaml({VERSION: FORMAT, **self.model_dump(mode="json")})
+    def to_yaml(self, *, expert_settings: bool = True) -> str:
+        """Return the configuration as YAML with all defaults.
+
+        Args:
+            expert_settings: False leaves out expert settings that have their default value.
+        """
+        values = self.model_dump(mode="json") if expert_settings else user_settings(self)
+        return write_yaml({VERSION: FORMAT, **values})
 
 
 PROVIDER_BLOCKS: dict[str, Kind] = {
@@ -169,6 +191,7 @@ PROVIDER_BLOCKS: dict[str, Kind] = {
     "depth": "depth",
     "normals": "normals",
 }
+"""Blocks with one provider and the kind of the provider."""
 
 BLOCKS = ("fast_pass", *PROVIDER_BLOCKS, "masks")
-"""The blocks that name providers, each after those that its choice depends on."""
+"""Blocks that name providers; each block follows those that its resolution depends on."""

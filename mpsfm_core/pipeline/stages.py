@@ -39,6 +39,8 @@ class Stages:
         self._registry = registry
         self._finished: dict[str, StageRecord] = {}
         self._running: dict[str, float] = {}
+        self.warnings: list[str] = []
+        """Warnings so far, for ``summary.json``."""
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -77,6 +79,11 @@ class Stages:
     def notice(self, text: str) -> None:
         """Something that the user should know now, in one line."""
         self._registry.call_hook("mpsfm_notice", text=text)
+
+    def warn(self, text: str) -> None:
+        """Show a warning in one line, and record it for ``summary.json``."""
+        self.warnings.append(text)
+        self.notice(f"warning: {text}")
 
     def stage_started(self, stage: str, total: int | None) -> None:
         """A stage begins, with this many steps if known."""

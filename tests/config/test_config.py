@@ -127,13 +127,35 @@ class TestMerging:
             ("", (f"fast_pass={QUICK}", "matcher.use=lighterglue"), True),
         ],
     )
-    def test_who_names_a_matcher_wants_that_one(
+    def test_naming_a_matcher_drops_the_fast_pass(
         self, load: Load, text: str, overrides: Sequence[str], kept: bool
     ) -> None:
         fast_pass = load(f"extends: fast-cpu\n{text}", *overrides).fast_pass
         assert (fast_pass is not None) == kept
         if fast_pass is not None:
             assert (fast_pass.features.use, fast_pass.matcher.use) == ("sift", "mutual-nearest")
+
+    @pytest.mark.parametrize(
+        ("text", "overrides", "named"),
+        [
+            ("matcher: {use: lighterglue}", (), "run.yaml:2: naming matcher switches the fast"),
+            ("", ("features.use=xfeat",), "--set features.use=xfeat: naming features switches"),
+            ("depth: {use: files, options: {directory: maps}}", (), None),
+            ("fast_pass: null\nmatcher: {use: lighterglue}", (), None),
+            ("matcher: {use: lighterglue}", (f"fast_pass={QUICK}",), None),
+        ],
+    )
+    def test_dropping_the_fast_pass_unasked_is_a_warning(
+        self, load: Load, text: str, overrides: Sequence[str], named: str | None
+    ) -> None:
+        warnings = load(f"extends: fast-cpu\n{text}", *overrides).warnings
+        assert len(warnings) == (named is not None)
+        if named is not None:
+            assert named in warnings[0]
+
+    def test_shipped_configurations_have_no_warnings(self) -> None:
+        for name in ("sift", "fast-cpu"):
+            assert load_config(name, (), make_registry()).warnings == ()
 
     def test_circles_are_told(self, tmp_path: Path) -> None:
         (tmp_path / "a.yaml").write_text("extends: b.yaml\n")
@@ -211,9 +233,18 @@ class TestErrors:
             ("dense_matcher: {use: lighterglue}\n", ":2: dense_matcher.use: 'lighterglue' is not"),
             ("matcher: null\n", ":2: matcher: a matcher or a dense_matcher is needed"),
             ("features: null\n", ":2: features: is needed by the sparse matcher 'lighterglue'"),
-            ("fast_pass: {matcher: {use: loftr}}\n", ":2: fast_pass.matcher.use: 'loftr' is not a sparse"),
-            ("fast_pass: {features: {use: sfit}}\n", ":2: fast_pass.features.use: no features provider"),
-            ("fast_pass: {}\ndepth: {use: matcher}\n", ": fast_pass: gives no depth, as depth.use: mat"),
+            (
+                "fast_pass: {matcher: {use: loftr}}\n",
+                ":2: fast_pass.matcher.use: 'loftr' is not a sparse",
+            ),
+            (
+                "fast_pass: {features: {use: sfit}}\n",
+                ":2: fast_pass.features.use: no features provider",
+            ),
+            (
+                "fast_pass: {}\ndepth: {use: matcher}\n",
+                ": fast_pass: gives no depth, as depth.use: mat",
+            ),
             (
                 "features: {use: sift}\nmatcher: {use: lighterglue}\n",
                 ":3: matcher.use: 'lighterglue' matches xfeat features, not 'sift'",

@@ -1,0 +1,46 @@
+"""Separation of user settings from expert settings."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+
+def is_expert(field: FieldInfo) -> bool:
+    """Check whether :func:`mpsfm_core.data.options.expert` declared a field."""
+    extra = field.json_schema_extra
+    return isinstance(extra, dict) and extra.get("expert") is True
+
+
+def user_settings(options: BaseModel) -> dict[str, Any]:
+    """Return the settings as plain data, without expert settings that have their default value.
+
+    Blocks that contain nothing else are left out.
+    """
+    values = options.model_dump(mode="json")
+    settings = {}
+    for name, field in type(options).model_fields.items():
+        value = getattr(options, name)
+        if is_expert(field) and value == field.get_default(call_default_factory=True):
+            continue
+        if isinstance(value, BaseModel):
+            nested = user_settings(value)
+            if nested:
+                settings[name] = nested
+        else:
+            settings[name] = values[name]
+    return settings
+
+
+def count_user_settings(options: type[BaseModel]) -> int:
+    """Count the settings of an options class and its nested classes that are not expert."""
+    count = 0
+    for field in options.model_fields.values():
+        if is_expert(field):
+            continue
+        nested = field.annotation
+        is_block = isinstance(nested, type) and issubclass(nested, BaseModel)
+        count += count_user_settings(nested) if is_block else 1  # type: ignore[arg-type]
+    return count
