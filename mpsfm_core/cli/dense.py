@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Quiet, assigned
-from mpsfm_core.cli.errors import heed_termination
+from mpsfm_core.cli.arguments import Quiet, parse_overrides
+from mpsfm_core.cli.errors import handle_sigterm
 
 
 def dense(
@@ -30,10 +30,10 @@ def dense(
     """
     from mpsfm_core.data.options import parse_settings
     from mpsfm_core.dense.options import DenseOptions
-    from mpsfm_core.pipeline.run import densify_model
+    from mpsfm_core.pipeline.dense_models import densify_model
 
-    heed_termination()
-    report = densify_model(model, images, output, parse_settings(DenseOptions, assigned(overrides)))
+    handle_sigterm()
+    report = densify_model(model, images, output, parse_settings(DenseOptions, parse_overrides(overrides)))
     if not quiet:
         shares = report.confirmed.values()
         typer.echo(

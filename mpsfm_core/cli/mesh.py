@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Quiet, assigned
-from mpsfm_core.cli.errors import heed_termination
+from mpsfm_core.cli.arguments import Quiet, parse_overrides
+from mpsfm_core.cli.errors import handle_sigterm
 
 
 def mesh(
@@ -31,9 +31,9 @@ def mesh(
     """
     from mpsfm_core.data.options import parse_settings
     from mpsfm_core.dense.options import MeshOptions
-    from mpsfm_core.pipeline.run import mesh_model
+    from mpsfm_core.pipeline.dense_models import mesh_model
 
-    heed_termination()
-    made = mesh_model(folder, images, parse_settings(MeshOptions, assigned(overrides)))
+    handle_sigterm()
+    made = mesh_model(folder, images, parse_settings(MeshOptions, parse_overrides(overrides)))
     if not quiet:
         typer.echo(f"{len(made.triangles)} triangles; written to {folder}/mesh.ply and mesh.glb")

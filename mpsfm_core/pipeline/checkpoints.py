@@ -172,7 +172,7 @@ class DenseCheckpoints:
         return self._cache.load("dense", self._key(name), StereoDepth)
 
     def save(self, name: str, depth: StereoDepth) -> None:
-        """As :class:`mpsfm_core.dense.densify.StereoCheckpoints`; a full disk as with the mapper."""
+        """Store the depth of an image; after a disk error, warn once and store no more."""
         if self._failed:
             return
         try:

@@ -1,8 +1,9 @@
-"""Compiles the kernels of extraction and mapping before they are needed.
+"""Compile the numba kernels of extraction, mapping and the dense stage before they are needed.
 
-A run that finds them not compiled starts this beside its extraction and waits for it before it
-maps; ``python -m mpsfm_core.pipeline.precompile`` does it at installation. Two processes map a tiny
-scene, of which one begins with what the other compiles last, and share what they have on disk."""
+A run without compiled kernels starts the compilation next to its extraction, and waits for it
+before mapping. ``python -m mpsfm_core.pipeline.precompile`` compiles at installation. Two processes
+reconstruct a small scene and share the kernels on disk; each starts with other kernels.
+"""
 
 from __future__ import annotations
 
@@ -29,48 +30,66 @@ from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
-_ENDS = ("bundles", "depth")
+_FIRST_KERNELS = ("bundles", "depth")
+"""Kernels that each of the two processes compiles first."""
 _PACKAGES = ("geometry", "providers/builtin", "extraction", "optimize", "mapping", "dense")
 _SOURCES = tuple(f"{package}/**/*.py" for package in _PACKAGES)
 _CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
 class Compilation(NamedTuple):
-    """What runs in the background, and the file that says that it was done."""
+    """Compilation in background processes."""
 
     processes: tuple[subprocess.Popen[bytes], ...]
     stamp: Path
+    """File that marks a finished compilation."""
 
     def wait(self) -> None:
-        """Until it is done. Where it fails, mapping compiles what it meets."""
+        """Wait for the end. After a failure, the stages compile their kernels themselves."""
         codes = [process.wait() for process in self.processes]
         if not any(codes):
             self.stamp.touch()
 
+    def stop(self) -> None:
+        """End processes that still run."""
+        for process in self.processes:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+
 
 def start_compilation() -> Compilation | None:
-    """Start compiling in the background; None if it was done before, or cannot be kept."""
-    stamp = _stamp()
+    """Start compiling in the background.
+
+    Returns:
+        The compilation; None if the kernels are compiled already, or cannot be stored on disk.
+    """
+    stamp = _stamp_path()
     if stamp is None or stamp.exists():
         return None
     command = [sys.executable, "-m", "mpsfm_core.pipeline.precompile"]
     quiet = subprocess.DEVNULL
-    return Compilation(
-        tuple(subprocess.Popen([*command, end], stdout=quiet, stderr=quiet) for end in _ENDS), stamp
+    processes = tuple(
+        subprocess.Popen([*command, first], stdout=quiet, stderr=quiet) for first in _FIRST_KERNELS
     )
+    return Compilation(processes, stamp)
 
 
-def compile_kernels(end: str) -> None:
-    """Compile all kernels, beginning with those of ``bundles`` or of ``depth``."""
+def compile_kernels(first: str) -> None:
+    """Compile all kernels by reconstructing a small scene.
+
+    Args:
+        first: ``bundles`` starts with bundle adjustment, ``depth`` with depth integration.
+    """
     scene, poses = room_scene(), arc_poses(3, 10.0)
     problem = make_mapping_problem(scene, _CAMERA, poses, points_per_view=60, map_width=64)
-    if end == "depth":
+    if first == "depth":
         depth, normals = problem.images[0].depth, problem.images[0].normals
         height, width = depth.shape
         DepthIntegrator(depth, normals, _CAMERA.resized(width, height)).refine()
-    for at_once in (True, False):
-        start = InitializationOptions(global_initialization=at_once)
-        mapping = mapper.reconstruct(problem, MapperOptions(initialization=start))
+    for is_global in (True, False):
+        initialization = InitializationOptions(global_initialization=is_global)
+        mapping = mapper.reconstruct(problem, MapperOptions(initialization=initialization))
     views = {
         image.name: View(image.name, scene.render(_CAMERA, pose).rgb, _CAMERA)
         for image, pose in zip(problem.images, poses, strict=True)
@@ -78,21 +97,21 @@ def compile_kernels(end: str) -> None:
     dense, _ = densify(mapping.reconstructions[0], views.__getitem__, DenseOptions())
     fuse_depth_maps(dense, views.__getitem__, ResultOptions())
     mutual_nearest(*np.ones((2, 1, 1), np.float32))
-    grey, nothing = np.ones((1, 1), np.float32), np.zeros((0, 2))
-    align_patches(grey, grey, nothing, nothing, np.zeros((0, 2, 2)), 3, 1.0)
+    gray, no_points = np.ones((1, 1), np.float32), np.zeros((0, 2))
+    align_patches(gray, gray, no_points, no_points, np.zeros((0, 2, 2)), 3, 1.0)
 
 
-def _stamp() -> Path | None:
-    """Beside the compiled kernels; its name holds all that they depend on."""
+def _stamp_path() -> Path | None:
+    """Return the stamp file next to the kernels; its name hashes all sources and versions."""
     folder = update_points.stats.cache_path  # type: ignore[attr-defined]
     if folder is None:
         return None
-    found = hashlib.sha256(f"{sys.version} {numba.__version__}".encode())
+    fingerprint = hashlib.sha256(f"{sys.version} {numba.__version__}".encode())
     package = Path(__file__).parents[1]
     for path in sorted(path for pattern in _SOURCES for path in package.glob(pattern)):
         stat = path.stat()
-        found.update(f"{path} {stat.st_mtime_ns} {stat.st_size}".encode())
-    return Path(folder) / f"precompiled-{found.hexdigest()[:16]}"
+        fingerprint.update(f"{path} {stat.st_mtime_ns} {stat.st_size}".encode())
+    return Path(folder) / f"precompiled-{fingerprint.hexdigest()[:16]}"
 
 
 if __name__ == "__main__":

@@ -23,7 +23,8 @@ from mpsfm_core.extraction.active_provider import thread_count, worker_count
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
 from mpsfm_core.extraction.runner import Extraction, extend_matches, extract
-from mpsfm_core.inputs.images import ImageSet, check_output_folder, find_images, load_images
+from mpsfm_core.inputs.image_search import check_output_folder, find_images
+from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.inputs.matches import (
     ImportedMatches,
     matches_from_database,
@@ -152,6 +153,7 @@ class _Run:
         self._estimate = resources.ResourceEstimate(0, 0, 0)
         self._children = resources.ChildMemoryMonitor()
         self._checkpoints: list[MappingCheckpoints | DenseCheckpoints] = []
+        self._compilation: precompile.Compilation | None = None
 
     @property
     def _config(self) -> Config:
@@ -170,16 +172,17 @@ class _Run:
                     f"{self._source.images}: the frames of a video need an output folder"
                 )
             stack.enter_context(self._children.watching())
+            stack.callback(self._stop_compilation)
             yield
 
     def execute(self) -> ReconstructionResult:
         """Run all stages and return the result."""
         self._resolve_providers()
         self._extract_video_frames()
-        compilation = precompile.start_compilation() if thread_limit() > 1 else None
+        self._start_compilation()
         images = self._load_inputs()
         images, extraction = self._extract(images)
-        self._finish_compilation(compilation)
+        self._finish_compilation()
         mapping = self._map(extraction.problem.with_poses(self._known_poses))
         if self._config.has_second_pass:
             extraction, mapping = self._run_second_pass(images, extraction, mapping)
@@ -202,17 +205,18 @@ class _Run:
             for text in self._config.warnings:
                 self._stages.warn(text)
             self._resolution = resolve_providers(self._config, self._registry, self._stages)
-            config = self._config
-            if config.fast_pass is not None and not config.has_second_pass:
-                if (
-                    config.matcher is not None
-                    and config.matcher.use != config.fast_pass.matcher.use
-                ):
-                    self._stages.warn(
-                        f"matcher {config.matcher.use!r} is not used: features and "
-                        f"fast_pass.features are both {config.fast_pass.features.use!r}, so the "
-                        "fast pass matches all images; set fast_pass=null to use it"
-                    )
+            self._warn_of_unused_matcher()
+
+    def _warn_of_unused_matcher(self) -> None:
+        """Warn if the fast pass matches all images, so that the chosen matcher never runs."""
+        fast_pass, matcher = self._config.fast_pass, self._config.matcher
+        if fast_pass is None or matcher is None or self._config.has_second_pass:
+            return
+        if matcher.use != fast_pass.matcher.use:
+            self._stages.warn(
+                f"matcher {matcher.use!r} is not used: the fast pass has the same features "
+                f"({fast_pass.features.use}) and matches all images; set fast_pass=null to use it"
+            )
 
     def _extract_video_frames(self) -> None:
         """Write the keyframes of a video into the output folder, and use them as images."""
@@ -252,10 +256,20 @@ class _Run:
             extraction = extract(images, config, self._registry, self._stages, self._imported)
         return images, extraction
 
-    def _finish_compilation(self, compilation: precompile.Compilation | None) -> None:
-        if compilation is not None:
+    def _start_compilation(self) -> None:
+        """Compile the kernels of mapping next to extraction, if a core is free."""
+        if thread_limit() > 1:
+            self._compilation = precompile.start_compilation()
+
+    def _finish_compilation(self) -> None:
+        if self._compilation is not None:
             with self._stages.stage("compilation"):
-                compilation.wait()
+                self._compilation.wait()
+
+    def _stop_compilation(self) -> None:
+        """End the compilation of a run that failed before mapping."""
+        if self._compilation is not None:
+            self._compilation.stop()
 
     def _map(self, problem: MappingProblem, options: MapperOptions | None = None) -> MappingResult:
         """Run the mapper; ``options`` default to those of the configuration."""

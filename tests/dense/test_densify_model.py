@@ -16,7 +16,7 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.depth_range import depth_prior_from_points
 from mpsfm_core.geometry import project, transform
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
-from mpsfm_core.pipeline.run import densify_model
+from mpsfm_core.pipeline.dense_models import densify_model
 from mpsfm_core.results.colmap_model import build_model, write_model
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.testing.synthetic.scenes import room_scene

@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 from safetensors.torch import save as save_safetensors
 
-from mpsfm_core.cli.time_left import TimeLeft
+from mpsfm_core.cli.remaining_time import RemainingTimeEstimator
 from mpsfm_core.data import Features
 from mpsfm_core.evaluation.importers import import_scene
 from mpsfm_core.evaluation.overlap import overlap_from_model
@@ -28,7 +28,7 @@ from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.matches import matches_from_database, matches_from_hloc
 from mpsfm_core.inputs.models import read_model, read_poses
 from mpsfm_core.inputs.options import InputOptions, VideoOptions
-from mpsfm_core.pipeline.run import _depths_of_points
+from mpsfm_core.pipeline.dense_models import _point_depths
 from mpsfm_core.providers.environments.codec import EncodedMessage, decode_message
 from mpsfm_core.providers.environments.environment import Environment
 from mpsfm_core.providers.uncertainty.calibration_file import load_calibration
@@ -94,7 +94,7 @@ def used(folder: Path) -> None:
     """As the dense command, the viewers and the sampling of test sets use a model."""
     model = read_model(folder)
     for image in model.images.values():
-        _depths_of_points(model, image)
+        _point_depths(model, image)
     overlap_from_model(model, [str(image.name) for image in model.images.values()])
     read_view(folder)
 
@@ -143,7 +143,7 @@ def results() -> Table:
         load_calibration(folder / "calibration.yaml")
 
     def timed(folder: Path) -> None:
-        TimeLeft(folder / "cache")
+        RemainingTimeEstimator(folder / "cache")
 
     def exchanged(folder: Path) -> None:
         with lock_output_folder(folder / "exchange"):

@@ -1,4 +1,4 @@
-"""Kernels are compiled once, in the background, and work where nothing can be kept on disk."""
+"""Precompilation of kernels in the background, and kernels without a disk cache."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ import sys
 from pathlib import Path
 from numba.core import event
 from mpsfm_core.cli.demo import demo
-from mpsfm_core.precompile import begin
-assert begin() is None
+from mpsfm_core.pipeline.precompile import start_compilation
+assert start_compilation() is None
 with event.install_recorder("numba:compile") as compiled:
     demo(Path(sys.argv[1]), offline=True, quiet=True)
 assert not compiled.buffer, compiled.buffer
@@ -31,7 +31,7 @@ def finished(code: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-c", f"raise SystemExit({code})"])
 
 
-def test_what_failed_is_tried_again(tmp_path: Path) -> None:
+def test_compilation_that_failed_leaves_no_stamp(tmp_path: Path) -> None:
     stamp = tmp_path / "stamp"
     Compilation((finished(0), finished(1)), stamp).wait()
     assert not stamp.exists()
@@ -39,7 +39,13 @@ def test_what_failed_is_tried_again(tmp_path: Path) -> None:
     assert stamp.exists()
 
 
-def test_a_kernel_works_where_nothing_can_be_kept(
+def test_stop_ends_running_processes(tmp_path: Path) -> None:
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    Compilation((process, finished(0)), tmp_path / "stamp").stop()
+    assert process.returncode
+
+
+def test_kernel_without_disk_cache_works_and_warns(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
@@ -55,7 +61,7 @@ def test_a_kernel_works_where_nothing_can_be_kept(
 
 
 @pytest.mark.slow
-def test_all_that_a_run_needs_is_compiled_before(tmp_path: Path) -> None:
+def test_run_after_precompilation_compiles_nothing(tmp_path: Path) -> None:
     """The sample scene, whose maps are thinned and read from a cache, as those of any photos."""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
     subprocess.run(

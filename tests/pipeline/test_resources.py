@@ -1,30 +1,44 @@
-"""What a run is said to take, and what happens where that is not there."""
+"""Estimated memory and disk of a run, and what happens if they are short."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import psutil
 import pytest
 
-from mpsfm_core.config import Config, RuntimeOptions
+from mpsfm_core.config import Config, FastPass, RuntimeOptions
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import ImageSet
-from mpsfm_core.pipeline import resources
-from mpsfm_core.pipeline import run as pipeline
-from mpsfm_core.pipeline.resources import ResourceEstimate, estimate_resources, shortages
+from mpsfm_core.pipeline.resources import (
+    TOLERANCE,
+    ResourceEstimate,
+    estimate_resources,
+    find_shortages,
+    measure_memory,
+    measure_weights,
+    reduce_workers,
+)
+from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.providers import WeightsFile
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.weights import WeightStore
+from mpsfm_core.support.control_groups import ControlGroups
 
 SIZE = (640, 480)
+SIFT = ProviderConfig(use="sift", options={"max_keypoints": 4096, "resize": 3200})
+NEAREST = ProviderConfig(use="mutual-nearest")
+MB = 1 << 20
 
 
-def config(**changes: object) -> Config:
+def make_config(**changes: object) -> Config:
     values = {
-        "features": ProviderConfig(use="sift", options={"max_keypoints": 1000}),
-        "matcher": ProviderConfig(use="mutual-nearest"),
+        "features": ProviderConfig(use="sift", options={"max_keypoints": 1000, "resize": 3200}),
+        "matcher": NEAREST,
         "depth": ProviderConfig(use="flat"),
         "normals": ProviderConfig(use="from-depth"),
         "runtime": RuntimeOptions(workers=1),
@@ -32,77 +46,165 @@ def config(**changes: object) -> Config:
     return Config(**values | changes)
 
 
-def test_what_a_run_takes_grows_with_what_it_is_given() -> None:
-    few, many = (estimate_resources([SIZE] * count, config(), (), ()) for count in (10, 100))
-    assert many.memory_mb > few.memory_mb + 90 * 15 and many.cache_mb > 9 * few.cache_mb
-    large = estimate_resources([(1280, 960)] * 10, config(), (), ())
+def test_estimate_grows_with_images_pixels_and_outputs() -> None:
+    few, many = (estimate_resources([SIZE] * n, make_config(), (), ()) for n in (10, 100))
+    assert many.memory_mb > few.memory_mb + 90 * 2 and many.cache_mb > 9 * few.cache_mb
+    large = estimate_resources([(1280, 960)] * 10, make_config(), (), ())
     assert large.memory_mb > few.memory_mb
-    sparse = estimate_resources([SIZE] * 100, config(dense={"enabled": False}), (), ())
+    sparse = estimate_resources([SIZE] * 100, make_config(dense={"enabled": False}), (), ())
     assert sparse.memory_mb < many.memory_mb and sparse.output_mb < many.output_mb
-    maps = estimate_resources([SIZE] * 100, config(results={"dense_cloud": False}), (), ())
+    maps = estimate_resources([SIZE] * 100, make_config(results={"dense_cloud": False}), (), ())
     assert maps.memory_mb < many.memory_mb and maps.output_mb < many.output_mb
-    pairs = estimate_resources([SIZE] * 100, config(pairs={"mode": "sequential"}), (), ())
+    pairs = estimate_resources([SIZE] * 100, make_config(pairs={"mode": "sequential"}), (), ())
     assert pairs.cache_mb < many.cache_mb
-    workers = estimate_resources([SIZE] * 10, config(runtime=RuntimeOptions(workers=4)), (), ())
-    network = estimate_resources([SIZE] * 10, config(), (), [200 << 20])
-    assert workers.memory_mb > few.memory_mb and network.memory_mb == few.memory_mb + 720
 
 
-def test_the_size_of_a_network_is_that_of_its_files(tmp_path: Path) -> None:
+def test_estimate_counts_workers_and_networks_of_each_worker() -> None:
+    def memory_mb(workers: int, *networks: int) -> float:
+        return estimate_resources(
+            [(1920, 1080)] * 10, make_config(), (), networks, workers
+        ).memory_mb
+
+    assert memory_mb(4) > memory_mb(1) + 3 * 500
+    assert memory_mb(2, 600 * MB) - memory_mb(1, 600 * MB) == 2 * 600 + 320
+
+
+@pytest.mark.parametrize(
+    ("megapixels", "workers", "measured_mb"),
+    # Three photos of each size with the configuration "sift", peak resident memory.
+    [(3, 1, 1161), (3, 4, 2812), (24, 4, 6189), (48, 1, 2641)],
+)
+def test_estimate_agrees_with_measured_peak(
+    megapixels: float, workers: int, measured_mb: float
+) -> None:
+    size = (round(1500 * (megapixels / 1.5) ** 0.5), round(1000 * (megapixels / 1.5) ** 0.5))
+    config = make_config(features=SIFT, fast_pass=FastPass(features=SIFT, matcher=NEAREST))
+    estimate = estimate_resources([size] * 3, config, (), (), workers)
+    assert measured_mb / TOLERANCE < estimate.memory_mb < measured_mb * TOLERANCE
+
+
+def test_estimate_of_large_images_is_limited_by_what_the_detector_sees() -> None:
+    medium, large = ([(side, side * 2 // 3)] * 3 for side in (3200, 8485))
+    difference = (
+        estimate_resources(large, make_config(), (), ()).memory_mb
+        - estimate_resources(medium, make_config(), (), ()).memory_mb
+    )
+    assert difference < 600  # decoded views only
+
+
+def test_estimate_of_few_images_keeps_few_workers_busy() -> None:
+    images = [(4000, 3000)] * 3
+    three, eight = (estimate_resources(images, make_config(), (), (), n) for n in (3, 8))
+    assert eight == three
+
+
+def estimate_by_workers(workers: int) -> ResourceEstimate:
+    return ResourceEstimate(500.0 + 1000 * workers, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("free_mb", "workers"), [(9000, 4), (4500, 4), (4400, 3), (2500, 2), (1600, 1), (100, 1)]
+)
+def test_reduce_workers_takes_as_many_as_fit(free_mb: float, workers: int) -> None:
+    assert reduce_workers(estimate_by_workers, 4, free_mb) == workers
+
+
+def test_measure_weights_includes_external_data(tmp_path: Path) -> None:
     store = WeightStore(tmp_path / "cache", offline=True)
     path = tmp_path / "large.onnx"
     path.write_bytes(bytes(10))
-    assert resources.network_bytes(WeightsFile(str(path), size=1), store) == 10
+    assert measure_weights(WeightsFile(str(path), size=1), store) == 10
     path.with_name("large.onnx.data").write_bytes(bytes(2000))
-    assert resources.network_bytes(WeightsFile(str(path)), store) == 2010
+    assert measure_weights(WeightsFile(str(path)), store) == 2010
     absent = WeightsFile("https://example.com/a.onnx", size=300)
-    assert resources.network_bytes(absent, store) == 300
-    assert resources.network_bytes(WeightsFile("https://example.com/b.onnx"), store) == 0
+    assert measure_weights(absent, store) == 300
+    assert measure_weights(WeightsFile("https://example.com/b.onnx"), store) == 0
 
 
 @pytest.fixture
-def machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resources, "memory_mb", lambda: (8000.0, 2000.0))
-    monkeypatch.setattr(resources, "_room_mb", lambda folder: 1000.0)
+def set_memory(monkeypatch: pytest.MonkeyPatch) -> Callable[[float, float], None]:
+    """Pretend a machine with total and free memory in MB, and 1000 MB of free disk space."""
+
+    def apply(total_mb: float, available_mb: float) -> None:
+        memory = SimpleNamespace(total=total_mb * MB, available=available_mb * MB)
+        monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+        disk = SimpleNamespace(free=1000 * MB)
+        monkeypatch.setattr("shutil.disk_usage", lambda folder: disk)
+
+    return apply
 
 
-@pytest.mark.usefixtures("machine")
-def test_a_run_that_fits_is_silent_and_one_that_may_not_is_told(tmp_path: Path) -> None:
-    assert shortages(ResourceEstimate(1900, 400, 400), tmp_path, tmp_path / "out") == []
-    (memory,) = shortages(ResourceEstimate(9000, 0, 0), tmp_path, tmp_path / "out")
+def test_find_shortages_of_a_run_that_fits_is_empty(set_memory, tmp_path: Path) -> None:
+    set_memory(8000, 2000)
+    assert find_shortages(ResourceEstimate(1900, 400, 400), tmp_path, tmp_path / "out") == []
+
+
+def test_find_shortages_names_memory_and_disks_that_are_short(set_memory, tmp_path: Path) -> None:
+    set_memory(8000, 2000)
+    (memory,) = find_shortages(ResourceEstimate(9000, 0, 0), tmp_path, tmp_path / "out")
     assert "takes about 9000 MB of memory and 2000 MB are free" in memory
-    together = shortages(ResourceEstimate(100, 600, 600), tmp_path, tmp_path / "out")
-    assert len(together) == 2 and "the cache" in together[0] and "the results" in together[1]
+    disks = find_shortages(ResourceEstimate(100, 600, 600), tmp_path, tmp_path / "out")
+    assert len(disks) == 2 and "the cache" in disks[0] and "the results" in disks[1]
 
 
-@pytest.mark.usefixtures("machine")
-@pytest.mark.parametrize("needs", [ResourceEstimate(10_500, 0, 0), ResourceEstimate(100, 0, 1400)])
-def test_a_run_that_cannot_fit_is_refused(needs: ResourceEstimate, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"MB are .*runtime\.check_resources=false"):
-        shortages(needs, tmp_path, tmp_path / "out")
-
-
-def test_limits_of_a_container_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "memory.max").write_text(f"{500 << 20}\n")
-    (tmp_path / "memory.current").write_text(f"{300 << 20}\n")
-    (tmp_path / "memory.stat").write_text(f"anon 1\ninactive_file {100 << 20}\n")
-    monkeypatch.setattr(resources, "_control_groups", lambda: iter([tmp_path]))
-    assert resources.memory_mb() == (500.0, 300.0)
-    (tmp_path / "memory.max").write_text("max\n")
-    assert resources.memory_mb()[0] > 500
-
-
-def test_no_photo_is_decoded_by_a_run_that_cannot_fit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "estimate", [ResourceEstimate(10_500, 0, 0), ResourceEstimate(100, 0, 1400)]
+)
+def test_find_shortages_refuses_a_run_that_cannot_fit(
+    set_memory, estimate: ResourceEstimate, tmp_path: Path
 ) -> None:
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    for number in range(2):
-        cv2.imwrite(str(photos / f"{number}.png"), np.zeros((20, 30, 3), np.uint8))
+    set_memory(8000, 2000)
+    with pytest.raises(InputError, match=r"MB are .*runtime\.check_resources=false"):
+        find_shortages(estimate, tmp_path, tmp_path / "out")
+
+
+def test_measure_memory_respects_limits_of_containers(tmp_path: Path) -> None:
+    (tmp_path / "memory.max").write_text(f"{500 * MB}\n")
+    (tmp_path / "memory.current").write_text(f"{300 * MB}\n")
+    (tmp_path / "memory.stat").write_text(f"anon 1\ninactive_file {100 * MB}\n")
+    (tmp_path / "membership").write_text("0::/\n")
+    groups = ControlGroups(tmp_path, tmp_path / "membership")
+    assert measure_memory(groups) == (500.0, 300.0)
+    (tmp_path / "memory.max").write_text("max\n")
+    assert measure_memory(groups)[0] > 500
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number in range(3):
+        cv2.imwrite(str(folder / f"{number}.png"), np.zeros((900, 1200, 3), np.uint8))
+    return folder
+
+
+def test_run_that_cannot_fit_ends_before_an_image_is_decoded(
+    photos: Path, set_memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     decoded: list[int] = []
     monkeypatch.setattr(ImageSet, "view", lambda self, index: decoded.append(index))
-    monkeypatch.setattr(resources, "memory_mb", lambda: (100.0, 100.0))
+    set_memory(100, 100)
     runtime = RuntimeOptions(workers=1, cache_dir=tmp_path / "cache")
     with pytest.raises(InputError, match=r"this run takes about \d+ MB of memory and 100 MB"):
-        pipeline.reconstruct(photos, tmp_path / "out", config(runtime=runtime))
+        reconstruct(photos, tmp_path / "out", make_config(runtime=runtime))
     assert not decoded and not (tmp_path / "out").exists()
+
+
+def test_run_that_fits_with_fewer_workers_is_not_refused(
+    photos: Path, set_memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Decoded(Exception):
+        """Ends the run at the first image."""
+
+    def stop(images: ImageSet, index: int) -> None:
+        raise Decoded
+
+    monkeypatch.setattr(ImageSet, "view", stop)
+    set_memory(700, 700)
+    runtime = RuntimeOptions(workers=3, cache_dir=tmp_path / "cache")
+    estimates = [
+        estimate_resources([(1200, 900)] * 3, make_config(), (), (), n).memory_mb for n in (1, 3)
+    ]
+    assert estimates[0] < 700 < 700 * TOLERANCE < estimates[1]
+    with pytest.raises(Decoded):
+        reconstruct(photos, tmp_path / "out", make_config(runtime=runtime))

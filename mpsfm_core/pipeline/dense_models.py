@@ -1,0 +1,171 @@
+"""Dense depth and meshes of finished models (``mpsfm dense`` and ``mpsfm mesh``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import DepthPrior, Float64, Pose, View
+from mpsfm_core.data.errors import InputError
+from mpsfm_core.data.result_layout import DENSE, DEPTH, MESH, SPARSE
+from mpsfm_core.dense.densify import DenseReport, densify
+from mpsfm_core.dense.depth_range import depth_prior_from_points
+from mpsfm_core.dense.fusion import fuse_depth_maps
+from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
+from mpsfm_core.dense.options import DenseOptions, MeshOptions
+from mpsfm_core.extraction.cache import cache_folder
+from mpsfm_core.geometry import transform
+from mpsfm_core.inputs.image_search import find_images
+from mpsfm_core.inputs.images import ImageSet, load_images
+from mpsfm_core.inputs.models import match_names, read_model, read_poses, reconstruction_poses
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.results.colmap_model import write_model
+from mpsfm_core.results.depth_maps import read_depth_map, write_depth_maps
+from mpsfm_core.results.exports.source import ExportSource
+from mpsfm_core.results.mesh import write_mesh
+from mpsfm_core.results.options import ResultOptions
+from mpsfm_core.results.ply import write_cloud
+from mpsfm_core.support.disk_arrays import DiskArrays
+from mpsfm_core.support.files import lock_output_folder, replace_entries
+from mpsfm_core.support.threads import limit_threads
+
+PathLike = str | Path
+
+
+def densify_model(
+    model: PathLike,
+    images: PathLike,
+    output: PathLike,
+    options: DenseOptions | None = None,
+    workers: int | None = None,
+) -> DenseReport:
+    """Compute depth maps of a posed model by multi-view stereo, and write them.
+
+    The search starts from the maps in ``model/depth`` of a result folder, or else from the depth
+    range of the points that an image observes. Images without either are left out.
+
+    Args:
+        model: COLMAP model, ``transforms.json`` or result folder.
+        images: Folder of the original photos.
+        output: Folder to write: the depth maps, ``dense.ply`` and the model.
+        options: Options of the dense stage.
+        workers: Number of threads; None means one per core.
+
+    Returns:
+        The report of the dense stage.
+
+    Raises:
+        InputError: model or photos cannot be read, names do not match, the model has no points, or
+            ``output`` cannot be written.
+    """
+    with lock_output_folder(Path(output)), limit_threads(workers):
+        return _densify_model(Path(model), Path(images), Path(output), options)
+
+
+def _densify_model(
+    model: Path, images: Path, output: Path, options: DenseOptions | None
+) -> DenseReport:
+    colmap, poses = read_model(model), read_poses(model)
+    matched = match_names(find_images(images), poses)
+    if len(matched) < 2:
+        raise InputError(f"{images}: has {len(matched)} of the photos of {model}, two are needed")
+    photos = load_images(images, model=model, names=list(matched))
+    points = {str(image.name): _point_depths(colmap, image) for image in colmap.images.values()}
+    depths, poses_use_depth = [], True
+    for photo in photos:
+        found = matched[photo.name]
+        file = model / DEPTH / f"{found}.npz"
+        poses_use_depth &= file.is_file()
+        depths.append(
+            read_depth_map(file)[1] if file.is_file() else depth_prior_from_points(points[found])
+        )
+    posed = _reconstruction_of_maps(
+        photos, [poses[matched[photo.name]] for photo in photos], depths
+    )
+    if not posed.images:
+        raise InputError(f"{model}: has no points, which the depth range of the surfaces needs")
+    view_of = _view_of(photos)
+    disk = DiskArrays(cache_folder())
+    dense, report = densify(
+        posed,
+        view_of,
+        options or DenseOptions(),
+        store_array=disk.store,
+        poses_use_depth=poses_use_depth,
+    )
+    with replace_entries(output, (SPARSE, DENSE, DEPTH)) as folder:
+        write_model(folder / SPARSE, colmap)
+        write_depth_maps(folder / DEPTH, dense)
+        write_cloud(folder / DENSE, fuse_depth_maps(dense, view_of, ResultOptions()))
+    return report
+
+
+def _reconstruction_of_maps(
+    photos: ImageSet, poses: Sequence[Pose], depths: Sequence[DepthPrior | None]
+) -> Reconstruction:
+    """Return a reconstruction without points of the images that have a depth map."""
+    none = np.zeros(0, np.int64)
+    found = enumerate(zip(photos, poses, depths, strict=True))
+    images = tuple(
+        RegisteredImage(index, photo.name, photo.pinhole, *pose, none, depth, 1.0)
+        for index, (photo, pose, depth) in found
+        if depth is not None
+    )
+    return Reconstruction(images, np.zeros((0, 3)), np.zeros(0))
+
+
+def _view_of(photos: ImageSet) -> Callable[[str], View]:
+    """Return a function that loads the view of an image name."""
+    rows = {name: row for row, name in enumerate(photos.names)}
+    return lambda name: photos.view(rows[name])
+
+
+def _point_depths(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Float64:
+    """Return the depths (n,) of the points that an image observes."""
+    seen = [point.point3D_id for point in image.points2D if point.has_point3D()]
+    seen = [number for number in seen if model.exists_point3D(number)]
+    if not seen or not image.has_pose:
+        return np.zeros(0)
+    xyz = np.array([model.points3D[number].xyz for number in seen])
+    matrix = np.asarray(image.cam_from_world().matrix())
+    return transform(matrix[:, :3], matrix[:, 3], xyz)[:, 2]
+
+
+def mesh_model(
+    folder: PathLike,
+    photos: PathLike | None = None,
+    options: MeshOptions | None = None,
+) -> TriangleMesh:
+    """Mesh the depth maps of a result folder into its ``mesh.ply`` and ``mesh.glb``.
+
+    The PLY file has the axes of the model. The GLB file has gravity down.
+
+    Args:
+        folder: Result folder with depth maps.
+        photos: Folder of the original photos; default: where the run found them.
+        options: Options of the mesh.
+
+    Returns:
+        The mesh in the frame of the model.
+
+    Raises:
+        InputError: folder or photos cannot be read, there are no depth maps, they show no surface,
+            or the libraries for meshes are not installed.
+    """
+    with lock_output_folder(Path(folder)):
+        source = ExportSource.read(Path(folder), None if photos is None else Path(photos))
+        poses = reconstruction_poses(source.model)
+        files = [source.folder / DEPTH / f"{name}.npz" for name in source.names]
+        depths = [read_depth_map(file)[1] if file.is_file() else None for file in files]
+        posed = _reconstruction_of_maps(
+            source.images, [poses[name] for name in source.names], depths
+        )
+        if not posed.images:
+            raise InputError(f"{folder}: has no depth maps: run mpsfm dense first")
+        mesh = mesh_depth_maps(posed, _view_of(source.images), options or MeshOptions())
+        with replace_entries(source.folder, MESH) as written:
+            write_mesh(written, mesh, source)
+    return mesh
