@@ -1,6 +1,6 @@
-"""Make the sample scene: a room built from nothing, rendered, with degraded priors.
+"""Generate the sample scene: build a room, render it, degrade its priors.
 
-Needs Blender as a Python module; see README.md beside this file for the command.
+Needs Blender as a Python module; README.md has the command.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def make_scene(
     samples: int,
     seed: int,
 ) -> None:
-    """Build a scene, look at it along a path, and write the scene folder."""
+    """Build a scene, render it along a path, and write the scene folder."""
     camera, errors = Camera(), PriorErrors()
     halved = camera.halved()
     empty_scene()
@@ -55,7 +55,7 @@ def make_scene(
 
 
 def main() -> None:
-    """Read the command line."""
+    """Parse the command line and generate the scene."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=Path(__file__).parent)
     parser.add_argument("--samples", type=int, default=32, help="Cycles samples a pixel")

@@ -1,6 +1,6 @@
-"""Measure a scene folder: do depth, normals and poses agree, are the declared variances honest?
+"""Verify a scene folder: consistency of depth, normals and poses, and the declared variances.
 
-``python verify.py [FOLDER]`` prints the numbers quoted in README.md. Needs numpy, OpenCV, pycolmap.
+``python verify.py [FOLDER]`` prints the numbers of README.md. Needs numpy, OpenCV, pycolmap.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 SAME_SURFACE = 0.05
-"""Relative depth difference up to which a pixel counts as seen in another view."""
+"""Maximum relative depth difference of a pixel that is visible in another view."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One view: ``K`` and pose (``x_camera = R x + t``), exact maps, and the priors' arrays."""
+    """One view: ``K``, pose (``x_camera = R x + t``), exact maps, and priors."""
 
     name: str
     K: Float
@@ -63,8 +63,10 @@ def load_views(folder: Path) -> list[View]:
 
 
 def seen_depth(a: View, b: View) -> tuple[Float, Float]:
-    """For each pixel of ``a``: the depth of its point in ``b``, and what ``b``'s depth map says
-    there (NaN outside of the image and where either map has nothing)."""
+    """Project the pixels of ``a`` to ``b``: their depth, and the depth map of ``b`` there.
+
+    Both are NaN outside the image and where a map has no depth.
+    """
     rays = pixel_rays(a)
     world = (rays * np.where(a.depth > 0, a.depth, np.nan)[..., None] - a.t) @ a.R
     point = world @ b.R.T + b.t
@@ -78,20 +80,20 @@ def seen_depth(a: View, b: View) -> tuple[Float, Float]:
 
 
 def seen_in(a: View, b: View) -> Bool:
-    """Which pixels of ``a`` are seen in ``b``."""
+    """Return which pixels of ``a`` are visible in ``b``."""
     expected, found = seen_depth(a, b)
     return np.abs(found - expected) < SAME_SURFACE * expected
 
 
 def pixel_rays(view: View) -> Float:
-    """(h, w, 3) rays through the pixel centres, z = 1."""
+    """Compute (h, w, 3) rays through the pixel centers, z = 1."""
     h, w = view.depth.shape
     u, v = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
     return np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(view.K).T
 
 
 def overlaps(views: list[View]) -> tuple[Float, float]:
-    """The (n, n) two-view overlaps, and the largest three-view overlap of any triplet."""
+    """Compute the (n, n) two-view overlaps, and the largest three-view overlap of any triplet."""
     count = range(len(views))
     area = [(v.depth > 0).sum() for v in views]
     seen = {(i, j): seen_in(views[i], views[j]) for i, j in permutations(count, 2)}
@@ -107,7 +109,7 @@ def overlaps(views: list[View]) -> tuple[Float, float]:
 
 
 def depth_errors(views: list[View]) -> Float:
-    """Relative difference of reprojected and stored exact depth, over pixels seen in both views."""
+    """Compute relative differences of reprojected and stored depth over shared pixels."""
     errors = []
     for a, b in permutations(views, 2):
         expected, found = seen_depth(a, b)
@@ -117,7 +119,7 @@ def depth_errors(views: list[View]) -> Float:
 
 
 def depth_scores(view: View) -> tuple[Float, Float]:
-    """Of the depth prior's valid pixels: relative error and error / declared std."""
+    """Compute relative error and error / declared std of the valid pixels of the depth prior."""
     prior = view.depth_prior
     truth, known = _reduced(view.depth, prior["depth"].shape)
     use = known & prior["valid"]
@@ -126,8 +128,11 @@ def depth_scores(view: View) -> tuple[Float, Float]:
 
 
 def normal_scores(view: View) -> tuple[Float, Float]:
-    """Of the normal prior's valid pixels: angle to the truth in degrees, and the angle over the
-    std declared for both tangent axes together (its mean square is 1 when that is honest)."""
+    """Compute the angular error in degrees and the normalized angle of the valid normals.
+
+    The normalized angle is the angle divided by the std of both tangent axes; its mean square is 1
+    for a correct variance.
+    """
     prior = view.normal_prior
     shape = prior["normals"].shape[:2]
     known = _reduced(view.depth, shape)[1] & prior["valid"]
@@ -138,14 +143,17 @@ def normal_scores(view: View) -> tuple[Float, Float]:
 
 
 def rms(values: Float) -> float:
-    """Root mean square."""
+    """Compute the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 def run_colmap(folder: Path, views: list[View]) -> tuple[list[float], list[int]]:
-    """Stock incremental COLMAP (SIFT, exhaustive, known intrinsics): for each verified pair of
-    neighbours the median distance of its matches to the exact epipolar lines, in pixels; and the
-    number of images in each model."""
+    """Run incremental COLMAP with SIFT, exhaustive matching and known intrinsics.
+
+    Returns:
+        For each verified pair of neighbors the median distance of its matches to the exact epipolar
+        lines in pixels, and the number of images of each model.
+    """
     camera = pycolmap.Reconstruction(folder / "gt").cameras[1]
     reader = pycolmap.ImageReaderOptions(
         camera_model="PINHOLE", camera_params=",".join(str(p) for p in camera.params)
@@ -164,7 +172,7 @@ def run_colmap(folder: Path, views: list[View]) -> tuple[list[float], list[int]]
 
 
 def epipolar_distance(a: View, b: View, x_a: Float, x_b: Float) -> Float:
-    """Distance in pixels of ``x_b`` (n, 2) in ``b`` to the exact epipolar lines of ``x_a``."""
+    """Compute the distance in pixels of ``x_b`` (n, 2) to the exact epipolar lines of ``x_a``."""
     rotation = b.R @ a.R.T
     tx, ty, tz = b.t - rotation @ a.t
     essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ rotation
@@ -187,7 +195,7 @@ def _prior(path: Path) -> dict[str, NDArray]:
 
 
 def _reduced(values: Float, shape: tuple[int, ...]) -> tuple[Float, Bool]:
-    """Block means on a grid of ``shape``, and the blocks without a zero (an unknown pixel)."""
+    """Compute block means on a grid of ``shape``, and the blocks without a zero (unknown pixel)."""
     h, w = shape
     blocks = values.reshape(h, values.shape[0] // h, w, values.shape[1] // w)
     return blocks.mean((1, 3)), (blocks != 0).all((1, 3))

@@ -1,1 +1,1 @@
-"""Parts of the sample-scene generator: geometry, materials, the room, rendering, priors."""
+"""Sample-scene generator: geometry, materials, the room, rendering, priors."""

@@ -1,4 +1,4 @@
-"""Cameras, poses and the exact maps of a view; knows nothing of Blender."""
+"""Cameras, poses and the exact maps of a view; independent of Blender."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole with square pixels and the principal point in the middle of the image."""
+    """Pinhole camera with square pixels and a centered principal point."""
 
     width: int = 640
     height: int = 480
@@ -20,15 +20,15 @@ class Camera:
 
     @property
     def params(self) -> list[float]:
-        """``[fx, fy, cx, cy]`` in COLMAP pixels (centre of the first pixel at (0.5, 0.5))."""
+        """Return ``[fx, fy, cx, cy]`` in COLMAP pixels (first pixel at (0.5, 0.5))."""
         return [self.focal, self.focal, self.width / 2, self.height / 2]
 
     def halved(self) -> Camera:
-        """The same view on a grid of half the size."""
+        """Return the camera of the same view at half the size."""
         return Camera(self.width // 2, self.height // 2, self.focal / 2)
 
     def rays(self) -> Float64:
-        """(height, width, 3) rays through the pixel centres, z = 1."""
+        """Compute (height, width, 3) rays through the pixel centers, z = 1."""
         u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         x, y = (u - self.width / 2) / self.focal, (v - self.height / 2) / self.focal
         return np.stack([x, y, np.ones_like(x)], -1)
@@ -36,7 +36,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Pose:
-    """``x_camera = rotation @ (x_world - centre)``; camera x right, y down, z forward."""
+    """Camera pose, ``x_camera = rotation @ (x_world - centre)``; x right, y down, z forward."""
 
     rotation: Float64
     centre: Float64
@@ -44,16 +44,21 @@ class Pose:
 
 @dataclass(frozen=True)
 class Truth:
-    """z depth (h, w) in metres, 0 where a ray leaves the scene; unit normals (h, w, 3) in the
-    camera frame facing the camera, 0 there."""
+    """Exact maps of a view.
+
+    z depth (h, w) in meters, 0 without a surface; unit normals (h, w, 3) in the camera frame that
+    face the camera, 0 without a surface.
+    """
 
     depth: Float64
     normals: Float64
 
 
 def look(centre: Float64, heading_deg: float, pitch_deg: float, roll_deg: float) -> Pose:
-    """A camera at ``centre`` looking ``heading_deg`` from +x to +y, up by ``pitch_deg``, turned
-    about its axis by ``roll_deg``; world z up."""
+    """Create a pose at ``centre`` from heading, pitch and roll in degrees; world z up.
+
+    ``heading_deg`` turns from +x to +y, ``pitch_deg`` up, ``roll_deg`` about the optical axis.
+    """
     heading, pitch, roll = np.radians([heading_deg, pitch_deg, roll_deg])
     level = np.array([np.cos(heading), np.sin(heading), 0])
     forward = np.cos(pitch) * level + [0, 0, np.sin(pitch)]

@@ -1,4 +1,4 @@
-"""The scene folder on disk: intrinsics, poses, exact maps, priors."""
+"""Scene folder on disk: intrinsics, poses, exact maps, priors."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def write_truth(folder: Path, stem: str, truth: Truth) -> None:
 def write_prior(path: Path, kind: str, prior: Prior) -> None:
     """Write a prior as ``.npz``: arrays ``kind``, ``variance`` (float16), ``valid`` (bool).
 
-    Values are rounded to what matters, so that they compress.
+    Values are rounded to their significant digits for better compression.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     hole = ~prior.valid
@@ -75,7 +75,7 @@ def write_prior(path: Path, kind: str, prior: Prior) -> None:
 
 
 def drop_jpeg_notes(path: Path) -> None:
-    """Remove the date and render times that Blender notes in a JPEG; pixels stay as they are."""
+    """Remove date and render times from a JPEG of Blender, without changing its pixels."""
     data = path.read_bytes()
     kept, start = data[:2], 2
     while data[start + 1] != JPEG_SCAN:

@@ -1,4 +1,4 @@
-"""Procedural materials. Patterns live in world coordinates, so no two places look alike."""
+"""Procedural materials in world coordinates, so that no two places look alike."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Colour = tuple[float, float, float]
 
 
 class Shader:
-    """A matte material whose colour is built from nodes; ``position`` is the world position."""
+    """Matte material built from nodes; ``position`` is the world position."""
 
     def __init__(self, roughness: float = 0.8) -> None:
         self.material = bpy.data.materials.new("material")
@@ -24,7 +24,7 @@ class Shader:
         self.position = self.node("ShaderNodeNewGeometry").outputs["Position"]
 
     def node(self, kind: str, inputs: dict[str | int, object] | None = None) -> bpy.types.Node:
-        """Add a node; an input is a constant or the output socket that feeds it."""
+        """Add a node; an input is a constant or an output socket."""
         node = self._tree.nodes.new(kind)
         for name, value in (inputs or {}).items():
             if isinstance(value, bpy.types.NodeSocket):
@@ -36,7 +36,7 @@ class Shader:
     def ramp(
         self, factor: bpy.types.NodeSocket, colours: Sequence[Colour], low: float, high: float
     ) -> bpy.types.NodeSocket:
-        """Colours evenly spread over ``factor`` in [low, high]."""
+        """Map ``factor`` in [low, high] to evenly spaced colors."""
         node = self.node("ShaderNodeValToRGB", {"Fac": factor})
         stops = np.linspace(low, high, len(colours))
         while len(node.color_ramp.elements) < len(colours):
@@ -48,7 +48,7 @@ class Shader:
     def noise(
         self, scale: float, at: bpy.types.NodeSocket | None = None, roughness: float = 0.65
     ) -> bpy.types.NodeSocket:
-        """Fractal noise in [0, 1] with ``scale`` cells a metre."""
+        """Create fractal noise in [0, 1] with ``scale`` cells per meter."""
         inputs = {"Vector": at or self.position, "Scale": scale, "Detail": 7.0}
         node = self.node("ShaderNodeTexNoise", {**inputs, "Roughness": roughness})
         return node.outputs["Fac"]
@@ -67,7 +67,7 @@ class Shader:
         return node.outputs["Color"]
 
     def plane(self, floor: bool) -> bpy.types.NodeSocket:
-        """Two coordinates on a floor (x, y) or on any axis-aligned wall (x + y, z)."""
+        """Return two coordinates of a floor (x, y) or of an axis-aligned wall (x + y, z)."""
         if floor:
             return self.position
         xyz = self.node("ShaderNodeSeparateXYZ", {"Vector": self.position}).outputs
@@ -75,12 +75,12 @@ class Shader:
         return self.node("ShaderNodeCombineXYZ", {"X": along, "Y": xyz["Z"]}).outputs["Vector"]
 
     def stretched(self, scale: Sequence[float]) -> bpy.types.NodeSocket:
-        """The world position with each axis scaled, for grain."""
+        """Return the world position with scaled axes, for wood grain."""
         node = self.node("ShaderNodeMapping", {"Vector": self.position, "Scale": tuple(scale)})
         return node.outputs["Vector"]
 
     def finish(self, colour: bpy.types.NodeSocket) -> bpy.types.Material:
-        """Make ``colour`` the colour of the material."""
+        """Set ``colour`` as the color of the material."""
         self._tree.links.new(colour, self._surface.inputs["Base Color"])
         return self.material
 
@@ -88,13 +88,13 @@ class Shader:
 def mottled(
     colours: Sequence[Colour], scale: float, *, low: float = 0.35, high: float = 0.65
 ) -> bpy.types.Material:
-    """Fractal blotches: plaster, stone, foliage, cloth."""
+    """Create fractal blotches: plaster, stone, foliage, cloth."""
     shader = Shader()
     return shader.finish(shader.ramp(shader.noise(scale), colours, low, high))
 
 
 def wood(light: Colour, dark: Colour, grain: Sequence[float] = (3, 3, 30)) -> bpy.types.Material:
-    """Wood whose grain runs along the axis with the smallest ``grain`` frequency."""
+    """Create wood with grain along the axis with the smallest ``grain`` frequency."""
     shader = Shader(0.5)
     fine = shader.noise(1.0, shader.stretched(grain), 0.75)
     colour = shader.ramp(fine, [dark, light, dark, light], 0.3, 0.7)
@@ -105,7 +105,7 @@ def wood(light: Colour, dark: Colour, grain: Sequence[float] = (3, 3, 30)) -> bp
 def bricks(
     first: Colour, second: Colour, mortar: Colour, size: tuple[float, float], *, floor: bool = False
 ) -> bpy.types.Material:
-    """Bricks, tiles or planks of ``size`` (length, height), each with its own shade and stains."""
+    """Create bricks, tiles or planks of ``size`` (length, height) with individual shades."""
     shader = Shader()
     inputs = {"Color1": (*first, 1), "Color2": (*second, 1), "Mortar": (*mortar, 1), "Scale": 1.0}
     pattern = shader.node("ShaderNodeTexBrick", {**inputs, "Vector": shader.plane(floor)})
@@ -117,7 +117,7 @@ def bricks(
 
 
 def patchwork(colours: Sequence[Colour], scale: float, *, grout: Colour) -> bpy.types.Material:
-    """Irregular cells of random colours with seams: rugs, wallpaper, cushions."""
+    """Create irregular cells of random colors with seams: rugs, wallpaper, cushions."""
     shader = Shader(0.9)
     cell = {"Vector": shader.position, "Scale": scale}
     shade = shader.node("ShaderNodeTexVoronoi", cell).outputs["Color"]
@@ -131,14 +131,14 @@ def patchwork(colours: Sequence[Colour], scale: float, *, grout: Colour) -> bpy.
 
 
 def plain(colour: Colour) -> bpy.types.Material:
-    """One colour with faint wear."""
+    """Create a uniform color with slight wear."""
     shader = Shader(0.6)
     wear = shader.ramp(shader.noise(25.0), [(0.55, 0.55, 0.55), (1, 1, 1)], 0.35, 0.6)
     return shader.finish(shader.mix(colour, wear, 0.8, "MULTIPLY"))
 
 
 def painting(rng: np.random.Generator, pixels: int = 256) -> NDArray[np.float32]:
-    """A random abstract picture, (pixels, pixels, 3) in [0, 1]: strokes, discs and blocks."""
+    """Create a random abstract picture, (pixels, pixels, 3) in [0, 1]."""
     rows, cols = np.mgrid[:pixels, :pixels] / pixels
     picture = np.ones((pixels, pixels, 3)) * rng.uniform(0.3, 0.9, 3)
     for _ in range(60):
@@ -155,7 +155,7 @@ def painting(rng: np.random.Generator, pixels: int = 256) -> NDArray[np.float32]
 def poster(
     rng: np.random.Generator, corner: Sequence[float], size: tuple[float, float]
 ) -> bpy.types.Material:
-    """A painting laid over the wall rectangle that starts at ``corner`` (x + y, z)."""
+    """Create a painting on the wall rectangle that starts at ``corner`` (x + y, z)."""
     shader = Shader(0.6)
     pixels = painting(rng)
     image = bpy.data.images.new("painting", pixels.shape[1], pixels.shape[0])

@@ -1,4 +1,4 @@
-"""Simple solids added to the open Blender scene, in metres, world z up."""
+"""Simple solids for the open Blender scene, in meters, world z up."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def add_mesh(
     at: Vector = (0, 0, 0),
     turn_deg: float = 0,
 ) -> None:
-    """Add a mesh: (n, 3) vertices turned about z by ``turn_deg``, then moved to ``at``."""
+    """Add a mesh: (n, 3) vertices rotated about z by ``turn_deg``, then moved to ``at``."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     turned = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + np.asarray(at)
     mesh = bpy.data.meshes.new("part")
@@ -33,7 +33,7 @@ def add_mesh(
 
 
 def add_box(material: bpy.types.Material, size: Vector, at: Vector, *, turn_deg: float = 0) -> None:
-    """Add a box of ``size`` whose bottom face is centred at ``at``."""
+    """Add a box of ``size`` whose bottom face is centered at ``at``."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)])
     add_mesh(corners * size, BOX_FACES, material, at=at, turn_deg=turn_deg)
 
@@ -41,7 +41,7 @@ def add_box(material: bpy.types.Material, size: Vector, at: Vector, *, turn_deg:
 def add_turned(
     material: bpy.types.Material, profile: Profile, at: Vector, *, stretch: Vector = (1, 1, 1)
 ) -> None:
-    """Add a turned solid (vase, leg, lamp): ``profile`` lists (radius, height), bottom to top."""
+    """Add a solid of revolution: ``profile`` lists (radius, height) from bottom to top."""
     angle = np.arange(SEGMENTS) * 2 * np.pi / SEGMENTS
     rings = [np.stack([r * np.cos(angle), r * np.sin(angle), 0 * angle + z], 1) for r, z in profile]
     faces = _grid_faces(len(rings), SEGMENTS)
@@ -49,12 +49,12 @@ def add_turned(
 
 
 def add_cylinder(material: bpy.types.Material, radius: float, height: float, at: Vector) -> None:
-    """Add an upright closed cylinder standing on ``at``."""
+    """Add an upright closed cylinder at ``at``."""
     add_turned(material, [(0, 0), (radius, 0), (radius, height), (0, height)], at)
 
 
 def add_ellipsoid(material: bpy.types.Material, radii: Vector, at: Vector) -> None:
-    """Add an ellipsoid with half axes ``radii`` centred at ``at``."""
+    """Add an ellipsoid with half axes ``radii`` centered at ``at``."""
     polar = np.linspace(0, np.pi, SEGMENTS // 2 + 1)
     add_turned(material, list(zip(np.sin(polar), -np.cos(polar), strict=True)), at, stretch=radii)
 

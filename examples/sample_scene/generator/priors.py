@@ -1,7 +1,7 @@
-"""Depth and normal priors with the errors of a monocular network, and honest variances.
+"""Depth and normal priors with simulated errors of a monocular network, and their variances.
 
-All errors are drawn from a seeded generator; variances are declared from what the errors were drawn
-with and from the local spread that a blurred edge has, never from the errors themselves.
+Errors come from a seeded generator. Variances are computed from the standard deviations of the
+errors and from the local spread at blurred edges, never from the errors themselves.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from .cameras import Truth
 Float64 = NDArray[np.float64]
 
 FIELD_SCALES = ((0.7, 0.2), (0.55, 0.07), (0.45, 0.025))
-"""(weight, correlation length as a share of the map's width); squared weights sum to 1."""
+"""(weight, correlation length relative to the map width); squared weights sum to 1."""
 
 
 @dataclass(frozen=True)
 class PriorErrors:
-    """How wrong the priors are. Standard deviations; blur in pixels of the prior's grid."""
+    """Standard deviations of the errors; blur in pixels of the prior grid."""
 
     std_scale: float = 0.05
     std_depth: float = 0.05
@@ -34,7 +34,7 @@ class PriorErrors:
 
 @dataclass(frozen=True)
 class Prior:
-    """A degraded map, its variance (m^2, or rad^2 a tangent axis) and where it holds."""
+    """Degraded map, its variance (m^2, or rad^2 per tangent axis) and its validity."""
 
     values: Float64
     variance: Float64
@@ -42,7 +42,7 @@ class Prior:
 
 
 def degrade_depth(truth: Truth, errors: PriorErrors, rng: np.random.Generator) -> Prior:
-    """Blurred edges, one wrong scale, and a smooth multiplicative error whose size varies."""
+    """Apply edge blur, one scale error, and a smooth multiplicative error of varying size."""
     valid = truth.depth > 0
     shape = truth.depth.shape
     mean = _blur(truth.depth, valid, errors.blur_px)
@@ -57,9 +57,9 @@ def degrade_depth(truth: Truth, errors: PriorErrors, rng: np.random.Generator) -
 def degrade_normals(
     truth: Truth, rays: Float64, errors: PriorErrors, rng: np.random.Generator
 ) -> Prior:
-    """Blurred edges and a smooth tilt about both tangent axes whose size varies.
+    """Apply edge blur and a smooth tilt about both tangent axes of varying size.
 
-    ``rays``: (h, w, 3) directions of the pixels; a normal turned away from its ray is invalid.
+    ``rays``: (h, w, 3) directions of the pixels; normals that do not face the camera are invalid.
     """
     valid = truth.depth > 0
     shape = truth.depth.shape
@@ -77,12 +77,12 @@ def degrade_normals(
 
 
 def _misjudged(errors: PriorErrors, rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
-    """Factor by which a network's own idea of its variance is off."""
+    """Create the smooth factor by which the declared variance is wrong."""
     return np.exp(2 * errors.declared_spread * _field(rng, shape))
 
 
 def _field(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
-    """A Gaussian random field of zero mean and unit variance with several correlation lengths."""
+    """Create a Gaussian random field of unit variance with several correlation lengths."""
     total = np.zeros(shape)
     for weight, share in FIELD_SCALES:
         sigma = share * shape[1]
@@ -94,7 +94,7 @@ def _field(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
 
 
 def _blur(values: Float64, valid: NDArray[np.bool_], sigma: float) -> Float64:
-    """Gaussian blur of the valid pixels alone; 0 elsewhere."""
+    """Blur the valid pixels only; invalid ones become 0."""
     weight = cv2.GaussianBlur(valid.astype(float), (0, 0), sigma)
     mean = cv2.GaussianBlur(np.where(valid, values, 0), (0, 0), sigma) / weight.clip(1e-9)
     return np.where(valid, mean, 0)

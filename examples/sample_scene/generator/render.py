@@ -1,4 +1,4 @@
-"""Colour by Cycles, and exact depth and normals by casting one ray through each pixel centre."""
+"""Color images by Cycles; exact depth and normals by casting one ray per pixel center."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SENSOR_MM = 36.0
 
 
 def empty_scene() -> None:
-    """Start Blender from nothing."""
+    """Start Blender with an empty scene."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
@@ -54,7 +54,7 @@ def _blender_camera(camera: Camera, pose: Pose) -> bpy.types.Object:
 
 
 def scene_surface() -> BVHTree:
-    """All triangles of the open scene in one ray-casting tree."""
+    """Build a ray-casting tree of all triangles of the open scene."""
     vertices, faces = [], []
     bpy.context.view_layer.update()
     for item in bpy.context.scene.objects:
@@ -66,7 +66,7 @@ def scene_surface() -> BVHTree:
 
 
 def cast_truth(surface: BVHTree, camera: Camera, pose: Pose) -> Truth:
-    """Exact depth and normals at the pixel centres."""
+    """Compute exact depth and normals at the pixel centers."""
     rays = camera.rays().reshape(-1, 3)
     length = np.linalg.norm(rays, axis=1)
     towards = (rays / length[:, None]) @ pose.rotation

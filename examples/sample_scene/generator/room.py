@@ -1,4 +1,4 @@
-"""The sample room, 6.4 m x 5.2 m x 2.7 m, and the path of the camera through it.
+"""Sample room, 6.4 m x 5.2 m x 2.7 m, and the camera path in it.
 
 World: x east, y north, z up, origin in the south-west corner of the floor.
 """
@@ -24,7 +24,7 @@ BRICK, PALE_BRICK, MORTAR = (0.45, 0.15, 0.08), (0.65, 0.33, 0.2), (0.6, 0.58, 0
 
 
 def build_room(rng: np.random.Generator) -> None:
-    """Fill the open, empty Blender scene with the room."""
+    """Fill the empty Blender scene with the room."""
     _shell()
     _lights()
     _south_wall(rng)
@@ -34,7 +34,7 @@ def build_room(rng: np.random.Generator) -> None:
 
 
 def room_path(rng: np.random.Generator, views: int = 8) -> list[Pose]:
-    """Hand-held views round the room: each looks past its centre, turning by 45 deg a view."""
+    """Create hand-held views around the room; each turns by 45 deg and looks past the center."""
     poses = []
     for step in np.arange(views) * 360 / views:
         heading = step + rng.normal(0, 0.7)
@@ -93,7 +93,7 @@ def _picture(
     *,
     along_x: bool,
 ) -> None:
-    """A framed picture flat on a wall; ``at`` is the middle of its lower edge."""
+    """Add a framed picture on a wall; ``at`` is the center of its lower edge."""
     flat = (size[0], 0.03) if along_x else (0.03, size[0])
     add_box(mat.wood(OCHRE, DARK_OAK), (*flat, size[1]), at)
     corner = (at[0] + at[1] - size[0] / 2 + 0.05, at[2] + 0.05)

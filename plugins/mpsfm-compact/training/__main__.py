@@ -1,4 +1,4 @@
-"""``python -m training``: make data, train, export, evaluate."""
+"""Commands of ``python -m training``: make data, train, export, evaluate."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def sky(data: Data, photos: Path, teacher: Path, names: list[str]) -> None:
 
 @app.command("triangulated")
 def triangulated(data: Data, images: Path, model: Path, name: str) -> None:
-    """Photos with the points of their COLMAP reconstruction, to hold out."""
+    """Write photos with the points of their COLMAP reconstruction, for validation."""
     from training.make_data import make_triangulated
 
     make_triangulated(data, images, model, name)
@@ -77,7 +77,7 @@ def train(
     seed: int = 0,
     rate: float = 1e-3,
 ) -> None:
-    """Train, or go on with a run."""
+    """Train, or resume a run."""
     from training.train import Schedule
     from training.train import train as run_training
 
@@ -87,7 +87,7 @@ def train(
 
 @app.command("average")
 def average(checkpoints: list[Path], output: Path) -> None:
-    """Write the mean of the weights of checkpoints as one that ``export`` takes."""
+    """Write the mean of the weights of checkpoints as a checkpoint for ``export``."""
     from training.export import average as run_average
 
     run_average(checkpoints, output)
@@ -99,7 +99,7 @@ def export(
     output: Path,
     weights: Annotated[Path | None, typer.Option(help="also the weights alone, here")] = None,
 ) -> None:
-    """Write the network of a checkpoint as ONNX, and say how far it is from torch's."""
+    """Write the network of a checkpoint as ONNX, and print its differences from torch."""
     from training.export import export as run_export
     from training.export import keep
 
@@ -113,7 +113,7 @@ def export(
 def unpack(
     data: Data, output: Path, shards: list[str], most: Annotated[int, typer.Option()] = 40
 ) -> None:
-    """Write samples of shards, named in part, as a scene folder for ``mpsfm calibrate``."""
+    """Write samples of the named shards as a scene folder for ``mpsfm calibrate``."""
     from training.samples import find_shards
     from training.unpack import unpack as run_unpack
 

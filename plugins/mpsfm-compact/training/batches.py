@@ -1,7 +1,7 @@
 """Batches of augmented samples.
 
-What a camera does to a picture is done to its labels and its intrinsics too: crops move the
-principal point, zooms lengthen the focal length, a roll turns the normals, a mirror flips them.
+Labels and intrinsics follow the augmentation: crops move the principal point, zooms change the
+focal length, a roll rotates the normals, a mirror flips them.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from training.network import CANONICAL_FOCAL
 from training.samples import HEIGHT, ROUGH, SURFACE, WIDTH, Shard
 
 _SIZES = ((256, 192), (256, 192), (256, 192), (192, 256), (224, 224))
-"""Width and height of the network's input, drawn for each batch; about 49 000 pixels."""
+"""Width and height of the network input, drawn for each batch; about 49 000 pixels."""
 _ZOOM = 1.6
-"""Largest enlargement; most samples are seen nearly whole, as photos are later."""
+"""Maximum zoom; most samples keep nearly the whole image, as at inference."""
 _ROLL_DEG = 6.0
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Input and labels; label maps are of half the size of the input.
+    """Input and labels; label maps have half the size of the input.
 
     ``image`` (n, 3, h, w) of 0 to 255; ``rays`` (n, 2, h / 32, w / 32); ``log_depth`` (n, 1, ...),
-    canonical; ``known`` bool; ``normals`` (n, 3, ...), 0 where unknown; ``kind``; ``log_focal``
-    (n, 1) over the diagonal; ``metric`` (n,) bool.
+    canonical; ``known`` bool; ``normals`` (n, 3, ...), 0 if unknown; ``kind``; ``log_focal`` (n, 1)
+    relative to the diagonal; ``metric`` (n,) bool.
     """
 
     image: Tensor
@@ -49,7 +49,10 @@ class Batch:
 
 
 class Sampler:
-    """Draws samples: every source with its share, within it scenes by the root of their size."""
+    """Sampler of stored samples.
+
+    Each source has its share; scenes of a source are drawn by the square root of their size.
+    """
 
     def __init__(self, sources: Sequence[tuple[Sequence[Path], float]]) -> None:
         self._shards: list[Shard] = []
@@ -62,13 +65,13 @@ class Sampler:
         self._weights = np.array(weights) / np.sum(weights)
 
     def draw(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """One stored sample."""
+        """Draw a stored sample."""
         shard = self._shards[rng.choice(len(self._shards), p=self._weights)]
         return shard[int(rng.integers(len(shard)))]
 
 
 def batches(sampler: Sampler, size: int, seed: int, first: int) -> Iterator[Batch]:
-    """Endless batches from number ``first`` on, made ahead in a thread."""
+    """Yield batches from number ``first`` on, prepared in a thread."""
 
     def make(number: int) -> Batch:
         rng = np.random.default_rng((seed, number))
@@ -87,7 +90,7 @@ def augmented(
     size: tuple[int, int],
     rng: np.random.Generator | None = None,
 ) -> Batch:
-    """A batch of stored samples at ``size`` (width, height); as they are without ``rng``."""
+    """Augment stored samples to a batch of ``size``; without ``rng``, no augmentation."""
     width, height = size
     n = len(drawn)
     image = torch.from_numpy(np.stack([_developed(d["image"], rng) for d in drawn]))
@@ -110,7 +113,7 @@ def augmented(
         mirror = rng.choice([-1.0, 1.0], n)
         slack = rng.random((n, 2))
     corner = slack * (np.array([WIDTH, HEIGHT]) - np.array(size) / zoom[:, None])
-    # out = c_out + mirror * R(-roll) * zoom * (stored - c): a turn about the principal point
+    # out = c_out + mirror * R(-roll) * zoom * (stored - c): a rotation about the principal point
     center_out = (camera[:, 2:] - corner) * zoom[:, None]
     center_out[:, 0] = np.where(mirror < 0, width - center_out[:, 0], center_out[:, 0])
     cos, sin = np.cos(roll), np.sin(roll)
@@ -156,9 +159,9 @@ def augmented(
 
 
 def rays(width: int, height: int, focal: np.ndarray, center: np.ndarray) -> Tensor:
-    """Slopes (n, 2, h / 32, w / 32) of the rays through the centres of blocks of 32 pixels.
+    """Compute slopes (n, 2, h / 32, w / 32) of the rays through the centers of blocks of 32 pixels.
 
-    ``focal`` (n, 2), ``center`` (n, 2) in pixels.
+    ``focal`` (n, 2) and ``center`` (n, 2) are in pixels.
     """
     x, y = np.meshgrid(np.arange(width // 32) * 32 + 16.0, np.arange(height // 32) * 32 + 16.0)
     slopes = (np.stack([x, y]) - center[:, :, None, None]) / focal[:, :, None, None]
@@ -166,7 +169,7 @@ def rays(width: int, height: int, focal: np.ndarray, center: np.ndarray) -> Tens
 
 
 def _developed(image: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
-    """Tone, colour and JPEG of another camera, on uint8 tables."""
+    """Apply tone, color and JPEG compression of another camera, with uint8 tables."""
     if rng is None:
         return image
     if rng.random() < 0.8:
@@ -194,7 +197,7 @@ def _developed(image: np.ndarray, rng: np.random.Generator | None) -> np.ndarray
 
 
 def _spoiled(image: Tensor, rng: np.random.Generator) -> Tensor:
-    """Blur by focus or motion, low resolution, noise."""
+    """Apply defocus, motion blur, low resolution and noise."""
     out = []
     for picture in image:
         kind = rng.random()

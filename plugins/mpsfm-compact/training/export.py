@@ -1,4 +1,4 @@
-"""The trained network as an ONNX file of the plugin."""
+"""Export of the trained network to the ONNX file of the plugin."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from training.network import CompactNetwork
 
 _OPSET = 18
 _SMALL = 1024
-"""Arrays of fewer values stay float32."""
+"""Arrays with fewer values stay float32."""
 
 
 class Exported(nn.Module):
-    """The network with the plugin's inputs and outputs.
+    """Network with the inputs and outputs of the plugin.
 
-    Input: ``image`` (1, 3, h, w) RGB of 0 to 255, ``intrinsics`` (1, 3, 3) in its pixels.
-    Output, (1, c, h / 2, w / 2): ``depth`` and ``std`` in metres for a camera of the
-    canonical focal length, ``normals``, ``angle`` (std about
-    each axis in rad), ``validity`` in 0..1; ``focal`` (1, 1), in pixels of the input.
+    Input: ``image`` (1, 3, h, w) RGB of 0 to 255, ``intrinsics`` (1, 3, 3) in its pixels. Output,
+    (1, c, h / 2, w / 2): ``depth`` and ``std`` in meters for the canonical focal length,
+    ``normals``, ``angle`` (std about each axis in rad), ``validity`` in 0..1; ``focal`` (1, 1) in
+    input pixels.
     """
 
     def __init__(self, network: CompactNetwork) -> None:
@@ -34,6 +34,7 @@ class Exported(nn.Module):
         self.network = network
 
     def forward(self, image: Tensor, intrinsics: Tensor) -> tuple[Tensor, ...]:
+        """Predict all maps and the focal length."""
         height, width = image.shape[2:]
         focal, center = intrinsics[:, [0, 1], [0, 1]], intrinsics[:, :2, 2]
         x = torch.arange(width // 32, device=image.device) * 32.0 + 16.0
@@ -59,9 +60,10 @@ _OUTPUTS = ("depth", "std", "normals", "angle", "validity", "focal")
 
 
 def export(checkpoint: Path, output: Path) -> dict[str, float]:
-    """Write the averaged weights of a checkpoint as ONNX, weights as float16; compare with torch.
+    """Write the averaged weights of a checkpoint as ONNX with float16 weights; compare with torch.
 
-    Returns the largest relative difference of each output on a random image.
+    Returns:
+        The largest relative difference of each output for a random image.
     """
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     network = CompactNetwork()
@@ -70,7 +72,7 @@ def export(checkpoint: Path, output: Path) -> dict[str, float]:
     image, intrinsics = torch.rand(1, 3, 192, 256) * 255, torch.eye(3)[None] * 220
     intrinsics[0, :2, 2] = torch.tensor([128.0, 96.0])
     with warnings.catch_warnings():
-        # The exporter that needs no further package, and what it says of shapes that are dynamic.
+        # The TorchScript exporter needs no further package; it warns about dynamic shapes.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             module,
@@ -94,17 +96,17 @@ def export(checkpoint: Path, output: Path) -> dict[str, float]:
 
 
 def keep(checkpoint: Path, output: Path) -> None:
-    """Write the averaged weights alone, as float16, for ``train --start``."""
+    """Write the averaged weights only, as float16, for ``train --start``."""
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     weights = averaged(state)
     torch.save({k: v.half() if v.is_floating_point() else v for k, v in weights.items()}, output)
 
 
 def average(checkpoints: Sequence[Path], output: Path) -> None:
-    """Write the mean of the weights of checkpoints, and the most samples that one has seen.
+    """Write the mean of the weights of checkpoints, with the largest number of samples.
 
-    Stages of one run lie in one basin, and their mean is often better than each (Wortsman et al.,
-    Model soups, 2022); what is held out must say so.
+    The mean of checkpoints of one run is often better than each (Wortsman et al., Model soups,
+    2022). Verify it on validation data.
     """
     states = [torch.load(path, map_location="cpu", weights_only=True) for path in checkpoints]
     stages = [averaged(state) for state in states]
@@ -117,7 +119,7 @@ def average(checkpoints: Sequence[Path], output: Path) -> None:
 
 
 def averaged(state: dict) -> dict[str, Tensor]:
-    """The running mean of the weights of a checkpoint of training, or the weights as they are."""
+    """Return the running mean of the weights of a checkpoint, else its weights."""
     mean = state.get("mean")
     if mean is None:
         return state
@@ -125,7 +127,7 @@ def averaged(state: dict) -> dict[str, Tensor]:
 
 
 def _halve(model: onnx.ModelProto) -> None:
-    """Store large arrays as float16; a Cast after each makes them float32 when it is loaded."""
+    """Store large arrays as float16, each followed by a Cast to float32."""
     graph = model.graph
     casts = []
     for array in list(graph.initializer):

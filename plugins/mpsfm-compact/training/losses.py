@@ -1,4 +1,4 @@
-"""What the network is trained to minimise."""
+"""Training losses."""
 
 from __future__ import annotations
 
@@ -21,18 +21,17 @@ _WEIGHTS = {
     "validity": 0.1,
     "focal": 0.1,
 }
-"""Chosen so that each part moves the shared layers about as much at the start."""
+"""Weights of the terms, balanced by their gradients in the shared layers at the start."""
 _EMPTY_WEIGHT = 3.0
-"""Pixels without a surface are rare."""
+"""Weight of pixels without a surface, which are rare."""
 
 
 def losses(out: Mapping[str, Tensor], batch: Batch) -> dict[str, Tensor]:
-    """The parts of the loss, weighted.
+    """Compute the weighted terms of the loss.
 
-    Depth is judged by the absolute difference of logs: its shape after each image is given its
-    own scale, for metric samples that scale, and where it is measured the steps between pixels at
-    four distances. A std is that of a Laplace distribution of what remains where it is measured
-    (of another network's guess it would say how far the two agree), and moves nothing but itself.
+    Depth: absolute difference of logs after scaling each image, the scale for metric samples, and
+    gradients at four pixel distances for measured depth. The std is that of a Laplace distribution
+    of the residuals of measured depth; its gradient does not reach the depth.
     """
     known = batch.known
     measured = known & (batch.kind == SURFACE)

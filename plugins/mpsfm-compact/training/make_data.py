@@ -1,4 +1,4 @@
-"""Fill a folder with shards of drawn and of real samples."""
+"""Creation of shards of synthetic and real samples."""
 
 from __future__ import annotations
 
@@ -22,18 +22,19 @@ from training.synthetic.make import draw_samples
 
 PER_SHARD = 240
 _TEACHER_FOCAL = 0.888
-"""Over the width, of the photos that FastDepth was trained on: 518.9 px of 640, cut to 304 of 333
-(Wofk et al., 2019)."""
+"""Focal length of FastDepth's training photos relative to the width: 518.9 px of 640, cropped to
+304 of 333 (Wofk et al., 2019).
+"""
 _EXACT = 1.0
-"""Largest error, in pixels, of triangulated points that are taken for true."""
+"""Maximum reprojection error in pixels of triangulated points that serve as truth."""
 _FIELD_DEG = 60.0
-"""Horizontal field of view of photos that do not tell theirs."""
+"""Horizontal field of view of photos without EXIF."""
 
 
 def make_drawn(output: Path, shards: int, seed: int, workers: int, photos: Path | None) -> None:
-    """Draw what is missing of ``shards`` shards of :data:`PER_SHARD` samples.
+    """Render the missing ones of ``shards`` shards of :data:`PER_SHARD` samples.
 
-    ``photos``: a folder of pictures whose pieces become textures.
+    ``photos``: a folder of pictures that are used as textures.
     """
     pictures = sorted(photos.rglob("*.jpg")) if photos else []
     wanted = [n for n in range(shards) if not (output / f"drawn-{seed}-{n:04d}").exists()]
@@ -46,10 +47,10 @@ def make_drawn(output: Path, shards: int, seed: int, workers: int, photos: Path 
 
 
 def make_real(output: Path, source: Path) -> None:
-    """Convert scenes of RGB-D frames, one shard a scene.
+    """Convert RGB-D scenes, one shard per scene.
 
     A scene is a folder with ``scene.json`` (fx, fy, cx, cy in pixels, metric), and pairs of
-    ``NAME.jpg`` and ``NAME.png``, depth along z in millimetres, 16 bit, 0 where unknown.
+    ``NAME.jpg`` and ``NAME.png``, depth along z in millimeters, 16 bit, 0 if unknown.
     """
     for description in sorted(source.rglob("scene.json")):
         name = "real-" + "-".join(description.parent.relative_to(source).parts)
@@ -59,9 +60,9 @@ def make_real(output: Path, source: Path) -> None:
 
 
 def make_triangulated(output: Path, images: Path, model: Path, name: str) -> None:
-    """Photos with the depth of points that COLMAP triangulated, in its unit, as shard ``name``.
+    """Convert photos and triangulated COLMAP points to shard ``name``, in units of the model.
 
-    ``images``: the photos; ``model``: COLMAP's reconstruction of them.
+    ``images``: the photos; ``model``: their COLMAP reconstruction.
     """
     import pycolmap
 
@@ -84,7 +85,7 @@ def make_triangulated(output: Path, images: Path, model: Path, name: str) -> Non
 def _sparse(
     image: NDArray[np.uint8], points: NDArray[np.float64], camera: NDArray[np.float32]
 ) -> Sample:
-    """A photo with points (n, 3) of its frame, each drawn as 3 x 3 pixels of the sample."""
+    """Create a sample from a photo and its points (n, 3), each drawn as 3 x 3 pixels."""
     blank = np.zeros(image.shape[:2], np.float32)
     sample = _fitted(image, blank, camera, metric=False)
     fx, fy, cx, cy = sample.camera
@@ -99,14 +100,14 @@ def _sparse(
 
 
 def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str]) -> None:
-    """Label photos of rooms by a depth network, one shard a folder of photos.
+    """Label photos of rooms by a depth network, one shard per folder.
 
-    ``photos``: a folder of folders with JPEGs and ``licence.json`` (``hfov_deg`` by file name, or
-    none: then 60). ``teacher``: ONNX file with input (1, 3, 224, 224) RGB in 0..1 and output
-    (1, 1, 224, 224), as FastDepth has. ``names``: photos whose name or folder begins so.
+    ``photos``: a folder of folders with JPEGs and ``licence.json`` (``hfov_deg`` by file name,
+    default 60). ``teacher``: ONNX file with input (1, 3, 224, 224) RGB in 0..1 and output (1, 1,
+    224, 224), as FastDepth. ``names``: prefixes of the photos or folders to use.
 
-    The teacher takes every photo for one of NYU Depth v2, so its depth is multiplied by the ratio
-    of the focal lengths. Its edges are not to be learned: all pixels are ROUGH.
+    The teacher assumes the camera of NYU Depth v2, so its depth is multiplied by the ratio of the
+    focal lengths. All pixels are ROUGH, which excludes edges of the teacher from the loss.
     """
     teach = _teacher(teacher, 224)
 
@@ -121,10 +122,10 @@ def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str
 
 
 def make_sky(output: Path, photos: Path, teacher: Path, names: Sequence[str]) -> None:
-    """Label the sky of photos by a network, as :func:`make_labelled`; their depth stays unknown.
+    """Label the sky of photos by a network, as :func:`make_labelled`; depth stays unknown.
 
     ``teacher``: ONNX file with input (1, 3, 384, 384) RGB in 0..1 and output (1, 1, 384, 384), the
-    probability of sky.
+    sky probability.
     """
     teach = _teacher(teacher, 384)
 
@@ -154,7 +155,7 @@ def make_views(output: Path, panoramas: Path, teacher: Path) -> None:
 
 
 def _teacher(path: Path, side: int) -> Callable[[NDArray[np.uint8]], NDArray[np.float32]]:
-    """A network that gives an image of any size (h, w, 3) a map (h, w)."""
+    """Return a function from an image (h, w, 3) of any size to a map (h, w)."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
@@ -217,7 +218,7 @@ def _frames(description: Path) -> Iterator[Sample]:
 def _fitted(
     image: NDArray[np.uint8], depth: NDArray[np.float32], camera: NDArray[np.float32], metric: bool
 ) -> Sample:
-    """A frame of any size, cut to the samples' aspect ratio about its middle and resized."""
+    """Crop a frame to the aspect ratio of the samples and resize it."""
     height, width = depth.shape
     scale = max(WIDTH / width, HEIGHT / height)
     w, h = min(width, round(WIDTH / scale)), min(height, round(HEIGHT / scale))

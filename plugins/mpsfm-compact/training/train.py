@@ -1,4 +1,4 @@
-"""Train the network; interrupted, go on from the last checkpoint."""
+"""Training loop; resumes from the last checkpoint."""
 
 from __future__ import annotations
 
@@ -19,26 +19,28 @@ from training.samples import Shard, find_shards
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long and how fast: rates are constant after ``warmup`` steps, and fall to zero in a
-    straight line over the last ``cooldown`` of ``steps``. So a run may be prolonged from its last
-    checkpoint, and cooled down when it is to be used."""
+    """Number of steps and learning rate.
+
+    The rate is constant after ``warmup`` steps, and falls linearly to zero over the last
+    ``cooldown`` of ``steps``. A run can therefore be extended from its last checkpoint.
+    """
 
     steps: int
     cooldown: int = 1000
     batch: int = 16
     rate: float = 1e-3
     encoder_rate: float = 0.4
-    """As a share of ``rate``."""
+    """Learning rate of the encoder relative to ``rate``."""
     warmup: int = 200
     decay: float = 1e-2
     average: float = 0.998
-    """Of the running mean of the weights, which is what is exported."""
+    """Decay of the running mean of the weights, which is exported."""
     real_share: float = 0.15
-    """Of real frames, beside drawn samples and views."""
+    """Share of real frames."""
     view_share: float = 0.25
-    """Of views of panoramas."""
+    """Share of views of panoramas."""
     sky_share: float = 0.06
-    """Of photos that only tell where there is sky, beside all others."""
+    """Share of photos with sky labels only."""
 
 
 def train(
@@ -50,10 +52,10 @@ def train(
     start: Path | None = None,
     minutes: float | None = None,
 ) -> None:
-    """Train on the shards of ``data`` whose names hold none of ``held_out``, judge on the others.
+    """Train on the shards of ``data``, and validate on those that ``held_out`` names.
 
-    ``run``: folder of ``last.pt`` and ``log.csv``. ``start``: a checkpoint whose weights are the
-    beginning, instead of those of ImageNet. ``minutes``: stop then, to go on another time.
+    ``run``: folder of ``last.pt`` and ``log.csv``. ``start``: checkpoint with initial weights,
+    instead of ImageNet. ``minutes``: stop after this time; a later call resumes.
     """
     torch.manual_seed(seed)
     torch.backends.cudnn.benchmark = True
@@ -133,8 +135,11 @@ def train(
 def judge(
     network: nn.Module, shards: Sequence[Path], device: torch.device
 ) -> dict[str, dict[str, float]]:
-    """Accuracy on shards, by name: AbsRel and delta < 1.25 after median scaling, median angle of
-    normals in deg, scale and focal length as medians of ratios to the truth."""
+    """Compute the accuracy on shards, by name.
+
+    Metrics: AbsRel and delta < 1.25 after median scaling, median angle of normals in deg, and
+    median ratios of scale and focal length to the truth.
+    """
     was = network.training
     network.eval()
     results = {}

@@ -1,4 +1,4 @@
-"""Shards as scene folders, for ``mpsfm calibrate`` and for looking at them."""
+"""Shards as scene folders, for ``mpsfm calibrate`` and for inspection."""
 
 from __future__ import annotations
 
@@ -13,8 +13,14 @@ from training.samples import Shard
 
 
 def unpack(shards: Sequence[Path], output: Path, most: int) -> int:
-    """Write ``images/``, ``gt_depth/`` (16-bit PNG, millimetres), ``gt_normals/`` and
-    ``intrinsics.yaml`` of up to ``most`` evenly chosen samples of each shard; returns how many."""
+    """Write up to ``most`` evenly spaced samples of each shard as a scene folder.
+
+    The folder has ``images/``, ``gt_depth/`` (16-bit PNG, millimeters), ``gt_normals/`` and
+    ``intrinsics.yaml``.
+
+    Returns:
+        The number of samples.
+    """
     cameras = {}
     for folder in shards:
         shard = Shard(folder)

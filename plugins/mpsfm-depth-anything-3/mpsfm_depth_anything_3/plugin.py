@@ -24,7 +24,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             code_license="Apache-2.0",
             weights_license=f"{LICENSES['da3-small']} (small, base), {LICENSES['da3-large']}",
             weights=weights,
-            # A guess: not measured, as the weights could not be had where this was written.
+            # [assumed: not measured, because the weights were not available]
             calibration=DepthCalibration(std_scale=1.0, relative_std=0.05),
             contract="mpsfm_depth_anything_3.contract:contract",
         )

@@ -84,12 +84,12 @@ class DepthAnything3:
 def network_of(name: str) -> Any:
     """Create the architecture from the configuration files of the library."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about what it uses of omegaconf and torch
+        warnings.simplefilter("ignore")  # deprecation warnings of omegaconf and torch
         from depth_anything_3.cfg import create_object, load_config
         from depth_anything_3.registry import MODEL_REGISTRY
         from depth_anything_3.utils.logger import logger
 
-        logger.level = _WARNINGS  # it prints to the terminal
+        logger.level = _WARNINGS  # the library prints to the terminal
         return create_object(load_config(MODEL_REGISTRY[name])).eval()
 
 

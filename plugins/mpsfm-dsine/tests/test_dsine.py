@@ -99,5 +99,5 @@ def test_black_padding_before_normalisation(write_onnx, context):
 
 def test_an_export_without_intrinsics_is_told(write_onnx, context):
     text = "dsine (float[b,3,h,w] image) => (float[b,3,h,w] normal) { normal = Identity (image) }"
-    with pytest.raises(ConfigError, match=r"wants inputs \['image', 'intrins'\]"):
+    with pytest.raises(ConfigError, match=r"needs inputs \['image', 'intrins'\]"):
         Dsine(DsineOptions(model=str(write_onnx(text))), context)

@@ -86,8 +86,8 @@ class LightGlueMatcher:
         dimension = features.descriptors.shape[1]
         if dimension != self.architecture["input_dim"]:
             raise ProviderError(
-                f"descriptors of {view.name!r} have {dimension} dimensions, this matcher wants "
-                f"{self.architecture['input_dim']}: choose the matcher made for these features"
+                f"descriptors of {view.name!r} have {dimension} dimensions, this matcher needs "
+                f"{self.architecture['input_dim']}: choose the matcher for these features"
             )
         arrays = {
             "keypoints": features.keypoints,

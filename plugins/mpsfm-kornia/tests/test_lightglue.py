@@ -71,7 +71,7 @@ def test_no_features_no_matches(make, blocks, family):
 def test_features_of_another_family(make, blocks):
     features = make("features", "xfeat").extract(blocks)
     matcher = make("matcher", "lightglue-aliked")
-    with pytest.raises(ProviderError, match="64 dimensions, this matcher wants 128"):
+    with pytest.raises(ProviderError, match="64 dimensions, this matcher needs 128"):
         matcher.match(blocks, blocks, features, features)
     with pytest.raises(ProviderError, match="choose a features provider"):
         matcher.match(blocks, blocks)

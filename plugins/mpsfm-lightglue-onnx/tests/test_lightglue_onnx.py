@@ -137,7 +137,7 @@ def test_no_features_no_matches_and_errors(write_onnx, detector, context):
     assert len(matcher.match(view, view, features_of(0), features_of(3)).sparse) == 0
     with pytest.raises(ProviderError, match="choose a features provider"):
         matcher.match(view, view)
-    with pytest.raises(ConfigError, match=r"LightGlue wants inputs \['desc0'"):
+    with pytest.raises(ConfigError, match=r"LightGlue needs inputs \['desc0'"):
         LightGlue(LightGlueOptions(model=detector(1)), context)
 
 

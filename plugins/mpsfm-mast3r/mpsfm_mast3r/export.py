@@ -136,7 +136,7 @@ def main() -> None:
         export(job, network(job.size))
         return
     stored = job.checkpoint(Namespace)
-    if "model" not in stored:  # of the Hub: weights alone
+    if "model" not in stored:  # files of the Hub contain only weights
         stored = {"model": stored, "args": Namespace(model=_PUBLISHED)}
     model = AsymmetricMASt3R(**arguments(stored["args"].model))
     job.load(model, stored["model"])

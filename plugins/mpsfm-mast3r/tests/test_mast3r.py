@@ -180,7 +180,7 @@ def test_reciprocal_search_finds_what_brute_force_finds():
 
 def test_another_model_is_told(write_onnx, context):
     text = "one (float[1,3,h,w] image) => (float[1,3,h,w] out) { out = Identity (image) }"
-    with pytest.raises(ConfigError, match="MASt3R wants inputs"):
+    with pytest.raises(ConfigError, match="MASt3R needs inputs"):
         DenseMatcher(DenseOptions(model=str(write_onnx(text))), context)
 
 

@@ -14,7 +14,7 @@ import torch
 from mpsfm_core.providers.model_export.author_script import ExportJob
 
 for _name in ("mmcv", "mmcv.utils", "timm", "timm.models", "timm.models.layers"):
-    sys.modules[_name] = ModuleType(_name)  # of what follows nothing is called here
+    sys.modules[_name] = ModuleType(_name)  # stubs of imports that are not used here
 sys.modules["timm.models.registry"] = ModuleType("timm.models.registry")
 sys.modules["mmcv.utils"].__dict__["collect_env"] = dict
 sys.modules["timm.models.layers"].__dict__.update(trunc_normal_=None, DropPath=None)

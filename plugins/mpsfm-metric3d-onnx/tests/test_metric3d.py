@@ -94,7 +94,7 @@ def test_missing_confidence_is_told(write_onnx, context):
     without = without.replace("confidence = Mul (blue, k)", "")
     path = write_onnx(without, zero=np.float32([0]), twenty=np.float32([20]))
     Metric3dDepth(Metric3dOptions(weights=str(path)), context)
-    with pytest.raises(ConfigError, match=r"wants .*'confidence'.*has inputs"):
+    with pytest.raises(ConfigError, match=r"needs .*'confidence'.*has inputs"):
         Metric3dDepth(Metric3dOptions(weights=str(path), confidence=True), context)
 
 

@@ -108,7 +108,7 @@ def stand_in(description: Description, folder: Path) -> Path:
         graph.add("Mul", "metres", unit, to=outputs.depth.name)
     if outputs.confidence is not None and outputs.confidence.output == "confidence":
         graph.add("Add", "nothing", graph.array([1 - RELATIVE_STD]), to=outputs.confidence.name)
-    elif outputs.confidence is not None:  # the std; a variance would be its square
+    elif outputs.confidence is not None:  # std, not variance
         share = graph.array([RELATIVE_STD * _canonical_unit(description)])
         graph.add("Mul", "metres", share, to=outputs.confidence.name)
     if outputs.mask is not None:

@@ -112,7 +112,7 @@ def z_shift(points: Float64, xy: Float64, valid: Bool | None = None) -> float:
     slope = on_ray / z
     shift = _step((x_y - on_ray * z) / z, slope)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        shift = max(shift, -0.99 * float(z.min()))  # all points stay in front of the camera
+        shift = max(shift, -0.99 * float(z.min()))  # keep all points in front of the camera
         depth = z + shift
         step = _step(x_y / depth - on_ray, x_y / depth**2)
         shift += step

@@ -59,7 +59,7 @@ class Model:
         inputs, outputs = sorted(set(inputs)), sorted(set(outputs))
         if inputs != sorted(self.inputs) or not set(outputs) <= set(self.outputs):
             raise ConfigError(
-                f"{what} wants inputs {inputs} and outputs {outputs}; {self._name} has inputs "
+                f"{what} needs inputs {inputs} and outputs {outputs}; {self._name} has inputs "
                 f"{list(self.inputs)} and outputs {list(self.outputs)}"
             )
 
@@ -91,6 +91,8 @@ def _open(path: Path, context: ProviderContext) -> onnxruntime.InferenceSession:
     except Exception as error:  # onnxruntime's exceptions share no base class
         reason = str(error).strip().splitlines()[0]
         raise WeightsError(f"{path} cannot be opened as an ONNX model: {reason}") from error
-    if not set(wanted) <= set(session.get_providers()):  # it may be there and lack its libraries
+    if not set(wanted) <= set(
+        session.get_providers()
+    ):  # CUDA may be listed although its libraries are missing
         _log.warning("%s runs on the CPU: onnxruntime cannot use the GPU here", path.name)
     return session

@@ -163,7 +163,9 @@ def _factor(rule: DepthOutput, answer: Answer, camera: PinholeCamera) -> float:
     resized, factor = camera.resized(*answer.canvas.image), 1.0
     if rule.canonical_focal is not None:
         sides = zip(answer.canvas.image, camera.size, strict=True)
-        scale = max(resized_side / side for resized_side, side in sides)  # one of them is exact
+        scale = max(
+            resized_side / side for resized_side, side in sides
+        )  # the other side is rounded
         factor *= (camera.fx + camera.fy) / 2 * scale / rule.canonical_focal
     if rule.assumed_focal is not None:
         factor *= resized.fx / answer.numbers[rule.assumed_focal]

@@ -170,7 +170,7 @@ def test_file_that_is_no_model(tmp_path, context):
 
 
 def test_model_of_another_description(red, context):
-    with pytest.raises(ConfigError, match=r"wants inputs \['image'\] and outputs \['depth'\].*has"):
+    with pytest.raises(ConfigError, match=r"needs inputs \['image'\] and outputs \['depth'\].*has"):
         OnnxDepth(OnnxOptions(model=red.model), context)
 
 

@@ -18,7 +18,7 @@ _INPUTS = {
         mean=_MEAN,
         std=_STD,
         interpolation="cubic",
-        # Not the 224 x 224 centre of classification, which shows a part of the view only.
+        # Classification uses the 224 x 224 center, which shows only a part of the view.
         size=SideSize(mode="longest", side=336, multiple_of=14),
     ),
     "eigenplaces": ImageInput(

@@ -153,5 +153,5 @@ def test_what_is_fed_is_normalised(write_onnx, context):
 def test_errors_say_what_is_missing(options, write_onnx, context):
     with pytest.raises(ProviderError, match="choose a features provider"):
         SparseMatcher(SparseOptions(**options()), context).match(A, B)
-    with pytest.raises(ConfigError, match=r"RoMa wants inputs \['image0', 'image1'\]"):
+    with pytest.raises(ConfigError, match=r"RoMa needs inputs \['image0', 'image1'\]"):
         DenseMatcher(DenseOptions(**options(inputs=("image0", "image1"))), context)

@@ -57,7 +57,7 @@ class TestNetwork:
 
     def test_another_kind_of_model_is_told(self, write_onnx, context):
         text = "two (float[1] a, float[1] b) => (float[1] c) { c = Add (a, b) }"
-        with pytest.raises(ConfigError, match="a sky network wants inputs"):
+        with pytest.raises(ConfigError, match="a sky network needs inputs"):
             SkyNetwork(SkyOptions(model=str(write_onnx(text))), context)
 
     def test_real_photo(self, shared_data, context):

@@ -37,7 +37,7 @@ class HubDepth:
         config = self._model.network.config
         if config.model_type == _PROMPTED:
             raise ConfigError(
-                f"{options.model} wants the depth of a sensor: use the provider "
+                f"{options.model} needs depth maps of a sensor: use the provider "
                 f"prompt-depth-anything"
             )
         self._output, self._metric = meaning(config, options)
@@ -85,7 +85,7 @@ class PromptDepth:
             directory=options.directory,
             suffix=options.suffix,
             scale=options.scale,
-            relative_std=1.0,  # of the maps, which nobody asks for here
+            relative_std=1.0,  # warnings about unused maps
         )
         self._sensor = DepthFiles(files, context)
         self._preparation: Preparation = preparation_for(self._model)

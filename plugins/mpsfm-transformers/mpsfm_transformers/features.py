@@ -20,7 +20,7 @@ class SuperPointFeatures:
     """SuperPoint; its pixel centers are integers."""
 
     def __init__(self, options: SuperPointOptions, context: ProviderContext) -> None:
-        config: dict[str, float] = {"max_keypoints": -1}  # a mask may take some away
+        config: dict[str, float] = {"max_keypoints": -1}  # a mask may remove some
         if options.detection_threshold is not None:
             config |= {"keypoint_threshold": options.detection_threshold}
         self._model = LoadedModel(SuperPointForKeypointDetection, options, context, **config)

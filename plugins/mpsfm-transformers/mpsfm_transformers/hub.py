@@ -84,7 +84,7 @@ def _explained(model: str) -> Iterator[None]:
     """Convert errors of the library to one error of MP-SfM."""
     try:
         yield
-    except Exception as error:  # its errors share no base class
+    except Exception as error:  # errors of the library share no base class
         reason = str(error).strip().splitlines() or [""]
         raise WeightsError(
             f"{model} cannot be loaded by transformers: {type(error).__name__}: {reason[0]}"

@@ -63,7 +63,7 @@ class GivenKeypointsMatcher:
             if one.descriptors.shape[1] != self._dimension:
                 raise ProviderError(
                     f"descriptors of {view.name!r} have {one.descriptors.shape[1]} dimensions, "
-                    f"this matcher wants {self._dimension}: choose the matcher made for these "
+                    f"this matcher needs {self._dimension}: choose the matcher for these "
                     f"features"
                 )
         if not min(map(len, features)):
@@ -73,7 +73,7 @@ class GivenKeypointsMatcher:
         size_only = torch.empty(1, device=self._model.device).expand(1, 2, 1, height, width)
         with inference():
             found = self._model.network(size_only)
-        # (1, 2, n), or (2, n) of a LightGlue that never stops early
+        # (1, 2, n), or (2, n) for a LightGlue without early stopping
         partners, scores = (
             tensor.reshape(2, -1)[0, : len(features[0])].cpu().numpy()
             for tensor in (found.matches, found.matching_scores)

@@ -279,7 +279,7 @@ def _save(
                 torch.nn.init.xavier_uniform_(parameter, 0.1 if len(parameter) == 1 else 1.0)
             elif parameter.numel() > 1:
                 torch.nn.init.uniform_(parameter, 0.0, 0.4)
-            else:  # of the last layer: depth in its unit, or an angle of view in degrees
+            else:  # bias of the last layer: depth in its unit, or angle of view in degrees
                 torch.nn.init.constant_(parameter, _ANGLE_DEG if "fov" in name else 1.0)
         _see(model, noise)
         model.save_pretrained(folder)

@@ -124,7 +124,7 @@ def test_features_of_another_family(name, context, tmp_path, view_of, blocks):
     matcher = factory(options(model=str(getattr(stand_in, name)(tmp_path / name))), context)
     features = Features(np.ones((2, 2)), np.ones((2, 64), dtype=np.float32))
     view = view_of(blocks)
-    with pytest.raises(ProviderError, match="64 dimensions, this matcher wants 32"):
+    with pytest.raises(ProviderError, match="64 dimensions, this matcher needs 32"):
         matcher.match(view, view, features, features)
 
 

@@ -22,7 +22,7 @@ def network(roma_outdoor: Callable[..., Any], device: str = "cpu") -> Any:
     """Create the authors' network with weights that are drawn by the name of each tensor."""
     options = {"coarse_res": COARSE, "upsample_res": FINE, "use_custom_corr": False}
     known = inspect.signature(roma_outdoor).parameters
-    with patch.object(torch.nn.Module, "load_state_dict"):  # there is nothing to load
+    with patch.object(torch.nn.Module, "load_state_dict"):  # no weights to load
         made = roma_outdoor(
             device=device,
             weights={},

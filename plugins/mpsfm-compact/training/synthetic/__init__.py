@@ -1,1 +1,1 @@
-"""Rooms, streets and things that are built at random and drawn by casting rays."""
+"""Random rooms, streets and objects, rendered by ray casting."""

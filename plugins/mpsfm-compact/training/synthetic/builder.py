@@ -1,4 +1,4 @@
-"""A scene being built: solids with looks, lights, and the sky."""
+"""Scene under construction: solids with materials, lights and sky."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Look:
-    """How a surface looks: a texture of the bank, its size in metres, tint, shine and glow."""
+    """Material: texture index, size in meters, tint, shine and glow."""
 
     texture: int
     period: float
@@ -27,11 +27,14 @@ class Look:
 
 @dataclass
 class Builder:
-    """Collects solids; lengths in metres, z up. ``at`` is the middle of a solid's lower side."""
+    """Collector of solids; lengths in meters, z up.
+
+    ``at`` is the center of the lower side of a solid.
+    """
 
     rng: np.random.Generator
     textures: int
-    """How many textures the bank has."""
+    """Number of textures."""
     _solids: list[tuple[int, NDArray[Any], NDArray[Any], Look, int, bool]] = field(
         default_factory=list
     )
@@ -42,7 +45,7 @@ class Builder:
     )
 
     def look(self, period: tuple[float, float] = (0.3, 3.0), **more: float) -> Look:
-        """A random look."""
+        """Draw a random material."""
         rng = self.rng
         tint = np.clip(rng.uniform(0.4, 1.1) + rng.normal(0, 0.08, 3), 0.05, 1.2)
         shine = rng.uniform(0, 0.8) if rng.random() < 0.25 else 0.0
@@ -59,7 +62,7 @@ class Builder:
     def box(
         self, at: ArrayLike, size: ArrayLike, look: Look, yaw: float = 0.0, **more: Any
     ) -> None:
-        """A box of full ``size``, turned by ``yaw`` (rad) about the vertical."""
+        """Add a box of full ``size``, rotated by ``yaw`` (rad) about the vertical."""
         half = np.asarray(size, float) / 2
         self._add(BOX, _lifted(at, half[2]), half, _turn(yaw), look, **more)
 
@@ -72,7 +75,7 @@ class Builder:
         axis: str = "z",
         yaw: float = 0.0,
     ) -> None:
-        """A cylinder that stands (axis z) or lies (axis x, turned by ``yaw``) on ``at``."""
+        """Add a vertical cylinder (axis z), or a horizontal one (axis x, rotated by ``yaw``)."""
         half = np.array([radius, radius, height / 2])
         turn = _turn(yaw)
         lift = height / 2
@@ -81,12 +84,12 @@ class Builder:
         self._add(CYLINDER, _lifted(at, lift), half, turn, look)
 
     def ball(self, center: ArrayLike, half: ArrayLike, look: Look, yaw: float = 0.0) -> None:
-        """An ellipsoid of the given half axes about ``center``."""
+        """Add an ellipsoid with half axes around ``center``."""
         half = np.broadcast_to(np.asarray(half, float), 3)
         self._add(BALL, np.asarray(center, float), half, _turn(yaw), look)
 
     def tumbled(self, kind: int, center: ArrayLike, half: ArrayLike, look: Look) -> None:
-        """A solid in any orientation."""
+        """Add a solid in any orientation."""
         q, _ = np.linalg.qr(self.rng.normal(size=(3, 3)))
         self._add(kind, np.asarray(center, float), np.asarray(half, float), q, look)
 
@@ -106,23 +109,23 @@ class Builder:
 
     @property
     def count(self) -> int:
-        """Solids so far."""
+        """Return the number of solids."""
         return len(self._solids)
 
     def lamp(self, at: ArrayLike, strength: float, warmth: float) -> None:
-        """A point light; warmth from -1 (blue) to 1 (yellow)."""
+        """Add a point light; warmth from -1 (blue) to 1 (yellow)."""
         colour = strength * np.array([1 + 0.15 * warmth, 1.0, 1 - 0.25 * warmth])
         self.lights.append([*np.asarray(at, float), *colour, 0.0])
 
     def sun(self, direction: ArrayLike, strength: float) -> None:
-        """A light from infinitely far, from ``direction``."""
+        """Add a directional light from ``direction``."""
         d = np.asarray(direction, float)
         self.lights.append(
             [*(d / np.linalg.norm(d)), *(strength * np.array([1.0, 0.95, 0.85])), 1.0]
         )
 
     def arrays(self, bank: NDArray[np.uint8]) -> tuple[Any, NDArray[Any], NDArray[Any]]:
-        """``scene``, ``shows`` and ``sky`` as :func:`raycast.draw` takes them."""
+        """Return ``scene``, ``shows`` and ``sky`` for :func:`raycast.draw`."""
         n = self.count
         kinds, shows = np.empty(n, np.int64), np.empty(n, np.int64)
         inverses, centers = np.empty((n, 3, 4)), np.empty((n, 3))
@@ -147,7 +150,7 @@ class Builder:
 
 
 def _groups(opaque: NDArray[Any], centers: NDArray[Any], radii: NDArray[Any]) -> tuple[Any, ...]:
-    """Balls round runs of solids: what was built in a row stands together."""
+    """Compute bounding spheres of runs of solids, because solids of one piece are consecutive."""
     runs = [opaque[k : k + GROUP] for k in range(0, len(opaque), GROUP)]
     middles = np.array([centers[run].mean(0) for run in runs]).reshape(-1, 3)
     reach = [

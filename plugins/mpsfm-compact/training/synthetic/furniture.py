@@ -1,6 +1,6 @@
-"""Things that stand in rooms, each a function ``(builder, x, y, yaw)`` that draws its own sizes.
+"""Furniture: functions ``(builder, x, y, yaw)`` that draw their own sizes.
 
-Their backs are at ``(x, y)`` and they face ``yaw``; sizes are those of real furniture.
+The back of a piece is at ``(x, y)``, its front faces ``yaw``; sizes are those of real furniture.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ class Frame:
         self.build, self.x, self.y, self.yaw = build, x, y, yaw
 
     def at(self, u: float, v: float, z: float) -> NDArray[np.float64]:
+        """Return the world position of a point."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return np.array([self.x - s * u + c * v, self.y + c * u + s * v, z])
 
@@ -37,15 +38,17 @@ class Frame:
         look: Look,
         turn: float = 0,
     ) -> None:
-        """Width along the wall, depth away from it, height."""
+        """Add a box by width along the wall, depth away from it, and height."""
         self.build.box(self.at(u, v, z), (d, w, h), look, self.yaw + turn)
 
     def pole(self, u: float, v: float, z: float, r: float, h: float, look: Look) -> None:
+        """Add a vertical cylinder."""
         self.build.cylinder(self.at(u, v, z), r, h, look)
 
     def ball(
         self, u: float, v: float, z: float, half: tuple[float, float, float], look: Look
     ) -> None:
+        """Add an ellipsoid."""
         self.build.ball(self.at(u, v, z), half, look, self.yaw)
 
 
@@ -54,7 +57,7 @@ def _between(b: Builder, low: float, high: float) -> float:
 
 
 def clutter(f: Frame, u: float, v: float, z: float, largest: float = 0.35) -> None:
-    """One small thing on a surface."""
+    """Add a small object on a surface."""
     b, look = f.build, f.build.look((0.05, 0.5))
     kind = b.rng.integers(6)
     r, h = _between(b, 0.02, largest / 3), _between(b, 0.04, largest)
@@ -92,6 +95,7 @@ def _scatter(f: Frame, z: float, width: float, v0: float, v1: float, most: int) 
 
 
 def table(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a table with objects on it."""
     f, top, leg = Frame(b, x, y, yaw), b.look(), b.look()
     w, d, h = _between(b, 0.6, 2.0), _between(b, 0.5, 1.0), _between(b, 0.4, 0.78)
     f.box(0, d / 2, h - 0.04, w, d, 0.04, top)
@@ -110,6 +114,7 @@ def table(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def desk(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a desk."""
     f, top, side = Frame(b, x, y, yaw), b.look(), b.look()
     w, d, h = _between(b, 1.0, 1.8), _between(b, 0.6, 0.8), _between(b, 0.7, 0.78)
     f.box(0, d / 2, h - 0.03, w, d, 0.03, top)
@@ -130,6 +135,7 @@ def desk(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def chair(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a chair."""
     f, look = Frame(b, x, y, yaw), b.look()
     seat = b.look() if b.rng.random() < 0.5 else look
     h, w = _between(b, 0.42, 0.48), _between(b, 0.38, 0.48)
@@ -142,6 +148,7 @@ def chair(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def office_chair(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build an office chair."""
     f, look, dark = Frame(b, x, y, yaw), b.look(), b.look()
     f.pole(0, 0.25, 0.06, 0.03, 0.38, dark)
     for turn in range(5):
@@ -160,6 +167,7 @@ def office_chair(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def sofa(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a sofa."""
     f, look = Frame(b, x, y, yaw), b.look()
     w, d = _between(b, 0.9, 2.4), _between(b, 0.8, 1.0)
     f.box(0, d / 2, 0.06, w, d, 0.34, look)
@@ -171,6 +179,7 @@ def sofa(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def bed(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a bed."""
     f, frame = Frame(b, x, y, yaw), b.look()
     w, d = _between(b, 0.9, 1.9), 2.05
     f.box(0, 0.03, 0, w + 0.1, 0.06, _between(b, 0.6, 1.2), frame)
@@ -182,6 +191,7 @@ def bed(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def cabinet(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a cabinet."""
     f, look, knob = Frame(b, x, y, yaw), b.look(), b.look()
     w, d, h = _between(b, 0.4, 2.2), _between(b, 0.3, 0.65), _between(b, 0.4, 2.2)
     f.box(0, d / 2, 0, w, d, h, look)
@@ -198,6 +208,7 @@ def cabinet(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def shelves(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build shelves with objects."""
     f, look = Frame(b, x, y, yaw), b.look()
     w, d, levels = _between(b, 0.5, 1.8), _between(b, 0.22, 0.4), int(b.rng.integers(2, 7))
     gap = _between(b, 0.28, 0.42)
@@ -227,6 +238,7 @@ def shelves(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def counter(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a kitchen counter."""
     f, front, top = Frame(b, x, y, yaw), b.look(), b.look((0.2, 1.5), shine=0.3)
     units = int(b.rng.integers(2, 6))
     w = units * 0.6
@@ -249,6 +261,7 @@ def counter(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def fridge(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a fridge."""
     f, look = Frame(b, x, y, yaw), b.look((1, 4), shine=0.4)
     h = _between(b, 0.85, 2.0)
     f.box(0, 0.33, 0, 0.62, 0.64, h, look)
@@ -257,6 +270,7 @@ def fridge(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def plant(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a plant in a pot."""
     f, leaf = Frame(b, x, y, yaw), b.look((0.05, 0.3))
     h, r = _between(b, 0.3, 1.6), _between(b, 0.1, 0.22)
     f.pole(0, 0.25, 0, r, r * 1.8, b.look())
@@ -268,6 +282,7 @@ def plant(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def floor_lamp(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a floor lamp."""
     f, look = Frame(b, x, y, yaw), b.look()
     h = _between(b, 1.2, 1.8)
     f.pole(0, 0.2, 0, 0.14, 0.03, look)
@@ -276,6 +291,7 @@ def floor_lamp(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def heap(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a heap of boxes."""
     f = Frame(b, x, y, yaw)
     for _ in range(b.rng.integers(1, 6)):
         size = b.rng.uniform(0.12, 0.55, 3)
@@ -286,6 +302,7 @@ def heap(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def radiator(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a radiator."""
     f, look = Frame(b, x, y, yaw), b.look((1, 4))
     n, h = int(b.rng.integers(6, 20)), _between(b, 0.4, 0.8)
     for i in range(n):
@@ -293,6 +310,7 @@ def radiator(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def person(b: Builder, x: float, y: float, yaw: float) -> None:
+    """Build a person."""
     f, top, legs, skin = Frame(b, x, y, yaw), b.look((0.1, 1)), b.look((0.1, 1)), b.look((0.5, 2))
     h = _between(b, 1.5, 1.9)
     v = 0.4
@@ -305,14 +323,14 @@ def person(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def screen(b: Builder, x: float, y: float, yaw: float) -> None:
-    """A television on a low board."""
+    """Add a television on a low board."""
     f, w = Frame(b, x, y, yaw), _between(b, 0.7, 1.5)
     f.box(0, 0.22, 0, w * 1.2, 0.4, 0.45, b.look())
     f.box(0, 0.2, 0.5, w, 0.05, w * 0.56, Look(0, 5, (0.05, 0.05, 0.06), (0, 0), 0.8))
 
 
 def odd(b: Builder, x: float, y: float, yaw: float) -> None:
-    """Something that has no name: solids in any orientation."""
+    """Add an abstract object: solids in any orientation."""
     f = Frame(b, x, y, yaw)
     look = b.look()
     for _ in range(b.rng.integers(1, 7)):

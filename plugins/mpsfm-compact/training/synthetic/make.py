@@ -1,4 +1,4 @@
-"""Draw shards of random scenes."""
+"""Rendering of shards of random scenes."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from training.synthetic.worlds import WORLDS, Shot
 _TEXTURES = 96
 _VIEWS = 6
 _OVERSAMPLE = 1.25
-"""Colours are drawn this much larger and averaged."""
+"""Oversampling factor of colors."""
 _NEAREST, _FARTHEST = 0.15, 120.0
 _DIFFERENT = 0.25
-"""Log of the ratio of the 95th to the 5th percentile of depth, at least: no bare walls."""
+"""Minimum log ratio of the 95th to the 5th percentile of depth; excludes bare walls."""
 
 
 def draw_samples(seed: Sequence[int], photos: Sequence[Path] = ()) -> Iterator[Sample]:
-    """Samples of endlessly many random scenes."""
+    """Yield samples of random scenes."""
     rng = np.random.default_rng(seed)
     bank = make_textures(rng, _TEXTURES, photos)
     worlds, shares = zip(*WORLDS, strict=True)
@@ -86,7 +86,7 @@ def _draw(scene, shows, sky, shot: Shot, focal: float, width: int, height: int):
 
 
 def _develop(rng: np.random.Generator, light: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Exposure, white balance, vignette, tone curve and sharpness of some camera."""
+    """Apply exposure, white balance, vignette, tone curve and sharpness of a random camera."""
     exposure = rng.uniform(0.35, 0.65) / (np.percentile(light, rng.uniform(40, 80)) + 0.02)
     light = light * (exposure * rng.uniform(0.92, 1.08, 3).astype(np.float32))
     y, x = np.mgrid[:HEIGHT, :WIDTH]

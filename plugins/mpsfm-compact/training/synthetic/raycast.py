@@ -1,8 +1,8 @@
-"""Casting rays at boxes, ellipsoids and cylinders, compiled.
+"""Compiled ray casting of boxes, ellipsoids and cylinders.
 
-Every solid is a unit solid (the cube [-1, 1]^3, the unit ball, the cylinder of radius 1 along z in
-[-1, 1]) seen through an affine map, so one intersection routine of each kind serves all. World: x
-and y level, z up, metres. Camera: x right, y down, z forward.
+Every solid is a unit solid (cube [-1, 1]^3, unit ball, cylinder of radius 1 along z in [-1, 1])
+under an affine map, so each kind has one intersection routine. World: x and y horizontal, z up,
+meters. Camera: x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from numba import njit
 
 BOX, BALL, CYLINDER = 0, 1, 2
 PLAIN, MIRROR, WINDOW = 0, 1, 2
-"""What a surface shows: itself, what it reflects, or the sky behind it."""
+"""Appearance of a surface: its own color, a reflection, or the sky behind it."""
 GROUP = 8
-"""Neighbouring solids that are left out of the way of a shadow ray together."""
+"""Number of consecutive solids that share a bounding sphere for shadow rays."""
 _NEAR = 1e-4
 _TILE = 16
 _compiled = njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
-"""Distances are compared with infinity, so that must keep its meaning."""
+"""Compiler options; comparisons with infinity must be exact."""
 
 
 @_compiled
 def _hit(kind, inverse, origin, direction):
-    """Distance along the ray to the first surface in front of it (inf: none), and the axis hit."""
+    """Compute the distance along the ray to the first surface (inf: none), and the axis hit."""
     ox = inverse[0, 0] * origin[0] + inverse[0, 1] * origin[1] + inverse[0, 2] * origin[2]
     oy = inverse[1, 0] * origin[0] + inverse[1, 1] * origin[1] + inverse[1, 2] * origin[2]
     oz = inverse[2, 0] * origin[0] + inverse[2, 1] * origin[1] + inverse[2, 2] * origin[2]
@@ -46,7 +46,7 @@ def _hit(kind, inverse, origin, direction):
             if near > enter:
                 enter, axis = near, a
             leave = min(leave, far)
-        if enter > leave or enter < _NEAR:  # from inside a box is not seen
+        if enter > leave or enter < _NEAR:  # surfaces are not visible from inside
             return np.inf, 0
         return enter, axis
     if kind == BALL:
@@ -77,7 +77,7 @@ def _hit(kind, inverse, origin, direction):
 
 @_compiled
 def _first(solids, chosen, count, origin, direction):
-    """Distance, solid (-1: none) and axis of the first of the chosen solids that a ray hits."""
+    """Find distance, solid (-1: none) and axis of the first hit among chosen solids."""
     kinds, inverses, centers, radii = solids
     best, found, face = np.inf, -1, 0
     for k in range(count):
@@ -92,7 +92,7 @@ def _first(solids, chosen, count, origin, direction):
 
 @_compiled
 def _blocked(solids, shadows, origin, direction, reach):
-    """Whether something that throws a shadow lies within ``reach``."""
+    """Return if a shadow caster is within ``reach``."""
     kinds, inverses, centers, radii = solids
     opaque, group_centers, group_radii = shadows
     for g in range(len(group_radii)):
@@ -110,7 +110,7 @@ def _blocked(solids, shadows, origin, direction, reach):
 
 @_compiled
 def _near(center, radius, origin, direction, reach):
-    """Whether a ray meets a ball within ``reach``."""
+    """Return if a ray meets a ball within ``reach``."""
     x, y, z = center[0] - origin[0], center[1] - origin[1], center[2] - origin[2]
     along = x * direction[0] + y * direction[1] + z * direction[2]
     if along + radius < 0 or along - radius > reach:
@@ -120,7 +120,7 @@ def _near(center, radius, origin, direction, reach):
 
 @_compiled
 def _surface(kinds, inverses, sizes, i, axis, point, direction, normal, uv):
-    """Normal that faces the ray, and texture coordinates in metres, of a point on a solid."""
+    """Compute normal and texture coordinates (meters) of a surface point."""
     local = np.empty(3)
     for a in range(3):
         m = inverses[i, a]
@@ -159,7 +159,7 @@ def _surface(kinds, inverses, sizes, i, axis, point, direction, normal, uv):
 
 @_compiled
 def _texture(textures, number, u, v, footprint, colour):
-    """Bilinear colour of a repeating texture, of the level that the footprint (texels) asks for."""
+    """Interpolate a repeating texture at the level of the footprint (in texels)."""
     size = textures.shape[2]
     level = 0
     while footprint > 1.5 and level < textures.shape[0] - 1:
@@ -178,7 +178,7 @@ def _texture(textures, number, u, v, footprint, colour):
 
 @_compiled
 def _sky(direction, sky, colour):
-    """Sky of a direction: from the horizon's colour to the zenith's, and a sun's glow."""
+    """Compute the sky color of a direction: horizon to zenith, and the glow of a sun."""
     up = max(0.0, direction[2]) ** 0.5
     glow = direction[0] * sky[2, 0] + direction[1] * sky[2, 1] + direction[2] * sky[2, 2]
     glow = max(0.0, glow) ** 40 * 0.6
@@ -188,7 +188,7 @@ def _sky(direction, sky, colour):
 
 @_compiled
 def _shade(scene, i, axis, point, direction, distance, pixel, normal, colour):
-    """Light that a surface point sends along the ray back: textured, lit, with shadows."""
+    """Compute the light from a surface point along the ray: texture, lighting, shadows."""
     solids, sizes, looks, textures, shadows, lights, ambient = scene
     kinds, inverses, _, _ = solids
     uv = np.empty(2)
@@ -239,16 +239,15 @@ def _shade(scene, i, axis, point, direction, distance, pixel, normal, colour):
 
 @_compiled
 def draw(scene, shows, sky, origin, rotation, focal, width, height, image, depth, normals, kind):
-    """Draw a view of ``scene``.
+    """Render a view of ``scene``.
 
-    ``scene``: solids (kinds (n,), inverses (n, 3, 4), centers (n, 3), radii (n,)), half sizes
-    (n, 3), looks (n, 9), textures (levels, t, s, s, 3), what throws shadows (indices of
-    solids, and centres and radii of balls round :data:`GROUP` of them each), lights (m, 7),
-    ambient (2, 3) from above and below. ``shows`` (n,): PLAIN, MIRROR or WINDOW.
-    ``rotation``: world_from_camera.
+    ``scene``: solids (kinds (n,), inverses (n, 3, 4), centers (n, 3), radii (n,)), half sizes (n,
+    3), looks (n, 9), textures (levels, t, s, s, 3), shadow casters (indices of solids, and centers
+    and radii of bounding spheres of :data:`GROUP` of them each), lights (m, 7), ambient (2, 3) from
+    above and below. ``shows`` (n,): PLAIN, MIRROR or WINDOW. ``rotation``: world_from_camera.
 
-    Fills ``image`` (h, w, 3) linear light, ``depth`` (h, w) along z, ``normals`` (h, w, 3) in the
-    camera's frame, ``kind`` (h, w) uint8: 0 sky, 1 a surface, 2 a mirror or window.
+    Fills ``image`` (h, w, 3) in linear light, ``depth`` (h, w) along z, ``normals`` (h, w, 3) in
+    the camera frame, ``kind`` (h, w) uint8: 0 sky, 1 surface, 2 mirror or window.
     """
     solids = scene[0]
     centers, radii = solids[2], solids[3]
@@ -262,7 +261,9 @@ def draw(scene, shows, sky, origin, rotation, focal, width, height, image, depth
             bottom, right = min(top + _TILE, height), min(left + _TILE, width)
             cx, cy = (left + right) / 2 - width / 2, (top + bottom) / 2 - height / 2
             length = np.sqrt(cx * cx + cy * cy + focal * focal)
-            spread = 0.75 * _TILE / length  # rad from the tile's axis to its corner, at most
+            spread = (
+                0.75 * _TILE / length
+            )  # maximum angle in rad from the axis of the tile to its corner
             for a in range(3):
                 ray[a] = (
                     rotation[a, 0] * cx + rotation[a, 1] * cy + rotation[a, 2] * focal

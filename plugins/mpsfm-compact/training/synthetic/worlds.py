@@ -1,4 +1,4 @@
-"""Rooms, streets and table tops, and where a photographer stands in them."""
+"""Rooms, streets and table tops, and camera positions in them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from training.synthetic.raycast import BALL, BOX, CYLINDER, MIRROR, WINDOW
 
 @dataclass(frozen=True)
 class Shot:
-    """A camera: where it is, world_from_camera (3, 3), and its focal length over the diagonal."""
+    """Camera: position, world_from_camera (3, 3), and focal length relative to the diagonal."""
 
     origin: NDArray[np.float64]
     rotation: NDArray[np.float64]
@@ -23,11 +23,11 @@ class Shot:
 
 
 World = Callable[[Builder], Callable[[], Shot]]
-"""Fills a builder, and returns what draws shots of it."""
+"""Function that fills a builder and returns a function that draws shots."""
 
 
 def room(b: Builder) -> Callable[[], Shot]:
-    """A furnished room with windows, doors and pictures."""
+    """Build a furnished room with windows, doors and pictures."""
     rng = b.rng
     (length, width), height = _floor_plan(rng)
     _sky(b)
@@ -84,7 +84,7 @@ def room(b: Builder) -> Callable[[], Shot]:
     def shoot() -> Shot:
         at = rng.uniform(-0.46, 0.46, 2) * (length, width)
         to = rng.uniform(-0.5, 0.5, 2) * (length, width)
-        if rng.random() < 0.5:  # who photographs a room steps back to see it
+        if rng.random() < 0.5:  # photos of a room are taken from near a wall
             longer = int(width > length)
             end = rng.choice([-1.0, 1.0]) * (length, width)[longer]
             at[longer], to[longer] = rng.uniform(0.2, 0.46) * end, -rng.uniform(0, 0.5) * end
@@ -99,8 +99,7 @@ def room(b: Builder) -> Callable[[], Shot]:
 
 
 def _floor_plan(rng: np.random.Generator) -> tuple[tuple[float, float], float]:
-    """Length, width and height in metres: closets and baths, ordinary rooms, large ones, halls and
-    corridors."""
+    """Draw length, width and height in meters: closets, ordinary rooms, halls or corridors."""
     kind = rng.choice(5, p=(0.12, 0.46, 0.22, 0.1, 0.1))
     low, high = ((1.8, 3.5), (3.0, 6.5), (4.5, 10.0), (8.0, 18.0), (5.0, 20.0))[kind]
     length, width = rng.uniform(low, high, 2)
@@ -112,7 +111,7 @@ def _floor_plan(rng: np.random.Generator) -> tuple[tuple[float, float], float]:
 
 
 def street(b: Builder) -> Callable[[], Shot]:
-    """House fronts round a street or court, with trees, cars, columns, basins and people."""
+    """Build house fronts around a street or court, with trees, cars, columns and people."""
     rng = b.rng
     _sky(b)
     b.box((0, 0, -1), (400, 400, 1), b.look((0.5, 5)), shadow=False)
@@ -151,7 +150,7 @@ def street(b: Builder) -> Callable[[], Shot]:
 
 
 def table_top(b: Builder) -> Callable[[], Shot]:
-    """Things on a table or floor, seen from near."""
+    """Build objects on a table or floor for close-up views."""
     rng = b.rng
     _sky(b)
     b.box((0, 0, -0.05), (rng.uniform(0.6, 3), rng.uniform(0.6, 3), 0.05), b.look((0.2, 2)))
@@ -188,11 +187,11 @@ def table_top(b: Builder) -> Callable[[], Shot]:
 
 
 WORLDS: tuple[tuple[World, float], ...] = ((room, 0.68), (street, 0.22), (table_top, 0.1))
-"""With the share of scenes that are of the kind."""
+"""Kinds of scenes and their shares."""
 
 
 def _aimed(rng: np.random.Generator, eye: NDArray[np.float64], goal: NDArray[np.float64]) -> Shot:
-    """Towards the goal, held by hand; focal lengths of phones, cameras and depth sensors."""
+    """Create a hand-held shot towards a goal, with the focal length of a common camera."""
     forward = (goal - eye) / np.linalg.norm(goal - eye)
     forward = forward + rng.normal(0, 0.05, 3)
     forward /= np.linalg.norm(forward)
@@ -216,7 +215,7 @@ def _sky(b: Builder) -> None:
 
 
 def _wall(b: Builder, f: Frame, wide: float, height: float) -> None:
-    """What hangs on a wall or is let into it."""
+    """Add an object on a wall, or an opening in it."""
     rng = b.rng
     frame = b.look((1, 5))
     for _ in range(rng.integers(0, 4)):
