@@ -1,8 +1,8 @@
-"""Guarded loading of plugins: whatever one does wrong becomes a reason, never an exception.
+"""Discovery: load the installed plugins so that a broken one becomes a reason, never an exception.
 
-Importing a plugin and asking it for its providers runs foreign code, so both happen in a thread
-of their own with a time limit. A thread cannot be killed: a plugin that hangs stays behind as a
-daemon thread, and the process goes on without it.
+Importing a plugin and calling its hooks runs foreign code. Both happen in a thread with a time
+limit. A thread cannot be killed: a plugin that hangs stays behind as a daemon thread, and the
+process continues without it.
 """
 
 from __future__ import annotations
@@ -42,21 +42,25 @@ _REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 @dataclass(frozen=True)
 class LoadedPlugin:
-    """What an entry point gave: its object and what it returned, or why it gave nothing."""
+    """Result of loading one entry point: its module and providers, or the fault."""
 
     name: str
     distribution: str
     version: str
     module: object = None
+    """Imported object, None if loading failed."""
     specs: tuple[object, ...] = ()
+    """What ``mpsfm_providers`` returned."""
     hooks: tuple[str, ...] = ()
-    """Names of the hooks it implements, without the prefix ``mpsfm_``."""
+    """Names of the implemented hooks, without the prefix ``mpsfm_``."""
     fault: str = ""
+    """Reason why the plugin cannot be used, else empty."""
     hint: str = ""
+    """Remedy for the fault."""
 
 
 def create_plugin_manager() -> pluggy.PluginManager:
-    """A plugin manager that knows our hooks and no plugin."""
+    """Create a pluggy manager with the hooks of MP-SfM and no plugins."""
     manager = pluggy.PluginManager("mpsfm")
     manager.add_hookspecs(Hooks)
     return manager
@@ -65,9 +69,14 @@ def create_plugin_manager() -> pluggy.PluginManager:
 def installed_plugins(
     timeout_s: float, crashing: Collection[tuple[str, str]] = ()
 ) -> Iterator[LoadedPlugin]:
-    """Load every entry point of the group ``mpsfm.plugins``, in the order of their names.
+    """Load every entry point of the group ``mpsfm.plugins``, ordered by distribution and name.
 
-    ``crashing``: (name, module) of those that are not loaded: see :func:`crashing_plugins`.
+    Args:
+        timeout_s: Time limit for each plugin.
+        crashing: (name, module) of entry points to skip, see :func:`crashing_plugins`.
+
+    Yields:
+        One result per entry point; a plugin that fails has a ``fault``.
     """
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
     for entry in sorted(entries, key=lambda e: (_distribution(e)[0], e.name)):
@@ -81,32 +90,45 @@ def installed_plugins(
 
 
 def crashing_plugins(timeout_s: float) -> set[tuple[str, str]]:
-    """(name, module) of the plugins that end the process in which they are loaded.
+    """Find the plugins that crash the process in which they are loaded.
 
-    Another process says of each which it is about to load: the last is the one that ended it.
+    A child process prints each entry point before it loads it. If the process crashes, the last
+    printed one is the cause; the search continues without it.
+
+    Args:
+        timeout_s: Time limit for each plugin.
+
+    Returns:
+        (name, module) of the entry points.
     """
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
-    left = {(entry.name, entry.value) for entry in entries}
+    remaining = {(entry.name, entry.value) for entry in entries}
     crashing: set[tuple[str, str]] = set()
-    while left:
-        command = [sys.executable, "-c", _TRIAL, json.dumps(sorted(left)), str(timeout_s)]
-        ended = subprocess.run(
+    while remaining:
+        command = [
+            sys.executable,
+            "-c",
+            _PROBE_SCRIPT,
+            json.dumps(sorted(remaining)),
+            str(timeout_s),
+        ]
+        process = subprocess.run(
             command,
             env=subprocess_environment(),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             check=False,
         )
-        named = [line for line in ended.stdout.decode().splitlines() if line.startswith("[")]
-        if ended.returncode >= 0 or not named:
+        announced = [line for line in process.stdout.decode().splitlines() if line.startswith("[")]
+        if process.returncode >= 0 or not announced:
             break
-        name, module = json.loads(named[-1])
-        left.discard((name, module))
+        name, module = json.loads(announced[-1])
+        remaining.discard((name, module))
         crashing.add((name, module))
     return crashing
 
 
-_TRIAL = """
+_PROBE_SCRIPT = """
 import json, os, sys
 from mpsfm_core.providers import discovery
 wanted = [tuple(pair) for pair in json.loads(sys.argv[1])]
@@ -119,12 +141,26 @@ os._exit(0)
 
 
 def subprocess_environment() -> dict[str, str]:
-    """An environment in which another interpreter finds the modules that this one finds."""
+    """Return environment variables with which a child finds the modules of this process."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
 def inspect_plugin(module: object, name: str, distribution: str, version: str) -> LoadedPlugin:
-    """Ask an imported plugin for what it has; raises what the plugin raises."""
+    """Collect the providers and hooks of an imported plugin.
+
+    Args:
+        module: Module or object with hook implementations.
+        name: Name of the entry point.
+        distribution: Name of the distribution.
+        version: Version of the distribution.
+
+    Returns:
+        The plugin, with a ``fault`` if it implements an unknown hook.
+
+    Raises:
+        TypeError: The object implements no hook, or ``mpsfm_providers`` does not return a list.
+        Exception: Whatever the plugin raises.
+    """
     manager = create_plugin_manager()
     manager.register(module, name)
     callers = manager.get_hookcallers(module) or []
@@ -145,7 +181,7 @@ def inspect_plugin(module: object, name: str, distribution: str, version: str) -
 
 
 def find_spec_fault(spec: ProviderSpec) -> tuple[str, str]:
-    """Why a provider cannot be used, and what to do about it; two empty texts when it can."""
+    """Return why a specification cannot be used and the remedy, or two empty texts."""
     if not isinstance(spec.api_version, int) or spec.api_version > API_VERSION:
         return (
             f"is made for plugin API {spec.api_version}, this core has {API_VERSION}",
@@ -153,7 +189,7 @@ def find_spec_fault(spec: ProviderSpec) -> tuple[str, str]:
         )
     try:
         fault = _malformed(spec)
-    except Exception as error:  # fields of types that nobody thought of
+    except Exception as error:  # fields of unexpected types
         fault = str(error)
     if fault:
         return f"has a wrong specification: {fault}", "tell the plugin's author"
@@ -165,7 +201,10 @@ def find_spec_fault(spec: ProviderSpec) -> tuple[str, str]:
 
 
 def _distribution(entry: metadata.EntryPoint) -> tuple[str, str]:
-    """Name and version; an entry point with damaged metadata still gets a row in the list."""
+    """Return name and version of the distribution of an entry point.
+
+    Damaged metadata must not hide the plugin from lists.
+    """
     try:
         if entry.dist is not None:
             return str(entry.dist.name), str(entry.dist.version)
@@ -177,16 +216,17 @@ def _distribution(entry: metadata.EntryPoint) -> tuple[str, str]:
 def _load(
     entry: metadata.EntryPoint, distribution: str, version: str, timeout_s: float
 ) -> LoadedPlugin:
+    """Load an entry point in a thread with a time limit."""
     outcome: list[LoadedPlugin | BaseException] = []
 
     def work() -> None:
         try:
             outcome.append(inspect_plugin(entry.load(), entry.name, distribution, version))
-        except BaseException as error:  # SystemExit in a plugin must not end the program either
+        except BaseException as error:  # SystemExit of a plugin must not end the program
             outcome.append(error)
 
     thread = threading.Thread(target=work, name=f"mpsfm plugin {entry.name}", daemon=True)
-    with redirect_stdout(sys.stderr):  # what a plugin prints must not get into a command's output
+    with redirect_stdout(sys.stderr):  # keep the standard output of commands clean
         thread.start()
         thread.join(timeout_s)
     if not outcome:
@@ -203,22 +243,24 @@ def _load(
 
 
 def _hint(error: BaseException, distribution: str) -> str:
-    """What to do about a plugin whose loading ended with an error."""
+    """Return the remedy for a plugin whose loading raised an error."""
     absent = (error.name or "") if isinstance(error, ImportError) else ""
     if absent.partition(".")[0] == "mpsfm_core" or "ProviderSpec.__init__()" in str(error):
-        return f"pip install --upgrade mpsfm-core, or uninstall {distribution}"  # a newer API's
+        return (
+            f"pip install --upgrade mpsfm-core, or uninstall {distribution}"  # made for a newer API
+        )
     if absent and isinstance(error, ModuleNotFoundError):
         return f"pip install the package of module {absent!r}, or uninstall {distribution}"
     return f"reinstall or uninstall {distribution}"
 
 
 def _malformed(spec: ProviderSpec) -> str:
-    """The first rule the specification breaks, or an empty text."""
+    """Return the first rule that a specification violates, or an empty text."""
     if spec.kind not in KINDS:
         return f"unknown kind {spec.kind!r}{did_you_mean(str(spec.kind), KINDS)}"
     name = spec.name
     if isinstance(name, str) and callable(spec.factory):
-        name = name.partition("@")[0]  # what follows is the environment that it lives in
+        name = name.partition("@")[0]  # the rest is the name of an environment
     if not (isinstance(name, str) and _NAME.fullmatch(name)):
         return f"name {spec.name!r} is not made of lower-case letters, digits and - . _"
     if not (callable(spec.factory) or _is_reference(spec.factory)):
@@ -246,7 +288,7 @@ def _is_reference(value: Any) -> bool:
 
 
 def _installed(name: str) -> bool:
-    """Whether a package can be found; only its top level is looked up, as that imports nothing."""
+    """Return whether a package exists. Looks up the top level only, which imports nothing."""
     try:
         return importlib.util.find_spec(name.partition(".")[0]) is not None
     except (ImportError, ValueError):

@@ -1,4 +1,4 @@
-"""Where the providers of this project's own plugins come from: install hints, no more."""
+"""Install hints for the plugins of this project: which distribution has which provider."""
 
 from __future__ import annotations
 
@@ -57,27 +57,29 @@ PLUGIN_PROVIDERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "mpsfm-sky": ("mask/sky", "mask/sky-simple"),
     }
 )
-"""Requirement for pip -> the providers that it brings, as ``kind/name``."""
+"""Providers as ``kind/name`` by pip requirement."""
 
 EXECUTORS: Mapping[str, str] = MappingProxyType({"dask": "mpsfm-dask", "ray": "mpsfm-ray"})
-"""Executor -> what to install for it."""
+"""Distribution by name of the executor."""
 
 VIEWERS: Mapping[str, str] = MappingProxyType({"viser": "mpsfm-viser", "rerun": "mpsfm-rerun"})
-"""Viewer -> what to install for it."""
+"""Distribution by name of the viewer."""
 
 EXPORTS: Mapping[str, str] = MappingProxyType({"rerun": "mpsfm-rerun"})
-"""Format of an export -> what to install for it."""
+"""Distribution by name of the export format."""
 
 
-def install_hint(homes: Mapping[str, str], name: str) -> str:
-    """How to get what is named, as the end of a sentence; empty if it is none of ours.
+def install_hint(distributions: Mapping[str, str], name: str) -> str:
+    """Return the end of a message that tells how to install something, or empty.
 
-    ``homes``: :data:`VIEWERS`, :data:`EXPORTS`.
+    Args:
+        distributions: Distribution by name: :data:`EXECUTORS`, :data:`VIEWERS` or :data:`EXPORTS`.
+        name: Name to look up.
     """
-    return f"; pip install {homes[name]}" if name in homes else ""
+    return f"; pip install {distributions[name]}" if name in distributions else ""
 
 
 def requirement_for(kind: str, name: str) -> str:
-    """What to install for a provider, empty if it is none of ours."""
+    """Return the pip requirement that provides a provider, or an empty text."""
     provider = f"{kind}/{name}"
-    return next((home for home, brought in PLUGIN_PROVIDERS.items() if provider in brought), "")
+    return next((r for r, provided in PLUGIN_PROVIDERS.items() if provider in provided), "")

@@ -1,8 +1,7 @@
-"""Which providers there are, and how one is made from its name and options.
+"""Registry of providers: discovery, availability, options, weights, calibration and construction.
 
-A :class:`Registry` is an ordinary object: the pipeline makes one with :meth:`Registry.discover`
-and hands it on. Finding and listing providers imports no plugin's heavy modules; those come with
-:meth:`Registry.create`.
+A :class:`Registry` is an ordinary object. The pipeline creates one with :meth:`Registry.discover`
+and passes it on.
 """
 
 from __future__ import annotations
@@ -46,58 +45,62 @@ from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, Norma
 _log = logging.getLogger(__name__)
 
 CORE = "mpsfm-core"
-"""Distribution of the built-in providers; no other can take a name away from it."""
+"""Distribution of the built-in providers. Other plugins cannot replace their names."""
 
 TIMEOUT_VARIABLE = "MPSFM_PLUGIN_TIMEOUT_S"
-"""Environment variable: how long one plugin may take to load, in seconds."""
+"""Environment variable with the time limit for loading one plugin, in seconds."""
 
 DEFAULT_TIMEOUT_S = 10.0
-"""A light plugin module loads in milliseconds; a cold network disk may take seconds."""
+"""Time limit for loading one plugin: milliseconds are normal, a network disk takes seconds."""
 
 Calibration = DepthCalibration | NormalCalibration
 
 
 @dataclass(frozen=True)
 class ProviderStatus:
-    """One line of ``mpsfm plugins list``.
-
-    ``kind`` is ``"plugin"`` for a plugin that could not be loaded (``name`` is then its entry
-    point) and for one that brings hooks but no providers (``capabilities`` are then its hooks).
-    ``reason`` says why it is not ``available``, ``install_hint`` what to do about it.
-    """
+    """Status of one provider or plugin: one line of ``mpsfm plugins list``."""
 
     kind: Kind | Literal["plugin"]
+    """``"plugin"`` for a plugin that failed to load or that has hooks and no providers."""
     name: str
+    """Name of the provider, or entry point of the plugin."""
     distribution: str
     version: str
     code_license: str = ""
     weights_license: str = ""
     capabilities: tuple[str, ...] = ()
+    """Capabilities of the provider, or hooks of the plugin."""
     summary: str = ""
     available: bool = True
     reason: str = ""
+    """Reason if it is not available."""
     install_hint: str = ""
+    """Remedy if it is not available."""
 
 
 @dataclass(frozen=True)
 class _Entry:
+    """Registered provider and its origin."""
+
     spec: ProviderSpec
     distribution: str
     version: str
     fault: str = ""
+    """Reason why the provider is unavailable, else empty."""
     hint: str = ""
+    """Remedy for the fault."""
 
     @property
     def label(self) -> str:
-        """How messages name the provider."""
+        """Name of the provider for messages: kind, name, distribution and version."""
         return f"{self.spec.kind} provider {self.spec.name!r} ({self.distribution} {self.version})"
 
 
 class Registry:
     """Providers by kind and name, and the hooks of all plugins.
 
-    A new registry is empty; :meth:`discover` returns one with the built-in providers and all
-    installed plugins.
+    A new registry is empty. :meth:`discover` returns one with the built-in providers and all
+    installed plugins. Listing providers imports no heavy module; :meth:`create` does.
     """
 
     def __init__(self) -> None:
@@ -110,12 +113,21 @@ class Registry:
     def discover(
         cls, timeout_s: float | None = None, environments: bool = True, *, probe: bool = False
     ) -> Registry:
-        """Load the built-in providers and every installed plugin, and look up what
-        ``environments`` bring (:mod:`mpsfm_core.providers.environments`), as ``NAME@ENVIRONMENT``.
+        """Load the built-in providers, every installed plugin and the environments.
 
-        A plugin that fails is listed with the reason and hurts nobody else. ``timeout_s``: time
-        limit for each plugin, by default ``$MPSFM_PLUGIN_TIMEOUT_S`` or 10 s. ``probe``: load
-        them in another process first, so that one which crashes is listed as well.
+        A plugin that fails to load is listed with the reason and affects no other plugin.
+
+        Args:
+            timeout_s: Time limit for loading one plugin; by default ``$MPSFM_PLUGIN_TIMEOUT_S`` or
+                10 s.
+            environments: True also registers the providers of other Python environments as
+                ``NAME@ENVIRONMENT``, see :mod:`mpsfm_core.providers.environments`.
+            probe: True loads the plugins in another process first. A plugin that crashes the
+                process
+                is then listed too.
+
+        Returns:
+            The registry.
         """
         registry = cls()
         registry.register(builtin, name="builtin", distribution=CORE, version=core_version())
@@ -134,10 +146,17 @@ class Registry:
         distribution: str = "this process",
         version: str = "0",
     ) -> None:
-        """Add a plugin (a module or object with ``@hookimpl`` functions) of this process.
+        """Add a plugin of this process.
 
-        Raises :class:`~mpsfm_core.data.errors.ProviderError` where discovery would list it as
-        broken."""
+        Args:
+            plugin: Module or object with ``@hookimpl`` functions.
+            name: Name of the plugin, by default the name of the module or class.
+            distribution: Distribution to show in lists.
+            version: Version to show in lists.
+
+        Raises:
+            ProviderError: The plugin fails to load or is already registered.
+        """
         name = name or str(getattr(plugin, "__name__", type(plugin).__name__))
         try:
             loaded = inspect_plugin(plugin, name, distribution, version)
@@ -150,12 +169,18 @@ class Registry:
     def add(
         self, *specs: ProviderSpec, distribution: str = "this process", version: str = "0"
     ) -> None:
-        """Add single providers of this process; their factory may be a callable."""
+        """Add single providers of this process; their factory may be a callable.
+
+        Args:
+            specs: Specifications.
+            distribution: Distribution to show in lists.
+            version: Version to show in lists.
+        """
         for spec in specs:
             self._entries.append(_Entry(spec, distribution, version, *find_spec_fault(spec)))
 
     def status(self) -> tuple[ProviderStatus, ...]:
-        """All providers by kind and name, then plugins that are broken or have hooks only."""
+        """List all providers by kind and name, then plugins that are broken or only have hooks."""
         providers = [_status(entry, *self._fault(entry)) for entry in self._entries]
         order = (*KINDS, "plugin")
         return tuple(
@@ -170,19 +195,22 @@ class Registry:
         )
 
     def names(self, kind: Kind) -> list[str]:
-        """Names of the available providers of a kind, sorted."""
+        """Return the sorted names of the available providers of a kind."""
         entries = [e for e in self._entries if e.spec.kind == kind]
         return sorted(e.spec.name for e in entries if not self._fault(e)[0])
 
     def spec(self, kind: Kind, name: str) -> ProviderSpec:
-        """The specification of an available provider.
+        """Return the specification of an available provider.
 
-        Raises :class:`~mpsfm_core.data.errors.ProviderError` with the nearest name and what to
-        install when there is none, or with the reason when it is there and unavailable."""
+        Raises:
+            ProviderError: There is no such provider, or it is unavailable. The message has the
+                reason,
+                the most similar name, or the package to install.
+        """
         return self._entry(kind, name).spec
 
     def version(self, kind: Kind, name: str) -> str:
-        """Distribution and version that a provider comes from, e.g. ``mpsfm-onnx 0.1.0``."""
+        """Return distribution and version of a provider, such as ``mpsfm-onnx 0.1.0``."""
         entry = self._entry(kind, name)
         return f"{entry.distribution} {entry.version}"
 
@@ -193,25 +221,45 @@ class Registry:
         values: Mapping[str, Any] | None = None,
         path: SettingPath = ("options",),
     ) -> Options | None:
-        """The provider's options with defaults filled in, None when it has none.
+        """Validate the options of a provider and fill in defaults.
 
-        Raises :class:`~mpsfm_core.data.options.SettingsError` with the path (below ``path``) and
-        the nearest key for each wrong setting."""
+        Args:
+            kind: Kind of the provider.
+            name: Name of the provider.
+            values: Values from the configuration.
+            path: Path of ``values`` in the configuration, for messages.
+
+        Returns:
+            The options, or None if the provider has none.
+
+        Raises:
+            SettingsError: A value is wrong; the message has the path and the most similar key.
+        """
         model = self._options_model(kind, name)
         return parse_settings(model or _NoOptions, values or {}, path) if model or values else None
 
     def default_options(self, kind: Kind, name: str) -> dict[str, Any]:
-        """The provider's options as plain values, None for those that the user has to give."""
+        """Return the default options as plain values; None for options that the user must set."""
         model = self._options_model(kind, name) or _NoOptions
         return dict.fromkeys(model.model_fields) | model.model_construct().model_dump(mode="json")
 
     def weights(
         self, kind: Kind, name: str, values: Mapping[str, Any] | None = None
     ) -> tuple[WeightsFile, ...]:
-        """The weights files that a provider loads with these options.
+        """List the weights files that a provider loads with the given options.
 
-        Raises :class:`~mpsfm_core.data.options.SettingsError` when the options are wrong or lack
-        one that the user has to give."""
+        Args:
+            kind: Kind of the provider.
+            name: Name of the provider.
+            values: Values from the configuration.
+
+        Returns:
+            The files.
+
+        Raises:
+            SettingsError: An option is wrong or missing.
+            ProviderError: The plugin's function fails.
+        """
         entry = self._entry(kind, name)
         files = entry.spec.weights
         if not callable(files):
@@ -225,21 +273,28 @@ class Registry:
             what = f"cannot say which weights it loads: {type(error).__name__}: {error}"
             raise ProviderError(_sentence(entry.label, what, "tell its author")) from error
 
-    def calibration(self, kind: Kind, backend: ProviderConfig) -> Calibration:
-        """The uncertainty model of a depth, multi-view or normals backend.
+    def calibration(self, kind: Kind, config: ProviderConfig) -> Calibration:
+        """Return the uncertainty model of a depth, multi-view or normals provider.
 
-        What the configuration says (``backend.calibration``, values only: a file was read when the
-        configuration was loaded) goes first. Else the outermost wrapper and then the provider are
-        asked: its plugin's ``mpsfm_calibration`` hook, then its specification. Else the class's
-        defaults.
+        Sources in order: the configuration; then for each wrapper, outermost first, and for the
+        provider the plugin's ``mpsfm_calibration`` hook and the specification; then the defaults of
+        the class.
+
+        Args:
+            kind: Kind of the provider.
+            config: Configuration of the provider. ``config.calibration`` has values only, because a
+                calibration file was read when the configuration was loaded.
+
+        Returns:
+            The calibration.
         """
         model: type[Calibration] = NormalCalibration if kind == "normals" else DepthCalibration
-        if isinstance(backend.calibration, Mapping):
-            return parse_settings(model, backend.calibration, ("calibration",))
+        if isinstance(config.calibration, Mapping):
+            return parse_settings(model, config.calibration, ("calibration",))
         wrappers: list[tuple[Kind, ProviderConfig]] = [
-            ("wrapper", w) for w in reversed(backend.wrap)
+            ("wrapper", w) for w in reversed(config.wrap)
         ]
-        for chosen, block in (*wrappers, (kind, backend)):
+        for chosen, block in (*wrappers, (kind, config)):
             options = self.validate_options(chosen, block.use, block.options)
             answers = self.call_hook(
                 "mpsfm_calibration", kind=chosen, provider=block.use, options=options
@@ -257,11 +312,22 @@ class Registry:
         context: ProviderContext,
         wrap: Sequence[ProviderConfig] = (),
     ) -> Any:
-        """Import and construct a provider, inside of its wrappers (the innermost first).
+        """Import and construct a provider inside its wrappers.
 
-        The result has the method of ``PROTOCOLS[kind]``. Raises
-        :class:`~mpsfm_core.data.errors.ProviderError` naming provider, plugin and what to do when
-        it cannot be imported or constructed; errors that are already ours pass unchanged."""
+        Args:
+            kind: Kind of the provider.
+            name: Name of the provider.
+            options: Validated options or values from the configuration.
+            context: Resources of the run.
+            wrap: Wrappers, innermost first.
+
+        Returns:
+            Object with the methods of ``PROTOCOLS[kind]``.
+
+        Raises:
+            ProviderError: The provider cannot be imported or constructed, or lacks a method.
+            MpsfmError: An error that the provider raises itself, unchanged.
+        """
         entry = self._entry(kind, name)
         provider = self._construct(entry, (), options, context)
         extra = [m for c, m in CAPABILITY_METHODS.items() if c in entry.spec.capabilities]
@@ -276,14 +342,21 @@ class Registry:
 
     @property
     def hook(self) -> pluggy.HookRelay:
-        """The hooks of all plugins, unguarded; :meth:`call_hook` is the guarded call."""
+        """Hooks of all plugins without protection from exceptions; see :meth:`call_hook`."""
         return self._manager.hook
 
     def call_hook(self, name: str, /, **arguments: Any) -> list[Any]:
-        """Call a hook of every plugin and return what they answer, None left out.
+        """Call a hook of every plugin and return the answers that are not None.
 
-        A plugin that raises is skipped with a logged warning and not called for this hook again:
-        an installed viewer, logger or filter that is broken must not end somebody's run.
+        A plugin that raises is skipped with a warning, and not called for this hook again. A broken
+        viewer or logger must not end a run.
+
+        Args:
+            name: Name of the hook.
+            arguments: Arguments of the hook.
+
+        Returns:
+            Answers in the order of registration.
         """
         answers = []
         for implementation in reversed(getattr(self.hook, name).get_hookimpls()):
@@ -329,41 +402,41 @@ class Registry:
             self._plugins.append(replace(status, summary="hooks only"))
 
     def _entry(self, kind: Kind, name: str) -> _Entry:
-        found = [e for e in self._entries if (e.spec.kind, e.spec.name) == (kind, name)]
-        for entry in found:
+        matching = [e for e in self._entries if (e.spec.kind, e.spec.name) == (kind, name)]
+        for entry in matching:
             if not self._fault(entry)[0]:
                 return entry
-        if found:
-            raise ProviderError(_sentence(found[0].label, *self._fault(found[0])))
+        if matching:
+            raise ProviderError(_sentence(matching[0].label, *self._fault(matching[0])))
         raise ProviderError(self._unknown(kind, name))
 
     def _fault(self, entry: _Entry) -> tuple[str, str]:
-        """Why a provider cannot be used (its own fault or a shared name), and what to do."""
+        """Return why a provider is unavailable (its own fault or a shared name), and a remedy."""
         if entry.fault:
             return entry.fault, entry.hint
-        same = [e for e in self._entries if _key(e) == _key(entry) and not e.fault]
-        homes = list(dict.fromkeys(e.distribution for e in same))
-        if len(homes) > 1 and CORE not in homes:
-            return f"is brought by {' and '.join(homes)}", "uninstall all but one of them"
-        if entry is not same[0]:
-            owner = f"{same[0].distribution} {same[0].version}"
+        same_name = [e for e in self._entries if _key(e) == _key(entry) and not e.fault]
+        distributions = list(dict.fromkeys(e.distribution for e in same_name))
+        if len(distributions) > 1 and CORE not in distributions:
+            return f"is brought by {' and '.join(distributions)}", "uninstall all but one of them"
+        if entry is not same_name[0]:
+            owner = f"{same_name[0].distribution} {same_name[0].version}"
             return f"has a name that belongs to {owner}", f"tell the author of {entry.distribution}"
         return "", ""
 
     def _unknown(self, kind: Kind, name: str) -> str:
-        if home := requirement_for(kind, name):
-            return f"{kind} provider {name!r} comes with a plugin: pip install '{home}'"
+        if requirement := requirement_for(kind, name):
+            return f"{kind} provider {name!r} comes with a plugin: pip install '{requirement}'"
         known = self.names(kind)
         base, _, environment = name.partition("@")
-        if environment and not any(other.endswith(f"@{environment}") for other in known):
+        if environment and not any(n.endswith(f"@{environment}") for n in known):
             return (
                 f"no {kind} provider {base!r} in an environment {environment!r}: "
                 f"'mpsfm env list' shows what there is, 'mpsfm env create' makes one"
             )
         text = f"no {kind} provider {name!r}{did_you_mean(name, known)}"
-        others = [e.spec.kind for e in self._entries if e.spec.name == name]
-        if others:
-            text += f" ({name!r} is of kind {others[0]})"
+        other_kinds = [e.spec.kind for e in self._entries if e.spec.name == name]
+        if other_kinds:
+            text += f" ({name!r} is of kind {other_kinds[0]})"
         broken = [p for p in self._plugins if not p.available]
         if broken:
             text += "; plugins that did not load: "
@@ -397,7 +470,7 @@ class Registry:
 
 
 class _NoOptions(Options):
-    """For a provider that has no options: refuses every key."""
+    """Options of a provider without options: rejects every key."""
 
 
 def _label(plugin: LoadedPlugin) -> str:
@@ -430,7 +503,7 @@ def _sentence(subject: str, what: str, hint: str) -> str:
 
 
 def _load_reference(entry: _Entry, reference: str) -> Any:
-    """The object that ``"package.module:Name"`` names."""
+    """Import the object that ``"package.module:Name"`` names."""
     module, _, path = reference.partition(":")
     try:
         target: Any = importlib.import_module(module)
@@ -464,7 +537,7 @@ def _default_timeout() -> float:
 
 
 def core_version() -> str:
-    """Version of the installed core, ``"source"`` in a tree that was never installed."""
+    """Return the version of the installed core, ``"source"`` if it was never installed."""
     try:
         return metadata.version(CORE)
     except metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""What plugins with networks in torch share. Imports torch: for their heavy modules only."""
+"""Helpers for plugins with torch networks. Imports torch: only for their heavy modules."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from mpsfm_core.providers import ProviderContext
 
 
 def use_threads(context: ProviderContext) -> None:
-    """Give torch the context's threads. This setting is torch's, for the whole process."""
+    """Set the number of threads of torch, which applies to the whole process."""
     torch.set_num_threads(context.threads)
 
 
 @contextmanager
 def inference() -> Iterator[None]:
-    """No gradients, and the same result for the same input."""
+    """Disable gradients and nondeterministic kernels of torch."""
     with (
         torch.inference_mode(),
         torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True),

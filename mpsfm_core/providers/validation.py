@@ -1,10 +1,10 @@
-"""The one gate between providers and the rest: what passes here obeys the contract.
+"""Validation of providers: everything that a provider returns passes through this module.
 
-``run_*`` calls a provider on a view or pair and validates the answer; whatever goes wrong becomes
-one :class:`~mpsfm_core.data.errors.MpsfmError` that names provider and image. ``validate_*`` checks
-an answer alone. The data types check themselves when they are made; here they are checked again
-(their arrays may have been written to since), against the view, and against what the provider's
-specification promises. """
+``run_*`` calls a provider and validates the answer. Any failure becomes one
+:class:`~mpsfm_core.data.errors.MpsfmError` that names provider and image. ``validate_*`` validates
+an answer alone. The data types validate themselves on construction. Here they are validated again,
+because arrays are mutable, and against the view and the capabilities of the specification.
+"""
 
 from __future__ import annotations
 
@@ -47,15 +47,16 @@ from mpsfm_core.providers import (
 )
 
 MAX_MEDIAN_NORMAL_VARIANCE = np.pi**2
-"""rad^2; no angle deviates by more than pi, so a larger median is in degrees or no variance."""
+"""Largest plausible median in rad^2. No angle exceeds pi: larger values are degrees or no
+variance."""
 
 FACING_TOLERANCE = 1e-3
-"""Cosine of the angle between ray and normal up to which a normal may look away: rounding, as in
+"""Largest ``n . ray`` of a normal that faces the camera; positive because of rounding, see
 :data:`~mpsfm_core.data.UNIT_NORMAL_TOLERANCE`."""
 
 
 def run_depth(spec: ProviderSpec, provider: DepthProvider, view: View) -> DepthPrior:
-    """Predict the depth of a view."""
+    """Predict the depth of a view and validate the answer, see :meth:`DepthProvider.predict`."""
     with provider_errors(spec, view.name):
         return validate_depth(spec, view, provider.predict(view))
 
@@ -63,7 +64,7 @@ def run_depth(spec: ProviderSpec, provider: DepthProvider, view: View) -> DepthP
 def run_joint(
     spec: ProviderSpec, provider: JointProvider, view: View
 ) -> tuple[DepthPrior, NormalPrior]:
-    """Predict depth and normals of a view in one pass."""
+    """Predict depth and normals of a view in one pass and validate both."""
     with provider_errors(spec, view.name):
         answer = provider.predict_joint(view)
         if not (isinstance(answer, tuple) and len(answer) == 2):
@@ -72,7 +73,7 @@ def run_joint(
 
 
 def run_focal(spec: ProviderSpec, provider: FocalEstimator, view: View) -> float | None:
-    """Estimate the focal length of a view in its pixels; None where the provider cannot tell."""
+    """Estimate the focal length of a view in pixels; None if the provider has no estimate."""
     with provider_errors(spec, view.name):
         focal = provider.estimate_focal(view)
         if focal is None:
@@ -85,7 +86,10 @@ def run_focal(spec: ProviderSpec, provider: FocalEstimator, view: View) -> float
 def run_normals(
     spec: ProviderSpec, provider: NormalsProvider, view: View, depth: DepthPrior | None = None
 ) -> NormalPrior:
-    """Predict the normals of a view; ``depth`` is handed on when the spec says ``needs-depth``."""
+    """Predict the normals of a view and validate the answer.
+
+    ``depth`` reaches the provider only if the specification declares ``needs-depth``.
+    """
     given = depth if "needs-depth" in spec.capabilities else None
     with provider_errors(spec, view.name):
         return validate_normals(spec, view, provider.predict(view, given))
@@ -94,13 +98,13 @@ def run_normals(
 def run_multiview(
     spec: ProviderSpec, provider: MultiViewProvider, views: Sequence[View]
 ) -> MultiViewPrior:
-    """Predict the depth of a group of views."""
+    """Predict the depth of a group of views and validate the answer."""
     with provider_errors(spec, _group_name(views)):
         return validate_multiview(spec, views, provider.predict_group(tuple(views)))
 
 
 def run_features(spec: ProviderSpec, provider: FeatureProvider, view: View) -> Features:
-    """Detect and describe the features of a view."""
+    """Extract the features of a view and validate the answer."""
     with provider_errors(spec, view.name):
         return validate_features(spec, view, provider.extract(view))
 
@@ -111,41 +115,66 @@ def run_matcher(
     views: tuple[View, View],
     features: tuple[Features, Features] | None = None,
 ) -> PairMatches:
-    """Match two views; ``features`` are handed on when the spec says ``sparse``."""
+    """Match two views and validate the answer.
+
+    ``features`` reach the provider only if the specification declares ``sparse``.
+    """
     given = features if features and "sparse" in spec.capabilities else (None, None)
     with provider_errors(spec, _pair_name(views)):
         return validate_matches(spec, views, features, provider.match(*views, *given))
 
 
 def run_retrieval(spec: ProviderSpec, provider: RetrievalProvider, view: View) -> Float32:
-    """Describe a view by one vector."""
+    """Compute the global descriptor of a view and validate it."""
     with provider_errors(spec, view.name):
         return validate_retrieval(spec, view, provider.describe(view))
 
 
 def run_mask(spec: ProviderSpec, provider: MaskProvider, view: View) -> Bool:
-    """Which pixels of a view may be used."""
+    """Segment the usable pixels of a view and validate the mask."""
     with provider_errors(spec, view.name):
         return validate_mask(spec, view, provider.mask(view))
 
 
 def validate_depth(spec: ProviderSpec, view: View, output: object) -> DepthPrior:
-    """Rules: type and values of :class:`DepthPrior`; not empty; metric and with a variance where
-    the spec promises that."""
-    with _rules(spec, view.name):
+    """Validate a depth prior: type, values, not empty, and the declared capabilities.
+
+    Args:
+        spec: Specification of the provider.
+        view: View that the answer belongs to.
+        output: Answer of the provider.
+
+    Returns:
+        The prior.
+
+    Raises:
+        ProviderOutputError: A rule is violated; it names provider, image, field and rule.
+    """
+    with _name_violations(spec, view.name):
         return _check_depth(spec, output, "depth")
 
 
 def validate_normals(spec: ProviderSpec, view: View, output: object) -> NormalPrior:
-    """Rules: type and values of :class:`NormalPrior`; not empty; facing the camera; with a
-    variance where the spec of a normals provider promises that, and that in rad^2."""
-    with _rules(spec, view.name):
-        prior = _checked(output, NormalPrior, "normals")
-        _not_empty(prior.shape, "normals")
-        _facing(prior, view.camera)
+    """Validate a normal prior: also facing the camera, with a variance in rad^2.
+
+    Args:
+        spec: Specification of the provider.
+        view: View that the answer belongs to.
+        output: Answer of the provider.
+
+    Returns:
+        The prior.
+
+    Raises:
+        ProviderOutputError: A rule is violated; it names provider, image, field and rule.
+    """
+    with _name_violations(spec, view.name):
+        prior = _revalidate(output, NormalPrior, "normals")
+        _require_not_empty(prior.shape, "normals")
+        _require_facing(prior, view.camera)
         if prior.variance is None:
             if spec.kind == "normals":
-                _promised(spec, "variance", "variance")
+                _require_undeclared(spec, "variance", "variance")
         elif prior.valid.any():
             median = float(np.median(prior.variance[prior.valid]))
             if median > MAX_MEDIAN_NORMAL_VARIANCE:
@@ -154,27 +183,50 @@ def validate_normals(spec: ProviderSpec, view: View, output: object) -> NormalPr
 
 
 def validate_multiview(spec: ProviderSpec, views: Sequence[View], output: object) -> MultiViewPrior:
-    """Rules: type and values of :class:`MultiViewPrior`; one prior a view, each as for depth; poses and
-    intrinsics where the spec promises them."""
-    with _rules(spec, _group_name(views)):
-        group = _checked(output, MultiViewPrior, "output")
+    """Validate the priors of a group: one per view, with the declared proposals.
+
+    Args:
+        spec: Specification of the provider.
+        views: Views that the answer belongs to.
+        output: Answer of the provider.
+
+    Returns:
+        The group prior.
+
+    Raises:
+        ProviderOutputError: A rule is violated; it names provider, images, field and rule.
+    """
+    with _name_violations(spec, _group_name(views)):
+        group = _revalidate(output, MultiViewPrior, "output")
         if not isinstance(group.depth, tuple) or len(group.depth) != len(views):
             found = len(group.depth) if isinstance(group.depth, tuple) else _type(group.depth)
             raise DataError("depth", f"must be a tuple of {len(views)} priors, got {found}")
         for prior in group.depth:
             _check_depth(spec, prior, "depth")
         if group.poses is None:
-            _promised(spec, "proposes-poses", "poses")
+            _require_undeclared(spec, "proposes-poses", "poses")
         if group.intrinsics is None:
-            _promised(spec, "proposes-intrinsics", "intrinsics")
+            _require_undeclared(spec, "proposes-intrinsics", "intrinsics")
         return group
 
 
 def validate_features(spec: ProviderSpec, view: View, output: object) -> Features:
-    """Rules: type and values of :class:`Features`; keypoints inside of the view."""
-    with _rules(spec, view.name):
-        features = _checked(output, Features, "features")
-        _inside(features.keypoints, view.camera, "keypoints")
+    """Validate features: type, values, and keypoints inside the view.
+
+    Args:
+        spec: Specification of the provider.
+        view: View that the answer belongs to.
+        output: Answer of the provider.
+
+    Returns:
+        The features.
+
+    Raises:
+        ProviderOutputError: A rule is violated; it names provider, image, field and rule.
+    """
+    with _name_violations(spec, view.name):
+        features = _revalidate(output, Features, "features")
+        _require_inside(features.keypoints, view.camera, "keypoints")
         return features
 
 
@@ -184,42 +236,78 @@ def validate_matches(
     features: tuple[Features, Features] | None,
     output: object,
 ) -> PairMatches:
-    """Rules: type and values of :class:`PairMatches`; sparse indices within the features, dense
-    points inside of the views; everything that the spec promises is there."""
-    with _rules(spec, _pair_name(views)):
-        matches = _checked(output, PairMatches, "matches")
+    """Validate matches: indices within the features, points inside the views.
+
+    Args:
+        spec: Specification of the provider.
+        views: Views that the answer belongs to.
+        features: Features of both views, None without features.
+        output: Answer of the provider.
+
+    Returns:
+        The matches.
+
+    Raises:
+        ProviderOutputError: A rule is violated or a declared capability is missing.
+    """
+    with _name_violations(spec, _pair_name(views)):
+        matches = _revalidate(output, PairMatches, "matches")
         for capability in ("sparse", "dense"):
             if getattr(matches, capability) is None:
-                _promised(spec, capability, capability)
+                _require_undeclared(spec, capability, capability)
         if matches.sparse is not None:
             _check_sparse(matches.sparse, features)
         if matches.dense is not None:
-            _checked(matches.dense, DenseMatches, "dense")
-            _inside(matches.dense.points_a, views[0].camera, "points_a")
-            _inside(matches.dense.points_b, views[1].camera, "points_b")
+            _revalidate(matches.dense, DenseMatches, "dense")
+            _require_inside(matches.dense.points_a, views[0].camera, "points_a")
+            _require_inside(matches.dense.points_b, views[1].camera, "points_b")
         if matches.depth is None:
-            _promised(spec, "pair-depth", "depth")
+            _require_undeclared(spec, "pair-depth", "depth")
         else:
-            depth = _checked(matches.depth, PairDepth, "depth")
+            depth = _revalidate(matches.depth, PairDepth, "depth")
             _check_depth(spec, depth.depth_a, "depth_a")
             _check_depth(spec, depth.depth_b, "depth_b")
         return matches
 
 
 def validate_retrieval(spec: ProviderSpec, view: View, output: object) -> Float32:
-    """Rules: (d,) float32 with d > 0, finite."""
-    with _rules(spec, view.name):
-        vector = _array(output, "descriptor", np.dtype(np.float32), 1)
-        _not_empty(vector.shape, "descriptor")
+    """Validate a global descriptor: (d,) float32, finite, d > 0.
+
+    Args:
+        spec: Specification of the provider.
+        view: View that the answer belongs to.
+        output: Answer of the provider.
+
+    Returns:
+        The descriptor.
+
+    Raises:
+        ProviderOutputError: A rule is violated; it names provider, image, field and rule.
+    """
+    with _name_violations(spec, view.name):
+        vector = _require_array(output, "descriptor", np.dtype(np.float32), 1)
+        _require_not_empty(vector.shape, "descriptor")
         if not np.isfinite(vector).all():
             raise DataError("descriptor", "must be finite")
         return vector
 
 
 def validate_mask(spec: ProviderSpec, view: View, output: object) -> Bool:
-    """Rules: (H, W) bool on the grid of the view."""
-    with _rules(spec, view.name):
-        mask = _array(output, "mask", np.dtype(np.bool_), 2)
+    """Validate a mask: (H, W) bool on the pixel grid of the view.
+
+    Args:
+        spec: Specification of the provider.
+        view: View that the answer belongs to.
+        output: Answer of the provider.
+
+    Returns:
+        The mask.
+
+    Raises:
+        ProviderOutputError: A rule is violated; it names provider, image, field and rule.
+    """
+    with _name_violations(spec, view.name):
+        mask = _require_array(output, "mask", np.dtype(np.bool_), 2)
         expected = (view.camera.height, view.camera.width)
         if mask.shape != expected:
             raise DataError("mask", f"must have the view's shape {expected}, got {mask.shape}")
@@ -228,12 +316,20 @@ def validate_mask(spec: ProviderSpec, view: View, output: object) -> Bool:
 
 @contextmanager
 def provider_errors(spec: ProviderSpec, image: str) -> Iterator[None]:
-    """Turn any exception of a provider into one that names provider and image.
+    """Convert exceptions of a provider to one error that names provider and image.
 
-    Errors that are ours already (missing weights, unreadable files) pass unchanged, as they say
-    what to do.
+    Errors of MP-SfM itself (missing weights, unreadable files) pass unchanged: they name their
+    remedy.
+
+    Args:
+        spec: Specification of the provider.
+        image: Name of the image, pair or group.
+
+    Raises:
+        ProviderRunError: The provider raised an exception.
+        ProviderOutputError: The answer violates a rule.
     """
-    with _rules(spec, image):
+    with _name_violations(spec, image):
         try:
             yield
         except MpsfmError:
@@ -247,7 +343,8 @@ def provider_errors(spec: ProviderSpec, image: str) -> Iterator[None]:
 
 
 @contextmanager
-def _rules(spec: ProviderSpec, image: str) -> Iterator[None]:
+def _name_violations(spec: ProviderSpec, image: str) -> Iterator[None]:
+    """Convert the violation of a rule to an error that names provider and image."""
     try:
         yield
     except DataError as error:
@@ -267,31 +364,32 @@ Checked = TypeVar(
 )
 
 
-def _checked(output: object, expected: type[Checked], field: str) -> Checked:
+def _revalidate(output: object, expected: type[Checked], field: str) -> Checked:
+    """Require the type of an output and validate its values again."""
     if not isinstance(output, expected):
         raise DataError(field, f"must be a {expected.__name__}, got {_type(output)}")
-    return replace(output)  # runs the checks of the type again
+    return replace(output)  # the constructor validates the values again
 
 
 def _check_depth(spec: ProviderSpec, output: object, field: str) -> DepthPrior:
-    prior = _checked(output, DepthPrior, field)
-    _not_empty(prior.shape, field)
+    prior = _revalidate(output, DepthPrior, field)
+    _require_not_empty(prior.shape, field)
     if not prior.metric:
-        _promised(spec, "metric", field)
+        _require_undeclared(spec, "metric", field)
     if prior.variance is None:
-        _promised(spec, "variance", "variance")
+        _require_undeclared(spec, "variance", "variance")
     return prior
 
 
-def _facing(prior: NormalPrior, camera: PinholeCamera) -> None:
-    away = (dot_with_rays(camera, prior.normals) > FACING_TOLERANCE)[prior.valid]
-    if away.any():
-        share = f"{100 * away.mean():.3g} % of the valid pixels"
-        raise DataError("normals", f"must face the camera (n . ray < 0), not so at {share}")
+def _require_facing(prior: NormalPrior, camera: PinholeCamera) -> None:
+    facing_away = (dot_with_rays(camera, prior.normals) > FACING_TOLERANCE)[prior.valid]
+    if facing_away.any():
+        ratio = f"{100 * facing_away.mean():.3g} % of the valid pixels"
+        raise DataError("normals", f"must face the camera (n . ray < 0), not so at {ratio}")
 
 
 def _check_sparse(sparse: SparseMatches, features: tuple[Features, Features] | None) -> None:
-    _checked(sparse, SparseMatches, "sparse")
+    _revalidate(sparse, SparseMatches, "sparse")
     if features is None:
         raise DataError("sparse", "must be absent, as there are no features")
     for column, (name, available) in enumerate(zip("ab", features, strict=True)):
@@ -301,13 +399,13 @@ def _check_sparse(sparse: SparseMatches, features: tuple[Features, Features] | N
             raise DataError("indices", text)
 
 
-def _promised(spec: ProviderSpec, capability: str, field: str) -> None:
-    """Raise for something that is absent if the specification promises it."""
+def _require_undeclared(spec: ProviderSpec, capability: str, field: str) -> None:
+    """Raise if the specification declares the capability of an absent field."""
     if capability in spec.capabilities:
         raise DataError(field, f"lacks what the specification declares: {capability!r}")
 
 
-def _inside(points: Float64, camera: PinholeCamera, field: str) -> None:
+def _require_inside(points: Float64, camera: PinholeCamera, field: str) -> None:
     outside = ((points < 0) | (points > camera.size)).any(axis=1)
     if outside.any():
         x, y = points[outside][0]
@@ -315,17 +413,19 @@ def _inside(points: Float64, camera: PinholeCamera, field: str) -> None:
         raise DataError(field, f"must lie inside of the {size} view, got ({x:.2f}, {y:.2f})")
 
 
-def _not_empty(shape: tuple[int, ...], field: str) -> None:
+def _require_not_empty(shape: tuple[int, ...], field: str) -> None:
     if 0 in shape:
         raise DataError(field, f"must not be empty, has shape {shape}")
 
 
-def _array(output: object, field: str, dtype: np.dtype[Any], dimensions: int) -> NDArray[Any]:
+def _require_array(
+    output: object, field: str, dtype: np.dtype[Any], dimensions: int
+) -> NDArray[Any]:
     if not isinstance(output, np.ndarray):
         raise DataError(field, f"must be a numpy array, got {_type(output)}")
     if output.dtype != dtype or output.ndim != dimensions:
-        wanted = f"{dimensions}-dimensional {dtype}"
-        raise DataError(field, f"must be a {wanted} array, got {output.dtype} {output.shape}")
+        expected = f"{dimensions}-dimensional {dtype}"
+        raise DataError(field, f"must be a {expected} array, got {output.dtype} {output.shape}")
     return output
 
 

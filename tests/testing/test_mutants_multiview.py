@@ -13,7 +13,7 @@ import pytest
 from mpsfm_core import DepthPrior, MultiViewPrior, View
 from mpsfm_core.geometry import invert, pixel_centers, rays
 from mpsfm_core.testing import ContractSetup
-from mpsfm_core.testing.checks.depth import OF_MAPS
+from mpsfm_core.testing.checks.depth import MAP_CHECKS
 from mpsfm_core.testing.contract import CHECKS_BY_KIND, check_id
 from tests.support import reference_providers as ref
 from tests.support.reference_providers import ToldGroup, depth_prior
@@ -224,5 +224,5 @@ def test_multiview(caught: Callable[..., None], factory: type, check: str, messa
 
 
 def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
-    checks = {check_id(check) for check in CHECKS_BY_KIND["multiview"] if check not in OF_MAPS}
+    checks = {check_id(check) for check in CHECKS_BY_KIND["multiview"] if check not in MAP_CHECKS}
     assert checks - named(test_multiview) == set()
