@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Distances, tolerances
+from mpsfm_core.cli.arguments import Distances, distance_thresholds
 
 
 def evaluate(
@@ -58,7 +58,7 @@ def evaluate(
             true_surface,
         )
 
-        within, cloud = tolerances(distance), model / "dense.ply"
+        within, cloud = distance_thresholds(distance), model / "dense.ply"
         if gt_depth is not None:
             report["depth"] = evaluate_depth(model, gt_depth)
         if scan is not None:
@@ -81,6 +81,6 @@ def _names(images: str | None, image_list: Path | None) -> list[str] | None:
         return [name.strip() for name in images.split(",") if name.strip()]
     if image_list is None:
         return None
-    from mpsfm_core.inputs.images import read_image_list
+    from mpsfm_core.inputs.image_search import read_image_list
 
     return read_image_list(image_list)

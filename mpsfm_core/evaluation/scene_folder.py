@@ -25,7 +25,7 @@ import yaml
 
 from mpsfm_core.data import Pose
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.images import find_images
+from mpsfm_core.inputs.image_search import find_images
 from mpsfm_core.inputs.models import match_names, read_poses
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.format_versions import VERSION, check_version

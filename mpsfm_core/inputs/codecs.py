@@ -14,7 +14,13 @@ from mpsfm_core.data import UInt8
 from mpsfm_core.data.errors import InputError
 
 HEIF = frozenset((".heic", ".heif", ".hif"))
-RAW = frozenset((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef"))
+AVIF = frozenset((".avif",))
+RAW = frozenset(
+    (
+        *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef"),
+        *(".srw", ".nrw", ".rwl", ".3fr", ".iiq", ".mrw", ".erf", ".kdc", ".mef", ".x3f"),
+    )
+)
 """Extensions of raw files. The content does not identify them: most are TIFF files."""
 
 
@@ -31,6 +37,8 @@ def find_decoder(data: bytes, path: Path) -> Callable[[bytes, Path], UInt8] | No
     """
     if is_heif(data):
         return _decode_heif
+    if is_avif(data):
+        return _decode_avif
     raw = path.suffix.lower() in RAW and data[:3] != b"\xff\xd8\xff"
     return _decode_raw if raw else None
 
@@ -38,6 +46,21 @@ def find_decoder(data: bytes, path: Path) -> Callable[[bytes, Path], UInt8] | No
 def is_heif(data: bytes) -> bool:
     """Return whether the content is HEIF (AVIF is not included)."""
     return data[4:8] == b"ftyp" and data[8:12] in (b"heic", b"heix", b"hevc", b"mif1", b"msf1")
+
+
+def is_avif(data: bytes) -> bool:
+    """Return whether the content is AVIF."""
+    return data[4:12] in (b"ftypavif", b"ftypavis")
+
+
+def avif_exif(data: bytes) -> bytes | None:
+    """Return the EXIF block of an AVIF file, None if there is none or Pillow is missing."""
+    try:
+        with importlib.import_module("PIL.Image").open(BytesIO(data)) as image:
+            block = image.info.get("exif")
+    except Exception:  # decoding the pixels reports the reason
+        return None
+    return bytes(block).removeprefix(b"Exif\x00\x00") if block else None
 
 
 def heif_exif(data: bytes) -> bytes | None:
@@ -60,6 +83,21 @@ def _decode_heif(data: bytes, path: Path) -> UInt8:
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
 
+def _decode_avif(data: bytes, path: Path) -> UInt8:
+    pillow = _library("PIL.Image", "avif", path)
+    operations = importlib.import_module("PIL.ImageOps")
+    try:
+        with pillow.open(BytesIO(data)) as image:
+            pixels = np.asarray(operations.exif_transpose(image).convert("RGB"))
+    except pillow.UnidentifiedImageError as error:
+        raise InputError(
+            f"image {path}: this Pillow does not read AVIF: pip install 'mpsfm-core[avif]'"
+        ) from error
+    except Exception as error:  # the library documents no exception types
+        raise InputError(f"image {path} cannot be decoded: {error}") from error
+    return np.ascontiguousarray(pixels, dtype=np.uint8)
+
+
 def _decode_raw(data: bytes, path: Path) -> UInt8:
     library = _library("rawpy", "raw", path)
     try:
@@ -70,11 +108,14 @@ def _decode_raw(data: bytes, path: Path) -> UInt8:
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
 
+_PACKAGES = {"pillow_heif": "pillow-heif", "rawpy": "rawpy", "PIL.Image": "Pillow 11.3 or newer"}
+
+
 def _library(name: str, extra: str, path: Path) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            f"image {path}: reading {path.suffix} files needs {name.replace('_', '-')}: "
+            f"image {path}: reading {path.suffix} files needs {_PACKAGES[name]}: "
             f"pip install 'mpsfm-core[{extra}]'"
         ) from error

@@ -9,21 +9,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core.data import Bool, Float64, UInt8
+from mpsfm_core.data import Float64, UInt8
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.codecs import HEIF, RAW, find_decoder
+from mpsfm_core.inputs.codecs import AVIF, HEIF, RAW, find_decoder
 from mpsfm_core.inputs.image_header import (
     ImageHeader,
     is_cut_jpeg,
     read_declared_num_pixels,
-    read_header,
 )
 
 EXTENSIONS = (
     HEIF
+    | AVIF
     | RAW
     | frozenset(
-        (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".webp", ".bmp", ".jp2", ".ppm", ".pgm")
+        (
+            *(".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff", ".webp", ".bmp"),
+            *(".jp2", ".ppm", ".pgm"),
+        )
     )
 )
 """Extensions of image files. The content decides the decoder, not the extension."""
@@ -42,7 +45,7 @@ def check_decodable(data: bytes, path: Path) -> None:
     if is_cut_jpeg(data):
         raise InputError(f"image {path} is cut off: its end is missing. Copy it again")
     if find_decoder(data, path) is None:  # other formats are decoded in full to get their size
-        _decode(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
+        decode_stored(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
 
 def check_size(data: bytes, path: Path, max_pixels: int) -> None:
@@ -84,7 +87,7 @@ def decode_rgb(data: bytes, header: ImageHeader, path: Path) -> UInt8:
     decode = find_decoder(data, path)
     if decode is not None:
         return decode(data, path)
-    pixels = _decode(data, path)
+    pixels = decode_stored(data, path)
     if pixels.ndim == 2:
         rgb = cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB)
     elif pixels.shape[2] == 2:
@@ -96,14 +99,6 @@ def decode_rgb(data: bytes, header: ImageHeader, path: Path) -> UInt8:
     elif rgb.dtype != np.uint8:
         rgb = np.round(np.clip(np.nan_to_num(rgb), 0, 1) * 255.0)
     return orient(rgb.astype(np.uint8), header.orientation)
-
-
-def read_mask(path: Path, max_pixels: int) -> Bool:
-    """Read an upright mask, (H, W) bool, False where the image is black."""
-    data = read_bytes(path)
-    check_size(data, path, max_pixels)
-    rgb = decode_rgb(data, read_header(data), path)
-    return np.asarray(rgb.any(axis=2))
 
 
 def orient(image: UInt8, orientation: int) -> UInt8:
@@ -130,7 +125,8 @@ def apply_orientation_to_pixels(xy: Float64, size: tuple[int, int], orientation:
     return np.stack([x, y], axis=1)
 
 
-def _decode(data: bytes, path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
+def decode_stored(data: bytes, path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
+    """Decode the stored pixels with OpenCV: BGR or BGRA or gray, any depth, not oriented."""
     if not data:
         raise InputError(f"image {path} is empty")
     try:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
-from mpsfm_core.inputs.codecs import heif_exif, is_heif
+from mpsfm_core.inputs.codecs import avif_exif, heif_exif, is_avif, is_heif
 
 _EXIF_SIGNATURE = b"Exif\x00\x00"
 _XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\x00"
@@ -141,8 +141,8 @@ def read_header(data: bytes) -> ImageHeader:
     block = exif_block(data)
     tags = _read_tags(block) if block else {}
     orientation = int(tags.get(_ORIENTATION, 1))
-    if block is data or is_heif(data) or not 1 <= orientation <= 8:
-        # Decoders apply the orientation of TIFF and HEIF themselves.
+    if block is data or is_heif(data) or is_avif(data) or not 1 <= orientation <= 8:
+        # Decoders apply the orientation of TIFF, HEIF and AVIF themselves.
         orientation = 1
     return ImageHeader(size, orientation, tags, _projection(data))
 
@@ -160,6 +160,8 @@ def exif_block(data: bytes) -> bytes | None:
         return block.removeprefix(_EXIF_SIGNATURE) if block else None
     if data[:4] in (b"II*\x00", b"MM\x00*"):
         return data
+    if is_avif(data):
+        return avif_exif(data)
     return heif_exif(data) if is_heif(data) else None
 
 

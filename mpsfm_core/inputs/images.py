@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -16,21 +15,25 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Bool, Float64, PinholeCamera, UInt8, View
-from mpsfm_core.data.errors import InputError, did_you_mean
-from mpsfm_core.data.result_layout import SUMMARY
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.geometry.pycolmap_conversion import camera_key
 from mpsfm_core.inputs.gps import GpsPosition, read_gps
 from mpsfm_core.inputs.image_decoding import (
-    EXTENSIONS,
     check_decodable,
     check_size,
     decode_rgb,
     read_bytes,
-    read_mask,
     upright_size,
 )
 from mpsfm_core.inputs.image_header import ImageHeader, read_header
+from mpsfm_core.inputs.image_search import (
+    MAX_LISTED,
+    find_images,
+    require_two_images,
+    select_listed_images,
+)
 from mpsfm_core.inputs.intrinsics import Intrinsics, read_intrinsics
+from mpsfm_core.inputs.masks import MaskFile, find_masks, orient_masks, resize_mask
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.undistortion import (
     UndistortionMap,
@@ -53,8 +56,6 @@ _CACHED_MAPS = 2
 """Number of cached undistortion maps, 8 bytes a pixel each; neighboring images share a camera."""
 _READERS = 4
 """Maximum number of threads that read and hash files."""
-_MAX_LISTED = 5
-"""Maximum number of names in a message."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,8 @@ class SourceImage:
     """EXIF orientation of the stored pixels."""
     gps: GpsPosition | None = None
     """Position in EXIF, None if there is none."""
+    mask: MaskFile | None = None
+    """Mask of the original image, None if there is none."""
 
     def original_pixels(self, xy: Float64) -> Float64:
         """Map pixels (n, 2) of the undistorted view to pixels of the upright original image."""
@@ -178,7 +181,7 @@ class ImageSet:
     def mask(self, index: int) -> Bool | None:
         """Return the mask of a view; do not decode the image if it has none."""
         image = self.images[index]
-        if is_pinhole(image.camera) and self._mask_path(image) is None:
+        if is_pinhole(image.camera) and image.mask is None:
             return None
         return self.view(index).mask
 
@@ -192,9 +195,10 @@ class ImageSet:
         parts = [image.digest, str(image.pinhole.size)]
         if not is_pinhole(image.camera):
             parts += [camera_key(image.camera), str(image.pinhole.params.tolist())]
-        mask = self._mask_path(image)
-        if mask is not None:
-            parts.append(hashlib.sha256(read_bytes(mask)).hexdigest())
+        if image.mask is not None:
+            parts.append(hashlib.sha256(read_bytes(image.mask.path)).hexdigest())
+            if image.mask.orientation != 1:
+                parts.append(f"mask orientation {image.mask.orientation}")
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
     def _load(self, image: SourceImage) -> View:
@@ -202,10 +206,10 @@ class ImageSet:
         pixels = decode_rgb(data, read_header(data), image.path)
         if (pixels.shape[1], pixels.shape[0]) != image.original_size:
             raise InputError(f"image {image.path} has changed its size during the run")
-        mask = self._user_mask(image)
+        mask = self._read_mask(image)
         if is_pinhole(image.camera):
             pixels = _resize(pixels, image.pinhole.size)
-            mask = None if mask is None else _resize_mask(mask, image.pinhole.size)
+            mask = None if mask is None else resize_mask(mask, image.pinhole.size)
             return View(image.name, pixels, image.pinhole, mask)
         size = _reduced_size(image.original_size, self._options.max_image_size)
         camera = resize_camera(image.camera, size)
@@ -214,29 +218,17 @@ class ImageSet:
         )
         pixels = undistortion.image(_resize(pixels, size))
         if mask is not None:
-            mask = undistortion.mask(_resize_mask(mask, size))
+            mask = undistortion.mask(resize_mask(mask, size))
         elif not undistortion.valid.all():
             mask = undistortion.valid
         return View(image.name, pixels, image.pinhole, mask)
 
-    def _mask_path(self, image: SourceImage) -> Path | None:
-        folder = self._options.masks
-        if folder is None:
+    def _read_mask(self, image: SourceImage) -> Bool | None:
+        if image.mask is None:
             return None
-        exact = folder / f"{image.name}.png"
-        candidates = [exact, (folder / image.name).with_suffix(".png")]
-        return next((path for path in candidates if path.is_file()), None)
-
-    def _user_mask(self, image: SourceImage) -> Bool | None:
-        path = self._mask_path(image)
-        if path is None:
-            return None
-        mask = read_mask(path, self._options.max_pixels)
+        mask = image.mask.read(self._options.max_pixels)
         if (mask.shape[1], mask.shape[0]) != image.original_size:
-            raise InputError(
-                f"mask {path} has {mask.shape[1]}x{mask.shape[0]} pixels, its image "
-                f"{image.name!r} has {image.camera.width}x{image.camera.height}"
-            )
+            raise InputError(f"mask {image.mask.path} has changed its size during the run")
         return mask
 
 
@@ -269,26 +261,33 @@ def load_images(
             or intrinsics that do not fit. The message names the file.
     """
     options = options or InputOptions()
-    if options.masks is not None and not options.masks.is_dir():
-        raise InputError(f"masks folder {options.masks} does not exist")
     if names is None:
         names = find_images(folder, without)
+        if options.masks is not None:
+            names = _exclude_masks(names, folder, options.masks)
         if image_list is not None:
-            names = _read_listed_names(image_list, names, folder)
-        if len(names) < 2:
-            content = f"only one image, {names[0]!r}" if names else "no images"
-            source = image_list or folder
-            raise InputError(f"{source} has {content}: a reconstruction needs two or more")
+            names = select_listed_images(image_list, names, folder)
+        require_two_images(folder, names, image_list or folder)
+    masks = {} if options.masks is None else find_masks(options.masks, names, folder)
     given = _read_cameras(intrinsics, names)
     partial = _read_cameras(model, names) if given is None else None
     with ThreadPoolExecutor(min(_READERS, thread_limit())) as pool:
         files = list(pool.map(lambda name: _probe(folder / name, options), names))
     left_out = {name: file.fault for name, file in zip(names, files, strict=True) if file.fault}
-    _report_damaged(left_out, len(names), options)
+    probed = {name: file for name, file in zip(names, files, strict=True) if not file.fault}
+    oriented_masks, mask_faults = orient_masks(
+        {name: path for name, path in masks.items() if name in probed},
+        {name: file.size for name, file in probed.items()},
+        {name: file.header.orientation for name, file in probed.items()},
+        options.mask_orientation,
+        options.max_pixels,
+    )
+    left_out |= mask_faults
+    _report_left_out(left_out, len(names), options)
     guesses = _CameraGuesses(options, partial.max_id if partial else 0)
     images = []
-    for name, file in zip(names, files, strict=True):
-        if file.fault:
+    for name, file in probed.items():
+        if name in left_out:
             continue
         focal: FocalSource = "intrinsics"
         if given is not None:
@@ -297,9 +296,19 @@ def load_images(
             camera = shared
         else:
             camera, focal = guesses.camera(file)
-        images.append(_source_image(name, folder / name, file, camera, focal, options))
+        image = _source_image(name, folder / name, file, camera, focal, options)
+        images.append(replace(image, mask=oriented_masks.get(name)))
     _warn_of_default_focal_lengths(images, options)
     return ImageSet(images, options, left_out)
+
+
+def _exclude_masks(names: Sequence[str], folder: Path, masks: Path) -> list[str]:
+    """Return the names that are not below a masks folder inside of the images folder."""
+    inner, outer = masks.resolve(), folder.resolve()
+    if inner == outer or not inner.is_relative_to(outer):
+        return list(names)
+    prefix = f"{inner.relative_to(outer).as_posix()}/"
+    return [name for name in names if not name.startswith(prefix)]
 
 
 def _read_cameras(path: Path | None, names: Sequence[str]) -> Intrinsics | None:
@@ -365,90 +374,6 @@ def _view_camera(camera: pycolmap.Camera, options: InputOptions) -> PinholeCamer
     return undistort_camera(reduced, options.blank_pixels)
 
 
-def find_images(folder: Path, without: Path | None = None) -> list[str]:
-    """Find all images below a folder.
-
-    Skips hidden files, the subfolder ``without``, and subfolders with results (those that contain
-    :data:`SUMMARY`).
-
-    Returns:
-        Names relative to the folder, in natural order.
-    """
-    if not folder.is_dir():
-        if folder.exists():
-            raise InputError(
-                f"{folder} is neither a folder of photos nor a video; give one of them"
-            )
-        raise InputError(f"images folder {folder} does not exist")
-    names = []
-    skipped = _find_below(without, folder)
-    for path in folder.rglob("*"):
-        relative = path.relative_to(folder)
-        hidden = any(part.startswith(".") for part in relative.parts)
-        if path.suffix.lower() not in EXTENSIONS or hidden or not path.is_file():
-            continue
-        parents = [folder / parent for parent in relative.parents[:-1]]
-        if not any(parent == skipped or (parent / SUMMARY).is_file() for parent in parents):
-            names.append(relative.as_posix())
-    return sorted(names, key=_natural_sort_key)
-
-
-def check_output_folder(output: Path, folder: Path) -> None:
-    """Raise :class:`InputError` if ``output`` is the images folder or a subfolder with images."""
-    if output.resolve() == folder.resolve():
-        raise InputError(
-            f"{output} is the folder of the photos, and results must not be mixed with them. "
-            f"Choose another output folder, such as {output / 'reconstruction'}"
-        )
-    inside = _find_below(output, folder)
-    if inside is None or not inside.is_dir() or (inside / SUMMARY).is_file():
-        return
-    if photos := find_images(inside):
-        raise InputError(
-            f"{output} is a subfolder of the photos with {len(photos)} of them, such as "
-            f"{photos[0]}. Results must not be mixed with photos; choose another output folder"
-        )
-
-
-def _find_below(inner: Path | None, folder: Path) -> Path | None:
-    """Return ``inner`` as a path that starts with ``folder``, None if it is not below."""
-    if inner is None or not inner.resolve().is_relative_to(folder.resolve()):
-        return None
-    return folder / inner.resolve().relative_to(folder.resolve())
-
-
-def _natural_sort_key(name: str) -> list[tuple[int, int, str]]:
-    """Return a key that sorts ``img2`` before ``img10``."""
-    parts = re.split(r"(\d+)", name)
-    return [(1, int(p), p) if p.isdecimal() else (0, 0, p) for p in parts]
-
-
-def read_image_list(path: Path) -> list[str]:
-    """Read a text file with one image name a line; ``#`` starts a comment line.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"image list {path} cannot be read: {error}") from error
-    return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
-
-
-def _read_listed_names(image_list: Path, names: list[str], folder: Path) -> list[str]:
-    listed = read_image_list(image_list)
-    available, seen = set(names), set()
-    for name in listed:
-        if name in seen:
-            raise InputError(f"{image_list}: image {name!r} is listed twice")
-        if name not in available:
-            near = did_you_mean(name, names) if len(names) <= 1000 else ""
-            raise InputError(f"{image_list}: there is no image {name!r} in {folder}{near}")
-        seen.add(name)
-    return listed
-
-
 def _probe(path: Path, options: InputOptions) -> _ProbedImage:
     try:
         data = read_bytes(path)
@@ -469,18 +394,18 @@ def _probe(path: Path, options: InputOptions) -> _ProbedImage:
     return _ProbedImage(size, header, hashlib.sha256(data).hexdigest(), gps=read_gps(data))
 
 
-def _report_damaged(left_out: Mapping[str, str], total: int, options: InputOptions) -> None:
-    """Warn of damaged images; raise if ``strict`` or if too many are damaged."""
+def _report_left_out(left_out: Mapping[str, str], total: int, options: InputOptions) -> None:
+    """Warn of images that cannot be used; raise if ``strict`` or if they are too many."""
     if not left_out:
         return
     faults = list(left_out.values())
-    rest = len(faults) - _MAX_LISTED
-    text = "; ".join(faults[:_MAX_LISTED]) + (f"; and {rest} more" if rest > 0 else "")
+    rest = len(faults) - MAX_LISTED
+    text = "; ".join(faults[:MAX_LISTED]) + (f"; and {rest} more" if rest > 0 else "")
     if options.strict:
-        raise InputError(f"{text} (inputs.strict=false leaves damaged photos out)")
+        raise InputError(f"{text} (inputs.strict=false leaves such photos out)")
     if len(faults) > total / 2 or total - len(faults) < 2:
-        raise InputError(f"{len(faults)} of {total} photos are damaged: {text}")
-    _log.warning("%d of %d photos are damaged and left out: %s", len(faults), total, text)
+        raise InputError(f"{len(faults)} of {total} photos cannot be used: {text}")
+    _log.warning("%d of %d photos cannot be used and are left out: %s", len(faults), total, text)
 
 
 def _warn_of_default_focal_lengths(images: Sequence[SourceImage], options: InputOptions) -> None:
@@ -491,8 +416,8 @@ def _warn_of_default_focal_lengths(images: Sequence[SourceImage], options: Input
             "is assumed; give --intrinsics for a better result",
             len(guessed),
             len(images),
-            ", ".join(guessed[:_MAX_LISTED]),
-            ", ..." if len(guessed) > _MAX_LISTED else "",
+            ", ".join(guessed[:MAX_LISTED]),
+            ", ..." if len(guessed) > MAX_LISTED else "",
             options.default_focal_ratio,
         )
 
@@ -509,14 +434,6 @@ def _resize(image: UInt8, size: tuple[int, int]) -> UInt8:
         return image
     resized: UInt8 = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return resized
-
-
-def _resize_mask(mask: Bool, size: tuple[int, int]) -> Bool:
-    if (mask.shape[1], mask.shape[0]) == size:
-        return mask
-    resized = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)
-    allowed: Bool = resized > 0
-    return allowed
 
 
 def _count_bytes(view: View) -> int:

@@ -114,7 +114,9 @@ class _Builder:
             columns.append(new_rows[rows])
         matches = np.stack(columns, axis=1)
         visible = (matches >= 0).all(axis=1)
-        self._matches[first, second] = SparseMatches.from_best_scores(matches[visible], scores[visible])
+        self._matches[first, second] = SparseMatches.from_best_scores(
+            matches[visible], scores[visible]
+        )
 
     def finish(self) -> ImportedMatches:
         """Return the imported matches; raise :class:`InputError` if there are none."""

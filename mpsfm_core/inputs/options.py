@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 
@@ -35,8 +36,12 @@ class InputOptions(Options):
     """True: a damaged image ends the run. False: damaged images are left out with a warning, unless
     more than half are damaged."""
     masks: Path | None = None
-    """Folder of masks of the original images, ``NAME.png`` or the name with ``.png`` instead of its
-    extension. Black pixels are not used [COLMAP mask_path]."""
+    """Folder of masks of the original images: ``X.jpg.png``, ``X.png``, ``X_mask.png`` or ``X.jpg``
+    for the image ``X.jpg``. Black pixels are not used [COLMAP mask_path]."""
+    mask_orientation: Literal["auto", "stored", "upright"] = "auto"
+    """Orientation of masks of images with an EXIF orientation if their size does not decide.
+    ``stored``: as the stored pixels; ``upright``: as the image is displayed; ``auto``: as the masks
+    whose size decides, else stored [COLMAP, which ignores EXIF orientation]."""
     default_focal_ratio: float = Field(1.2, gt=0)
     """Ratio of focal length to longer side for images without a known focal length [COLMAP
     default_focal_length_factor]."""

@@ -28,7 +28,8 @@ from mpsfm_core.evaluation.records import read_record
 from mpsfm_core.evaluation.scene_folder import _read_sets
 from mpsfm_core.extraction.cache import Cache, content_key
 from mpsfm_core.inputs.image_header import is_cut_jpeg, read_declared_num_pixels, read_header
-from mpsfm_core.inputs.images import load_images, read_image_list
+from mpsfm_core.inputs.image_search import read_image_list
+from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.models import read_model, read_poses
 from mpsfm_core.mapping.state import freeze, thaw
@@ -285,7 +286,9 @@ def test_an_export_writes_nothing_elsewhere(tmp_path: Path) -> None:
     for name in ("../../0.png", "/tmp/0.png", "a/../../0.png"):
         model.images[1].name = name
         model.write_binary(str(out / "sparse"))
-        with pytest.raises(InputError, match=r"the name of image .* is not below the images folder"):
+        with pytest.raises(
+            InputError, match=r"the name of image .* is not below the images folder"
+        ):
             export(out, "gsplat")
 
 

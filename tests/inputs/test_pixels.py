@@ -12,8 +12,9 @@ import pytest
 
 from mpsfm_core.data import UInt8
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.image_decoding import decode_rgb, orient, read_bytes, read_mask
+from mpsfm_core.inputs.image_decoding import decode_rgb, orient, read_bytes
 from mpsfm_core.inputs.image_header import read_header
+from mpsfm_core.inputs.masks import decode_mask
 
 ORIENTATION = 0x0112
 
@@ -139,4 +140,4 @@ def test_missing_file(tmp_path: Path) -> None:
 def test_mask(photo, write_image) -> None:
     drawn = np.zeros(photo.shape[:2], dtype=np.uint8)
     drawn[10:20, 30:50] = 255
-    assert np.array_equal(read_mask(write_image("m.png", drawn), 4800), drawn > 0)
+    assert np.array_equal(decode_mask(write_image("m.png", drawn), 4800), drawn > 0)

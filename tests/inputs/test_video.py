@@ -11,7 +11,7 @@ import pytest
 
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.images import find_images
+from mpsfm_core.inputs.image_search import find_images
 from mpsfm_core.inputs.options import VideoOptions
 from mpsfm_core.inputs.video import choose_frames, extract_frames, is_video
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene

@@ -114,6 +114,11 @@ class MaskFiles:
         values = read_arrays(path, "mask")["mask"]
         allowed = (values.any(axis=-1) if values.ndim == 3 else values != 0) != self._options.invert
         check_map(path, allowed, view, 1)
+        if not allowed.any():
+            raise InputError(
+                f"mask {path} excludes every pixel of image {view.name!r}; leave the image out, or "
+                f"set the option 'invert' if black pixels may be used"
+            )
         resized = cv2.resize(
             allowed.astype(np.uint8), view.camera.size, interpolation=cv2.INTER_NEAREST_EXACT
         )

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import View
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.image_decoding import check_size
+from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.providers.builtin.options import FileOptions
 from mpsfm_core.support.npz import read_npz
 
@@ -32,11 +32,22 @@ def find_file(options: FileOptions, view: View, what: str) -> Path:
     bases = [full, full.with_suffix("")]
     for base in bases:
         for suffix in suffixes:
-            path = base.with_name(base.name + suffix)
-            if path.is_file():
+            path = _find_ignoring_case(base.with_name(base.name + suffix))
+            if path is not None:
                 return path
     wanted = f"{bases[1]}{suffixes[0] if len(suffixes) == 1 else '{' + ','.join(suffixes) + '}'}"
     raise InputError(f"{what} of image {view.name!r}: there is no file {wanted}")
+
+
+def _find_ignoring_case(path: Path) -> Path | None:
+    """Return the file of this name, else the one whose name differs only in case."""
+    if path.is_file():
+        return path
+    if not path.parent.is_dir():
+        return None
+    name = path.name.casefold()
+    similar = (other for other in path.parent.iterdir() if other.name.casefold() == name)
+    return next((other for other in sorted(similar) if other.is_file()), None)
 
 
 def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:

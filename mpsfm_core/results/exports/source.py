@@ -15,7 +15,8 @@ from mpsfm_core.data import DepthPrior, Float64, NormalPrior, PinholeCamera, UIn
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.data.result_layout import DENSE, DEPTH, SUMMARY
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
-from mpsfm_core.inputs.images import ImageSet, find_images, load_images
+from mpsfm_core.inputs.image_search import find_images
+from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.inputs.models import find_model_folder, match_names, read_model
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.providers.builtin.normals_from_depth import fit_normals

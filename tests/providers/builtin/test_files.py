@@ -245,6 +245,22 @@ def test_masks(folder: Path, context: ProviderContext) -> None:
         masks_of(folder, context)
 
 
+@pytest.mark.parametrize("name", ["a.jpg.PNG", "A.JPG.png", "a.PNG"])
+def test_mask_whose_name_differs_in_case_is_found(
+    folder: Path, context: ProviderContext, name: str
+) -> None:
+    cv2.imwrite(str(folder / "mask.png"), np.full((15, 20), 255, np.uint8))
+    (folder / "mask.png").rename(folder / "side" / name)
+    assert masks_of(folder, context).all()
+
+
+def test_black_mask_is_named(folder: Path, context: ProviderContext) -> None:
+    cv2.imwrite(str(folder / "side" / "a.png"), np.zeros((15, 20), np.uint8))
+    with pytest.raises(InputError, match=r"a\.png excludes every pixel.*invert"):
+        masks_of(folder, context)
+    assert masks_of(folder, context, invert=True).all()
+
+
 def test_shared_depth(shared_data: Path, context: ProviderContext) -> None:
     folder = shared_data / "data" / "hololens_room"
     name = sorted((folder / "images").iterdir())[0].name

@@ -1,0 +1,233 @@
+"""Search for images in a folder: names, lists of names, and files that cannot be read."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from mpsfm_core.data.errors import InputError, did_you_mean
+from mpsfm_core.data.result_layout import SUMMARY
+from mpsfm_core.inputs.image_decoding import EXTENSIONS
+from mpsfm_core.inputs.video import EXTENSIONS as VIDEO_EXTENSIONS
+
+_log = logging.getLogger(__name__)
+
+MAX_LISTED = 5
+"""Maximum number of names in a message."""
+_UNREADABLE = frozenset(
+    (".gif", ".jxl", ".psd", ".xcf", ".tga", ".exr", ".hdr", ".insp", ".gpr", ".heics", ".svg")
+)
+"""Extensions of pictures that are not read."""
+_SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\x00", b"MM\x00*")
+"""First bytes of images, to recognize files without extension."""
+_MASK_MARK = re.compile(r"[_.-]masks?$", re.IGNORECASE)
+"""End of the stem of a mask file such as ``X_mask.png`` (OpenDroneMap, Metashape)."""
+
+
+def find_images(folder: Path, without: Path | None = None) -> list[str]:
+    """Find all images below a folder, through links to folders too.
+
+    Skips hidden files, the subfolder ``without``, and subfolders with results (those that contain
+    :data:`SUMMARY`). Logs a warning for pictures that are not read and for files that are masks
+    of images in the same folder.
+
+    Returns:
+        Names relative to the folder, in natural order.
+
+    Raises:
+        InputError: the folder does not exist or is not a folder.
+    """
+    if not folder.is_dir():
+        if folder.exists():
+            raise InputError(
+                f"{folder} is neither a folder of photos nor a video; give one of them"
+            )
+        raise InputError(f"images folder {folder} does not exist")
+    names, unread = [], []
+    for name in _walk_input_files(folder, without):
+        extension = PurePosixPath(name).suffix.lower()
+        if extension in EXTENSIONS:
+            names.append(name)
+        elif extension in _UNREADABLE or (not extension and _has_signature(folder / name)):
+            unread.append(name)
+    names = sorted(names, key=_natural_sort_key)
+    masks = _find_mask_names(names)
+    if unread:
+        _log.warning(
+            "%s in %s: %s; convert them to JPEG or PNG, with the extension in their names",
+            _count(len(unread), "picture is not read", "pictures are not read"),
+            folder,
+            list_names(sorted(unread, key=_natural_sort_key)),
+        )
+    if masks:
+        _log.warning(
+            "%s in %s: %s; they are not reconstructed. To use them: --set inputs.masks=%s",
+            _count(len(masks), "file is a mask", "files are masks"),
+            folder,
+            list_names(masks),
+            folder,
+        )
+    excluded = set(masks)
+    return [name for name in names if name not in excluded]
+
+
+def find_videos(folder: Path) -> list[str]:
+    """Find all videos below a folder, as names relative to it in natural order."""
+    names = _walk_input_files(folder, None)
+    videos = [name for name in names if PurePosixPath(name).suffix.lower() in VIDEO_EXTENSIONS]
+    return sorted(videos, key=_natural_sort_key)
+
+
+def require_two_images(folder: Path, names: list[str], source: Path) -> None:
+    """Raise :class:`InputError` for fewer than two images, with the next step.
+
+    Args:
+        folder: images folder.
+        names: images that were found.
+        source: folder or list to name in the message.
+    """
+    if len(names) >= 2:
+        return
+    content = f"only one image, {names[0]!r}" if names else "no images"
+    videos = find_videos(folder)
+    if videos:
+        raise InputError(
+            f"{source} has {content}, but {_count(len(videos), 'video', 'videos')}, such as "
+            f"{videos[0]!r}. Give one video instead of the folder: "
+            f"mpsfm reconstruct '{folder / videos[0]}'"
+        )
+    raise InputError(f"{source} has {content}: a reconstruction needs two or more")
+
+
+def check_output_folder(output: Path, folder: Path) -> None:
+    """Raise :class:`InputError` if ``output`` is the images folder or a subfolder with images."""
+    if output.resolve() == folder.resolve():
+        raise InputError(
+            f"{output} is the folder of the photos, and results must not be mixed with them. "
+            f"Choose another output folder, such as {output / 'reconstruction'}"
+        )
+    inside = _find_below(output, folder)
+    if inside is None or not inside.is_dir() or (inside / SUMMARY).is_file():
+        return
+    if photos := find_images(inside):
+        raise InputError(
+            f"{output} is a subfolder of the photos with {len(photos)} of them, such as "
+            f"{photos[0]}. Results must not be mixed with photos; choose another output folder"
+        )
+
+
+def read_image_list(path: Path) -> list[str]:
+    """Read a text file with one image name a line; ``#`` starts a comment line.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"image list {path} cannot be read: {error}") from error
+    return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def select_listed_images(image_list: Path, names: list[str], folder: Path) -> list[str]:
+    """Return the names in a list file, in its order.
+
+    Raises:
+        InputError: a name is listed twice or is not among ``names``.
+    """
+    listed = read_image_list(image_list)
+    available, seen = set(names), set()
+    for name in listed:
+        if name in seen:
+            raise InputError(f"{image_list}: image {name!r} is listed twice")
+        if name not in available:
+            near = did_you_mean(name, names) if len(names) <= 1000 else ""
+            raise InputError(f"{image_list}: there is no image {name!r} in {folder}{near}")
+        seen.add(name)
+    return listed
+
+
+def walk_files(folder: Path) -> Iterator[str]:
+    """Yield all files below a folder, relative and with forward slashes, except hidden ones.
+
+    Follows links to folders. A folder that several links reach is read once.
+    """
+    visited: set[tuple[int, int]] = set()
+    for parent, folders, files in os.walk(folder, followlinks=True):
+        status = Path(parent).stat()
+        if (status.st_dev, status.st_ino) in visited:
+            folders.clear()
+            continue
+        visited.add((status.st_dev, status.st_ino))
+        # Real folders first: images keep the names that they have without links.
+        folders[:] = sorted(
+            (name for name in folders if not name.startswith(".")),
+            key=lambda name, parent=parent: (Path(parent, name).is_symlink(), name),
+        )
+        for name in sorted(files):
+            path = Path(parent, name)
+            if not name.startswith(".") and path.is_file():
+                yield path.relative_to(folder).as_posix()
+
+
+def list_names(names: list[str]) -> str:
+    """Join at most :data:`MAX_LISTED` names for a message."""
+    rest = len(names) - MAX_LISTED
+    return ", ".join(names[:MAX_LISTED]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _walk_input_files(folder: Path, without: Path | None) -> Iterator[str]:
+    """Yield files below a folder except those below ``without`` and in result folders."""
+    skipped = _find_below(without, folder)
+    results: dict[Path, bool] = {}
+
+    def is_skipped(parent: Path) -> bool:
+        if parent not in results:
+            results[parent] = parent == skipped or (parent / SUMMARY).is_file()
+        return results[parent]
+
+    for name in walk_files(folder):
+        parents = [folder / parent for parent in PurePosixPath(name).parents][:-1]
+        if not any(map(is_skipped, parents)):
+            yield name
+
+
+def _find_mask_names(names: list[str]) -> list[str]:
+    """Return names such as ``X_mask.png`` whose image ``X`` is in the same folder."""
+    stems = {str(PurePosixPath(name).with_suffix("")).casefold() for name in names}
+    stems |= {name.casefold() for name in names}
+    masks = []
+    for name in names:
+        stem = str(PurePosixPath(name).with_suffix("")).casefold()
+        image = _MASK_MARK.sub("", stem)
+        if image != stem and image in stems:
+            masks.append(name)
+    return masks
+
+
+def _has_signature(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(8).startswith(_SIGNATURES)
+    except OSError:
+        return False
+
+
+def _find_below(inner: Path | None, folder: Path) -> Path | None:
+    """Return ``inner`` as a path that starts with ``folder``, None if it is not below."""
+    if inner is None or not inner.resolve().is_relative_to(folder.resolve()):
+        return None
+    return folder / inner.resolve().relative_to(folder.resolve())
+
+
+def _natural_sort_key(name: str) -> list[tuple[int, int, str]]:
+    """Return a key that sorts ``img2`` before ``img10``."""
+    parts = re.split(r"(\d+)", name)
+    return [(1, int(p), p) if p.isdecimal() else (0, 0, p) for p in parts]
+
+
+def _count(number: int, one: str, several: str) -> str:
+    return f"{number} {one if number == 1 else several}"
