@@ -1,4 +1,4 @@
-"""``mpsfm reconstruct``: the main command."""
+"""``mpsfm reconstruct``: reconstruct a folder of photos or a video."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mpsfm_core.cli.arguments import ConfigName, Offline, Overrides, Quiet, ViewerName, settings
-from mpsfm_core.cli.errors import heed_termination
-from mpsfm_core.report.reasons import explain_image
+from mpsfm_core.cli.arguments import ConfigName, Offline, Overrides, Quiet, ViewerName, config_overrides
+from mpsfm_core.cli.errors import handle_sigterm
+from mpsfm_core.report.reasons import explain_gps, explain_image
 
 if TYPE_CHECKING:
     from mpsfm_core.pipeline.run import ReconstructionResult
@@ -18,37 +18,42 @@ if TYPE_CHECKING:
 
 def reconstruct(
     images: Annotated[Path, typer.Argument(help="Folder of photos, or a video.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Is written.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Write the results here.")
+    ],
     config: ConfigName = "default",
     intrinsics: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="intrinsics.yaml, a COLMAP model or transforms.json; else --poses, else EXIF.",
+            help="Read cameras from intrinsics.yaml, a COLMAP model or transforms.json; "
+            "default: --poses, then EXIF.",
         ),
     ] = None,
     image_list: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Use these images only, one name a line.")
+        Path | None, typer.Option(metavar="FILE", help="Use only these photos, one name per line.")
     ] = None,
     poses: Annotated[
         Path | None,
         typer.Option(
             metavar="MODEL",
-            help="COLMAP model or transforms.json with known poses and cameras; "
+            help="Start from known poses and cameras of a COLMAP model or transforms.json; "
             "--set mapping.known_poses=fixed keeps the poses.",
         ),
     ] = None,
     overrides: Overrides = None,
     database: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Keypoints and matches of a COLMAP database, not ours."),
+        typer.Option(metavar="FILE", help="Use the keypoints and matches of a COLMAP database."),
     ] = None,
     hloc: Annotated[
         tuple[Path, Path] | None,
-        typer.Option(metavar="FEATURES MATCHES", help="... of hloc's two files (.h5)."),
+        typer.Option(
+            metavar="FEATURES MATCHES", help="Use the keypoints and matches of two hloc files (.h5)."
+        ),
     ] = None,
     fresh: Annotated[
-        bool, typer.Option("--fresh", help="Do not go on from where a killed run was.")
+        bool, typer.Option("--fresh", help="Start over; ignore checkpoints of interrupted runs.")
     ] = False,
     offline: Offline = False,
     viewer: ViewerName = None,
@@ -56,15 +61,14 @@ def reconstruct(
 ) -> None:
     """Reconstruct a folder of photos, or a video.
 
-    Without --config it takes the best features, depth and normals that it can get, and says which.
+    Without --config, the best installed features, depth and normals are used and listed.
 
     Writes a COLMAP model (DIR/sparse), point clouds (DIR/points.ply, DIR/dense.ply), refined
-    depth (DIR/depth) and DIR/summary.json. Exits with 0 on success, 2 on wrong input, 3 when no
-    reconstruction was possible; the summary then has the reasons. After a run that was killed the
-    same command goes on where it was.
+    depth (DIR/depth) and DIR/summary.json. Exit codes: 0 success, 2 wrong input, 3 no
+    reconstruction (the summary has the reasons). Repeat the command to resume an interrupted run.
     """
     if database is not None and hloc is not None:
-        raise typer.BadParameter("matches are of --database or of --hloc, not of both")
+        raise typer.BadParameter("use --database or --hloc for matches, not both")
     run(
         images,
         output,
@@ -75,7 +79,7 @@ def reconstruct(
         poses=poses,
         database=database,
         hloc=hloc,
-        overrides=settings(overrides, offline),
+        overrides=config_overrides(overrides, offline),
         fresh=fresh,
         viewer=viewer,
     )
@@ -87,25 +91,30 @@ def run(
     config: str,
     quiet: bool,
     viewer: str | None = None,
-    **further: Any,
+    **arguments: Any,
 ) -> ReconstructionResult:
-    """Reconstruct with progress bars and print what came out, neither if ``quiet``.
+    """Reconstruct with progress bars and print a summary.
 
-    ``viewer``: name of a viewer that shows the run as it goes on. ``further``: keyword arguments
-    of :func:`mpsfm_core.pipeline.run.reconstruct`.
+    Args:
+        images: Folder of images, or a video.
+        output: Output folder.
+        config: Name or file of the configuration.
+        quiet: Print neither progress nor summary.
+        viewer: Name of a viewer that shows the run.
+        arguments: Further arguments of :func:`mpsfm_core.pipeline.run.reconstruct`.
     """
-    from mpsfm_core.cli.progress import showing_progress
-    from mpsfm_core.cli.view import showing_run
+    from mpsfm_core.cli.progress import show_progress
+    from mpsfm_core.cli.view import show_run
     from mpsfm_core.data.errors import ReconstructionError
     from mpsfm_core.pipeline.run import reconstruct
     from mpsfm_core.providers.registry import Registry
 
-    heed_termination()
+    handle_sigterm()
     registry = Registry.discover()
-    with showing_run(registry, viewer, images, output):
+    with show_run(registry, viewer, images, output):
         try:
-            with showing_progress(registry, quiet):
-                result = reconstruct(images, output, config, registry=registry, **further)
+            with show_progress(registry, quiet):
+                result = reconstruct(images, output, config, registry=registry, **arguments)
         except ReconstructionError as error:
             if error.summary and not quiet:
                 _print_failure(error.summary, output)
@@ -116,7 +125,7 @@ def run(
 
 
 def _print_failure(summary: Mapping[str, Any], output: Path) -> None:
-    """What went wrong and what to do, on stderr."""
+    """Print the findings of a failed run and their remedies on stderr."""
     from mpsfm_core.report.findings import findings
 
     for finding in findings(summary):
@@ -128,12 +137,13 @@ def _print_failure(summary: Mapping[str, Any], output: Path) -> None:
 
 
 def _print_outcome(result: ReconstructionResult, output: Path) -> None:
-    """In one look: is it good, what is weak, what to open."""
-    from mpsfm_core.report.findings import findings, verdict, weakest
+    """Print the verdict, weak and missing photos, and the files to open."""
+    from mpsfm_core.report.findings import findings, weakest
+    from mpsfm_core.report.verdict import judge
 
     images, best = result.summary["images"], result.summary["reconstructions"][0]
     _row(
-        verdict(result.summary).level,
+        judge(result.summary).level,
         f"{len(images['registered'])} of {images['total']} images, {best['points']} points, mean "
         f"reprojection error {best['mean_reprojection_error_px'] or 0:.2f} px",
     )
@@ -162,25 +172,29 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
     _row("time", f"written to {output} in {seconds:.0f} s")
 
 
+_YELLOW = ("partial", "doubtful", "warning", "missing")
+
+
 def _row(label: str, text: str) -> None:
-    colors = {"good": "green", "partial": "yellow", "warning": "yellow", "missing": "yellow"}
+    """Print a line with a colored label."""
+    colors = {"good": "green", **dict.fromkeys(_YELLOW, "yellow")}
     typer.echo(typer.style(f"{label:<9}", fg=colors.get(label), bold=True) + text)
 
 
 def _unit(metric: dict[str, Any] | None) -> str:
-    """What one unit of the reconstruction is; ``metric``: the summary's ``metric_scale``."""
+    """Describe the unit of the reconstruction from the summary's ``metric_scale``."""
     if metric is None:
         return "unit unknown: no depth is metric"
-    by = f"by {metric['num_images']} {metric['by']}, spread {metric['spread']:.0%}"
+    source = f"by {metric['num_images']} {metric['by']}, spread {metric['spread']:.0%}"
     if metric["trusted"]:
-        return f"in metres, {by}"
-    return f"not in metres: one unit is about {metric['metres_per_unit']:.3g} m {by}"
+        return f"in meters, {source}"
+    return f"not in meters: one unit is about {metric['metres_per_unit']:.3g} m {source}"
 
 
 def _place(georeference: Mapping[str, Any]) -> str:
-    """Where on Earth, or why not; ``georeference``: of the summary."""
+    """Describe the summary's ``georeference``, or why it is missing."""
     if "why_not" in georeference:
-        return f"not georeferenced: {georeference['why_not']}"
+        return f"not georeferenced: {explain_gps(georeference['why_not']).text}"
     origin = georeference["origin"]
     return (
         f"east, north, up of {origin['latitude']:.6f}, {origin['longitude']:.6f}; "
@@ -190,7 +204,7 @@ def _place(georeference: Mapping[str, Any]) -> str:
 
 
 def _refined_focal_lengths(details: Collection[Mapping[str, Any]]) -> str:
-    """What became of guessed focal lengths; empty if nothing. ``details``: of the summary."""
+    """Describe the refined focal lengths from the summary's image details; empty if none."""
     changes = {
         (image["focal_length_px"], image["refined_focal_length_px"], image["focal_length_from"])
         for image in details

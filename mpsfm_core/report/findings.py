@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.report.reasons import explain, explain_image, explain_pair, explain_provider
+from mpsfm_core.report.verdict import judge
 
 Level = Literal["bad", "warning", "note"]
 _ORDER: tuple[Level, ...] = ("bad", "warning", "note")
@@ -31,30 +32,11 @@ class Finding:
     images: tuple[str, ...] = field(default=())
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """``level``: good, partial or failed. ``text``: a sentence."""
-
-    level: Literal["good", "partial", "failed"]
-    text: str
-
-
-def verdict(summary: Mapping[str, Any]) -> Verdict:
-    """Whether the run is good, in one look. ``summary``: of ``summary.json``."""
-    images = summary["images"]
-    registered, total = len(images["registered"]), images["total"]
-    if summary["status"] != "success":
-        return Verdict("failed", f"No reconstruction was possible from {_count(total, 'photo')}.")
-    if registered == total:
-        return Verdict("good", f"All {total} photos have their place.")
-    missing = total - registered
-    return Verdict("partial", f"{registered} of {total} photos have their place, {missing} not.")
-
-
 def findings(summary: Mapping[str, Any]) -> list[Finding]:
     """The worst first. ``summary``: of ``summary.json``."""
     found = [
         *_failure(summary),
+        *_doubts(summary),
         *_missing(summary),
         *_unconfirmed(summary),
         *_providers(summary),
@@ -100,6 +82,14 @@ def _failure(summary: Mapping[str, Any]) -> Iterator[Finding]:
     )
 
 
+def _doubts(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield one finding for each reason to doubt the model."""
+    for doubt in judge(summary).doubts:
+        explained = explain(doubt.reason)
+        title = f"{explained.title[:1].upper()}{explained.title[1:]}"
+        yield Finding("warning", title, explained.text, explained.remedy, doubt.images)
+
+
 def _missing(summary: Mapping[str, Any]) -> Iterator[Finding]:
     by_title = defaultdict(list)
     for name, reason in summary["images"]["unregistered"].items():
@@ -127,7 +117,7 @@ def _unconfirmed(summary: Mapping[str, Any]) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"{_count(len(names), 'photo')} placed without proof",
-            "Their matches fit best there (mapping.register_tentatively). Nothing confirms the poses.",
+            "Their matches fit best there (mapping.register_tentatively). Nothing confirms that.",
             "Check their poses before you use them.",
             names,
         )
@@ -182,16 +172,19 @@ def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
         name: (image["focal_length_px"], image.get("refined_focal_length_px"))
         for name, image in details.items()
     }
-    guessed = [name for name, image in details.items() if image["focal_length_from"] == "default"]
+    guessed = [
+        name
+        for name, image in details.items()
+        if image["focal_length_from"] == "default" and refined[name][1]
+    ]
     if guessed:
-        before, after = refined[next((n for n in guessed if refined[n][1]), guessed[0])]
-        became = f"It was refined, from {before:.0f} to {after:.0f} px, but a" if after else "A"
+        changes = [after / before for before, after in (refined[name] for name in guessed)]
         yield Finding(
-            "warning",
-            f"The focal length of {_count(len(guessed), 'photo')} was guessed",
-            f"Neither EXIF nor --intrinsics nor a network tells it. {became} wrong one bends "
-            "everything.",
-            "Give it with --intrinsics, or use photos as they come from the camera, with EXIF.",
+            "note",
+            f"The focal length of {_count(len(guessed), 'photo')} was estimated from the photos",
+            "EXIF and --intrinsics give none. Bundle adjustment changed the initial guess by "
+            f"{min(changes) - 1:+.0%} to {max(changes) - 1:+.0%}.",
+            "Give it with --intrinsics if you know it.",
             tuple(guessed),
         )
     far = [

@@ -23,6 +23,7 @@ from mpsfm_core.report.findings import findings, partner_counts
 from mpsfm_core.report.points import PointSet, dense_points, sparse_points
 from mpsfm_core.report.reasons import explain_image, explain_pair
 from mpsfm_core.report.result_folder import PairMatches, PriorMaps, RefinedMap, ResultFolder
+from mpsfm_core.report.verdict import judge
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.threads import parallel_map
 from mpsfm_core.support.yaml_text import write_yaml
@@ -100,6 +101,7 @@ def _payload(result: ResultFolder) -> dict[str, Any]:
     refined_maps = [refined for refined in maps.values() if refined is not None]
     photos = _ImageEntries(result, maps)
     ids = {name: row for row, name in enumerate(result.names)}
+    verdict = judge(summary)
     return {
         "folder": result.path.resolve().name,
         "verdict": {"level": verdict.level, "text": verdict.text},

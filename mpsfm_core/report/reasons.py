@@ -13,6 +13,8 @@ from typing import Any
 from mpsfm_core.data.decisions import (
     CameraReason,
     ChoiceReason,
+    DoubtReason,
+    GpsReason,
     ImageReason,
     PairReason,
     ProviderReason,
@@ -177,6 +179,66 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
     ChoiceReason.CONFIGURED: ("configured", "as configured", _NO_REMEDY),
     ChoiceReason.FIRST_CHOICE: ("first choice", "the first choice", _NO_REMEDY),
     ChoiceReason.FALLBACK: ("fallback", "a fallback", _NO_REMEDY),
+    GpsReason.TOO_FEW_POSITIONS: (
+        "too few GPS positions",
+        "{num_positions} registered photos have a GPS position; {min_positions} are needed.",
+        _NO_REMEDY,
+    ),
+    GpsReason.TOO_LITTLE_SPREAD: (
+        "GPS positions too close together",
+        "GPS positions spread over {spread_m:.1f} m; their noise is {std_m:.1f} m.",
+        _NO_REMEDY,
+    ),
+    GpsReason.INCONSISTENT: (
+        "inconsistent GPS positions",
+        "No alignment fits the GPS positions.",
+        _NO_REMEDY,
+    ),
+    GpsReason.FEW_INLIERS: (
+        "GPS positions contradict the model",
+        "Only {num_inliers} of {num_positions} GPS positions fit the model.",
+        _NO_REMEDY,
+    ),
+    DoubtReason.UNEXPLAINED_PAIRS: (
+        "matching photos that the model keeps apart",
+        "{num_pairs} pairs of photos have many verified matches but share hardly any point, for "
+        "example {image_a} and {image_b} with {num_matches} matches.",
+        "Look at these matches below. If they are right, part of the model is wrong: add photos "
+        "between these two, or give the true focal length with --intrinsics.",
+    ),
+    DoubtReason.DISCONNECTED: (
+        "parts of the model share no points",
+        "The model has {num_parts} parts that share no points; {num_images} photos are outside of "
+        "the largest part, and their position relative to it is uncertain.",
+        "Add photos that overlap with both parts.",
+    ),
+    DoubtReason.LOW_PARALLAX: (
+        "hardly any parallax",
+        "The rays of half of the points meet at less than {angle_deg:.2g} degrees: the camera "
+        "hardly moved, and depth comes from the depth network alone.",
+        "Move sideways between photos instead of only turning or zooming.",
+    ),
+    DoubtReason.FEW_POINTS: (
+        "poses from few points",
+        "{num_images} photos see fewer than {min_points} points.",
+        _ADD_OVERLAP,
+    ),
+    DoubtReason.FEW_EXPLAINED_MATCHES: (
+        "most matches contradict the model",
+        "The model explains less than {min_ratio:.0%} of the matches of {num_images} photos.",
+        _CHECK_MATCHES,
+    ),
+    DoubtReason.GPS_MISFIT: (
+        "GPS contradicts the model",
+        "Only {num_inliers} of {num_positions} GPS positions fit the model.",
+        "Check the photos whose positions do not fit: the model may be bent or folded there.",
+    ),
+    DoubtReason.UNKNOWN_FOCAL_LENGTH: (
+        "unknown focal length",
+        "The focal length of {num_images} photos is a guess that the photos could not refine; a "
+        "wrong one bends the whole model.",
+        "Give it with --intrinsics, or use photos with EXIF as they come from the camera.",
+    ),
     CameraReason.TOO_FEW_IMAGES: (
         "too few images",
         "{num_images} images of the camera are registered; {min_images} are needed.",
@@ -216,6 +278,11 @@ def explain_pair(stored: Mapping[str, Any]) -> Explanation:
 def explain_provider(stored: Mapping[str, Any]) -> Explanation:
     """Explain why a provider was passed over, as ``summary.json`` stores it."""
     return explain(reason_from_json(ProviderReason, stored))
+
+
+def explain_gps(stored: Mapping[str, Any]) -> Explanation:
+    """Explain why a model is not georeferenced, as ``summary.json`` stores it."""
+    return explain(reason_from_json(GpsReason, stored))
 
 
 def _readable(value: str | int | float) -> str | int | float:

@@ -1,4 +1,4 @@
-"""What came out of a run, as plain data for ``summary.json``."""
+"""Content of ``summary.json``: images, pairs and reconstructions as plain data."""
 
 from __future__ import annotations
 
@@ -11,32 +11,34 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import PinholeCamera
+from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, MetricScale, Reconstruction
+from mpsfm_core.results.evidence import count_explained_matches, describe_evidence
 from mpsfm_core.support.format_versions import check_version
 
 FORMAT = 1
-"""Of ``summary.json`` and of ``views/`` beside it."""
+"""Version of ``summary.json`` and of ``views/`` in the same folder."""
 
 
 def read_summary(path: Path) -> dict[str, Any]:
-    """The content of a ``summary.json``.
+    """Read a ``summary.json``.
 
-    Raises :class:`InputError` when it is missing, damaged, of a newer version or something else.
+    Raises:
+        InputError: the file is missing, damaged, of a newer version or not a summary.
     """
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(
-            f"{path}: {error.strerror}; a folder that 'mpsfm reconstruct' wrote is needed"
+            f"{path}: {error.strerror}; give a folder that 'mpsfm reconstruct' wrote"
         ) from error
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is damaged: {error}") from error
+        raise InputError(f"{path} is damaged: {error}") from error
     if not isinstance(summary, dict) or summary.get("status") not in ("success", "failed"):
-        raise InputError(f"{path}: is not the summary of a run")
+        raise InputError(f"{path} is not the summary of a run")
     check_version(summary, FORMAT, path)
     return summary
 
@@ -44,9 +46,12 @@ def read_summary(path: Path) -> dict[str, Any]:
 def describe_images(
     images: ImageSet, extraction: Mapping[str, Any], mapping: MappingResult
 ) -> dict[str, Any]:
-    """Who is registered, who is not and why, and what is known of each.
+    """Describe all images: registered or not, with the reason, and their statistics.
 
-    ``extraction``: the report of the extraction.
+    Args:
+        images: images of the run.
+        extraction: report of the extraction.
+        mapping: result of the mapper.
     """
     component = {
         image.name: number
@@ -83,7 +88,7 @@ def describe_images(
 
 
 def _focal_length(image: SourceImage, refined: PinholeCamera | None) -> dict[str, Any]:
-    """Of the upright photo: as it was given or guessed, and as it came out if it was refined."""
+    """Describe the initial and, if refined, the final focal length of the upright original."""
     described = {
         "focal_length_from": image.focal_source,
         "focal_length_px": image.camera.mean_focal_length(),
@@ -94,12 +99,29 @@ def _focal_length(image: SourceImage, refined: PinholeCamera | None) -> dict[str
     return described
 
 
-def describe_pairs(extraction: Mapping[str, Any], mapping: MappingResult) -> dict[str, Any]:
-    """Each matched pair: what was found, why it was dropped or could not be the first one."""
+def describe_pairs(
+    extraction: Mapping[str, Any], mapping: MappingResult, problem: MappingProblem
+) -> dict[str, Any]:
+    """Describe all matched pairs: matches, inliers, and why a pair was dropped or cannot start.
+
+    ``explained`` counts the inliers of a pair whose keypoints see one point of the first model.
+
+    Args:
+        extraction: report of the extraction.
+        mapping: result of the mapper.
+        problem: input of the mapper.
+    """
     described = []
+    models = mapping.reconstructions[:1]
+    explained = count_explained_matches(models[0], problem) if models else {}
     for pair in extraction["pairs"]:
-        reason = mapping.report.pair_reasons.get(" ".join(pair["images"]))
-        described.append(pair if reason is None else {**pair, "cannot_start": reason.to_json()})
+        entry = dict(pair)
+        names = tuple(pair["images"])
+        if names in explained:
+            entry["explained"] = explained[names]
+        if (reason := mapping.report.pair_reasons.get(" ".join(names))) is not None:
+            entry["cannot_start"] = reason.to_json()
+        described.append(entry)
     return {
         "proposed": extraction["pairs_proposed"],
         "matched": extraction["pairs_matched"],
@@ -109,15 +131,19 @@ def describe_pairs(extraction: Mapping[str, Any], mapping: MappingResult) -> dic
 
 
 def describe_reconstructions(
-    mapping: MappingResult, models: Sequence[pycolmap.Reconstruction]
+    mapping: MappingResult, models: Sequence[pycolmap.Reconstruction], problem: MappingProblem
 ) -> list[dict[str, Any]]:
-    """Sizes and errors of each reconstruction, in the order of ``components/``, first ``sparse``.
+    """Describe size and errors of each reconstruction: ``sparse``, then ``components/``.
 
-    ``models``: the COLMAP model of each. ``mean_reprojection_error_px`` is over its points, in
-    pixels of the original photos.
+    ``mean_reprojection_error_px`` is the mean over the points, in pixels of the original images.
+
+    Args:
+        mapping: result of the mapper.
+        models: COLMAP model of each reconstruction.
+        problem: input of the mapper.
     """
     return [
-        _describe(reconstruction, model)
+        {**_describe(reconstruction, model), "evidence": describe_evidence(reconstruction, problem)}
         for reconstruction, model in zip(mapping.reconstructions, models, strict=True)
     ]
 

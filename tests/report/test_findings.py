@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 
 from mpsfm_core.data.decisions import (
+    DoubtReason,
+    GpsReason,
     ImageReason,
     PairReason,
     ProviderReason,
@@ -17,8 +19,9 @@ from mpsfm_core.data.decisions import (
     reason_from_json,
 )
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.report.findings import findings, verdict
+from mpsfm_core.report.findings import findings
 from mpsfm_core.report.reasons import explain
+from mpsfm_core.report.verdict import judge
 
 CODES = [code for codes in ReasonCode.__subclasses__() for code in codes]
 EXAMPLES: dict[str, str | float] = {
@@ -86,7 +89,17 @@ def summary(**changes: Any) -> dict[str, Any]:
             ],
         },
         "reconstructions": [
-            {"metric_scale": {"trusted": True, "spread": 0.1, "num_images": 3}},
+            {
+                "metric_scale": {"trusted": True, "spread": 0.1, "num_images": 3},
+                "evidence": {
+                    "parts": [["a", "b", "c"]],
+                    "median_angle_deg": 8.0,
+                    "images": {
+                        name: {"points": 90, "points_in_3_images": 40, "explained_ratio": 0.9}
+                        for name in "abc"
+                    },
+                },
+            },
         ],
         "providers": [{"block": "depth", "name": "compact", "passed_over": {}}],
         **changes,
@@ -95,7 +108,7 @@ def summary(**changes: Any) -> dict[str, Any]:
 
 def test_nothing_is_found_where_nothing_is_wrong() -> None:
     assert findings(summary()) == []
-    assert verdict(summary()).level == "good"
+    assert judge(summary()).level == "good"
 
 
 def test_the_worst_comes_first() -> None:
@@ -108,7 +121,7 @@ def test_the_worst_comes_first() -> None:
     found = findings(said)
     assert [finding.level for finding in found] == ["warning", "warning", "note"]
     assert found[-1].text.endswith("better (weights missing).")
-    assert verdict(said).text == "2 of 3 photos have their place, 1 not."
+    assert judge(said).level == "doubtful"
 
 
 def test_a_run_that_matched_nothing() -> None:
@@ -131,14 +144,70 @@ def test_a_photo_that_hangs_on_another_is_told() -> None:
     assert set(found.images) == {"b", "c"}
 
 
-def test_focal_lengths_are_told_of_once() -> None:
-    said = summary()
+def test_refined_focal_lengths_are_reported_once() -> None:
+    report = summary()
     for name, origin in (("a", "default"), ("b", "exif")):
-        said["images"]["details"][name] |= {
+        report["images"]["details"][name] |= {
             "focal_length_from": origin,
             "refined_focal_length_px": 400.0,
         }
-    guess, change = findings(said)
+    guess, change = findings(report)
     assert (guess.images, change.images) == (("a",), ("b",))
-    assert "refined, from 500 to 400 px, but a wrong one" in guess.text
+    assert "-20%" in guess.text
     assert change.text.startswith("From 500 (exif) to 400 px.")
+
+
+def doubts(report: dict[str, Any]) -> list[DoubtReason]:
+    """Return the codes of the doubts of a run."""
+    return [doubt.reason.code for doubt in judge(report).doubts]
+
+
+def test_verdict_without_doubt_is_good_or_partial() -> None:
+    report = summary()
+    assert judge(report).level == "good"
+    report["images"]["registered"].remove("c")
+    assert judge(report).text == "2 of 3 photos registered, 1 missing."
+    assert judge(report).level == "partial"
+
+
+def test_verdict_doubts_pairs_that_share_no_points() -> None:
+    report = summary()
+    for pair in report["pairs"]["all"][:2]:
+        pair |= {"inliers": 80, "explained": 3}
+    (doubt,) = judge(report).doubts
+    assert doubt.reason.code is DoubtReason.UNEXPLAINED_PAIRS
+    assert doubt.images == ("a", "b", "c") and doubt.reason.values["num_matches"] == 80
+    report["pairs"]["all"][0]["explained"] = 60
+    assert not doubts(report)
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"parts": [["a", "b"], ["c"]]}, DoubtReason.DISCONNECTED),
+        ({"median_angle_deg": 0.1}, DoubtReason.LOW_PARALLAX),
+        ({"images": {"a": {"points": 12, "explained_ratio": 0.9}}}, DoubtReason.FEW_POINTS),
+        (
+            {"images": {"a": {"points": 99, "explained_ratio": 0.05}}},
+            DoubtReason.FEW_EXPLAINED_MATCHES,
+        ),
+    ],
+)
+def test_verdict_doubts_weak_evidence(change: dict[str, Any], code: DoubtReason) -> None:
+    report = summary()
+    report["reconstructions"][0]["evidence"] |= change
+    assert doubts(report) == [code]
+
+
+def test_verdict_doubts_a_model_that_gps_contradicts() -> None:
+    report = summary()
+    misfit = GpsReason.FEW_INLIERS.because(num_inliers=7, num_positions=24).to_json()
+    report["georeference"] = {"why_not": misfit}
+    assert doubts(report) == [DoubtReason.GPS_MISFIT]
+
+
+def test_verdict_doubts_guessed_focal_lengths_that_were_not_refined() -> None:
+    report = summary()
+    report["images"]["details"]["b"]["focal_length_from"] = "default"
+    (doubt,) = judge(report).doubts
+    assert doubt.images == ("b",)

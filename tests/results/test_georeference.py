@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 
 from mpsfm_core.data import DepthPrior, PinholeCamera
+from mpsfm_core.data.decisions import GpsReason, Reason
 from mpsfm_core.geometry import angle_between_deg, camera_center
 from mpsfm_core.inputs.gps import GpsPosition, convert_to_enu
 from mpsfm_core.mapping.scene.reconstruction import (
@@ -109,20 +110,19 @@ def test_wrong_positions_do_not_count() -> None:
 @pytest.mark.parametrize(
     ("centers", "noise_m", "why"),
     [
-        (STREET[:3], 1.0, "3 registered photos have a GPS position, 4 are needed"),
-        (STREET / 20, 3.0, "GPS positions spread over"),
-        (np.random.default_rng(1).uniform(0, 900, (25, 3)), None, "GPS positions"),
+        (STREET[:3], 1.0, GpsReason.TOO_FEW_POSITIONS),
+        (STREET / 20, 3.0, GpsReason.TOO_LITTLE_SPREAD),
+        (np.random.default_rng(1).uniform(0, 900, (25, 3)), None, GpsReason.FEW_INLIERS),
     ],
 )
-def test_positions_that_do_not_suffice_change_nothing(centers, noise_m, why: str) -> None:
+def test_positions_that_do_not_suffice_change_nothing(centers, noise_m, why: GpsReason) -> None:
     given = positions(centers, noise_m or 1.0, altitudes=False)
     if noise_m is None:  # of other photos
         given = dict(
             zip(given, np.random.default_rng(2).permutation(list(given.values())), strict=True)
         )
     found = georeference(scrambled(walk(centers)), given)
-    assert isinstance(found, str)
-    assert why in found
+    assert isinstance(found, Reason) and found.code is why
 
 
 def test_enu_is_metres_and_unknown_altitudes_stay_unknown() -> None:

@@ -286,9 +286,9 @@ def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path)
         "focal_length_px": pytest.approx(140.5),
         "keypoints": 46,
     }
-    (pair,) = describe_pairs(extraction, mapping)["all"]
+    (pair,) = describe_pairs(extraction, mapping, solved.problem)["all"]
     assert pair == {**extraction["pairs"][0], "cannot_start": {"code": "no-pose"}}
-    (numbers,) = describe_reconstructions(mapping, [model])
+    (numbers,) = describe_reconstructions(mapping, [model], solved.problem)
     assert (numbers["images"], numbers["points"], numbers["observations"]) == (3, 40, 120)
     assert numbers["mean_track_length"] == 3
     assert numbers["mean_reprojection_error_px"] == pytest.approx(0, abs=1e-6)

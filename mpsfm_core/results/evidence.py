@@ -1,0 +1,144 @@
+"""Measure the evidence for a reconstruction: explained matches, parallax and connectivity.
+
+The measures go into ``summary.json``. :mod:`mpsfm_core.report.verdict` judges them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from mpsfm_core.data import Float64, Int64, MappingProblem
+from mpsfm_core.geometry import camera_center
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+
+MIN_SHARED_POINTS = 3
+"""Images with fewer common points are not connected [minimal sample of PnP]."""
+
+
+def count_explained_matches(
+    reconstruction: Reconstruction, problem: MappingProblem
+) -> dict[tuple[str, str], int]:
+    """Count for each pair of registered images the matches whose keypoints see one point.
+
+    Args:
+        reconstruction: Reconstruction of some images of the problem.
+        problem: Images and verified pairs.
+
+    Returns:
+        Names of both images -> number of explained matches.
+    """
+    point_ids = {image.index: image.point_ids for image in reconstruction.confirmed_images}
+    counts = {}
+    for pair in problem.pairs:
+        if pair.image_a in point_ids and pair.image_b in point_ids:
+            rows_a = point_ids[pair.image_a][pair.matches[:, 0]]
+            rows_b = point_ids[pair.image_b][pair.matches[:, 1]]
+            names = problem.images[pair.image_a].name, problem.images[pair.image_b].name
+            counts[names] = int(((rows_a >= 0) & (rows_a == rows_b)).sum())
+    return counts
+
+
+def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -> dict[str, Any]:
+    """Describe the evidence for the poses of a reconstruction as plain data.
+
+    Args:
+        reconstruction: Reconstruction of some images of the problem.
+        problem: Images and verified pairs.
+
+    Returns:
+        ``parts``: names of the images in each part that shares points, largest part first.
+        ``median_angle_deg``: median over the points of the largest angle between two rays.
+        ``images``: per image the number of points, of points in at least three images, and the
+        share of its matches that the model explains.
+    """
+    images = reconstruction.confirmed_images
+    explained = count_explained_matches(reconstruction, problem)
+    matched = _count_per_image(
+        {
+            (problem.images[pair.image_a].name, problem.images[pair.image_b].name): len(pair)
+            for pair in problem.pairs
+        },
+        explained.keys(),
+    )
+    supported = _count_per_image(explained, explained.keys())
+    track_lengths = _track_lengths(images, len(reconstruction.points))
+    return {
+        "parts": _connected_parts(images, len(reconstruction.points)),
+        "median_angle_deg": _median_angle_deg(images, reconstruction.points),
+        "images": {
+            image.name: {
+                "points": int((image.point_ids >= 0).sum()),
+                "points_in_3_images": int((track_lengths[_rows(image)] >= 3).sum()),
+                "explained_ratio": round(
+                    supported.get(image.name, 0) / max(matched.get(image.name, 0), 1), 4
+                ),
+            }
+            for image in images
+        },
+    }
+
+
+def _count_per_image(counts: dict[tuple[str, str], int], pairs: Any) -> dict[str, int]:
+    """Sum the counts of the given pairs over each of their images."""
+    sums: dict[str, int] = {}
+    for names in pairs:
+        for name in names:
+            sums[name] = sums.get(name, 0) + counts[names]
+    return sums
+
+
+def _rows(image: RegisteredImage) -> Int64:
+    """Return the distinct points that an image sees."""
+    return np.unique(image.point_ids[image.point_ids >= 0])
+
+
+def _track_lengths(images: tuple[RegisteredImage, ...], num_points: int) -> Int64:
+    """Count the images of each point."""
+    rows = [_rows(image) for image in images]
+    return np.bincount(np.concatenate([*rows, np.zeros(0, np.int64)]), minlength=num_points)
+
+
+def _connected_parts(images: tuple[RegisteredImage, ...], num_points: int) -> list[list[str]]:
+    """Group the images that share points, directly or through others; largest part first."""
+    if not images:
+        return []
+    rows = [_rows(image) for image in images]
+    observations = coo_array(
+        (
+            np.ones(sum(map(len, rows))),
+            (np.repeat(np.arange(len(images)), list(map(len, rows))), np.concatenate(rows)),
+        ),
+        shape=(len(images), max(num_points, 1)),
+    ).tocsr()
+    shared = (observations @ observations.T) >= MIN_SHARED_POINTS
+    _, labels = connected_components(shared, directed=False)
+    parts = [
+        [image.name for image, label in zip(images, labels, strict=True) if label == part]
+        for part in range(labels.max() + 1)
+    ]
+    return sorted(parts, key=len, reverse=True)
+
+
+def _median_angle_deg(images: tuple[RegisteredImage, ...], points: Float64) -> float | None:
+    """Return the median over the points of the largest angle between two of their rays."""
+    if not len(points) or not images:
+        return None
+    mean_rays = np.zeros_like(points)
+    rays = []
+    for image in images:
+        rows = _rows(image)
+        ray = points[rows] - camera_center(image.rotation, image.translation)
+        ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
+        mean_rays[rows] += ray
+        rays.append((rows, ray))
+    mean_rays /= np.maximum(np.linalg.norm(mean_rays, axis=1, keepdims=True), 1e-12)
+    # Twice the largest angle to the mean ray bounds the largest angle between two rays.
+    cosines = np.ones(len(points))
+    for rows, ray in rays:
+        cosines[rows] = np.minimum(cosines[rows], (ray * mean_rays[rows]).sum(axis=1))
+    angles = 2 * np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    return round(float(np.median(angles)), 4)

@@ -1,0 +1,41 @@
+"""Evidence for a reconstruction, against scenes with known answers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mpsfm_core.data import VerifiedPair
+from mpsfm_core.results.evidence import count_explained_matches, describe_evidence
+
+
+def test_explained_matches_count_common_points_of_a_pair(solved) -> None:
+    right = np.stack([np.arange(10)] * 2, axis=1)
+    wrong = np.stack([np.arange(10), np.arange(10) + 1], axis=1)
+    matches = np.concatenate([right, wrong])
+    scores = np.ones(len(matches), np.float32)
+    pairs = (
+        VerifiedPair(0, 1, matches, scores, np.eye(3), np.zeros(3)),
+        VerifiedPair(0, 3, matches, scores, np.eye(3), np.zeros(3)),
+    )
+    explained = count_explained_matches(solved.best, replace(solved.problem, pairs=pairs))
+    assert explained == {("images/0.png", "images/1.png"): 10}
+
+
+def test_evidence_of_a_connected_model(solved) -> None:
+    model = solved.best
+    evidence = describe_evidence(model, solved.problem)
+    assert [len(part) for part in evidence["parts"]] == [len(model.images)]
+    assert evidence["median_angle_deg"] > 1
+    assert all(image["points"] > 0 for image in evidence["images"].values())
+
+
+def test_image_without_common_points_is_a_part_of_its_own(solved) -> None:
+    model = solved.best
+    *others, last = model.images
+    lost = replace(last, point_ids=np.full_like(last.point_ids, -1))
+    evidence = describe_evidence(replace(model, images=(*others, lost)), solved.problem)
+    assert evidence["parts"][-1] == [last.name]
+    assert evidence["images"][last.name]["points"] == 0
+    assert evidence["images"][last.name]["explained_ratio"] == 0
