@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import yaml
 
-from mpsfm_core.cli.time_left import TimeLeft
+from mpsfm_core.cli.remaining_time import RemainingTimeEstimator
 from mpsfm_core.config import load_config
 from mpsfm_core.data import DepthPrior, Features, NormalPrior, PairMatches
 from mpsfm_core.data.errors import InputError
@@ -87,9 +87,9 @@ def calibrated(path: Path) -> Any:
 
 
 def speeds(folder: Path) -> Any:
-    left = TimeLeft(folder / "cache")
-    left.started("features", 100)
-    return left._usual["features"]
+    left = RemainingTimeEstimator(folder / "cache")
+    left.start_stage("features", 100)
+    return left._expected["features"]
 
 
 def frames(folder: Path) -> Any:

@@ -1,9 +1,9 @@
-"""The command ``mpsfm``: thin commands over the front door.
+"""Command line ``mpsfm``: thin commands over the public API.
 
-One module a command or command group, added to :func:`build_app`. A module imports what its
-command needs inside of the command's function, so that every command starts as fast as it can.
-Commands raise; :class:`~mpsfm_core.cli.errors.GuardedGroup` turns what they raise into one line
-on stderr and an exit code.
+Each command or command group has a module, and :func:`build_app` adds them all. A command imports
+its dependencies inside its function, so that every command starts fast.
+:class:`~mpsfm_core.cli.errors.CommandGroup` turns exceptions into one line on stderr and an exit
+code.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from mpsfm_core.cli import (
     testsets,
     view,
 )
-from mpsfm_core.cli.errors import GuardedGroup
+from mpsfm_core.cli.errors import CommandGroup
 
 
 def main() -> None:
-    """Entry point of the ``mpsfm`` command."""
+    """Run the ``mpsfm`` command."""
     build_app()(prog_name="mpsfm")
 
 
 def build_app() -> typer.Typer:
-    """The command line with all its commands."""
+    """Build the command line with all commands."""
     app = typer.Typer(
-        cls=GuardedGroup,
-        callback=_options,
+        cls=CommandGroup,
+        callback=_configure_logging,
         no_args_is_help=True,
         add_completion=False,
-        pretty_exceptions_show_locals=False,  # they would print whole images
+        pretty_exceptions_show_locals=False,  # locals include whole images
     )
     app.command("reconstruct")(reconstruct.reconstruct)
     app.command("demo")(demo.demo)
@@ -70,24 +70,28 @@ def build_app() -> typer.Typer:
     return app
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(requested: bool) -> None:
+    """Print the version and exit if requested."""
+    if requested:
         from mpsfm_core.providers.registry import core_version
 
         typer.echo(core_version())
         raise typer.Exit
 
 
-def _options(
+def _configure_logging(
     debug: Annotated[
         bool, typer.Option("--debug", envvar="MPSFM_DEBUG", help="Show tracebacks and debug logs.")
     ] = False,
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="And exit.")
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Structure-from-Motion with depth and normal priors from plugins."""
     logging.basicConfig(format="mpsfm: %(levelname)s: %(message)s", level=logging.WARNING)
     logging.getLogger("mpsfm_core").setLevel(logging.DEBUG if debug else logging.WARNING)
     if not debug:
-        os.environ.setdefault("GLOG_minloglevel", "1")  # COLMAP logs what it creates
+        os.environ.setdefault("GLOG_minloglevel", "1")  # hides COLMAP's info messages

@@ -9,7 +9,7 @@ import typer
 ConfigName: TypeAlias = Annotated[
     str,
     typer.Option(
-        "--config", metavar="NAME_OR_FILE", help="A shipped configuration or a YAML file."
+        "--config", metavar="NAME_OR_FILE", help="Use a shipped configuration or a YAML file."
     ),
 ]
 Overrides: TypeAlias = Annotated[
@@ -17,10 +17,10 @@ Overrides: TypeAlias = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, e.g. runtime.workers=2."),
 ]
 Offline: TypeAlias = Annotated[
-    bool, typer.Option("--offline", help="Download nothing; take what is on this machine.")
+    bool, typer.Option("--offline", help="Download nothing; use only local files.")
 ]
 Quiet: TypeAlias = Annotated[
-    bool, typer.Option("--quiet", "-q", help="No progress, no summary; errors only.")
+    bool, typer.Option("--quiet", "-q", help="Print errors only: no progress, no summary.")
 ]
 Distances: TypeAlias = Annotated[
     list[float] | None,
@@ -28,29 +28,34 @@ Distances: TypeAlias = Annotated[
         "--distance",
         metavar="D",
         min=1e-6,
-        help="Of the cloud, in the unit of the truth; may be repeated. Default: 1 to 50 cm.",
+        help="Add a distance threshold for the cloud, in the unit of the truth; may be repeated. "
+        "Default: 1 to 50 cm.",
     ),
 ]
 ViewerName: TypeAlias = Annotated[
     str | None,
-    typer.Option("--viewer", metavar="NAME", help="Of a viewer plugin: viser, rerun."),
+    typer.Option("--viewer", metavar="NAME", help="Show the run in a viewer: viser or rerun."),
 ]
 
 
-def settings(overrides: list[str] | None, offline: bool) -> list[str]:
-    """The settings that the options ``--set`` and ``--offline`` mean."""
+def config_overrides(overrides: list[str] | None, offline: bool) -> list[str]:
+    """Merge the options ``--set`` and ``--offline`` to configuration overrides."""
     return [*(overrides or ()), *(["runtime.offline=true"] if offline else [])]
 
 
-def tolerances(distances: list[float] | None) -> tuple[float, ...]:
-    """The distances that the options ``--distance`` mean, each once, the smallest first."""
+def distance_thresholds(distances: list[float] | None) -> tuple[float, ...]:
+    """Return the sorted, unique thresholds of ``--distance``, or the default thresholds."""
     from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES
 
     return tuple(sorted(set(distances or TOLERANCES)))
 
 
-def assigned(overrides: list[str] | None) -> dict[str, Any]:
-    """The values that ``--set`` gives to the settings of one command; raises ConfigError."""
+def parse_overrides(overrides: list[str] | None) -> dict[str, Any]:
+    """Parse the ``--set`` options of a command with settings of its own.
+
+    Raises:
+        ConfigError: An option is no assignment.
+    """
     from mpsfm_core.support.yaml_text import parse_assignment
 
     values: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""``mpsfm benchmark``: configurations and peers on scenes with known poses."""
+"""``mpsfm benchmark``: compare configurations and other mappers on scenes with true poses."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Distances, Overrides, Quiet, tolerances
+from mpsfm_core.cli.arguments import Distances, Overrides, Quiet, distance_thresholds
 
 if TYPE_CHECKING:
     from mpsfm_core.evaluation.records import Record
@@ -18,27 +18,29 @@ def benchmark(
         list[Path] | None, typer.Argument(metavar="SCENE...", help="Scene folders.")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Is written.")
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Write the results here.")
     ] = None,
     configs: Annotated[
         list[str] | None,
-        typer.Option("--config", metavar="NAME_OR_FILE", help="May be repeated."),
+        typer.Option(
+            "--config", metavar="NAME_OR_FILE", help="Run a configuration; may be repeated."
+        ),
     ] = None,
     sets: Annotated[
-        str | None, typer.Option(metavar="A,B", help="Buckets of test sets; all by default.")
+        str | None, typer.Option(metavar="A,B", help="Use only these buckets of test sets.")
     ] = None,
     prior: Annotated[
         str,
         typer.Option(
             metavar="A,B",
-            help="Depth: sensor (gt_depth), degraded (gt_depth with errors of a network, "
-            "degraded-1, ... with others) or config (the configuration's provider).",
+            help="Choose the depth: sensor (gt_depth), degraded (gt_depth with the errors of a "
+            "network; degraded-1, ... use other seeds) or config (the configuration's provider).",
         ),
     ] = "config",
     peers: Annotated[
         str | None,
         typer.Option(
-            metavar="A,B", help="Other methods on the same matches (default: all), or none."
+            metavar="A,B", help="Run other mappers on the same matches (default: all), or none."
         ),
     ] = None,
     results: Annotated[
@@ -46,27 +48,27 @@ def benchmark(
         typer.Option(
             "--result",
             metavar="NAME=FOLDER",
-            help="Models that another program made, FOLDER/SCENE/SET each: COLMAP's or "
-            "transforms.json. May be repeated.",
+            help="Add models of another program in FOLDER/SCENE/SET: COLMAP or transforms.json. "
+            "May be repeated.",
         ),
     ] = None,
     distance: Distances = None,
-    workers: Annotated[int, typer.Option(min=1, help="Sets mapped at the same time.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Map so many sets in parallel.")] = 1,
     overrides: Overrides = None,
     compare: Annotated[
         tuple[str, str] | None,
         typer.Option(
             metavar="A B",
-            help="Compare two finished benchmarks instead; DIR, or DIR:METHOD for one method.",
+            help="Compare two finished benchmarks instead: DIR, or DIR:METHOD for one method.",
         ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Compare our mapper with COLMAP's on scenes with true poses; pose AUC, images, time.
+    """Compare mpsfm with COLMAP and others on scenes with true poses: AUC, images, time.
 
-    A SCENE is a folder with images/, gt/, and maybe intrinsics.yaml, gt_depth/ and testsets.yaml.
-    Writes DIR/report.md, .json and .html. What DIR has already is not computed again.
-    With gt_depth/ and --set dense.enabled=true also what depth maps and clouds are worth.
+    A SCENE is a folder with images/, gt/, and optionally intrinsics.yaml, gt_depth/ and
+    testsets.yaml. Writes DIR/report.md, .json and .html. Finished results in DIR are reused.
+    With gt_depth/ and --set dense.enabled=true, also evaluates depth maps and clouds.
     """
     from mpsfm_core.data.errors import InputError
 
@@ -74,8 +76,8 @@ def benchmark(
         _compare(*compare)
         return
     if not scenes or output is None:
-        raise InputError("benchmark needs scene folders and --output DIR, or --compare A B")
-    from mpsfm_core.cli.progress import showing_progress
+        raise InputError("benchmark needs scene folders and --output DIR, or else --compare A B")
+    from mpsfm_core.cli.progress import show_progress
     from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
     from mpsfm_core.evaluation.methods import OTHERS
     from mpsfm_core.evaluation.report import make_rows, markdown, write_report
@@ -84,30 +86,30 @@ def benchmark(
     plan = Plan(
         tuple(scenes),
         tuple(configs or ("benchmark",)),
-        None if sets is None else _listed(sets),
-        _listed(prior),
-        OTHERS if peers is None else () if peers == "none" else _listed(peers),
+        None if sets is None else _split_list(sets),
+        _split_list(prior),
+        OTHERS if peers is None else () if peers == "none" else _split_list(peers),
         tuple(overrides or ()),
         workers,
-        dict(_named(text) for text in results or ()),
-        tolerances(distance),
+        dict(_parse_result(text) for text in results or ()),
+        distance_thresholds(distance),
     )
     registry = Registry.discover()
-    with showing_progress(registry, quiet):
-        records = run_benchmark(plan, output, registry, None if quiet else _tell)
+    with show_progress(registry, quiet):
+        records = run_benchmark(plan, output, registry, None if quiet else _print_record)
     write_report(output, records)
     typer.echo(markdown(make_rows(records)), nl=False)
 
 
-def _tell(record: Record, known: bool) -> None:
-    """One line on stderr for a finished run."""
+def _print_record(record: Record, cached: bool) -> None:
+    """Print a line on stderr for a finished run."""
     images = f"{len(record.estimated)}/{len(record.truth)} images"
-    end = "known" if known else record.error or f"{record.cpu_seconds:.1f} s"
+    end = "cached" if cached else record.error or f"{record.cpu_seconds:.1f} s"
     typer.echo(f"{record.scene} {record.set_name} {record.label}: {images}, {end}", err=True)
 
 
-def _named(text: str) -> tuple[str, Path]:
-    """Name and folder of ``--result``."""
+def _parse_result(text: str) -> tuple[str, Path]:
+    """Parse name and folder of ``--result``."""
     import re
 
     from mpsfm_core.data.errors import InputError
@@ -115,17 +117,21 @@ def _named(text: str) -> tuple[str, Path]:
 
     name, _, folder = text.partition("=")
     if not (folder and re.fullmatch(r"[\w.-]+", name) and Path(folder).is_dir()):
-        raise InputError(f"--result {text}: must look like NAME=FOLDER, of a folder that is there")
+        raise InputError(f"--result {text}: must be NAME=FOLDER with an existing folder")
     if name.split("-")[0] == OURS or name in OTHERS:
-        raise InputError(f"--result {text}: {name!r} is the name of a method of the benchmark")
+        raise InputError(
+            f"--result {text}: {name!r} is a method of the benchmark; choose another name"
+        )
     return name, Path(folder)
 
 
-def _listed(text: str) -> tuple[str, ...]:
+def _split_list(text: str) -> tuple[str, ...]:
+    """Split a comma-separated option."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def _compare(first: str, second: str) -> None:
+    """Print the comparison of two finished benchmarks."""
     from mpsfm_core.evaluation.comparison import compare, describe, read_side
 
     typer.echo(describe(compare(read_side(first), read_side(second))), nl=False)

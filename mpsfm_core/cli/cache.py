@@ -1,4 +1,4 @@
-"""``mpsfm cache``: what is kept on this machine between runs, and less of it."""
+"""``mpsfm cache``: show and prune the files that runs reuse."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ import typer
 
 from mpsfm_core.cli.models import CacheDir
 
-app = typer.Typer(no_args_is_help=True, help="What is kept between runs: size, less of it.")
+app = typer.Typer(no_args_is_help=True, help="Show and prune the files that runs reuse.")
 
 _DAY_S = 86_400
 PARTS = {
-    "extraction": "results of providers, computed again when they are missed",
+    "extraction": "results of providers, computed again if missing",
     "mapping": "checkpoints of interrupted runs",
     "weights": "downloaded networks",
 }
+"""Subfolder of the cache -> description."""
 
 
 @app.command()
 def show(cache: CacheDir = None) -> None:
-    """Show where the cache is and how large its parts are."""
+    """Show the folder of the cache and the size of its parts."""
     from mpsfm_core.cli.tables import print_table
     from mpsfm_core.extraction.cache import cache_folder
 
@@ -33,24 +34,27 @@ def show(cache: CacheDir = None) -> None:
     rows = []
     for part, meaning in PARTS.items():
         files = list(_files(folder / part))
-        rows.append((part, f"{len(files)}", size_text(sum(s for _, s, _ in files)), meaning))
-    print_table(("part", "files", "size", "what it is"), rows)
+        rows.append((part, f"{len(files)}", format_size(sum(s for _, s, _ in files)), meaning))
+    print_table(("part", "files", "size", "content"), rows)
 
 
 @app.command()
 def prune(
     days: Annotated[
-        float, typer.Option("--older-than", min=0, metavar="DAYS", help="Not used for so long.")
+        float,
+        typer.Option(
+            "--older-than", min=0, metavar="DAYS", help="Remove files unused for so many days."
+        ),
     ] = 30,
     weights: Annotated[
-        bool, typer.Option("--weights", help="Downloaded networks too; they are fetched again.")
+        bool, typer.Option("--weights", help="Remove downloaded networks, too.")
     ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would go.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print sizes.")] = False,
     cache: CacheDir = None,
 ) -> None:
-    """Remove what was not used for some time.
+    """Remove files that were not used for some time.
 
-    Nothing is lost but time: what a later run misses it computes or fetches again.
+    Later runs compute or download missing files again.
     """
     from mpsfm_core.extraction.cache import cache_folder
 
@@ -63,30 +67,31 @@ def prune(
         for part in parts:
             _remove_empty(folder / part)
     verb = "would free" if dry_run else "freed"
-    typer.echo(f"{verb} {size_text(sum(size for _, size, _ in old))}, {len(old)} files")
+    typer.echo(f"{verb} {format_size(sum(size for _, size, _ in old))}, {len(old)} files")
 
 
 def cache_size(folder: Path) -> int:
-    """Bytes of all parts."""
+    """Return the bytes of all parts of a cache."""
     return sum(size for part in PARTS for _, size, _ in _files(folder / part))
 
 
-def size_text(size: int) -> str:
-    """Bytes in words."""
+def format_size(size: int) -> str:
+    """Format a number of bytes."""
     return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
 
 
 def _files(folder: Path) -> Iterator[tuple[Path, int, float]]:
-    """Files with their sizes and when they were last used; one that goes meanwhile is left out."""
+    """Yield path, size and time of last use of each file; files that disappear are skipped."""
     for path in sorted(folder.rglob("*")):
         with suppress(OSError):
             if path.is_file():
-                found = path.stat()
-                yield path, found.st_size, max(found.st_atime, found.st_mtime)
+                status = path.stat()
+                yield path, status.st_size, max(status.st_atime, status.st_mtime)
 
 
 def _remove_empty(folder: Path) -> None:
+    """Remove empty subfolders."""
     for path in sorted(folder.rglob("*"), reverse=True):
         if path.is_dir():
-            with suppress(OSError):  # it is not empty
+            with suppress(OSError):  # not empty
                 path.rmdir()

@@ -1,4 +1,4 @@
-"""``mpsfm calibrate``: make the declared uncertainty of a prior trustworthy."""
+"""``mpsfm calibrate``: fit the uncertainty of a depth or normals provider."""
 
 from __future__ import annotations
 
@@ -14,86 +14,111 @@ if TYPE_CHECKING:
     from mpsfm_core.calibration.fitting import Alignment
     from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 
-_OWN = ("options.", "wrap.", "calibration")
-_TRUTH = "ground_truth."
+_PROVIDER_KEYS = ("options.", "wrap.", "calibration")
+"""Prefixes of settings that belong to the provider."""
+_GROUND_TRUTH_KEY = "ground_truth."
+"""Prefix of settings that belong to the true maps."""
 
 
 def calibrate(
-    provider: Annotated[str, typer.Option(metavar="NAME", help="Of a depth or normals provider.")],
+    provider: Annotated[
+        str, typer.Option(metavar="NAME", help="Calibrate this depth or normals provider.")
+    ],
     images: Annotated[Path, typer.Option(metavar="DIR", help="Folder of photos.")],
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="Is written: .yaml or .json.")
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Write the calibration here: .yaml or .json."
+        ),
     ],
-    kind: Annotated[str, typer.Option(metavar="KIND", help="depth or normals.")] = "depth",
+    kind: Annotated[
+        str, typer.Option(metavar="KIND", help="Kind of the provider: depth or normals.")
+    ] = "depth",
     ground_truth: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="True maps, named like the photos.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Compare with true maps, named like the photos."),
     ] = None,
     model: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="COLMAP model with points, as truth.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Compare with the points of a COLMAP model."),
     ] = None,
     intrinsics: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="intrinsics.yaml or a COLMAP model; else --model, EXIF."),
+        typer.Option(
+            metavar="FILE",
+            help="Read cameras from intrinsics.yaml or a COLMAP model; default: --model, EXIF.",
+        ),
     ] = None,
     image_list: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Use these images only, one name a line.")
+        Path | None, typer.Option(metavar="FILE", help="Use only these photos, one name per line.")
     ] = None,
     alignment: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="To try: scale, scale-shift, disparity."),
+        typer.Option(
+            metavar="NAME", help="Try only these alignments: scale, scale-shift, disparity."
+        ),
     ] = None,
     config: Annotated[
-        str | None, typer.Option("--config", metavar="NAME_OR_FILE", help="Of everything else.")
+        str | None,
+        typer.Option(
+            "--config",
+            metavar="NAME_OR_FILE",
+            help="Take all other settings from here.",
+        ),
     ] = None,
     overrides: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="options.K=V: of the provider; ground_truth.K=V: of its files (scale=0.001 for "
-            "16-bit millimetres); else a setting of the configuration.",
+            help="Change a setting: options.K=V of the provider, ground_truth.K=V of the true maps "
+            "(scale=0.001 for 16-bit millimeters), or any of the configuration.",
         ),
     ] = None,
-    folds: Annotated[int, typer.Option(min=2, help="Groups of images to hold out in turn.")] = 4,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    folds: Annotated[
+        int, typer.Option(min=2, help="Number of folds of the cross-validation over photos.")
+    ] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random sampling.")] = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Fit the uncertainty of a depth or normals provider and report how good it is.
+    """Fit the uncertainty of a depth or normals provider and report its quality.
 
-    Compares with true maps, or with the points of a COLMAP model, or, given neither, with the
-    points of our own reconstruction. Writes FILE for `depth.calibration: FILE`, and a report
-    beside it.
+    Compares with true maps or with the points of a COLMAP model. Given neither, reconstructs the
+    photos and compares with the points. Writes FILE for `depth.calibration: FILE`, and a report
+    next to FILE.
     """
     from mpsfm_core.calibration.calibrate import Photos, calibrate
     from mpsfm_core.calibration.report import write_report
     from mpsfm_core.calibration.study import StudyOptions
-    from mpsfm_core.cli.progress import showing_progress
+    from mpsfm_core.cli.progress import show_progress
     from mpsfm_core.config import load_config
     from mpsfm_core.data.errors import InputError
     from mpsfm_core.inputs.models import find_model_folder
     from mpsfm_core.providers.registry import Registry
 
-    calibrated_kind, alignments = _checked(kind, alignment or [])
+    calibrated_kind, alignments = _check_names(kind, alignment or [])
     if output.suffix not in (".yaml", ".yml", ".json"):
-        raise InputError(f"{output}: a calibration file ends in .yaml or .json")
+        raise InputError(f"{output}: a calibration file must end in .yaml or .json")
     registry = Registry.discover()
-    own, truth = _sorted(kind, overrides or [])
-    alone = ground_truth is None and model is None
+    config_settings, truth_settings = _split_overrides(kind, overrides or [])
+    needs_reconstruction = ground_truth is None and model is None
     loaded = load_config(
-        config or ("default" if alone else "demo"),
-        [f"{kind}.use={provider}", *own],
+        config or ("default" if needs_reconstruction else "demo"),
+        [f"{kind}.use={provider}", *config_settings],
         registry,
-        complete=alone,
+        complete=needs_reconstruction,
     )
     output.parent.mkdir(parents=True, exist_ok=True)
     if intrinsics is None and model is not None:
         intrinsics = find_model_folder(model)
-    with showing_progress(registry, quiet):
+    with show_progress(registry, quiet):
         result = calibrate(
             Photos(images, intrinsics, image_list),
             loaded,
             calibrated_kind,
-            ground_truth=None if ground_truth is None else {"directory": ground_truth, **truth},
+            ground_truth=None
+            if ground_truth is None
+            else {"directory": ground_truth, **truth_settings},
             model=model,
             alignments=alignments,
             options=StudyOptions(folds=folds, seed=seed),
@@ -106,10 +131,14 @@ def calibrate(
         typer.echo(f"written to {output}; the report is {page}")
 
 
-def _checked(
+def _check_names(
     kind: str, alignments: list[str]
 ) -> tuple[CalibratedKind, tuple[Alignment, ...] | None]:
-    """The kind and the alignments if there are such."""
+    """Check the kind and the alignments.
+
+    Raises:
+        InputError: A name is unknown.
+    """
     from mpsfm_core.calibration.fitting import Alignment
     from mpsfm_core.data.errors import InputError, did_you_mean
     from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
@@ -122,21 +151,24 @@ def _checked(
     return kinds[kind], tuple(known[name] for name in alignments) or None
 
 
-def _sorted(kind: str, overrides: list[str]) -> tuple[list[str], dict[str, Any]]:
-    """Settings of the configuration, and those of the true maps, from what ``--set`` says."""
+def _split_overrides(kind: str, overrides: list[str]) -> tuple[list[str], dict[str, Any]]:
+    """Split ``--set`` options into overrides of the configuration and settings of true maps."""
     from mpsfm_core.support.yaml_text import parse_yaml
 
-    own, truth = [], {}
+    config_settings, truth_settings = [], {}
     for text in overrides:
         key, _, value = text.partition("=")
-        if key.startswith(_TRUTH):
-            truth[key.removeprefix(_TRUTH)] = parse_yaml(value, f"--set {text}")
+        if key.startswith(_GROUND_TRUTH_KEY):
+            name = key.removeprefix(_GROUND_TRUTH_KEY)
+            truth_settings[name] = parse_yaml(value, f"--set {text}")
         else:
-            own.append(f"{kind}.{text}" if key.startswith(_OWN) else text)
-    return own, truth
+            is_provider = key.startswith(_PROVIDER_KEYS)
+            config_settings.append(f"{kind}.{text}" if is_provider else text)
+    return config_settings, truth_settings
 
 
 def _print_outcome(result: Calibrated) -> None:
+    """Print the fitted values and the cross-validated coverage."""
     report = result.report
     for name, (low, high) in report["intervals_95"].items():
         value = report["calibration"]["after"][name]

@@ -1,4 +1,4 @@
-"""``mpsfm config``: which configurations there are and what one amounts to."""
+"""``mpsfm config``: list configurations and show their effective settings."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from typing import Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Offline, Overrides, settings
+from mpsfm_core.cli.arguments import Offline, Overrides, config_overrides
 
 app = typer.Typer(no_args_is_help=True, help="Configurations and their effective settings.")
 
 
 @app.command("list")
 def list_configs() -> None:
-    """List the configurations that come with the package."""
+    """List the shipped configurations."""
     from mpsfm_core.cli.tables import print_table
     from mpsfm_core.config import describe_shipped
 
@@ -28,7 +28,7 @@ def show(
 ) -> None:
     """Print the effective configuration as YAML, with all defaults.
 
-    Comments at its end say which providers a run would take here and now; nothing is downloaded.
+    Comments at the end list the providers that a run on this machine would use. Downloads nothing.
     """
     from mpsfm_core.config import load_config
     from mpsfm_core.data.errors import InputError
@@ -36,11 +36,11 @@ def show(
     from mpsfm_core.providers.registry import Registry
 
     registry = Registry.discover()
-    config = load_config(name, settings(overrides, offline), registry, complete=False)
+    config = load_config(name, config_overrides(overrides, offline), registry, complete=False)
     typer.echo(config.to_yaml(), nl=False)
-    typer.echo("\n# here and now:")
+    typer.echo("\n# providers on this machine:")
     try:
         for choice in preview_providers(config, registry).choices:
             typer.echo(f"# {choice}")
     except InputError as error:
-        typer.echo(f"# it does not run: {error}")
+        typer.echo(f"# cannot run: {error}")

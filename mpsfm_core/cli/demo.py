@@ -1,4 +1,4 @@
-"""``mpsfm demo``: the sample scene, from photos to a comparison with the truth."""
+"""``mpsfm demo``: reconstruct the sample scene and compare with the true poses."""
 
 from __future__ import annotations
 
@@ -7,27 +7,26 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import Offline, Overrides, Quiet, settings
+from mpsfm_core.cli.arguments import Offline, Overrides, Quiet, config_overrides
 
 if TYPE_CHECKING:
     from mpsfm_core.evaluation import Pose
 
 
 def demo(
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Is written.")] = (
-        Path("demo-output")
-    ),
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Write the results here.")
+    ] = Path("demo-output"),
     scene: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Another scene, with images/ and gt/.")
+        Path | None, typer.Option(metavar="DIR", help="Use another scene with images/ and gt/.")
     ] = None,
     overrides: Overrides = None,
     offline: Offline = False,
     quiet: Quiet = False,
 ) -> None:
-    """Reconstruct the sample photos, from pixels alone, and say how far the poses are off.
+    """Reconstruct the sample photos and print the errors of the poses.
 
-    gt/ is a COLMAP model of true poses. The cameras are its, and nothing else of it is used before
-    the comparison.
+    gt/ is a COLMAP model with true cameras and poses. The run uses its cameras only.
     """
     from mpsfm_core.cli.reconstruct import run
     from mpsfm_core.evaluation import read_poses, reconstruction_poses
@@ -39,7 +38,7 @@ def demo(
         "demo",
         quiet,
         intrinsics=folder / "gt",
-        overrides=settings(overrides, offline),
+        overrides=config_overrides(overrides, offline),
     )
     metric = result.summary["reconstructions"][0]["metric_scale"] is not None
     _compare(reconstruction_poses(result.model), read_poses(folder / "gt"), metric)
@@ -47,19 +46,20 @@ def demo(
     typer.echo(f"  {output}/report.html   in a browser: cameras, points, photos, depth, matches")
     typer.echo(f"  {output}/dense.ply     in MeshLab, CloudCompare or Blender")
     typer.echo(f"  {output}/sparse        in COLMAP (File > Import model) or pycolmap")
-    typer.echo(f"  {output}/summary.json  what was used and what came out")
+    typer.echo(f"  {output}/summary.json  settings and results")
 
 
 def _sample_scene() -> Path:
-    """Installed from a wheel it lies in the package, in a source tree among the examples."""
+    """Return the folder of the sample scene, in the installed package or in a source tree."""
     import mpsfm_core
 
     package = Path(mpsfm_core.__file__).parent
-    places = (package / "sample_scene", package.parent / "examples" / "sample_scene")
-    return next(place for place in places if place.is_dir())
+    folders = (package / "sample_scene", package.parent / "examples" / "sample_scene")
+    return next(folder for folder in folders if folder.is_dir())
 
 
 def _compare(estimated: dict[str, Pose], truth: dict[str, Pose], metric: bool) -> None:
+    """Print pose AUC and trajectory errors."""
     from mpsfm_core.evaluation import evaluate
 
     report = evaluate(estimated, truth)

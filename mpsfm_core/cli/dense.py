@@ -1,4 +1,4 @@
-"""``mpsfm dense``: depth maps and a cloud for a model that is there already."""
+"""``mpsfm dense``: compute depth maps and a point cloud for an existing model."""
 
 from __future__ import annotations
 
@@ -13,30 +13,37 @@ from mpsfm_core.cli.errors import handle_sigterm
 
 def dense(
     model: Annotated[
-        Path, typer.Argument(help="COLMAP model, transforms.json with points, or our output.")
+        Path,
+        typer.Argument(help="COLMAP model, transforms.json with points, or mpsfm result folder."),
     ],
-    images: Annotated[Path, typer.Argument(help="Folder of its photos.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Is written.")],
+    images: Annotated[Path, typer.Argument(help="Folder of the photos.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Write the results here.")
+    ],
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="A setting of dense, e.g. max_size=1000."),
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Change a setting of dense, e.g. max_size=1000."
+        ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Measure depth in the photos of a model: DIR/depth, DIR/dense.ply and the model, DIR/sparse.
+    """Run multi-view stereo on the photos of a model: DIR/depth, DIR/dense.ply and DIR/sparse.
 
-    The search starts from the maps in MODEL/depth if MODEL is an output folder of ours, else from
-    the range of the model's points.
+    The search starts from MODEL/depth if MODEL is a result folder of mpsfm, else from the depth
+    range of the model's points.
     """
     from mpsfm_core.data.options import parse_settings
     from mpsfm_core.dense.options import DenseOptions
     from mpsfm_core.pipeline.dense_models import densify_model
 
     handle_sigterm()
-    report = densify_model(model, images, output, parse_settings(DenseOptions, parse_overrides(overrides)))
+    report = densify_model(
+        model, images, output, parse_settings(DenseOptions, parse_overrides(overrides))
+    )
     if not quiet:
-        shares = report.confirmed.values()
+        ratios = report.confirmed.values()
         typer.echo(
-            f"{len(shares)} images, {sum(shares) / len(shares):.0%} of their pixels confirmed by "
+            f"{len(ratios)} images, {sum(ratios) / len(ratios):.0%} of their pixels confirmed by "
             f"another view; written to {output}"
         )

@@ -1,4 +1,4 @@
-"""``mpsfm doctor``: what is here, what is broken, and what would make runs better."""
+"""``mpsfm doctor``: check the installation and suggest improvements."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from mpsfm_core.cli.arguments import ConfigName, Offline, settings
+from mpsfm_core.cli.arguments import ConfigName, Offline, config_overrides
 from mpsfm_core.cli.models import CacheDir
 from mpsfm_core.report.reasons import explain
 
@@ -26,11 +26,11 @@ def doctor(
     offline: Offline = False,
     cache: CacheDir = None,
 ) -> None:
-    """Say what is installed, what a run would take, and what would make it better here.
+    """List what is installed, what a run would use, and how to improve runs on this machine.
 
-    It downloads and computes nothing. Exits with 1 when a plugin is broken.
+    Downloads and computes nothing. Exit code 1 if a plugin is broken.
     """
-    from mpsfm_core.cli.cache import cache_size, size_text
+    from mpsfm_core.cli.cache import cache_size, format_size
     from mpsfm_core.config import load_config
     from mpsfm_core.data.errors import InputError
     from mpsfm_core.extraction.cache import cache_folder
@@ -44,79 +44,84 @@ def doctor(
     _line("processor", f"{count_cores()} cores{_memory()}")
     _line("GPU", _gpu())
     folder = cache_folder(cache)
-    _line("cache", f"{folder}, {size_text(cache_size(folder))} (mpsfm cache prune makes it less)")
+    _line("cache", f"{folder}, {format_size(cache_size(folder))} (to shrink: mpsfm cache prune)")
     _heading("plugins")
     broken = _print_plugins(registry)
-    _heading(f"a run with --config {config} takes")
+    _heading(f"a run with --config {config} uses")
     advice = list(_missing_plugins(registry))
     try:
-        overrides = [*settings(None, offline), *([f"runtime.cache_dir={cache}"] if cache else [])]
+        overrides = [
+            *config_overrides(None, offline),
+            *([f"runtime.cache_dir={cache}"] if cache else []),
+        ]
         provision = preview_providers(load_config(config, overrides, registry), registry)
     except InputError as error:
         _line("nothing", str(error))
         advice.insert(0, str(error))
     else:
         for choice in provision.choices:
-            fetched = ", to be downloaded" if choice.to_fetch else ""
-            why = explain(choice.reason.because()).text
-            _line(choice.block, f"{choice.provider.name} ({why}{fetched})")
+            download = ", to be downloaded" if choice.to_fetch else ""
+            reason = explain(choice.reason.because()).text
+            _line(choice.block, f"{choice.provider.name} ({reason}{download})")
         advice = [*_better_choices(provision), *advice]
     if "none" in _gpu():
         advice.append("a GPU with CUDA makes networks and dense matching many times faster")
-    _heading("what would make runs better here")
-    for text in dict.fromkeys(advice) or ["nothing that mpsfm knows of"]:
+    _heading("how to improve runs on this machine")
+    for text in dict.fromkeys(advice) or ["no suggestions"]:
         typer.echo(f"  - {text}")
     if broken:
         raise typer.Exit(1)
 
 
 def _print_plugins(registry: Registry) -> bool:
-    """One line a distribution; whether one is broken."""
+    """Print a line per distribution; returns True if a plugin is broken."""
     status = registry.status()
     usable = Counter(line.distribution for line in status if line.available)
     versions = {line.distribution: line.version for line in status}
     faults = [line for line in status if not line.available]
     for name, version in sorted(versions.items()):
         count = usable[name]
-        own = [line for line in faults if line.distribution == name]
-        missing = f", {len(own)} cannot be used" if own else ""
-        _line(name, f"{version}, {count} providers and hooks usable{missing}")
+        num_faults = sum(line.distribution == name for line in faults)
+        unavailable = f", {num_faults} unavailable" if num_faults else ""
+        _line(name, f"{version}, {count} providers and hooks available{unavailable}")
     for line in faults:
         _line("", f"{line.kind} {line.name} {line.reason}; {line.install_hint}".rstrip("; "))
     return any(line.kind == "plugin" for line in faults)
 
 
 def _missing_plugins(registry: Registry) -> Iterator[str]:
-    """Our own plugins that are not installed."""
+    """Yield suggestions to install missing first-party plugins."""
     from mpsfm_core.providers.first_party import PLUGIN_PROVIDERS
 
     installed = {line.distribution for line in registry.status()}
-    for requirement, brings in PLUGIN_PROVIDERS.items():
+    for requirement, providers in PLUGIN_PROVIDERS.items():
         if requirement.partition("[")[0] not in installed:
-            yield f"pip install '{requirement}' brings {', '.join(brings)}"
+            yield f"pip install '{requirement}' adds {', '.join(providers)}"
 
 
 def _better_choices(provision: ProviderResolution) -> Iterator[str]:
-    """What the configuration prefers, and why it cannot be had."""
+    """Yield the providers that the configuration prefers, with the reasons they are unavailable."""
     for choice in provision.choices:
         for name, why in choice.passed_over.items():
             yield f"{choice.block}: {name} would be better: {explain(why).text}"
         for file in choice.to_fetch:
-            yield f"mpsfm models fetch {choice.provider.name} gets {file.uri} before a run needs it"
+            yield f"mpsfm models fetch {choice.provider.name} downloads {file.uri} in advance"
 
 
 def _gpu() -> str:
+    """Describe the GPUs; the text contains "none" without a usable GPU."""
     if shutil.which("nvidia-smi") is None:
-        return "none that CUDA can use: networks run on the processor"
-    asked = ["nvidia-smi", "--query-gpu=name,memory.total", "--format=csv,noheader"]
+        return "none with CUDA: networks run on the processor"
+    query = ["nvidia-smi", "--query-gpu=name,memory.total", "--format=csv,noheader"]
     try:
-        found = subprocess.run(asked, capture_output=True, text=True, timeout=10, check=True)
+        output = subprocess.run(query, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError) as error:
-        return f"none that answers: {error}"
-    return "; ".join(found.stdout.strip().splitlines()) or "none"
+        return f"none usable: {error}"
+    return "; ".join(output.stdout.strip().splitlines()) or "none"
 
 
 def _memory() -> str:
+    """Describe the memory of the machine; empty if unknown."""
     try:
         text = Path("/proc/meminfo").read_text(encoding="ascii")
     except OSError:

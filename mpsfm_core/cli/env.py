@@ -1,4 +1,4 @@
-"""``mpsfm env``: Python environments for providers whose packages do not fit together."""
+"""``mpsfm env``: manage Python environments for providers with conflicting packages."""
 
 from __future__ import annotations
 
@@ -6,23 +6,27 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Environments for providers that need their own.")
+app = typer.Typer(
+    no_args_is_help=True, help="Manage environments for providers with conflicting packages."
+)
 
-Name = Annotated[str, typer.Argument(help="Of the environment.")]
+Name = Annotated[str, typer.Argument(help="Name of the environment.")]
 
 
 @app.command()
 def create(
     name: Name,
-    packages: Annotated[list[str], typer.Argument(help="For pip: plugins, or their folders.")],
-    python: Annotated[str | None, typer.Option(help="Interpreter, by default this one.")] = None,
+    packages: Annotated[list[str], typer.Argument(help="Packages for pip: plugins or folders.")],
+    python: Annotated[
+        str | None, typer.Option(help="Use this interpreter; default: the running one.")
+    ] = None,
 ) -> None:
-    """Make an environment with these packages beside the core, and show what it brings."""
+    """Create an environment with the core and these packages, and list its providers."""
     from mpsfm_core.providers.environments.environment import create_environment
 
-    environment, found = create_environment(name, packages, python)
+    environment, providers = create_environment(name, packages, python)
     typer.echo(f"{environment.folder}")
-    _print_providers(environment.name, found)
+    _print_providers(environment.name, providers)
 
 
 @app.command("list")
@@ -37,7 +41,7 @@ def list_environments() -> None:
 
 @app.command()
 def refresh(name: Name) -> None:
-    """Look again what an environment brings, after a change in it."""
+    """Update the list of providers after a change in an environment."""
     from mpsfm_core.providers.environments.environment import find_environment
 
     _print_providers(name, find_environment(name).refresh())
@@ -45,15 +49,16 @@ def refresh(name: Name) -> None:
 
 @app.command()
 def remove(name: Name) -> None:
-    """Remove an environment with all that is in it."""
+    """Delete an environment with all its packages."""
     from mpsfm_core.providers.environments.environment import remove_environment
 
     remove_environment(name)
 
 
-def _print_providers(name: str, found: list[dict[str, str]]) -> None:
-    for entry in found:
-        why = f", not usable: {entry['fault']}" if entry["fault"] else ""
-        typer.echo(f"  {entry['kind']}: {entry['name']}@{name} ({entry['distribution']}){why}")
-    if not found:
-        typer.echo("  it brings no providers: install a plugin in it")
+def _print_providers(name: str, providers: list[dict[str, str]]) -> None:
+    """Print a line per provider of an environment."""
+    for entry in providers:
+        fault = f", not usable: {entry['fault']}" if entry["fault"] else ""
+        typer.echo(f"  {entry['kind']}: {entry['name']}@{name} ({entry['distribution']}){fault}")
+    if not providers:
+        typer.echo("  no providers; install a plugin in the environment")

@@ -1,7 +1,7 @@
-"""How a command ends: one line on stderr and an exit code, or a traceback with ``--debug``.
+"""Error handling of commands: a line on stderr and an exit code; ``--debug`` for a traceback.
 
-Exit codes: 0 success, 1 a fault of ours or of the machine, 2 wrong input or usage, 3 no
-reconstruction was possible, 130 interrupted.
+Exit codes: 0 success, 1 internal error or fault of the machine, 2 wrong input or usage, 3 no
+reconstruction, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from typer.core import TyperGroup
 from mpsfm_core.data.errors import MpsfmError
 
 INTERRUPTED = 130
+"""Exit code of an interrupted command."""
 
 
-class GuardedGroup(TyperGroup):
-    """The root command; nothing that a command raises gets past it as a bare traceback."""
+class CommandGroup(TyperGroup):
+    """Root command that turns exceptions of commands into messages and exit codes."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the chosen command."""
+        """Run the selected command."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -33,30 +34,34 @@ class GuardedGroup(TyperGroup):
             fail(*_explain(error))
 
 
-def heed_termination() -> None:
-    """SIGTERM ends a command as Ctrl-C does. For after the import of pycolmap, which has a stack
-    trace of its own printed."""
+def handle_sigterm() -> None:
+    """Let SIGTERM end a command like Ctrl-C.
+
+    Call this function after the import of pycolmap, which installs a handler of its own.
+    """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def fail(message: str, exit_code: int) -> NoReturn:
-    """Print one line on stderr and leave."""
+    """Print one line on stderr and exit."""
     typer.echo(f"mpsfm: {' '.join(message.split())}", err=True)
     raise typer.Exit(exit_code)
 
 
 def _explain(error: Exception) -> tuple[str, int]:
+    """Return the message and exit code of an error."""
     if isinstance(error, MpsfmError):
         return str(error), error.exit_code
-    if isinstance(error, OSError):  # disk full, no permission, gone
+    if isinstance(error, OSError):  # for example a full disk or missing permissions
         return str(error), 1
     name = type(error).__name__
-    return f"internal error: {name}: {error} (mpsfm --debug ... shows where)", 1
+    return f"internal error: {name}: {error} (run mpsfm --debug ... for a traceback)", 1
 
 
 def _is_control_flow(error: Exception) -> bool:
-    """Exits, usage errors and closed pipes, which the command line library ends properly."""
+    """Return True for exits, usage errors and closed pipes, which typer handles itself."""
     if isinstance(error, OSError):
         return error.errno == errno.EPIPE
-    own = isinstance(error, (typer.Exit, typer.Abort))
-    return own or (hasattr(error, "format_message") and hasattr(error, "exit_code"))
+    if isinstance(error, (typer.Exit, typer.Abort)):
+        return True
+    return hasattr(error, "format_message") and hasattr(error, "exit_code")

@@ -1,4 +1,4 @@
-"""``mpsfm evaluate``: how far a model is from the truth."""
+"""``mpsfm evaluate``: compare a model with true poses, depth or a scan."""
 
 from __future__ import annotations
 
@@ -11,33 +11,45 @@ from mpsfm_core.cli.arguments import Distances, distance_thresholds
 
 
 def evaluate(
-    model: Annotated[Path, typer.Argument(help="COLMAP model, transforms.json or our output.")],
-    truth: Annotated[Path, typer.Argument(metavar="GT", help="The same with true poses.")],
+    model: Annotated[
+        Path, typer.Argument(help="COLMAP model, transforms.json or mpsfm result folder.")
+    ],
+    truth: Annotated[
+        Path, typer.Argument(metavar="GT", help="Model with true poses, in the same formats.")
+    ],
     images: Annotated[
         str | None,
-        typer.Option(metavar="A,B,C", help="Only these images; extensions may be left out."),
+        typer.Option(
+            metavar="A,B,C", help="Evaluate only these photos; extensions may be omitted."
+        ),
     ] = None,
     image_list: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The same, one name a line.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Evaluate only these photos, one name per line."),
     ] = None,
     convention: Annotated[
-        str, typer.Option(metavar="NAME", help="Of the pose AUC: paper, models, colmap or vggt.")
+        str,
+        typer.Option(
+            metavar="NAME", help="Compute the pose AUC like paper, models, colmap or vggt."
+        ),
     ] = "paper",
     gt_depth: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="True depth, 16-bit PNG in mm; for MODEL/depth."),
+        typer.Option(metavar="DIR", help="Evaluate MODEL/depth with true depth, 16-bit PNG in mm."),
     ] = None,
     scan: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.ply", help="Scan in the frame of GT; for MODEL/dense.ply."),
+        typer.Option(
+            metavar="FILE.ply", help="Evaluate MODEL/dense.ply with a scan in the frame of GT."
+        ),
     ] = None,
     distance: Distances = None,
 ) -> None:
-    """Print pose AUC at 1, 5 and 20 degrees, trajectory errors and registered share as JSON.
+    """Print pose AUC at 1, 5 and 20 degrees, trajectory errors and registered images as JSON.
 
-    Images are matched by name. Images of GT that MODEL lacks count as unregistered. With true
-    depth or a scan, also how far the depth maps and the dense cloud of an output folder are off;
-    without a scan, the true depth of its images is the scan.
+    Photos are matched by name. Photos of GT without pose in MODEL count as unregistered. With true
+    depth or a scan, also prints errors of the depth maps and the dense cloud of a result folder.
+    Without a scan, the true depth maps form the scan.
     """
     import json
 
@@ -47,7 +59,7 @@ def evaluate(
         from mpsfm_core.data.errors import InputError, did_you_mean
 
         raise InputError(f"no convention {convention!r}{did_you_mean(convention, CONVENTIONS)}")
-    names = _names(images, image_list)
+    names = _select_names(images, image_list)
     poses, true_poses = read_poses(model), read_poses(truth)
     report = evaluate(poses, true_poses, names, CONVENTIONS[convention])
     if gt_depth is not None or scan is not None:
@@ -72,11 +84,12 @@ def evaluate(
     typer.echo(json.dumps(report, indent=2))
 
 
-def _names(images: str | None, image_list: Path | None) -> list[str] | None:
+def _select_names(images: str | None, image_list: Path | None) -> list[str] | None:
+    """Return the names of the selected images; None for all."""
     from mpsfm_core.data.errors import InputError
 
     if images is not None and image_list is not None:
-        raise InputError("--images and --image-list exclude each other")
+        raise InputError("--images and --image-list exclude each other; use one of them")
     if images is not None:
         return [name.strip() for name in images.split(",") if name.strip()]
     if image_list is None:

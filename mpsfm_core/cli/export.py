@@ -1,4 +1,4 @@
-"""``mpsfm export``: results in the formats of other programs."""
+"""``mpsfm export``: write results in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ def export(
         Path, typer.Argument(metavar="DIR", help="Result folder of a run, or a COLMAP model.")
     ],
     to: Annotated[
-        str, typer.Option("--to", metavar="FORMAT", help="'list' shows them all.")
+        str, typer.Option("--to", metavar="FORMAT", help="Format to write; 'list' shows all.")
     ] = "list",
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR", help="Default: exports/FORMAT below DIR."),
+        typer.Option(
+            "--output", "-o", metavar="DIR", help="Write here; default: exports/FORMAT in DIR."
+        ),
     ] = None,
     images: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="The photos, if they are not where the run found them."),
+        typer.Option(metavar="DIR", help="Folder of the photos, if moved since the run."),
     ] = None,
     turn: Annotated[
         bool | None,
         typer.Option(
             "--turn/--as-is",
-            help="Gravity along -z and the middle as origin; default: what suits the format.",
+            help="Rotate gravity to -z and center the scene; default: as the format requires.",
             show_default=False,
         ),
     ] = None,
@@ -52,5 +54,5 @@ def export(
     unit = "unknown" if metres is None else f"{metres:.3g} m, to about {spread:.0%}"
     typer.echo(f"  unit {unit}")
     for name in done["left_out"]:
-        typer.echo(f"  left out, its pose is not confirmed: {name}")
+        typer.echo(f"  left out because the pose is not confirmed: {name}")
     typer.echo(f"written to {done['output']}")

@@ -1,4 +1,4 @@
-"""``mpsfm mesh``: one surface from the depth maps of a result."""
+"""``mpsfm mesh``: build a mesh from the depth maps of a result."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ def mesh(
     ],
     images: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="The photos, if they are not where the run found them."),
+        typer.Option(metavar="DIR", help="Folder of the photos, if moved since the run."),
     ] = None,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="voxel_px or max_triangles."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Change voxel_px or max_triangles."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Join the depth maps in a mesh with colours: DIR/mesh.ply and DIR/mesh.glb.
+    """Build a colored mesh from the depth maps: DIR/mesh.ply and DIR/mesh.glb.
 
-    Needs pip install 'mpsfm-core[mesh]'.
+    Requires pip install 'mpsfm-core[mesh]'.
     """
     from mpsfm_core.data.options import parse_settings
     from mpsfm_core.dense.options import MeshOptions
     from mpsfm_core.pipeline.dense_models import mesh_model
 
     handle_sigterm()
-    made = mesh_model(folder, images, parse_settings(MeshOptions, parse_overrides(overrides)))
+    surface = mesh_model(folder, images, parse_settings(MeshOptions, parse_overrides(overrides)))
     if not quiet:
-        typer.echo(f"{len(made.triangles)} triangles; written to {folder}/mesh.ply and mesh.glb")
+        typer.echo(f"{len(surface.triangles)} triangles; written to {folder}/mesh.ply and mesh.glb")

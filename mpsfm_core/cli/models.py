@@ -1,4 +1,4 @@
-"""``mpsfm models``: the weights of networks, on this machine and elsewhere."""
+"""``mpsfm models``: list, download, export and verify the weights of networks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mpsfm_core.providers import WeightsFile
     from mpsfm_core.providers.weights import Progress, WeightStore
 
-app = typer.Typer(no_args_is_help=True, help="Weights: list, download, check.")
+app = typer.Typer(no_args_is_help=True, help="List, download and verify weights.")
 
 Targets: TypeAlias = Annotated[
     list[str],
@@ -27,7 +27,7 @@ Targets: TypeAlias = Annotated[
         metavar="NAME_OR_URI...", help="Providers (xfeat, matcher/loftr) or URIs of weights files."
     ),
 ]
-Wanted: TypeAlias = Annotated[
+FetchTargets: TypeAlias = Annotated[
     list[str],
     typer.Argument(
         metavar="NAME_OR_URI...",
@@ -35,25 +35,27 @@ Wanted: TypeAlias = Annotated[
     ),
 ]
 _RESTRICTED = re.compile(r"\bNC\b|non-?commercial|research", re.IGNORECASE)
-"""Licences that forbid commercial use, by their text."""
+"""Pattern of licenses that forbid commercial use."""
 
 CacheDir: TypeAlias = Annotated[
     Path | None,
-    typer.Option("--cache", metavar="DIR", help="Instead of $MPSFM_CACHE or the user's cache."),
+    typer.Option(
+        "--cache", metavar="DIR", help="Use this cache; default: $MPSFM_CACHE or the user's cache."
+    ),
 ]
 
 
 @app.command("list")
 def list_models(
-    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     cache: CacheDir = None,
 ) -> None:
-    """List the default weights of all providers, and whether they are on this machine."""
+    """List the default weights of all providers and their local files."""
     from mpsfm_core.cli.tables import print_table
     from mpsfm_core.providers.weights import WeightStore
 
     store = WeightStore(cache)
-    files = [(provider, file, store.locate(file.uri)) for provider, file in _known()]
+    files = [(provider, file, store.locate(file.uri)) for provider, file in _default_weights()]
     if as_json:
         lines = [
             {"provider": provider, **asdict(file), "path": path and str(path)}
@@ -65,14 +67,14 @@ def list_models(
         (provider, file.license, _state(file.uri, path), str(path or file.uri))
         for provider, file, path in files
     ]
-    print_table(("provider", "licence", "state", "file"), rows)
+    print_table(("provider", "license", "state", "file"), rows)
 
 
 @app.command()
 def fetch(
-    targets: Wanted,
+    targets: FetchTargets,
     sha256: Annotated[
-        str | None, typer.Option("--sha256", help="Expected hash, for a single URI.")
+        str | None, typer.Option("--sha256", help="Require this hash, for a single URI.")
     ] = None,
     overrides: Overrides = None,
     accepted: Annotated[
@@ -80,23 +82,23 @@ def fetch(
         typer.Option(
             "--accept",
             metavar="PROVIDER",
-            help="Accept the non-commercial licence of its weights without being asked.",
+            help="Accept the non-commercial license of a provider's weights without a prompt.",
         ),
     ] = None,
     cache: CacheDir = None,
 ) -> None:
-    """Download weights that are missing, check them, and print where they are.
+    """Download missing weights, verify them, and print their files.
 
-    Of a configuration all that a run with it needs. What will be downloaded is shown first, with
-    licences and the total size; weights that are not for commercial use are asked for by name.
+    For a configuration, download all weights that a run needs. Licenses and the total size are
+    printed first. Weights that are not for commercial use need a confirmation by name.
     """
     from mpsfm_core.providers.weights import WeightStore
 
-    wanted = _wanted(targets, overrides or [])
+    provider_files = _resolve_targets(targets, overrides or [])
     store = WeightStore(cache)
-    for provider in _show_plan(wanted, store):
-        _ask_for(provider, accepted or [])
-    files = [file for _, file in wanted]
+    for provider in _print_downloads(provider_files, store):
+        _require_acceptance(provider, accepted or [])
+    files = [file for _, file in provider_files]
     with _progress_bars() as progress:
         store = WeightStore(cache, progress=progress)
         paths = [store.resolve(file.uri, sha256 or file.sha256) for file in files]
@@ -106,33 +108,39 @@ def fetch(
 
 @app.command()
 def export(
-    name: Annotated[str, typer.Argument(help="dsine, mast3r, metric3d, moge, unidepth.")],
+    name: Annotated[
+        str, typer.Argument(help="Network: dsine, mast3r, metric3d, moge or unidepth.")
+    ],
     code: Annotated[
         list[Path],
         typer.Option(
-            metavar="CHECKOUT", help="Of the authors' code; again for libraries that it needs."
+            metavar="CHECKOUT", help="Checkout of the authors' code; repeat for its libraries."
         ),
     ],
     checkpoint: Annotated[
         str,
         typer.Option(
-            metavar="FILE_OR_URI", help="Their weights; 'random' tries the export without."
+            metavar="FILE_OR_URI", help="The authors' weights; 'random' tests the export without."
         ),
     ],
     output: Annotated[
-        Path | None, typer.Option(metavar="FILE.onnx", help="Instead of the user's data folder.")
+        Path | None,
+        typer.Option(metavar="FILE.onnx", help="Write here; default: the user's data folder."),
     ] = None,
-    size: Annotated[str, typer.Option(help="Of a network that comes in several.")] = "",
-    sha256: Annotated[str | None, typer.Option(help="Expected hash of the checkpoint.")] = None,
+    size: Annotated[str, typer.Option(help="Size, if the network has several.")] = "",
+    sha256: Annotated[str | None, typer.Option(help="Require this hash of the checkpoint.")] = None,
     environment: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Run their code there (mpsfm env create).")
+        str | None,
+        typer.Option(
+            metavar="NAME", help="Run the authors' code in this environment (mpsfm env create)."
+        ),
     ] = None,
     cache: CacheDir = None,
 ) -> None:
-    """Make the file of a network that nobody publishes, from its authors' code and weights.
+    """Export a network that is not published as a file, from its authors' code and weights.
 
-    Their code runs in a process of its own. The file is checked against what their network says,
-    and its provider takes it by name from then on.
+    The authors' code runs in a subprocess. The exported file is compared with the authors' network,
+    and its provider then finds the file by name.
     """
     from mpsfm_core.data.errors import InputError, did_you_mean
     from mpsfm_core.providers.environments.environment import find_environment
@@ -141,7 +149,9 @@ def export(
     from mpsfm_core.providers.weights import WeightStore
 
     known = {
-        n: r for found in Registry.discover().call_hook("mpsfm_exports") for n, r in found.items()
+        key: recipe
+        for exports in Registry.discover().call_hook("mpsfm_exports")
+        for key, recipe in exports.items()
     }
     if name not in known:
         raise InputError(f"no installed plugin exports {name!r}{did_you_mean(name, known)}")
@@ -158,9 +168,9 @@ def export(
             python=python,
             store=WeightStore(cache, progress=progress),
         )
-    worst = max(manifest["largest_differences"].values())
-    typer.echo(f"licence of the weights: {manifest['license']}", err=True)
-    typer.echo(f"differs from the authors' network by {worst:.1e} at most", err=True)
+    max_difference = max(manifest["largest_differences"].values())
+    typer.echo(f"license of the weights: {manifest['license']}", err=True)
+    typer.echo(f"maximum difference to the authors' network: {max_difference:.1e}", err=True)
     typer.echo(manifest["file"])
 
 
@@ -169,97 +179,105 @@ def verify(
     targets: Annotated[list[str] | None, typer.Argument(metavar="[NAME_OR_URI...]")] = None,
     cache: CacheDir = None,
 ) -> None:
-    """Hash weights and compare; without arguments, all default weights on this machine."""
+    """Verify the hashes of weights; without arguments, of all local default weights."""
     from mpsfm_core.providers.weights import WeightStore
 
     store = WeightStore(cache)
     if targets:
-        chosen = _select(targets)
+        files = _select_files(targets)
     else:
-        chosen = [file for _, file in _known() if store.locate(file.uri)]
-    for file in chosen:
+        files = [file for _, file in _default_weights() if store.locate(file.uri)]
+    for file in files:
         typer.echo(f"{store.verify(file.uri, file.sha256)}  {file.uri}")
 
 
 @app.command()
 def path(targets: Targets, cache: CacheDir = None) -> None:
-    """Print where weights are on this machine; fails if they are not."""
+    """Print the local files of weights; fails if a file is missing."""
     from mpsfm_core.data.errors import WeightsError
     from mpsfm_core.providers.weights import WeightStore
 
     store = WeightStore(cache)
-    for file in _select(targets):
-        found = store.locate(file.uri)
-        if found is None:
-            raise WeightsError(f"{file.uri} is not on this machine; 'mpsfm models fetch' gets it")
-        typer.echo(found)
+    for file in _select_files(targets):
+        local = store.locate(file.uri)
+        if local is None:
+            raise WeightsError(f"{file.uri} is not on this machine; run 'mpsfm models fetch' first")
+        typer.echo(local)
 
 
-def _known() -> Iterator[tuple[str, WeightsFile]]:
-    """Kind and name of each usable provider with each of its default weights files."""
+def _default_weights() -> Iterator[tuple[str, WeightsFile]]:
+    """Yield kind and name of each available provider with each of its default weights files."""
     from mpsfm_core.data.errors import InputError
     from mpsfm_core.providers.registry import Registry
 
     registry = Registry.discover()
     for status in registry.status():
         if status.available and status.kind != "plugin":
-            with suppress(InputError):  # the user has to name the file: there is no default
+            with suppress(InputError):  # no default: the user names the file
                 for file in registry.weights(status.kind, status.name):
                     yield f"{status.kind}/{status.name}", file
 
 
-def _select(targets: list[str]) -> list[WeightsFile]:
-    """The weights files that names and URIs stand for, each once."""
+def _select_files(targets: list[str]) -> list[WeightsFile]:
+    """Resolve provider names and URIs to unique weights files.
+
+    Raises:
+        InputError: A target is neither a provider with weights nor a URI.
+    """
     from mpsfm_core.data.errors import InputError, did_you_mean
     from mpsfm_core.providers import WeightsFile
 
-    known = [(provider.split("/")[1], provider, file) for provider, file in _known()]
-    chosen: dict[str, WeightsFile] = {}
+    known = [(provider.split("/")[1], provider, file) for provider, file in _default_weights()]
+    selected: dict[str, WeightsFile] = {}
     for target in targets:
-        found = [file for name, provider, file in known if target in (name, provider, file.uri)]
-        if not found and not _is_uri(target):
+        files = [file for name, provider, file in known if target in (name, provider, file.uri)]
+        if not files and not _is_uri(target):
             raise InputError(
                 f"no provider {target!r} with weights"
                 f"{did_you_mean(target, [name for name, _, _ in known])}; "
                 f"'mpsfm models list' shows all"
             )
-        chosen |= {file.uri: file for file in found or [WeightsFile(target)]}
-    return list(chosen.values())
+        selected |= {file.uri: file for file in files or [WeightsFile(target)]}
+    return list(selected.values())
 
 
-def _wanted(targets: list[str], overrides: list[str]) -> list[tuple[str, WeightsFile]]:
-    """The files that configurations, providers and URIs stand for, each once, with the name of a
-    provider that loads it."""
+def _resolve_targets(targets: list[str], overrides: list[str]) -> list[tuple[str, WeightsFile]]:
+    """Resolve configurations, providers and URIs to unique files with the name of a provider."""
     from mpsfm_core.config import load_config, shipped_configs
     from mpsfm_core.pipeline.provider_resolution import preview_providers
     from mpsfm_core.providers.registry import Registry
 
-    chosen: dict[str, tuple[str, WeightsFile]] = {}
+    selected: dict[str, tuple[str, WeightsFile]] = {}
     for target in targets:
         if target not in shipped_configs() and not target.endswith((".yaml", ".yml")):
-            found = [(target, file) for file in _select([target])]
+            files = [(target, file) for file in _select_files([target])]
         else:
             registry = Registry.discover()
             provision = preview_providers(load_config(target, overrides, registry), registry)
-            found = [
+            files = [
                 (spec.name, file)
                 for path, kind, backend in provision.config.provider_configs()
                 for spec in [registry.spec(kind, backend.use)]
                 for file in registry.weights(kind, backend.use, backend.options)
             ]
-        for name, file in found:
-            chosen.setdefault(file.uri, (name, file))
-    return list(chosen.values())
+        for name, file in files:
+            selected.setdefault(file.uri, (name, file))
+    return list(selected.values())
 
 
-def _show_plan(wanted: list[tuple[str, WeightsFile]], store: WeightStore) -> list[tuple[str, str]]:
-    """Tell on stderr what will be downloaded; the providers whose licence forbids commercial use,
-    with that licence."""
+def _print_downloads(
+    files: list[tuple[str, WeightsFile]], store: WeightStore
+) -> list[tuple[str, str]]:
+    """Print licenses and the total download size on stderr.
+
+    Returns:
+        Name and license of each provider whose license forbids commercial use.
+    """
     from mpsfm_core.providers.weights import is_remote
 
     total, unknown, restricted = 0, 0, {}
-    for name, file in wanted:
-        typer.echo(f"licence of {file.uri}: {file.license}", err=True)
+    for name, file in files:
+        typer.echo(f"license of {file.uri}: {file.license}", err=True)
         if not is_remote(file.uri) or store.locate(file.uri) is not None:
             continue
         size = file.size or store.size(file.uri)
@@ -272,8 +290,12 @@ def _show_plan(wanted: list[tuple[str, WeightsFile]], store: WeightStore) -> lis
     return list(restricted.items())
 
 
-def _ask_for(restricted: tuple[str, str], accepted: list[str]) -> None:
-    """Raise unless the user accepts a licence that forbids commercial use."""
+def _require_acceptance(restricted: tuple[str, str], accepted: list[str]) -> None:
+    """Prompt for acceptance of a license that forbids commercial use.
+
+    Raises:
+        InputError: The user does not accept the license.
+    """
     from mpsfm_core.data.errors import InputError
 
     name, license = restricted
@@ -283,7 +305,7 @@ def _ask_for(restricted: tuple[str, str], accepted: list[str]) -> None:
     if not sys.stdin.isatty() or typer.prompt(f"{question} {name}", err=True) != name:
         raise InputError(
             f"the weights of {name} are not for commercial use ({license}): nothing was "
-            f"downloaded; '--accept {name}' accepts that"
+            f"downloaded; to accept, add '--accept {name}'"
         )
 
 
@@ -292,14 +314,15 @@ def _is_uri(target: str) -> bool:
 
 
 def _state(uri: str, path: Path | None) -> str:
+    """Describe the local state of a weights file."""
     if path:
-        return "here"
-    return "to be fetched" if "://" in uri else "its package is not installed"
+        return "local"
+    return "to be downloaded" if "://" in uri else "its package is not installed"
 
 
 @contextmanager
 def _progress_bars() -> Iterator[Progress]:
-    """A bar on stderr for each file that is downloaded."""
+    """Show a progress bar on stderr for each downloaded file."""
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 

@@ -1,4 +1,4 @@
-"""``mpsfm plugins``: what is installed, what is wrong with it, and a start for a new one."""
+"""``mpsfm plugins``: list and check plugins, and create a new one."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from mpsfm_core.testing import CheckResult
 
 _CHECKING = "MPSFM_CHECKING"
-"""Set in the process that runs the checks."""
+"""Environment variable of the process that runs the checks."""
 
 app = typer.Typer(no_args_is_help=True, help="Installed plugins and their providers.")
 
 
 @app.command("list")
 def list_plugins(
-    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """List all providers: where they come from, licences, and whether they can be used."""
+    """List all providers with distribution, licenses and availability."""
     from mpsfm_core.providers.registry import Registry
 
     status = Registry.discover(probe=True).status()
@@ -46,31 +46,36 @@ def list_plugins(
 @app.command()
 def check(
     name: Annotated[
-        str, typer.Argument(help="A provider (onnx, depth/onnx) or all of a distribution.")
+        str, typer.Argument(help="Check a provider (onnx, depth/onnx) or all of a distribution.")
     ],
     options: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Its options, instead of its stand-in's."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Set an option of the provider; replaces the options of its test network.",
+        ),
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option("--only", metavar="CHECK", help="Not all checks.")
+        list[str] | None,
+        typer.Option("--only", metavar="CHECK", help="Run only this check; may be repeated."),
     ] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+    device: Annotated[str, typer.Option(help="Run on cpu or cuda.")] = "cpu",
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Check whether providers keep the contract; exit code 1 if one does not."""
+    """Check that providers satisfy the contract; exit code 1 if one does not."""
     if _CHECKING not in os.environ:
         arguments = [name, "--device", device, *(["--json"] if as_json else [])]
         arguments += [part for value in options or () for part in ("--set", value)]
         arguments += [part for value in only or () for part in ("--only", value)]
-        raise typer.Exit(_elsewhere(name, arguments))
+        raise typer.Exit(_check_in_subprocess(name, arguments))
     from mpsfm_core.providers.registry import Registry
     from mpsfm_core.testing.contract import (
         find_plugin,
         find_providers,
         parse_check_ids,
-        run_checks,
         parse_setup,
+        run_checks,
     )
 
     registry = Registry.discover(probe=True)
@@ -78,11 +83,11 @@ def check(
     if plugin is not None and plugin.available and not as_json:
         hooks = ", ".join(plugin.capabilities)
         typer.echo(
-            f"{plugin.name} ({plugin.distribution} {plugin.version}) loads and brings hooks, "
-            f"{hooks}, all of them known; it has no provider whose contract could be checked"
+            f"{plugin.name} ({plugin.distribution} {plugin.version}) loads; all its hooks are "
+            f"known: {hooks}; it has no provider to check"
         )
         return
-    wanted = None if only is None else parse_check_ids(only)
+    check_ids = None if only is None else parse_check_ids(only)
     results: list[CheckResult] = []
     for kind, provider in find_providers(registry, name):
         results += run_checks(
@@ -90,7 +95,7 @@ def check(
             kind,
             provider,
             parse_setup(options or []),
-            only=wanted,
+            only=check_ids,
             device=device,
             on_result=None if as_json else _print_result,
         )
@@ -105,13 +110,15 @@ def check(
 
 @app.command()
 def new(
-    name: Annotated[str, typer.Argument(help="Of the package and of its provider: my-depth.")],
-    kind: Annotated[Kind, typer.Option(help="What it provides.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where to.")] = (
-        Path()
-    ),
+    name: Annotated[
+        str, typer.Argument(help="Name of the package and its provider, e.g. my-depth.")
+    ],
+    kind: Annotated[Kind, typer.Option(help="Kind of the provider.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Create the package here.")
+    ] = Path(),
 ) -> None:
-    """Write a package with a provider that passes its contract; put your method into it."""
+    """Create a plugin package with a provider that passes its contract, to fill in your method."""
     from mpsfm_core.testing.scaffold import write_plugin
 
     for path in write_plugin(name, kind, output):
@@ -119,8 +126,8 @@ def new(
     typer.echo(f"next: pip install -e {output / name} && mpsfm plugins check {name}")
 
 
-def _elsewhere(name: str, arguments: list[str]) -> int:
-    """Check in another process, which a crashing provider may end; returns the exit code."""
+def _check_in_subprocess(name: str, arguments: list[str]) -> int:
+    """Run the checks in a subprocess, which survives crashes; returns the exit code."""
     command = [sys.executable, "-m", "mpsfm_core"]
     environment = {**subprocess_environment(), _CHECKING: "1"}
     with tempfile.TemporaryFile("w+") as errors:
@@ -139,13 +146,14 @@ def _elsewhere(name: str, arguments: list[str]) -> int:
         typer.echo(errors.read(), nl=False, err=True)
     if process.returncode >= 0:
         return process.returncode
-    ended = signal.Signals(-process.returncode).name
+    signal_name = signal.Signals(-process.returncode).name
     raise ProviderError(
-        f"{name}: a check ended the whole process ({ended}): the one after the last that is listed"
+        f"{name}: the check after the last listed one crashed the process ({signal_name})"
     )
 
 
 def _print_result(result: CheckResult) -> None:
+    """Print the line of a finished check."""
     around = f" around {result.around}" if result.around else ""
     line = f"{result.status:5} {result.provider}{around}: {result.id}, {result.seconds:.2f} s"
     typer.echo(f"{line}: {result.message}" if result.message else line)
@@ -168,7 +176,7 @@ def _print_table(status: tuple[ProviderStatus, ...]) -> None:
         for line in status
     ]
     print_table(
-        ("kind", "name", "distribution", "licence of code / weights", "capabilities", "state"), rows
+        ("kind", "name", "distribution", "license of code / weights", "capabilities", "state"), rows
     )
 
 

@@ -1,4 +1,4 @@
-"""Progress bars: a plugin that listens to the events of the run."""
+"""Progress bars and lines: plugins that listen to the events of a run."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
-from mpsfm_core.cli.time_left import TimeLeft, in_words
+from mpsfm_core.cli.remaining_time import RemainingTimeEstimator, format_remaining_time
 from mpsfm_core.providers import hookimpl
 from mpsfm_core.providers.registry import Registry
 
 
 @contextmanager
-def showing_progress(registry: Registry, quiet: bool) -> Iterator[None]:
-    """Show progress on stderr while the block runs: bars on a terminal, else a line a stage."""
+def show_progress(registry: Registry, quiet: bool) -> Iterator[None]:
+    """Show progress on stderr while the block runs: bars on a terminal, else a line per stage."""
     if quiet:
         yield
         return
     console = Console(stderr=True, highlight=False)
     if not console.is_terminal:
-        registry.register(Lines(console), name="progress lines")
+        registry.register(ProgressLines(console), name="progress lines")
         yield
         return
-    left = TimeLeft()
+    remaining = RemainingTimeEstimator()
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -39,48 +39,48 @@ def showing_progress(registry: Registry, quiet: bool) -> Iterator[None]:
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=console) as progress:
-        bars = Bars(progress, left)
+        bars = ProgressBars(progress, remaining)
         registry.register(bars, name="progress bars")
         yield
-        bars.end()
-        left.keep()
+        bars.finish()
+        remaining.save()
 
 
-class Bars:
-    """One bar a stage, and one for the whole run, for people who watch."""
+class ProgressBars:
+    """Progress bars of the stages and of the whole run, for terminals."""
 
-    def __init__(self, progress: Progress, left: TimeLeft) -> None:
+    def __init__(self, progress: Progress, remaining: RemainingTimeEstimator) -> None:
         self._progress = progress
-        self._left = left
+        self._remaining = remaining
         self._registered = ""
         self._run = progress.add_task("run", total=None)
         self._tasks: dict[str, TaskID] = {}
 
     @hookimpl
     def mpsfm_notice(self, text: str) -> None:
-        """Print it above the bars."""
+        """Print a message above the bars."""
         self._progress.console.print(text, markup=False)
 
     @hookimpl
     def mpsfm_stage_started(self, stage: str, total: int | None) -> None:
-        """Add a bar."""
+        """Add the bar of a stage."""
         self._tasks[stage] = self._progress.add_task(stage, total=total)
-        self._left.started(stage, total)
-        self._tell()
+        self._remaining.start_stage(stage, total)
+        self._update_run()
 
     @hookimpl
     def mpsfm_stage_progress(self, stage: str, done: int, total: int) -> None:
-        """Advance it."""
+        """Advance the bar of a stage."""
         if stage in self._tasks:
             self._progress.update(self._tasks[stage], completed=done, total=total)
-        self._left.progress(stage, done, total)
-        self._tell()
+        self._remaining.update_stage(stage, done, total)
+        self._update_run()
 
     @hookimpl
     def mpsfm_stage_finished(self, stage: str, seconds: float) -> None:
-        """Fill it."""
-        self._left.finished(stage)
-        self._tell()
+        """Fill the bar of a stage."""
+        self._remaining.finish_stage(stage)
+        self._update_run()
         task = self._tasks.pop(stage, None)
         if task is not None:
             total = self._progress.tasks[task].total or 1
@@ -88,33 +88,33 @@ class Bars:
 
     @hookimpl
     def mpsfm_image_registered(self, name: str, registered: int, total: int) -> None:
-        """Registered images are the mapper's progress."""
+        """Show the number of registered images as progress of mapping."""
         self._registered = f"{registered} of {total} images registered"
         self.mpsfm_stage_progress("mapping", registered, total)
 
-    def end(self) -> None:
-        """The whole run is done."""
-        done = " - ".join(("run", *filter(None, (self._registered,))))
-        self._progress.update(self._run, description=done, completed=1, total=1)
+    def finish(self) -> None:
+        """Fill the bar of the whole run."""
+        description = " - ".join(("run", *filter(None, (self._registered,))))
+        self._progress.update(self._run, description=description, completed=1, total=1)
 
-    def _tell(self) -> None:
-        """The line of the whole run."""
-        known = (in_words(self._left.seconds()), self._registered)
-        self._progress.update(self._run, description=" - ".join(("run", *filter(None, known))))
+    def _update_run(self) -> None:
+        """Update the description of the whole run."""
+        parts = (format_remaining_time(self._remaining.seconds()), self._registered)
+        self._progress.update(self._run, description=" - ".join(("run", *filter(None, parts))))
 
 
-class Lines:
-    """One line a finished stage, for logs."""
+class ProgressLines:
+    """Progress as one line per finished stage, for logs."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
 
     @hookimpl
     def mpsfm_notice(self, text: str) -> None:
-        """Print it."""
+        """Print a message."""
         self._console.print(text, markup=False, soft_wrap=True)
 
     @hookimpl
     def mpsfm_stage_finished(self, stage: str, seconds: float) -> None:
-        """Say how long it took."""
+        """Print the duration of a stage."""
         self._console.print(f"{stage}: {seconds:.1f} s", markup=False)

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mpsfm_core.cli.arguments import ConfigName, Offline, Overrides, Quiet, ViewerName, config_overrides
+from mpsfm_core.cli.arguments import (
+    ConfigName,
+    Offline,
+    Overrides,
+    Quiet,
+    ViewerName,
+    config_overrides,
+)
 from mpsfm_core.cli.errors import handle_sigterm
 from mpsfm_core.report.reasons import explain_gps, explain_image
 
@@ -49,7 +56,8 @@ def reconstruct(
     hloc: Annotated[
         tuple[Path, Path] | None,
         typer.Option(
-            metavar="FEATURES MATCHES", help="Use the keypoints and matches of two hloc files (.h5)."
+            metavar="FEATURES MATCHES",
+            help="Use keypoints and matches of hloc (.h5 files).",
         ),
     ] = None,
     fresh: Annotated[

@@ -1,4 +1,4 @@
-"""``mpsfm report``: the page of a finished result folder, made anew."""
+"""``mpsfm report``: write the report page of a result folder."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import typer
 
 def report(
     folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="What 'mpsfm reconstruct' has written.")
+        Path, typer.Argument(metavar="DIR", help="Result folder of 'mpsfm reconstruct'.")
     ],
 ) -> None:
-    """Write DIR/report.html, which every run writes by itself, anew.
+    """Write DIR/report.html again; every run writes the page once.
 
-    It reads DIR and nothing else, and opens in any browser without a network.
+    Reads DIR only. The page opens in any browser without a network.
     """
     from mpsfm_core.report.page import write_report
 

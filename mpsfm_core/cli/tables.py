@@ -1,4 +1,4 @@
-"""Tables on the terminal."""
+"""Tables for the terminal."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from rich.table import Table
 from rich.text import Text
 
 _PIPE_WIDTH = 2000
-"""Columns when the output is not a terminal: lines then stay whole for grep."""
+"""Columns if the output is no terminal; wide enough that grep sees whole lines."""
 
 
 def print_table(header: Sequence[str], rows: Iterable[Sequence[str | Text]]) -> None:
-    """Print rows under a header; texts are taken literally, never as markup."""
+    """Print rows under a header; texts are never interpreted as markup."""
     console = Console(highlight=False)
     if not console.is_terminal:
         console.width = _PIPE_WIDTH

@@ -1,4 +1,4 @@
-"""``mpsfm testsets``: scene folders for the benchmark, and their sets of images."""
+"""``mpsfm testsets``: create scene folders and test sets for the benchmark."""
 
 from __future__ import annotations
 
@@ -7,27 +7,32 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Make scene folders and test sets for benchmark.")
+app = typer.Typer(no_args_is_help=True, help="Create scene folders and test sets for benchmark.")
 
 
 @app.command("build")
 def build(
-    scene: Annotated[Path, typer.Argument(help="Scene folder: images/, gt/, maybe gt_depth/.")],
+    scene: Annotated[
+        Path, typer.Argument(help="Scene folder with images/, gt/ and optionally gt_depth/.")
+    ],
     source: Annotated[
-        str, typer.Option(metavar="NAME", help="Of overlap: depth, model (its points) or auto.")
+        str,
+        typer.Option(metavar="NAME", help="Compute overlap from depth, model (points) or auto."),
     ] = "auto",
     min_two_view: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Overlap an image needs with some other.")
+        float, typer.Option(min=0.0, max=1.0, help="Minimum overlap of a photo with another.")
     ] = 0.25,
-    sets: Annotated[int, typer.Option(min=1, help="Sets a bucket; minimal has twice as many.")] = 5,
-    min_images: Annotated[int, typer.Option(min=3, help="Images of a set at least.")] = 5,
-    max_images: Annotated[int | None, typer.Option(min=3, help="Images of a set at most.")] = None,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same sets.")] = 0,
-    replace: Annotated[bool, typer.Option(help="Replace a testsets.yaml that is there.")] = False,
+    sets: Annotated[
+        int, typer.Option(min=1, help="Number of sets per bucket; minimal has twice as many.")
+    ] = 5,
+    min_images: Annotated[int, typer.Option(min=3, help="Minimum photos per set.")] = 5,
+    max_images: Annotated[int | None, typer.Option(min=3, help="Maximum photos per set.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed; the same seed gives the same sets.")] = 0,
+    replace: Annotated[bool, typer.Option(help="Replace an existing testsets.yaml.")] = False,
 ) -> None:
-    """Write SCENE/testsets.yaml: minimal, leq5, leq10, leq30, triplets and all images.
+    """Write SCENE/testsets.yaml with the buckets minimal, leq5, leq10, leq30, triplets and all.
 
-    leq5 means that no three images of a set share more than 5 % of what one of them sees.
+    In leq5, the three-view overlap of any three photos of a set is at most 5 %.
     """
     from mpsfm_core.evaluation.build_sets import build_sets
     from mpsfm_core.evaluation.sampling import SamplingOptions
@@ -47,13 +52,15 @@ def build(
 def import_dataset(
     kind: Annotated[
         str,
-        typer.Argument(help="eth3d, smerf, tanks-and-temples, realestate10k, 7-scenes or scannet."),
+        typer.Argument(
+            help="Dataset: eth3d, smerf, tanks-and-temples, realestate10k, 7-scenes or scannet."
+        ),
     ],
-    source: Annotated[Path, typer.Argument(metavar="SRC", help="One scene as it is distributed.")],
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="One scene as distributed.")],
     target: Annotated[Path, typer.Argument(metavar="DST", help="Scene folder to write.")],
     every: Annotated[int, typer.Option(min=1, help="Take every n-th image.")] = 1,
 ) -> None:
-    """Turn one scene of a public dataset into a scene folder; photos are linked or copied."""
+    """Convert one scene of a public dataset to a scene folder; photos are linked or copied."""
     from mpsfm_core.evaluation.importers import import_scene
 
     scene = import_scene(kind, source, target, every)

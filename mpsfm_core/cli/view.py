@@ -1,4 +1,4 @@
-"""``mpsfm view``: results and COLMAP models in a viewer plugin; and viewers of runs."""
+"""``mpsfm view``: show results and COLMAP models in a viewer plugin."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def view(
         Path, typer.Argument(metavar="DIR", help="A result folder or any COLMAP model.")
     ],
     viewer: Annotated[
-        str, typer.Option("--viewer", metavar="NAME", help="Of a viewer plugin: viser, rerun.")
+        str, typer.Option("--viewer", metavar="NAME", help="Use this viewer: viser or rerun.")
     ] = "viser",
 ) -> None:
     """Show cameras and points; viser serves a page until Ctrl-C, rerun writes DIR/scene.rrd."""
@@ -34,17 +34,18 @@ def view(
 
 
 def open_viewer(registry: Registry, name: str, output: Path, pictures: Pictures) -> Any:
-    """A viewer by its name.
+    """Open a viewer by name.
 
-    Raises :class:`~mpsfm_core.data.errors.InputError` when no plugin brings it, or it cannot be
-    opened. """
+    Raises:
+        InputError: No installed plugin provides the viewer, or the viewer fails to open.
+    """
     from pkgutil import resolve_name
 
     from mpsfm_core.data.errors import InputError, did_you_mean
     from mpsfm_core.providers.first_party import VIEWERS, install_hint
 
-    brought = registry.call_hook("mpsfm_viewers")
-    known = {key: value for answer in brought for key, value in dict(answer).items()}
+    answers = registry.call_hook("mpsfm_viewers")
+    known = {key: value for answer in answers for key, value in dict(answer).items()}
     if name not in known:
         hint = install_hint(VIEWERS, name) or did_you_mean(name, known or VIEWERS)
         raise InputError(f"no viewer {name!r}{hint}")
@@ -57,17 +58,17 @@ def open_viewer(registry: Registry, name: str, output: Path, pictures: Pictures)
 
 
 @contextmanager
-def showing_run(registry: Registry, name: str | None, photos: Path, output: Path) -> Iterator[None]:
-    """A viewer shows what the block reconstructs; without a name nothing is shown.
+def show_run(registry: Registry, name: str | None, photos: Path, output: Path) -> Iterator[None]:
+    """Show the run of the block in a viewer; without a name, show nothing.
 
-    It stays open after a run that ended well, until Ctrl-C.
+    After a successful run the viewer stays open until Ctrl-C.
     """
     if name is None:
         yield
         return
-    from mpsfm_core.report.viewing import photos_in, read_scene
+    from mpsfm_core.report.viewing import pictures_from_photos, read_scene
 
-    viewer = open_viewer(registry, name, output, photos_in(photos))
+    viewer = open_viewer(registry, name, output, pictures_from_photos(photos))
     registry.register(viewer, name=f"viewer {name}")
     try:
         yield

@@ -1,4 +1,4 @@
-"""The command ``mpsfm evaluate``."""
+"""Tests of ``mpsfm evaluate``."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def names_of(folder: Path) -> list[str]:
     return sorted(image.name for image in model.images.values())
 
 
-def test_the_truth_against_itself_is_perfect(truth: Path) -> None:
+def test_evaluate_truth_against_itself_has_full_auc(truth: Path) -> None:
     code, out, _ = evaluate(truth, truth)
     report = json.loads(out)
     assert code == 0
@@ -43,7 +43,7 @@ def test_the_truth_against_itself_is_perfect(truth: Path) -> None:
     assert (report["images"], report["registered"]) == (6, 6)
 
 
-def test_images_are_chosen_by_option_or_file(truth: Path, tmp_path: Path) -> None:
+def test_evaluate_selects_images_by_option_or_file(truth: Path, tmp_path: Path) -> None:
     chosen = names_of(truth)[:3]
     stems = [name.rsplit(".", 1)[0] for name in chosen]
     listed = tmp_path / "names.txt"
@@ -57,7 +57,7 @@ def test_images_are_chosen_by_option_or_file(truth: Path, tmp_path: Path) -> Non
     assert "exclude each other" in err
 
 
-def test_the_convention_is_named_and_changes_the_pairs(truth: Path) -> None:
+def test_evaluate_convention_changes_pairs(truth: Path) -> None:
     report = json.loads(evaluate(truth, truth, "--convention", "vggt")[1])
     assert report["convention"] == "vggt"
     assert report["pairs"] == 15
@@ -66,7 +66,7 @@ def test_the_convention_is_named_and_changes_the_pairs(truth: Path) -> None:
     assert "did you mean 'vggt'" in err
 
 
-def test_missing_models_and_images_exit_with_2(truth: Path, tmp_path: Path) -> None:
+def test_evaluate_missing_model_or_image_exits_with_2(truth: Path, tmp_path: Path) -> None:
     code, out, err = evaluate(tmp_path / "nowhere", truth)
     assert (code, out) == (2, "")
     assert "no COLMAP model" in err

@@ -58,18 +58,18 @@ def uri(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     server.server_close()
 
 
-def test_from_listed_to_fetched_to_verified(uri: str, install_plugin: Callable[..., str]) -> None:
+def test_models_list_fetch_verify(uri: str, install_plugin: Callable[..., str]) -> None:
     install_plugin("mpsfm-tiny", PLUGIN.format(uri=uri, sha256=SHA256))
-    assert "to be fetched" in _line(models("list")[1], "depth/tiny-depth")
+    assert "to be downloaded" in _line(models("list")[1], "depth/tiny-depth")
     code, _, message = models("path", "tiny-depth")
     assert code == 2 and "mpsfm models fetch" in message
 
     code, out, message = models("fetch", "tiny-depth")
-    assert message.startswith(f"licence of {uri}: MIT\n")
+    assert message.startswith(f"license of {uri}: MIT\n")
     path = Path(out.strip())
     assert code == 0 and path.read_bytes() == CONTENT
     assert models("path", "depth/tiny-depth")[1].strip() == str(path)
-    assert "here" in _line(models("list")[1], "depth/tiny-depth")
+    assert "local" in _line(models("list")[1], "depth/tiny-depth")
     (entry,) = [e for e in json.loads(models("list", "--json")[1]) if e["uri"] == uri]
     assert entry["path"] == str(path) and entry["license"] == "MIT"
     assert f"{SHA256}  {uri}" in models("verify")[1]
@@ -84,7 +84,7 @@ def _line(table: str, name: str) -> str:
     return line
 
 
-def test_uri_with_a_hash_of_ones_own(uri: str, tmp_path: Path) -> None:
+def test_fetch_uri_with_given_hash(uri: str, tmp_path: Path) -> None:
     other = tmp_path / "other"
     code, out, _ = models("fetch", uri, "--sha256", SHA256, "--cache", str(other))
     assert code == 0 and Path(out.strip()).is_relative_to(other)
@@ -92,17 +92,17 @@ def test_uri_with_a_hash_of_ones_own(uri: str, tmp_path: Path) -> None:
     assert code == 2 and "expected 0000" in message
 
 
-def test_offline(
+def test_fetch_offline_fails(
     uri: str, install_plugin: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install_plugin("mpsfm-tiny", PLUGIN.format(uri=uri, sha256=SHA256))
     monkeypatch.setenv("MPSFM_OFFLINE", "1")
     code, out, message = models("fetch", "tiny-depth")
     assert (code, out) == (2, "") and "downloads are switched off" in message
-    assert "to be fetched" in _line(models("list")[1], "depth/tiny-depth")
+    assert "to be downloaded" in _line(models("list")[1], "depth/tiny-depth")
 
 
-def test_unknown_name(uri: str, install_plugin: Callable[..., str]) -> None:
+def test_fetch_unknown_name_suggests_closest(uri: str, install_plugin: Callable[..., str]) -> None:
     install_plugin("mpsfm-tiny", PLUGIN.format(uri=uri, sha256=SHA256))
     code, _, message = models("fetch", "tiny-dept")
     assert code == 2 and "did you mean 'tiny-depth'" in message
@@ -117,7 +117,7 @@ normals: {{use: from-depth}}
 """
 
 
-def test_all_weights_of_a_configuration(
+def test_fetch_configuration_downloads_all_weights(
     uri: str, tmp_path: Path, install_plugin: Callable[..., str]
 ) -> None:
     install_plugin("mpsfm-tiny", PLUGIN.format(uri=uri, sha256=SHA256))
@@ -125,11 +125,11 @@ def test_all_weights_of_a_configuration(
     config.write_text(CONFIG.format(name="tiny-depth"))
     code, out, message = models("fetch", str(config))
     assert code == 0 and Path(out.strip()).read_bytes() == CONTENT
-    assert message.splitlines()[:2] == [f"licence of {uri}: MIT", "to be downloaded: 0 MB"]
+    assert message.splitlines()[:2] == [f"license of {uri}: MIT", "to be downloaded: 0 MB"]
     assert "to be downloaded" not in models("fetch", str(config))[2]
 
 
-def test_weights_that_are_not_for_commercial_use_are_asked_for_by_name(
+def test_fetch_noncommercial_weights_needs_acceptance(
     uri: str, install_plugin: Callable[..., str]
 ) -> None:
     plugin = PLUGIN.replace('"MIT"', '"CC-BY-NC-4.0"').format(uri=uri, sha256=SHA256)
@@ -142,9 +142,7 @@ def test_weights_that_are_not_for_commercial_use_are_asked_for_by_name(
     assert models("fetch", "tiny-depth")[0] == 0, "it is here: nothing is left to accept"
 
 
-def test_what_nobody_publishes_is_exported_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_export_writes_unpublished_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MPSFM_EXPORTS", str(tmp_path))
     code, _, message = models("fetch", "export:dsine")
     assert code == 2 and "mpsfm models export dsine --code CHECKOUT" in " ".join(message.split())
@@ -153,7 +151,7 @@ def test_what_nobody_publishes_is_exported_here(
     assert models("path", "export:dsine")[1].strip() == str(tmp_path / "elsewhere.onnx")
 
 
-def test_local_file(uri: str, tmp_path: Path) -> None:
+def test_fetch_local_file_prints_path(uri: str, tmp_path: Path) -> None:
     path = tmp_path / "served" / "tiny.onnx"
     assert models("path", str(path))[1].strip() == str(path)
     assert models("verify", os.fspath(path))[1].startswith(SHA256)

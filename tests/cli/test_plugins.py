@@ -27,7 +27,7 @@ def mpsfm(*arguments: str) -> tuple[int, str, str]:
     return result.exit_code, result.stdout, result.stderr
 
 
-def test_listing_plugins_imports_nothing_heavy(install_plugin: Callable[..., str]) -> None:
+def test_plugins_list_imports_nothing_heavy(install_plugin: Callable[..., str]) -> None:
     source = """
         from mpsfm_core import ProviderSpec, hookimpl
         @hookimpl
@@ -54,7 +54,7 @@ def test_listing_plugins_imports_nothing_heavy(install_plugin: Callable[..., str
     assert "no_such_pkg" in line["reason"]
 
 
-def test_json_and_table_say_the_same(install_plugin: Callable[..., str]) -> None:
+def test_plugins_list_json_equals_table(install_plugin: Callable[..., str]) -> None:
     source = """
         from mpsfm_core import ProviderSpec, hookimpl
         @hookimpl
@@ -188,7 +188,9 @@ class TestEndings:
         assert code == 0 and text.strip()
 
 
-def test_checking_a_plugin_of_hooks_says_which(install_plugin: Callable[..., str]) -> None:
+def test_plugins_check_plugin_without_providers_lists_hooks(
+    install_plugin: Callable[..., str],
+) -> None:
     source = """
         from mpsfm_core import hookimpl
         @hookimpl

@@ -1,4 +1,4 @@
-"""``mpsfm doctor``, ``mpsfm cache`` and the estimate of what is left."""
+"""Tests of ``mpsfm doctor``, ``mpsfm cache`` and the estimate of the remaining time."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ import pytest
 from typer.testing import CliRunner
 
 from mpsfm_core.cli import build_app
-from mpsfm_core.cli.time_left import TimeLeft, in_words
+from mpsfm_core.cli.remaining_time import RemainingTimeEstimator, format_remaining_time
 
 
 def run(*arguments: object) -> str:
-    ended = CliRunner().invoke(build_app(), [*map(str, arguments)])
-    assert ended.exit_code == 0, ended.output
-    return ended.output
+    result = CliRunner().invoke(build_app(), [*map(str, arguments)])
+    assert result.exit_code == 0, result.output
+    return result.output
 
 
-def test_the_doctor_says_what_is_here(tmp_path: Path) -> None:
-    said = run("doctor", "--offline", "--cache", tmp_path)
+def test_doctor_lists_machine_and_providers(tmp_path: Path) -> None:
+    output = run("doctor", "--offline", "--cache", tmp_path)
     for text in ("this machine", "cores", "GPU", "mpsfm-core", "features", "depth", str(tmp_path)):
-        assert text in said
-    assert "what would make runs better here" in said
+        assert text in output
+    assert "how to improve runs on this machine" in output
 
 
-def test_the_doctor_names_a_broken_plugin(tmp_path: Path, install_plugin) -> None:
+def test_doctor_broken_plugin_exits_with_1(tmp_path: Path, install_plugin) -> None:
     install_plugin("mpsfm-broken", "import nothing_of_that_name")
-    ended = CliRunner().invoke(build_app(), ["doctor", "--offline", "--cache", str(tmp_path)])
-    assert ended.exit_code == 1
-    assert "nothing_of_that_name" in ended.output
+    result = CliRunner().invoke(build_app(), ["doctor", "--offline", "--cache", str(tmp_path)])
+    assert result.exit_code == 1
+    assert "nothing_of_that_name" in result.output
 
 
 @pytest.fixture
 def cache(tmp_path: Path) -> Path:
-    """A cache with an old and a new entry, and old weights."""
+    """Create a cache with an old and a new entry, and old weights."""
     for part, name, days in (
         ("extraction/depth/ab", "old.npz", 40),
         ("extraction/depth/cd", "new.npz", 1),
@@ -49,24 +49,24 @@ def cache(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def kept(cache: Path) -> set[str]:
+def cached_files(cache: Path) -> set[str]:
     return {path.name for path in cache.rglob("*") if path.is_file()}
 
 
-def test_prune_takes_what_was_not_used(cache: Path) -> None:
+def test_cache_prune_removes_unused_files(cache: Path) -> None:
     assert "1 files" in run("cache", "prune", "--dry-run", "--cache", cache)
-    assert kept(cache) == {"old.npz", "new.npz", "network.onnx"}
+    assert cached_files(cache) == {"old.npz", "new.npz", "network.onnx"}
     run("cache", "prune", "--cache", cache)
-    assert kept(cache) == {"new.npz", "network.onnx"}
+    assert cached_files(cache) == {"new.npz", "network.onnx"}
     assert not (cache / "extraction" / "depth" / "ab").exists()
     run("cache", "prune", "--older-than", 0, "--weights", "--cache", cache)
-    assert kept(cache) == set()
+    assert cached_files(cache) == set()
 
 
-def test_show_names_the_parts(cache: Path) -> None:
-    said = run("cache", "show", "--cache", cache)
-    assert "extraction" in said
-    assert "weights" in said
+def test_cache_show_lists_parts(cache: Path) -> None:
+    output = run("cache", "show", "--cache", cache)
+    assert "extraction" in output
+    assert "weights" in output
 
 
 class Clock:
@@ -76,63 +76,65 @@ class Clock:
         return self.now
 
 
-def go_through(left: TimeLeft, clock: Clock, seconds_a_unit: dict[str, float]) -> list[float]:
-    """The error of the estimate in the middle of each step, relative to what is left in truth."""
+def simulate_run(
+    left: RemainingTimeEstimator, clock: Clock, seconds_a_unit: dict[str, float]
+) -> list[float]:
+    """Return the relative errors of the estimates in the middle of each stage."""
     units = dict.fromkeys(seconds_a_unit, 10) | {"matching": 45, "verification": 45}
     steps = {name: units[name] * seconds_a_unit[name] for name in units}
     end, errors = clock.now + sum(steps.values()), []
     for name, took in steps.items():
-        left.started(name, units[name])
+        left.start_stage(name, units[name])
         clock.now += took / 2
-        left.progress(name, units[name] // 2, units[name])
+        left.update_stage(name, units[name] // 2, units[name])
         told, truth = left.seconds(), end - clock.now
         assert told is not None
         errors.append(told / truth - 1)
         clock.now += took / 2
-        left.finished(name)
+        left.finish_stage(name)
     return errors
 
 
-def test_the_second_run_is_foretold_by_the_first(tmp_path: Path) -> None:
+def test_remaining_time_uses_speeds_of_earlier_run(tmp_path: Path) -> None:
     clock = Clock()
     speeds = {"features": 2.0, "matching": 3.0, "verification": 0.1, "depth": 0.1}
     speeds |= {"normals": 0.2, "mapping": 9.0, "dense": 4.0, "results": 1.0, "report": 0.5}
-    first = TimeLeft(tmp_path, clock)
+    first = RemainingTimeEstimator(tmp_path, clock)
     assert first.seconds() is None
-    go_through(first, clock, speeds)
-    first.keep()
-    errors = go_through(TimeLeft(tmp_path, clock), clock, speeds)
+    simulate_run(first, clock, speeds)
+    first.save()
+    errors = simulate_run(RemainingTimeEstimator(tmp_path, clock), clock, speeds)
     assert np.abs(errors).max() < 0.15
 
 
-def test_a_stage_that_is_switched_off_is_not_waited_for(tmp_path: Path) -> None:
+def test_remaining_time_ignores_disabled_stage(tmp_path: Path) -> None:
     clock = Clock()
-    left = TimeLeft(tmp_path, clock)
-    left.started("features", 10)
-    left.finished("features")
-    left.started("mapping", 10)
+    left = RemainingTimeEstimator(tmp_path, clock)
+    left.start_stage("features", 10)
+    left.finish_stage("features")
+    left.start_stage("mapping", 10)
     with_dense = left.seconds()
-    left.finished("mapping")
-    left.started("results", 10)
+    left.finish_stage("mapping")
+    left.start_stage("results", 10)
     without = left.seconds()
     assert with_dense is not None
     assert without is not None
     assert with_dense > without + 10  # ten images of mapping, and of dense
-    left.finished("results")
-    left.started("report", 10)
-    left.finished("report")
+    left.finish_stage("results")
+    left.start_stage("report", 10)
+    left.finish_stage("report")
     assert left.seconds() == 0
 
 
-def test_a_damaged_record_of_speeds_is_no_worry(tmp_path: Path) -> None:
+def test_remaining_time_ignores_damaged_timings(tmp_path: Path) -> None:
     (tmp_path / "timings.json").write_text("[1")
-    left = TimeLeft(tmp_path)
-    left.started("features", 10)
+    left = RemainingTimeEstimator(tmp_path)
+    left.start_stage("features", 10)
     assert left.seconds()
 
 
-def test_time_in_words() -> None:
-    assert in_words(None) == ""
-    assert in_words(30) == "less than a minute left"
-    assert in_words(600) == "about 10 min left"
-    assert in_words(7200) == "about 2.0 h left"
+def test_format_remaining_time_rounds_to_units() -> None:
+    assert format_remaining_time(None) == ""
+    assert format_remaining_time(30) == "less than a minute left"
+    assert format_remaining_time(600) == "about 10 min left"
+    assert format_remaining_time(7200) == "about 2.0 h left"

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from mpsfm_core import reconstruct
-from mpsfm_core.cli.time_left import TimeLeft
+from mpsfm_core.cli.remaining_time import RemainingTimeEstimator
 from mpsfm_core.config import load_config
 from mpsfm_core.data import (
     DenseMatches,
@@ -137,10 +137,10 @@ def write_cache(output: Path) -> None:
     record = output / "cache" / "weights" / "hashes.json"
     record.write_text(record.read_text().replace(server.url, "https://example.org"))
     clock = iter(range(9))
-    speeds = TimeLeft(output / "cache", lambda: float(next(clock)))
-    speeds.started("features", 4)
-    speeds.finished("features")
-    speeds.keep()
+    speeds = RemainingTimeEstimator(output / "cache", lambda: float(next(clock)))
+    speeds.start_stage("features", 4)
+    speeds.finish_stage("features")
+    speeds.save()
     for path in (*output.rglob("*.lock"), *(output / "cache" / "weights").rglob("*.onnx")):
         path.unlink()
 

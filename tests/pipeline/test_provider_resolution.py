@@ -319,7 +319,7 @@ def test_a_cheap_fault_is_found_before_a_download(
 def test_config_show_says_what_would_be_chosen(tmp_path: Path) -> None:
     settings = ["--set", f"runtime.cache_dir={tmp_path}", "--offline"]
     shown = CliRunner().invoke(build_app(), ["config", "show", "default", *settings]).output
-    config, _, comment = shown.partition("# here and now:\n")
+    config, _, comment = shown.partition("# providers on this machine:\n")
     assert "fallback:" in config
     lines = dict(line[2:].split(": ", 1) for line in comment.splitlines())
     fast_pass = {"fast_pass.features", "fast_pass.matcher"}
