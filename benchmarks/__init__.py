@@ -1,1 +1,1 @@
-"""Performance and accuracy measurements, kept apart from the tests."""
+"""Benchmarks of accuracy, time and memory."""

@@ -1,4 +1,4 @@
-"""Runs benchmarks one after the other: ``python -m benchmarks [NAME ...]``, all by default."""
+"""Runner of benchmarks: ``python -m benchmarks [NAME ...]``, all by default."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def main() -> int:
-    """Run the named modules of this folder; returns how many failed."""
+    """Run the named benchmarks; return how many failed."""
     known = sorted(
         module.name
         for module in pkgutil.iter_modules([str(Path(__file__).parent)])

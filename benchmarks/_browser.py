@@ -1,4 +1,4 @@
-"""A headless Chromium for pictures of our pages."""
+"""Headless Chromium for screenshots of pages."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ _ARGUMENTS = (
 )
 
 
-def picture_of(browser: Any) -> bytes:
-    """The window as PNG, however long it takes; the driver's own command gives up after 10 s."""
+def capture_png(browser: Any) -> bytes:
+    """Capture the window as PNG, without the timeout of the driver's own command."""
     taken = browser.execute_cdp_cmd("Page.captureScreenshot", {"format": "png"})
     return base64.b64decode(taken["data"])
 
 
 @contextmanager
-def headless(width: int = 1280, height: int = 800) -> Iterator[Any]:
-    """Selenium's driver of a page of this size. Ends the script where there is no browser."""
+def start_browser(width: int = 1280, height: int = 800) -> Iterator[Any]:
+    """Start a browser of a given size; exit if none is installed."""
     try:
         from selenium import webdriver
     except ImportError as error:
@@ -39,10 +39,10 @@ def headless(width: int = 1280, height: int = 800) -> Iterator[Any]:
     options.binary_location = chromium
     for argument in _ARGUMENTS:
         options.add_argument(argument)
-    options.page_load_strategy = "none"  # who wants to see something waits for it
+    options.page_load_strategy = "none"  # callers wait for the content
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
-    browser.command_executor.client_config.timeout = 600  # seconds; drawn without a GPU
+    browser.command_executor.client_config.timeout = 600  # seconds; rendering without a GPU is slow
     browser.set_script_timeout(600)
     screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)

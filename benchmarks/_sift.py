@@ -1,4 +1,4 @@
-"""COLMAP's SIFT and exhaustive matching, as its own pipeline does them."""
+"""COLMAP's SIFT and exhaustive matching."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pycolmap
 def extract(
     database: Path, images: Path, model: str, params: Sequence[float], names: Sequence[str] = ()
 ) -> None:
-    """Features of images of one known camera; ``names``: of all by default."""
+    """Extract SIFT features of images of one known camera; ``names`` None: all images."""
     pycolmap.extract_features(
         database,
         images,
@@ -25,7 +25,7 @@ def extract(
 
 
 def match(database: Path) -> None:
-    """All pairs."""
+    """Match all pairs."""
     pycolmap.match_exhaustive(
         database, matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False)
     )

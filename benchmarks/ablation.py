@@ -1,11 +1,11 @@
-"""What each part of the mapper is worth: our mapper with one part changed at a time.
+"""Ablation of the mapper: one component changed at a time.
 
     python -m benchmarks.ablation [--scene rendered_kitchen] [--priors sensor,degraded]
         [--sets minimal,leq10,leq30,all] [--only NAME ...] [--output DIR] [--workers 1]
 
-Each variant is a row of :data:`VARIANTS`, settings below ``mapping`` that differ from the
-defaults. Matches are the same for all and come from the cache after the first. Resumable. Writes
-benchmarks/results/ablation-SCENE.md, a table as the paper's table 5: AUC@1 / 5 / 20 degrees.
+Each variant is a row of :data:`VARIANTS`, settings below ``mapping`` that differ from the defaults.
+All variants use the same matches. An interrupted benchmark resumes from --output. Writes
+benchmarks/results/ablation-SCENE.md with AUC@1 / 5 / 20 degrees, as table 5 of the paper.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from benchmarks._scenes import RESULTS, shared_folder, tell
-from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
+from benchmarks._scenes import RESULTS, print_progress, shared_folder
+from mpsfm_core.evaluation.benchmark import BenchmarkPlan, run_benchmark
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS
 from mpsfm_core.evaluation.report import Row, make_rows
 from mpsfm_core.optimize.options import Loss
@@ -23,25 +23,25 @@ from mpsfm_core.support.yaml_text import write_yaml
 
 VARIANTS: Mapping[str, Mapping[str, object]] = {
     "default": {},
-    "start from a pair": {"initialization": {"global_initialization": False}},
-    "reprojection loss not measured": {"refinement": {"measure_keypoint_noise": False}},
+    "initialization from one pair": {"initialization": {"global_initialization": False}},
+    "reprojection loss not estimated": {"refinement": {"measure_keypoint_noise": False}},
     "no lifting": {"registration": {"lifting": False}},
-    "bundle adjustment beside refined depth": {"refinement": {"bundle_depth": "refined"}},
+    "bundle adjustment with refined depth": {"refinement": {"bundle_depth": "refined"}},
     "no depth refinement": {"refinement": {"integrate": False}},
-    "no depth regularisation": {"refinement": {"depth_regularization": False}},
-    "no refinement, no regularisation": {
+    "no depth regularization": {"refinement": {"depth_regularization": False}},
+    "no refinement, no regularization": {
         "refinement": {"integrate": False, "depth_regularization": False}
     },
     "no depth check": {"consistency": {"enabled": False}},
-    "evidence not weighed": {"consistency": {"weigh_evidence": False}},
-    "depth check not at the end": {"consistency": {"check_at_end": False}},
+    "evidence not weighted": {"consistency": {"weigh_evidence": False}},
+    "no final depth check": {"consistency": {"check_at_end": False}},
     "final robust pass": {"refinement": {"final_robust": True}},
     "next view by inlier matches": {"registration": {"next_view": "inlier-matches"}},
     "next view by visible points": {"registration": {"next_view": "visible-points"}},
-    "poses of RANSAC as they are": {"registration": {"num_improved": 0}},
+    "RANSAC poses not refined": {"registration": {"num_locally_optimized": 0}},
     "declared depth noise": {"refinement": {"measure_depth_noise": False}},
-    "scales of priors stay as first estimated": {"refinement": {"free_scales": False}},
-    "matches count the same": {"weigh_by_score": False},
+    "scales fixed after initialization": {"refinement": {"free_scales": False}},
+    "matches weighted equally": {"weigh_by_score": False},
     "new images with the final loss": {"refinement": {"first_reprojection_scale": 1.0}},
     "reprojection loss of the reference": {
         "refinement": {
@@ -64,7 +64,7 @@ def main() -> None:
     arguments = parser.parse_args()
     output = arguments.output / f"ablation-{arguments.scene}"
     configs = {_file_name(name): name for name in arguments.only}
-    plan = Plan(
+    plan = BenchmarkPlan(
         (shared_folder() / "data" / arguments.scene,),
         tuple(str(_write_config(output / "configs", name)) for name in arguments.only),
         tuple(arguments.sets.split(",")),
@@ -73,7 +73,7 @@ def main() -> None:
         overrides=("runtime.workers=1",),
         workers=arguments.workers,
     )
-    rows = make_rows(run_benchmark(plan, output, done=tell))
+    rows = make_rows(run_benchmark(plan, output, done=print_progress))
     text = _table(arguments.scene, rows, configs)
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"ablation-{arguments.scene}.md").write_text(text, encoding="utf-8")
@@ -92,7 +92,7 @@ def _file_name(variant: str) -> str:
 
 
 def _table(scene: str, rows: Sequence[Row], configs: Mapping[str, str]) -> str:
-    """One table a prior: variants down, buckets across."""
+    """Format one table per prior: a row per variant, a column per bucket."""
     convention = CONVENTIONS["paper"]
     parts = [
         f"# Ablation on {scene}",

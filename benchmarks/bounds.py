@@ -1,11 +1,10 @@
-"""What matches and depth hold: our mapper beside itself started at the true poses.
+"""Upper bound for the pose search: our mapper, and our mapper initialized with the true poses.
 
     python -m benchmarks.bounds [--buckets minimal leq30] [--output DIR]
 
-On rendered_kitchen with degraded depth, errors of several seeds. Started at the truth the mapper
-refines, and drops images that see no points; where it ends is as good as its search for poses can
-get. What is missing there is due to the matches, the errors of depth, or the objective. Writes
-benchmarks/results/bounds-rendered_kitchen.md.
+Uses rendered_kitchen with degraded depth of several seeds. With true poses the mapper only refines,
+and drops images without points. The remaining error is due to matches, depth errors or the
+objective. Writes benchmarks/results/bounds-rendered_kitchen.md.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import numpy as np
 from benchmarks._scenes import RESULTS, percent, shared_folder
 from benchmarks.accuracy import DEGRADED
 from mpsfm_core.data import Float64, MappingProblem, Pose
-from mpsfm_core.evaluation.benchmark import PairsOfSets, problem_of_sets
+from mpsfm_core.evaluation.benchmark import SetPairFilter, prepare_sets
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.evaluation.scene_folder import read_scene
 from mpsfm_core.mapping.mapper import reconstruct
@@ -28,7 +27,9 @@ from mpsfm_core.providers.registry import Registry
 
 SCENE = "rendered_kitchen"
 CONVENTION = CONVENTIONS["paper"]
-HEADER = "| bucket | sets | started | AUC@1/5/20 | registered |\n| --- | --- | --- | --- | --- |"
+HEADER = (
+    "| bucket | sets | initialization | AUC@1/5/20 | registered |\n| --- | --- | --- | --- | --- |"
+)
 
 
 def main() -> None:
@@ -39,13 +40,13 @@ def main() -> None:
     arguments = parser.parse_args()
     scene = read_scene(shared_folder() / "data" / SCENE)
     sets = scene.chosen(arguments.buckets)
-    registry, only = Registry.discover(), PairsOfSets()
+    registry, only = Registry.discover(), SetPairFilter()
     only.allow(sets)
     registry.register(only, name="pairs of sets")
     errors: dict[tuple[str, str], list[Float64]] = {}
     sizes: dict[tuple[str, str], list[float]] = {}
     for prior in DEGRADED:
-        prepared = problem_of_sets(
+        prepared = prepare_sets(
             scene,
             sets,
             prior,
@@ -58,7 +59,7 @@ def main() -> None:
         for item in sets:
             truth = {name: scene.truth[name] for name in item.images}
             plain = prepared.of(item)
-            for start, run in (("by itself", plain), ("at the truth", _posed(plain, truth))):
+            for start, run in (("own", plain), ("true poses", _posed(plain, truth))):
                 models = reconstruct(run, options).reconstructions
                 found = models[0].poses if models else {}
                 key = item.bucket, start
@@ -70,8 +71,8 @@ def main() -> None:
         share = np.mean(sizes[bucket, start])
         lines.append(f"| {bucket} | {len(each)} | {start} | {percent(area)} | {share:.0%} |")
     parts = [
-        f"# What matches and depth hold on {SCENE}",
-        f"Degraded depth, errors of {len(DEGRADED)} seeds; our mapper, and the same started at the "
+        f"# Bounds set by matches and depth on {SCENE}",
+        f"Degraded depth, {len(DEGRADED)} seeds: our mapper, and our mapper initialized with the "
         "true poses. "
         f"Pose AUC in percent, convention `{CONVENTION.name}`: {CONVENTION.description}.",
         "\n".join(lines),

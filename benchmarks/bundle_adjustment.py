@@ -1,12 +1,12 @@
-"""Time and accuracy of bundle adjustment with depth, beside pycolmap's own without depth.
+"""Time and accuracy of bundle adjustment with depth, compared with pycolmap without depth.
 
     python -m benchmarks.bundle_adjustment [--sizes S M L] [--repeats 5] [--json]
 
-Both sides start from the same perturbed cameras and points, build their problem inside of the
-clock (from arrays here, from a reconstruction there) and stop at a relative cost change of 1e-6.
-Times are medians and ratios are of medians, of runs in turn. The last line is one JSON object
-with ``--json``, else there is one line for each figure. Bars: ratio at most 0.35, cost within
-1e-6 and poses within 1e-5 of Ceres' from 20 starts, covariances within 1 % of a dense inverse.
+Both start from the same perturbed cameras and points and stop at a relative cost change of 1e-6.
+Times include building the problem (from arrays, or from a reconstruction) and are medians of
+interleaved runs. ``--json`` prints one JSON object as the last line. Targets: time ratio at most
+0.35, cost within 1e-6 and poses within 1e-5 of Ceres from 20 starts, covariances within 1 % of a
+dense inverse.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ STARTS = 20
 
 
 def timed(function: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds and result."""
+    """Return seconds and result of a call."""
     start = time.perf_counter()
     result = function()
     return time.perf_counter() - start, result
 
 
 def side_by_side(sides: dict[str, Callable[[], Any]], repeats: int) -> tuple[dict[str, float], Any]:
-    """Median seconds of each side, run in turn, and the last results."""
+    """Return median seconds of interleaved calls, and their last results."""
     seconds: dict[str, list[float]] = {name: [] for name in sides}
     results: dict[str, Any] = {}
     for _ in range(repeats):
@@ -60,11 +60,11 @@ def side_by_side(sides: dict[str, Callable[[], Any]], repeats: int) -> tuple[dic
 
 
 def bench_speed(size: tuple[int, int, float], repeats: int) -> dict[str, float]:
-    """Times and ratios for one size; pycolmap starts from a fresh reconstruction each time."""
+    """Measure times and ratios of one size; pycolmap starts from a new reconstruction each time."""
     problem = perturb(make_problem(*size), seed=1)
     plain = without_depth(problem)
     reconstructions = [to_pycolmap(problem) for _ in range(repeats)]
-    fresh = iter(reconstructions)  # the adjuster does not keep its reconstruction alive
+    fresh = iter(reconstructions)  # keep a reference: the adjuster holds none
     threads = SOFT_L1_OPTIONS.model_copy(update={"threads": 1})
     median, results = side_by_side(
         {
@@ -98,7 +98,7 @@ def bench_speed(size: tuple[int, int, float], repeats: int) -> dict[str, float]:
 
 
 def bench_optimum(starts: int) -> dict[str, float]:
-    """Largest differences to Ceres (depth as a Python cost) over perturbed starts."""
+    """Measure the largest differences to Ceres (depth as a Python cost) over perturbed starts."""
     truth = make_problem(6, 80, 3.5)
     tight = SOFT_L1_OPTIONS.model_copy(update={"function_tolerance": 1e-13, "max_iterations": 1000})
     cost, turn, shift = [], [], []
@@ -124,7 +124,7 @@ def bench_optimum(starts: int) -> dict[str, float]:
 
 
 def bench_covariance(repeats: int) -> dict[str, float]:
-    """Point covariances against the inverse of the dense normal equations, and their cost."""
+    """Compare point covariances with the dense inverse, and measure their time."""
     small = replace(make_problem(6, 80, 3.5), obs_log_depth=None)
     information = dense_point_information(small) + DAMPING * np.eye(3 * len(small.points))
     inverse = np.linalg.inv(information).reshape(len(small.points), 3, -1, 3)
@@ -155,7 +155,7 @@ def bench_covariance(repeats: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", nargs="*", choices=list(SIZES), default=list(SIZES))
     parser.add_argument("--repeats", type=int, default=5)

@@ -1,14 +1,14 @@
-"""What calibration does: coverage and poses with right and wrong uncertainty, in a real room.
+"""Effect of calibration: coverage and poses with correct and wrong std, in a real room.
 
     python -m benchmarks.calibration [--buckets minimal leq5 leq10] [--output DIR] [--workers 1]
 
-Two depth priors of the HoloLens room: FastDepth, and the sensor's depth with smooth errors
-(`mpsfm_core.testing.synthetic.degraded_depth`). Each is calibrated on the images that no set holds,
-and then declared in four ways: calibrated, 5 times too certain, 5 times too uncertain, and
-uncalibrated (the defaults, which are those of another network). Coverage is on the images of the
-sets, poses are of the sets, with the mapper measuring the noise of depth itself (its default) and
-without. Resumable: --output keeps what is done. Writes benchmarks/results/calibration.md; scenes
-are in $MPSFM_SHARED or ../shared. """
+Two depth priors of hololens_room are used: FastDepth, and sensor depth with smooth errors
+(`mpsfm_core.testing.synthetic.degraded_depth`). Each is calibrated on the images outside the sets,
+and declared in four ways: calibrated, std 5 times too small, 5 times too large, and uncalibrated
+(defaults of another network). Coverage is measured on the images of the sets. Poses are measured
+with and without the estimation of depth noise. Resumable with --output. Writes
+benchmarks/results/calibration.md; scenes are in $MPSFM_SHARED or ../shared.
+"""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks._scenes import RESULTS, shared_folder, tell
+from benchmarks._scenes import RESULTS, print_progress, shared_folder
 from mpsfm_core.calibration.calibrate import Photos, calibrate, compare
 from mpsfm_core.calibration.study import judge
 from mpsfm_core.config import load_config
-from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
+from mpsfm_core.evaluation.benchmark import BenchmarkPlan, run_benchmark
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS
 from mpsfm_core.evaluation.prior_quality import prior_settings
 from mpsfm_core.evaluation.report import Row, make_rows
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.providers.uncertainty.calibration_file import load_calibration
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration_file import load_calibration
 from mpsfm_core.support.yaml_text import write_yaml
 
 FACTOR = 5.0
 MEASURED = {"measured": True, "trusted": False}
-"""How the mapper weighs depth -> its setting ``measure_depth_noise``."""
+"""Setting ``measure_depth_noise`` by label."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """A depth prior: its ``depth`` block."""
+    """Depth prior: its ``depth`` block."""
 
     name: str
     block: Mapping[str, Any]
@@ -76,17 +76,17 @@ def _priors(scene: SceneFolder, fastdepth: Path, output: Path) -> Iterator[Prior
     yield Prior("FastDepth", {"use": "onnx", "options": {"model": str(fastdepth)}})
     degraded = (output / "degraded").resolve()
     prior_settings("degraded", scene, scene.truth, degraded)
-    # The declared std is nearly nothing, so that the calibration alone says how good it is.
+    # The declared std is negligible, so that only the calibration determines the variance.
     options = {"directory": str(degraded), "scale": 0.001, "relative_std": 1e-6}
     yield Prior("degraded sensor depth", {"use": "files", "options": options})
 
 
 def _declarations(calibrated: DepthCalibration) -> dict[str, DepthCalibration]:
-    """The calibrated uncertainty, wrong ones, and the defaults."""
+    """Return the calibrated uncertainty, wrong ones, and the defaults."""
     return {
         "calibrated": calibrated,
-        "5 x too certain": _scaled(calibrated, 1 / FACTOR),
-        "5 x too uncertain": _scaled(calibrated, FACTOR),
+        "std 5 x too small": _scaled(calibrated, 1 / FACTOR),
+        "std 5 x too large": _scaled(calibrated, FACTOR),
         "uncalibrated": DepthCalibration(),
     }
 
@@ -97,7 +97,7 @@ def _scaled(calibration: DepthCalibration, factor: float) -> DepthCalibration:
 
 
 def _calibrated(prior: Prior, scene: SceneFolder, images: Path, output: Path) -> DepthCalibration:
-    """Fitted on the images of a list, or what an earlier run left."""
+    """Fit the calibration on listed images, or read that of an earlier run."""
     file = output / f"{_slug(prior.name)}.calibration.yaml"
     if not file.is_file():
         config = _config(prior, DepthCalibration(), True, output / "fit.yaml")
@@ -112,7 +112,7 @@ def _calibrated(prior: Prior, scene: SceneFolder, images: Path, output: Path) ->
 def _coverage(
     prior: Prior, scene: SceneFolder, images: Path, declared: Mapping[str, DepthCalibration]
 ) -> dict[str, dict[str, Any]]:
-    """Metrics of each declaration on the images of a list."""
+    """Compute the metrics of each declaration on listed images."""
     config = _config(prior, DepthCalibration(), True, images.with_name("judge.yaml"))
     photos = Photos(scene.images, scene.intrinsics, images)
     data = compare(photos, load_config(config), _truth(scene))
@@ -126,7 +126,7 @@ def _poses(
     output: Path,
     arguments: argparse.Namespace,
 ) -> dict[tuple[str, str], Row]:
-    """Pose accuracy over all sets, by declaration and how the mapper weighs depth."""
+    """Compute the pose accuracy over all sets by declaration and depth weighting."""
     configs = {
         (name, weighing): _config(
             prior,
@@ -137,14 +137,14 @@ def _poses(
         for name, calibration in declared.items()
         for weighing, measure in MEASURED.items()
     }
-    plan = Plan(
+    plan = BenchmarkPlan(
         (scene.path,),
         tuple(str(path) for path in configs.values()),
         tuple(arguments.buckets),
         peers=(),
         workers=arguments.workers,
     )
-    records = run_benchmark(plan, output, Registry.discover(), tell)
+    records = run_benchmark(plan, output, Registry.discover(), print_progress)
     rows = {}
     for key, path in configs.items():
         own = [replace(r, bucket="all") for r in records if r.config == Path(path).stem]
@@ -153,7 +153,7 @@ def _poses(
 
 
 def _config(prior: Prior, calibration: DepthCalibration, measure: bool, path: Path) -> str:
-    """Write a configuration; returns its path."""
+    """Write a configuration; return its path."""
     depth = {**prior.block, "calibration": calibration.model_dump(mode="json")}
     values = {
         "extends": "benchmark",
@@ -189,7 +189,7 @@ def _table(
     yield ""
     yield (
         "| declared | within 1 std | within 2 std | 1.4826 MAD of z | nll (heavy) | AUC, noise "
-        "measured | registered | AUC, std trusted | registered |"
+        "estimated | registered | AUC, declared std | registered |"
     )
     yield "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
     for name, metrics in coverage.items():

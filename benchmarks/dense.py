@@ -2,15 +2,14 @@
 
     python -m benchmarks.dense [--cases fountain-all-config ...] [--true-poses] [--output DIR]
 
-A case is a scene, a bucket of its sets and a depth prior. The mapped sets (poses, points, refined
-depth) are kept in the output folder, so that only what comes after the mapper is run again. With
-``--true-poses`` the mapper is given the true poses and holds them; scales of depth, points and
-refined maps are its own.
+A case is a scene, a bucket of its sets and a depth prior. Mapped sets (poses, points, refined
+depth) are stored in the output folder and reused. With ``--true-poses`` the mapper keeps the true
+poses; scales of depth, points and refined maps are its own.
 
-Depth is compared in the scale of the cameras, its std in the one that fits the depth of the set
-best, the cloud after aligning the cameras' centres, with all true depth maps of the set as the
-scan. ``fountain`` has no true depth: there it is the share of matches, triangulated with the true
-poses, whose depth is right to 1 %. The last line of ``--json`` is one JSON object.
+Depth is compared in the scale of the cameras, its std in the scale that fits the depth of the set
+best, and the cloud after aligning the camera centers, with all true depth maps of the set as the
+scan. ``fountain`` has no true depth: there the measure is the share of matches, triangulated with
+the true poses, whose depth is within 1 %. ``--json`` prints one JSON object as the last line.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ import pycolmap
 from benchmarks._scenes import shared_folder
 from benchmarks.accuracy import FASTDEPTH, PRIORS
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, MappingProblem, Pose
+from mpsfm_core.dense.densify import densify
+from mpsfm_core.dense.depth_range import depth_prior_from_points
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.depth_range import depth_prior_from_points
-from mpsfm_core.dense.densify import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
-from mpsfm_core.evaluation.benchmark import PairsOfSets, PreparedSets, problem_of_sets
+from mpsfm_core.evaluation.benchmark import SetPairFilter, PreparedSets, prepare_sets
 from mpsfm_core.evaluation.dense_geometry import dense_accuracy
 from mpsfm_core.evaluation.depth_accuracy import depth_beside_truth
 from mpsfm_core.evaluation.prior_quality import read_depth
@@ -61,16 +60,17 @@ from mpsfm_core.providers.registry import Registry
 from mpsfm_core.results.options import ResultOptions
 
 TOLERANCES = (0.02, 0.05)
-"""Metres, of the clouds."""
+"""Distance thresholds of the clouds in meters."""
 NEAR = 0.1
-"""Relative error of depth that counts as near."""
+"""Maximum relative error of accurate depth."""
 WAYS = ("mapper", "dense", "without prior")
-"""Maps as the mapper refined them, after the dense stage, and after one that knew no more than the
-range of the points that an image sees."""
+"""Kinds of maps: refined by the mapper, after the dense stage, and after a dense stage that only
+knows the depth range of the points.
+"""
 POINT_NEAR = 0.01
-"""The same at true points."""
+"""Maximum relative error of accurate depth at true points."""
 ANGLE, ERROR_PX = 3.0, 1.0
-"""Of true points: smallest angle of their rays in degrees, largest reprojection error."""
+"""Minimum triangulation angle in degrees and maximum reprojection error of true points."""
 
 
 @dataclass(frozen=True)
@@ -97,11 +97,11 @@ CASES: Mapping[str, Case] = {
     for bucket in buckets
     for prior in priors
 }
-"""``config`` is FastDepth."""
+"""Cases by name; ``config`` is FastDepth."""
 
 
 def main() -> None:
-    """Command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=CASES, metavar="CASE")
     parser.add_argument("--true-poses", action="store_true", help="map with the true poses, fixed")
@@ -122,7 +122,7 @@ def main() -> None:
 
 
 def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Reconstruction]:
-    """What the mapper makes of the sets of a case, now or earlier; with ``true_poses`` held."""
+    """Map the sets of a case, or read the stored result; ``true_poses``: keep the true poses."""
     kept = output / f"{name}{'-true-poses' if true_poses else ''}.pickle"
     if kept.is_file():
         return list(pickle.loads(kept.read_bytes()))
@@ -140,7 +140,7 @@ def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Recon
 
 
 def problem_of_case(name: str, output: Path) -> tuple[PreparedSets, list[EvaluationSet]]:
-    """What is mapped for a case; extracted now, or earlier and kept in the output folder."""
+    """Extract the mapping problems of a case, or read the stored ones."""
     case = CASES[name]
     scene = read_scene(shared_folder() / "data" / case.scene)
     sets = scene.chosen([case.bucket])
@@ -148,10 +148,10 @@ def problem_of_case(name: str, output: Path) -> tuple[PreparedSets, list[Evaluat
     config = output / "fastdepth.yaml"
     model = shared_folder() / "models" / "fastdepth_224.onnx"
     config.write_text(f"extends: benchmark\n{FASTDEPTH.format(model=model)}", encoding="utf-8")
-    registry, only = Registry.discover(), PairsOfSets()
+    registry, only = Registry.discover(), SetPairFilter()
     only.allow(sets)
     registry.register(only, name="pairs of sets")
-    prepared = problem_of_sets(
+    prepared = prepare_sets(
         scene, sets, case.prior, str(config), ("runtime.workers=1",), output / name, registry
     )
     return prepared, sets
@@ -164,9 +164,9 @@ def measured(
     problem: MappingProblem | None,
     poses_use_depth: bool = True,
 ) -> list[dict[str, Any]]:
-    """Means over the sets of a case, a row for each way to make the maps.
+    """Compute means over the sets of a case, one row per kind of map.
 
-    ``poses_use_depth``: the mapper found the poses.
+    ``poses_use_depth``: the poses are those of the mapper.
     """
     photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
     rows = []
@@ -196,7 +196,7 @@ def measured(
 
 
 def without_prior(model: Reconstruction) -> Reconstruction:
-    """With one depth an image, from its points; images without points are left out."""
+    """Replace depth priors by one depth per image from its points; drop images without points."""
     images = []
     for image in model.images:
         points = model.points[image.point_ids[image.point_ids >= 0]]
@@ -207,7 +207,7 @@ def without_prior(model: Reconstruction) -> Reconstruction:
 
 
 def view_of(photos: ImageSet) -> Any:
-    """Views by name."""
+    """Return the views by name."""
     index = {name: number for number, name in enumerate(photos.names)}
     return lambda name: photos.view(index[name])
 
@@ -220,10 +220,10 @@ def set_errors(
     seen: Mapping[str, Bool],
     cloud: Float64,
 ) -> dict[str, float]:
-    """Errors of the depth maps and of the cloud (n, 3) of one set; empty if it has no scale.
+    """Compute the errors of depth maps and cloud (n, 3) of one set; empty without a scale.
 
-    ``problem``: what was mapped, where matches tell the true depth. ``seen``: by image, (h, w), of
-    its map, pixels that were measured in the photos.
+    ``problem``: the mapping problem, whose matches define the true depth of fountain. ``seen``: by
+    image, mask (h, w) of the measured pixels of its map.
     """
     maps = {image.name: image.depth for image in reconstruction.images}
     errors = trajectory_errors(reconstruction.poses, scene.truth)
@@ -241,7 +241,7 @@ def set_errors(
     found = [map_errors(each, scale, own) for each in beside]
     cameras = {photo.name: photo.pinhole for photo in photos}
     accuracy = dense_accuracy(reconstruction, cloud, scene, cameras, TOLERANCES)
-    assert accuracy is not None  # it has a scale and true depth
+    assert accuracy is not None  # guaranteed by scale and true depth
     result = {"abs_rel": accuracy["depth"]["abs_rel"], **_means(found)}
     for tolerance in map(str, TOLERANCES):
         centimetres = round(100 * float(tolerance))
@@ -252,8 +252,10 @@ def set_errors(
 
 
 class MapBesideTruth(NamedTuple):
-    """Pixels (n,) where a map and the truth are known: depth and its std, the true depth, and
-    whether the photos told it."""
+    """Pixels (n,) with depth in a map and in the truth.
+
+    Depth and its std, the true depth, and the mask of measured pixels.
+    """
 
     depth: Float64
     std: Float64
@@ -262,8 +264,8 @@ class MapBesideTruth(NamedTuple):
 
     @classmethod
     def of(cls, depth: DepthPrior, truth: Float32, seen: Bool | None) -> MapBesideTruth:
-        """Of a map and the true one; ``seen`` (h, w): pixels that were measured in the photos."""
-        assert depth.variance is not None  # of a refined map always
+        """Collect the common pixels of a map and the true map; ``seen`` (h, w): measured pixels."""
+        assert depth.variance is not None  # refined maps always have a std
         xy, found, true = depth_beside_truth(depth.depth, depth.valid, truth)
         variance, _ = sample_bilinear(depth.variance, depth.valid, xy)
         own = np.zeros(depth.shape, np.bool_) if seen is None else seen
@@ -271,17 +273,22 @@ class MapBesideTruth(NamedTuple):
 
 
 def own_scale(maps: Sequence[MapBesideTruth]) -> float:
-    """The scale in which most of what was measured in a set is right, or of all where nothing was:
-    centres of a few cameras tell it worse than depth does."""
+    """Compute the median scale of the measured pixels of a set, or of all pixels.
+
+    It is more accurate than the scale of a few camera centers.
+    """
     ratios = [each.truth / each.depth for each in maps]
     told = [ratio[each.measured] for ratio, each in zip(ratios, maps, strict=True)]
     return float(np.median(np.concatenate(told if any(map(len, told)) else ratios)))
 
 
 def map_errors(of: MapBesideTruth, scale: float, own: float) -> dict[str, float]:
-    """The share that is near of one map, and the part that what was not measured has in the
-    AbsRel, in the ``scale`` of the cameras; AbsRel and the share within the stated std, of pixels
-    that were measured and of the rest, in the depth's ``own`` scale."""
+    """Compute the errors of one map.
+
+    In the ``scale`` of the cameras: share of accurate pixels, AbsRel, and the part of AbsRel of
+    pixels that are not measured. In the ``own`` scale: AbsRel and the share within the stated std,
+    for measured and other pixels.
+    """
     measured, relative = of.measured, np.abs(scale * of.depth - of.truth) / of.truth
     error = np.abs(own * of.depth - of.truth)
     within = error <= own * of.std
@@ -296,9 +303,9 @@ def map_errors(of: MapBesideTruth, scale: float, own: float) -> dict[str, float]
 
 
 def triangulated(problem: MappingProblem, truth: Mapping[str, Pose]) -> dict[str, Float64]:
-    """Keypoints and their true depth (n, 3) by image: matches, triangulated with the true poses.
+    """Triangulate matches with true poses; return keypoints and true depth (n, 3) by image.
 
-    Those whose rays meet within a pixel, at an angle that leaves no doubt of the depth.
+    Points with a residual above a pixel or a small triangulation angle are excluded.
     """
     found: dict[str, list[Float64]] = {}
     for pair in problem.pairs:
@@ -330,7 +337,7 @@ def points_near(
     maps: Mapping[str, DepthPrior],
     scale: float,
 ) -> dict[str, float]:
-    """Share of true points whose depth in the map is right to 1 %, and how many there are."""
+    """Compute the share of true points whose depth in the map is within 1 %, and their number."""
     cameras = {image.name: image.camera for image in problem.images}
     right = total = 0
     for name, points in triangulated(problem, truth).items():
@@ -345,13 +352,13 @@ def points_near(
 
 
 def _means(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Of each key, over those that have a value."""
+    """Compute the mean of each key over the entries that have it."""
     values = {key: [each[key] for each in found if np.isfinite(each[key])] for key in found[0]}
     return {key: float(np.mean(known)) if known else np.nan for key, known in values.items()}
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown."""
+    """Format a Markdown table."""
     keys = list(dict.fromkeys(key for row in rows for key in row))
     lines = ["| " + " | ".join(keys) + " |", "|" + " --- |" * len(keys)]
     for row in rows:

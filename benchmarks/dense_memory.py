@@ -1,11 +1,10 @@
-"""Peak memory and CPU of the dense stage as photos get more.
+"""Peak memory and CPU time of the dense stage by number of photos.
 
     python -m benchmarks.dense_memory [--photos 16 160] [--output FILE]
 
-The photos of rendered_kitchen with their true poses, and their true depth at a quarter of the
-photo's size as what is known; more than there are come from copies of the room far away. Each
-number of photos runs in a process of its own. Memory is resident memory at its peak, and what of it
-was there before the stage began: photos on disk, poses and known depth.
+Uses the photos of rendered_kitchen with true poses and true depth at a quarter of their size.
+Larger numbers use distant copies of the room. Each number runs in a process of its own. Memory is
+peak resident memory, and the memory before the stage (photos on disk, poses and known depth).
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ import numpy as np
 from benchmarks._scenes import shared_folder
 from benchmarks.dense import view_of
 from mpsfm_core.data import DepthPrior
-from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.densify import densify
+from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.scene_folder import read_scene
 from mpsfm_core.evaluation.true_surface import depth_file
@@ -36,13 +35,13 @@ from mpsfm_core.pipeline.stages import peak_memory_mb
 from mpsfm_core.support.disk_arrays import DiskArrays
 
 _STD = 0.05
-"""Of the known depth, relative."""
+"""Relative std of the known depth."""
 _APART = 1000.0
-"""Metres between the copies of the room."""
+"""Distance in meters between the copies of the room."""
 
 
 def main() -> None:
-    """Command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--photos", nargs="+", type=int, default=[16, 160])
     parser.add_argument("--output", type=Path)
@@ -68,7 +67,7 @@ def main() -> None:
 
 
 def measured(count: int) -> dict[str, float | None]:
-    """The stage on so many photos, in this process."""
+    """Run the stage on a number of photos in this process."""
     scene = read_scene(shared_folder() / "data" / "rendered_kitchen")
     assert scene.depth is not None
     photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
@@ -89,7 +88,7 @@ def measured(count: int) -> dict[str, float | None]:
     model = Reconstruction(tuple(images), np.zeros((0, 3)), np.zeros(0))
     photo_of = view_of(photos)
     few = Reconstruction(tuple(images[:3]), model.points, model.errors_px)
-    densify(few, lambda name: photo_of(original[name]), DenseOptions())  # compiles
+    densify(few, lambda name: photo_of(original[name]), DenseOptions())  # compiles the kernels
     before, started = peak_memory_mb(), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         densify(

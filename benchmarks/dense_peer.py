@@ -1,15 +1,15 @@
-"""Our dense stage beside a pipeline for CPUs from the package registry, with the same poses.
+"""Comparison of our dense stage with another CPU pipeline on the same poses.
 
     python -m benchmarks.dense_peer [--cases kitchen-all-config ...] [--true-poses] [--output DIR]
 
-The peer is pyarchinit-photogrammetry (GPL), which nothing else here uses:
+The peer is pyarchinit-photogrammetry (GPL), which is used only here:
 
     pip install --no-deps pyarchinit-photogrammetry pyarchinit-photogrammetry-core
 
-PatchMatch in Rust, started from OpenCV's semi-global matching of rectified pairs, and COLMAP's
-fusion on the CPU, with its own defaults for close range (``moderate``). It is given what a user
-would give it: photos and the COLMAP model that the mapper wrote, with poses and points. Cases as in
-:mod:`benchmarks.dense`, whose mapped sets are taken.
+It runs PatchMatch in Rust, initialized by OpenCV's semi-global matching of rectified pairs, and
+COLMAP's fusion on the CPU, with its defaults for close range (``moderate``). Its input is the
+photos and the COLMAP model of the mapper. Cases are those of :mod:`benchmarks.dense`, whose mapped
+sets are reused.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.ply import read_ply
 
 MODE = "moderate"
-"""The peer's own default."""
+"""Default mode of the peer."""
 _INSTALL = "pip install --no-deps pyarchinit-photogrammetry pyarchinit-photogrammetry-core"
 Maps = dict[str, DepthPrior]
 
@@ -56,7 +56,7 @@ Maps = dict[str, DepthPrior]
 def peer_result(
     model: Reconstruction, view: Callable[[str], View], folder: Path
 ) -> tuple[Maps, Float64]:
-    """The peer's maps by image name, and its cloud (n, 3); as its ``_PatchMatchJob`` goes."""
+    """Run the peer as its ``_PatchMatchJob``; return maps by image name and cloud (n, 3)."""
     try:
         from pyarchinit_photogrammetry.engine import dense as peer
     except ImportError as error:
@@ -134,7 +134,7 @@ def _params(peer: Any, matrix: Float64) -> tuple[float, ...]:
 def ours(
     model: Reconstruction, view: Callable[[str], View], prior: bool, true_poses: bool
 ) -> tuple[Maps, Float64, dict[str, Bool]]:
-    """Our maps, our cloud, and what was measured."""
+    """Run our stage; return maps, cloud, and masks of measured pixels."""
     model = model if prior else without_prior(model)
     poses_use_depth = prior and not true_poses
     model, report = densify(model, view, DenseOptions(), poses_use_depth=poses_use_depth)
@@ -145,7 +145,7 @@ def ours(
 def depth_errors(
     scene: SceneFolder, maps: Maps, chosen: dict[str, Bool], names: Sequence[str], scale: float
 ) -> dict[str, float]:
-    """Of chosen pixels the median relative error and the share within 1 %; their share of all."""
+    """Compute median relative error and share within 1 % of chosen pixels, and their share."""
     assert scene.depth is not None
     total, errors = 0, [np.zeros(0)]
     for name in names:
@@ -165,7 +165,7 @@ def depth_errors(
 
 
 def main() -> None:
-    """Command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     chosen = ["kitchen-all-config", "kitchen-leq30-config"]
     parser.add_argument("--cases", nargs="+", default=chosen, choices=CASES, metavar="CASE")

@@ -1,12 +1,11 @@
-"""How a set that hangs on one pair of images fares beside better poses than the device's.
+"""Sensitivity of hololens_room `minimal` to errors of the device poses.
 
     python -m benchmarks.device_poses [--output DIR]
 
-The true poses of hololens_room are what the device tracked, good to a degree or two. In its set
-of the bucket `minimal` only one pair can be posed, so that the figure of that bucket says how far
-one pose is from the device's. Frames around that pair overlap much; COLMAP poses them without any
-depth, on matches of two features. Here these poses take the place of the device's. Writes
-benchmarks/results/device_poses.md.
+The true poses of hololens_room are tracked by the device, with an accuracy of one or two degrees.
+In the set of the bucket `minimal` only one pair can be posed, so the score measures one relative
+pose. Frames around that pair overlap well; COLMAP poses them without depth, on matches of two
+features. Here these poses replace the device poses. Writes benchmarks/results/device_poses.md.
 """
 
 from __future__ import annotations
@@ -18,24 +17,31 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from benchmarks._scenes import RESULTS, frame_names, percent, shared_folder, tell, with_sets
+from benchmarks._scenes import (
+    RESULTS,
+    frame_names,
+    percent,
+    print_progress,
+    shared_folder,
+    with_sets,
+)
 from benchmarks.accuracy import ALIKED
 from mpsfm_core.data import Pose
-from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
+from mpsfm_core.evaluation.benchmark import BenchmarkPlan, run_benchmark
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
-from mpsfm_core.evaluation.records import Record
+from mpsfm_core.evaluation.records import BenchmarkRecord
 from mpsfm_core.evaluation.scene_folder import read_scene
 
 SCENE = "hololens_room"
 BUCKET = "minimal"
 WINDOW = 12
-"""Frames around a pair; it may be half as far apart."""
+"""Number of frames around a pair, which may be up to half of it apart."""
 PEERS = ("colmap-tuned", "colmap-global")
 METHODS = ("ours-sensor", "colmap-tuned")
-"""Whose poses of the bucket are held against the device's and those of the window."""
+"""Methods whose poses of the bucket are compared with the device and with the window."""
 CONVENTION = CONVENTIONS["paper"]
 FEATURES = {"benchmark": "XFeat", ALIKED[0]: "ALIKED"}
-"""Of each configuration."""
+"""Features of each configuration."""
 Poses = Mapping[str, Pose]
 
 
@@ -53,19 +59,20 @@ def main() -> None:
     output.mkdir(parents=True, exist_ok=True)
     aliked = output / f"{ALIKED[0]}.yaml"
     aliked.write_text("extends: benchmark\n" + ALIKED[1], encoding="utf-8")
-    plan = Plan(
+    plan = BenchmarkPlan(
         (with_sets(folder, output / SCENE, sets),),
         ("benchmark", str(aliked)),
         priors=("sensor",),
         peers=PEERS,
         overrides=("runtime.workers=1",),
     )
-    records = run_benchmark(plan, output, done=tell)
+    records = run_benchmark(plan, output, done=print_progress)
     text = (
-        f"# Truth of {SCENE}, {BUCKET}\n\n"
-        f"AUC@20 in percent of the bucket's one set, when the pair that is in a window of {WINDOW} "
-        "frames takes COLMAP's pose of that window for true, not the device's. Beside it how far "
-        "that pose is from the device's, and at most from the other windows', in degrees.\n\n"
+        f"# Accuracy of the device poses, {SCENE} `{BUCKET}`\n\n"
+        "AUC@20 in percent of the one set of the bucket, if the pose of one pair is taken from "
+        f"COLMAP on a window of {WINDOW} images instead of the device. The last columns: "
+        "difference of that pose from the device pose, and the largest difference between "
+        "windows, in degrees.\n\n"
         f"{_table(records)}\n"
     )
     RESULTS.mkdir(exist_ok=True)
@@ -74,7 +81,7 @@ def main() -> None:
 
 
 def _around(a: str, b: str, frames: Sequence[str]) -> list[str]:
-    """The window in whose middle two frames are; none if they are too far apart."""
+    """Return the window centered at two frames, or none if they are too far apart."""
     first, last = sorted((frames.index(a), frames.index(b)))
     if last - first > WINDOW // 2:
         return []
@@ -82,8 +89,8 @@ def _around(a: str, b: str, frames: Sequence[str]) -> list[str]:
     return list(frames[start : start + WINDOW])
 
 
-def _table(records: Sequence[Record]) -> str:
-    """A row for each truth: the device's, and that of each peer and feature."""
+def _table(records: Sequence[BenchmarkRecord]) -> str:
+    """Format a row for each truth: the device, and each peer and feature."""
     hard = {r.label: r for r in records if r.bucket == BUCKET and r.config == "benchmark"}
     device = hard[METHODS[0]].truth
     truths: dict[str, list[Poses]] = {}
@@ -92,7 +99,7 @@ def _table(records: Sequence[Record]) -> str:
             name = f"{record.label}, {FEATURES[record.config]}, {len(record.estimated)} images"
             truths.setdefault(name, []).append(record.estimated)
     lines = [
-        f"| truth | {' | '.join(METHODS)} | from the device | from each other |",
+        f"| truth | {' | '.join(METHODS)} | to device pose | between windows |",
         f"| --- |{' ---: |' * len(METHODS)} ---: | ---: |",
         f"| device | {' | '.join(_area(hard[method], []) for method in METHODS)} | | |",
     ]
@@ -105,8 +112,8 @@ def _table(records: Sequence[Record]) -> str:
     return "\n".join(lines)
 
 
-def _area(record: Record, truths: Sequence[Poses]) -> str:
-    """AUC@20, each pair held against the first of some truths that has it, at last the device."""
+def _area(record: BenchmarkRecord, truths: Sequence[Poses]) -> str:
+    """Compute AUC@20 with the first truth that has both images of a pair."""
     errors = []
     for pair in combinations(record.truth, 2):
         truth = _of_pair(truths, pair) or {name: record.truth[name] for name in pair}
@@ -115,7 +122,7 @@ def _area(record: Record, truths: Sequence[Poses]) -> str:
 
 
 def _apart(some: Sequence[Poses], others: Sequence[Poses], images: Poses) -> float:
-    """Largest difference of the pairs of these images that are in one model of both, in degrees."""
+    """Compute the largest pose difference in degrees of the pairs that both models contain."""
     errors = [0.0]
     for pair in combinations(images, 2):
         ours, theirs = _of_pair(some, pair), _of_pair(others, pair)
@@ -125,7 +132,7 @@ def _apart(some: Sequence[Poses], others: Sequence[Poses], images: Poses) -> flo
 
 
 def _of_pair(models: Sequence[Poses], pair: tuple[str, str]) -> Poses:
-    """The poses of two images in the first model that has both; empty if none has."""
+    """Return the poses of two images in the first model with both; empty if none has."""
     model = next((model for model in models if model.keys() >= set(pair)), None)
     return {name: model[name] for name in pair} if model else {}
 

@@ -1,12 +1,12 @@
-"""The paper's efficiency table: CPU seconds of the steps of mapping, and memory.
+"""CPU time of the steps of mapping, and memory, as the efficiency table of the paper.
 
     python -m benchmarks.efficiency [--views 25 49 100 250 505]
 
-Halls of :mod:`benchmarks.everyday` with honest priors, on maps as large as those of photos.
-Whatever a step calls belongs to it. The paper's rows of one kind (global, local, after
-registration) are summed; they are of other scenes (ETH3D) and of the authors' machine: growth
-compares, seconds hardly do. All sizes run in one process, the smallest first, so that the peak of
-memory is that of the largest so far, with its problem.
+Halls of :mod:`benchmarks.everyday` with honest priors, with maps of the size that photos have. A
+step includes all functions that it calls. Rows of the paper of one kind (global, local, after
+registration) are summed; they are of other scenes (ETH3D) and of the authors' machine, so compare
+growth rather than seconds. All sizes run in one process, the smallest first; peak memory is that of
+the largest so far.
 """
 
 from __future__ import annotations
@@ -26,13 +26,12 @@ from mpsfm_core.pipeline.stages import peak_memory_mb
 from mpsfm_core.testing.synthetic.halls import CALIBRATED_PRIORS, make_hall_problem
 
 MAP_WIDTH = 387
-"""As the extraction room leaves maps (``extraction.integration_size``)."""
+"""Width of the prior maps (``extraction.integration_size``)."""
 WHOLE = "mapping"
 
 
 class Step(NamedTuple):
-    """``functions``: (file, name) of those that do it, none of which calls another. ``paper``:
-    seconds by number of images."""
+    """One step: (file, name) of its functions, and the paper's seconds by number of images."""
 
     functions: frozenset[tuple[str, str]]
     paper: Mapping[int, float]
@@ -72,11 +71,11 @@ STEPS: Mapping[str, Step] = MappingProxyType(
 
 
 def main() -> None:
-    """Command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--views", type=int, nargs="+", default=[25, 49, 100, 250, 505])
     sizes = sorted(parser.parse_args().views)
-    _measured(9)  # loads what is compiled
+    _measured(9)  # loads compiled code
     columns = {views: _measured(views) for views in sizes}
     print(f"| CPU seconds | {' | '.join(map(str, sizes))} | paper: 25 | 44 | 110 | 505 |")
     print("|---" * (len(sizes) + 5) + "|")
@@ -89,7 +88,7 @@ def main() -> None:
 
 
 def _measured(views: int) -> dict[str, float]:
-    """CPU seconds of each step, of all threads together, and ``peak`` in MiB."""
+    """Measure CPU seconds of each step over all threads, and ``peak`` in MiB."""
     problem = make_hall_problem(views, CALIBRATED_PRIORS, map_width=MAP_WIDTH).problem
     profile = cProfile.Profile(time.process_time)
     with threadpool_limits(1):

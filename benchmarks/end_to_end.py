@@ -1,12 +1,11 @@
-"""From photos to poses: ``mpsfm reconstruct`` beside COLMAP's own SIFT pipeline.
+"""From photos to poses: ``mpsfm reconstruct`` compared with COLMAP's SIFT pipeline.
 
     python -m benchmarks.end_to_end [--scenes fountain ...] [--output FILE]
 
-COLMAP: SIFT, all pairs, incremental mapper, as ``colmap automatic_reconstructor`` would do it, each
-step with as many threads as it takes by itself. Ours: whole commands, with an empty cache, compiled
-kernels and true intrinsics on both sides; without the dense stage and the report, which COLMAP's
-steps have no part of. Both poses are compared with the truth, pose AUC in percent, convention
-`paper`. Time is of the clock, of one run on a machine with nothing else to do.
+COLMAP: SIFT, exhaustive matching, incremental mapper, as ``colmap automatic_reconstructor``, each
+step with its default number of threads. Ours: whole commands with an empty cache, compiled kernels,
+without the dense stage and the report. Both use true intrinsics. Pose AUC in percent, convention
+`paper`. Wall time of one run on an idle machine.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ from mpsfm_core.inputs.models import read_poses, reconstruction_poses
 
 SCENES = ("fountain", "rendered_kitchen", "hololens_room")
 OURS = ("sift", "fast-cpu")
-"""Configurations."""
+"""Configurations of our runs."""
 _ALONE = ("dense.enabled=false", "results.dense_cloud=false", "results.report=false")
 
 
 def main() -> None:
-    """Command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--scenes", nargs="+", default=["fountain"], choices=SCENES)
     parser.add_argument("--output", type=Path, help="also write the table to this file")
@@ -62,7 +61,7 @@ def main() -> None:
 
 
 def compared(scene: SceneFolder) -> list[str]:
-    """Rows of the table."""
+    """Yield the rows of the table."""
     folder = scene.images.parent
     rows = []
     with tempfile.TemporaryDirectory() as work:
@@ -83,7 +82,7 @@ def compared(scene: SceneFolder) -> list[str]:
 
 
 def timed(command: list[str], environment: Mapping[str, str]) -> float:
-    """Seconds of the clock that a command takes."""
+    """Return the wall seconds of a command."""
     started = time.perf_counter()
     subprocess.run(command, check=True, env={**os.environ, **environment}, stdout=sys.stderr)
     return time.perf_counter() - started
@@ -92,7 +91,7 @@ def timed(command: list[str], environment: Mapping[str, str]) -> float:
 def row(
     scene: SceneFolder, label: str, poses: Mapping[str, Pose], seconds: float, reference: float
 ) -> str:
-    """One line of the table."""
+    """Format one row of the table."""
     convention = CONVENTIONS["paper"]
     area = pose_auc(pose_errors_deg(poses, scene.truth, convention), convention)
     registered = f"{len(poses)} of {len(scene.truth)}"
@@ -104,7 +103,7 @@ def row(
 
 
 def colmap(scene: SceneFolder, output: Path) -> None:
-    """COLMAP's largest model of a scene."""
+    """Compute COLMAP's largest model of a scene."""
     photos = load_images(scene.images, scene.intrinsics)
     output.mkdir(parents=True)
     database = output / "database.db"

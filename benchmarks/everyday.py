@@ -1,15 +1,15 @@
-"""Ordinary photo sets: our mapper beside COLMAP's incremental one on the same verified matches.
+"""Well-connected image sets: our mapper and COLMAP's on the same verified matches.
 
     python -m benchmarks.everyday [--views 49 100 ...] [--priors exact honest "locally wrong"]
         [--only NAME ...] [--threads 1] [--repeats 1] [--json] [--output FILE]
 
-Analytic halls with boxes (:mod:`mpsfm_core.testing.synthetic.halls`): each view overlaps well with
-those around it, keypoints have 0.7 px of noise and 5 % of the matches are wrong. Each run has a
-process of its own; compiled loops are loaded before. Times are medians of the repeats, in turn with
-COLMAP's; memory is the peak of the process, with the problem in it. With more than one of
-``--threads`` for both, what a user waits for is the wall time. ``--only``: of :data:`VARIANTS`,
-settings below ``mapping`` that differ from the defaults. The last line is one JSON object with
-``--json``."""
+Analytic halls with boxes (:mod:`mpsfm_core.testing.synthetic.halls`): neighboring views overlap
+well, keypoints have 0.7 px of noise and 5 % of the matches are outliers. Each run has a process of
+its own, with compiled loops loaded before. Times are medians of the repeats, interleaved with
+COLMAP's; memory is the peak of the process. With more than one thread, compare wall times.
+``--only`` selects :data:`VARIANTS`, settings below ``mapping`` that differ from the defaults.
+``--json`` prints one JSON object as the last line.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks._scenes import percent
-from mpsfm_core.evaluation.methods import OURS, MethodRun, Outcome, run_tasks
+from mpsfm_core.evaluation.methods import OURS, MethodRun, MethodResult, run_methods
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.synthetic.halls import QUALITIES, HallProblem, make_hall_problem
@@ -41,7 +41,7 @@ CONVENTION = CONVENTIONS["paper"]
 
 
 def main() -> None:
-    """Command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--views", type=int, nargs="+", default=[49, 100])
     parser.add_argument("--priors", nargs="+", choices=list(QUALITIES), default=list(QUALITIES))
@@ -66,17 +66,17 @@ def main() -> None:
 def measured(
     views: int, prior: str, variants: Sequence[str], repeats: int, threads: int = 1
 ) -> list[dict[str, Any]]:
-    """A row for COLMAP and one for each variant of ours."""
+    """Yield a row for COLMAP and one for each variant of ours."""
     hall = make_hall_problem(views, QUALITIES[prior])
     methods = {PEER: (PEER, MapperOptions())}
     for variant in variants:
         methods[variant] = OURS, MapperOptions.model_validate(dict(VARIANTS[variant]))
-    outcomes: dict[str, list[Outcome]] = {label: [] for label in methods}
+    outcomes: dict[str, list[MethodResult]] = {label: [] for label in methods}
     for _ in range(repeats):
         for label, (method, options) in methods.items():
-            # one task at a time: the next one's memory is counted in a process of its own
+            # one task per process, because peak memory is per process
             tasks = [MethodRun(label, method, hall.problem, options, threads=threads)]
-            outcomes[label] += [outcome for _, outcome in run_tasks(tasks, 1)]
+            outcomes[label] += [outcome for _, outcome in run_methods(tasks, 1)]
             print(f"{views} {prior} {label}: {outcomes[label][-1].seconds:.1f} s", file=sys.stderr)
     base = _row(hall, outcomes[PEER])
     shared = {
@@ -95,8 +95,8 @@ def measured(
     return rows
 
 
-def _row(hall: HallProblem, outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Medians of the repeats; accuracy is that of the first, as it is the same in all."""
+def _row(hall: HallProblem, outcomes: Sequence[MethodResult]) -> dict[str, Any]:
+    """Compute medians of the repeats; the accuracy is the same in all."""
     first = outcomes[0]
     found = first.models[0] if first.models else {}
     area = pose_auc(pose_errors_deg(found, hall.truth, CONVENTION), CONVENTION)
@@ -112,7 +112,7 @@ def _row(hall: HallProblem, outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def growth(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Exponent of CPU time over views, by method and prior, where there are several sizes."""
+    """Compute the exponent of CPU time over views, by method and prior."""
     points: dict[str, list[tuple[int, float]]] = {}
     for row in rows:
         name = f"{row['method']}, {row['priors']}"
@@ -125,7 +125,7 @@ def growth(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown: a line a run, and the exponents of growth."""
+    """Format a Markdown table with a row per run, and the exponents of growth."""
     lines = [
         "| views | priors | method | registered | AUC@1/5/20 | CPU, s | wall, s | CPU / COLMAP | "
         "wall / COLMAP | peak, MiB |",

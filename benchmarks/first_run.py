@@ -1,12 +1,11 @@
-"""A new user's way: a phone's video, a reconstruction in the browser, a folder for splatting.
+"""First run of a new user: a phone video, a reconstruction in the browser, a folder for splatting.
 
     python -m benchmarks.first_run [--gsplat FOLDER]
 
-Films hololens_room (123 photos of a walk through a real room, a camera worn on the head, motion
-blur) as twelve seconds of H.264, which needs PyAV (pip install av); gives the commands that
-docs/first-run.md gives, opens the page in headless Chromium, and reads the exported folder with
-gsplat's own loader, if FOLDER is the ``examples`` folder of its repository (pip install imageio
-piexif tqdm). Prints a table; processor time is what other work on the machine hardly changes.
+Encodes hololens_room (123 photos of a head-mounted camera, with motion blur) as twelve seconds of
+H.264 (needs PyAV: pip install av); runs the commands of docs/first-run.md; opens the page in
+headless Chromium; and reads the exported folder with gsplat's loader, if FOLDER is the ``examples``
+folder of its repository (pip install imageio piexif tqdm). Prints a table.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks._browser import headless, picture_of
+from benchmarks._browser import capture_png, start_browser
 from benchmarks._scenes import MPSFM, shared_folder
 
 FPS = 10
@@ -59,7 +58,7 @@ def film(photos: Sequence[Path], video: Path) -> None:
 
 
 def timed(command: Sequence[str], folder: Path) -> tuple[float, float, str]:
-    """Seconds of processor and clock that a command takes in a folder, and what it prints."""
+    """Return CPU and wall seconds of a command, and its output."""
     before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     ended = subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, text=True, check=False)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -70,8 +69,8 @@ def timed(command: Sequence[str], folder: Path) -> tuple[float, float, str]:
 
 
 def look(page: Path) -> tuple[float, str]:
-    """Open a report; seconds of the clock until its scene is drawn, and its first sentence."""
-    with headless() as browser:
+    """Open a report; return the wall seconds until its scene is drawn, and its first sentence."""
+    with start_browser() as browser:
         started = time.perf_counter()
         browser.get(page.resolve().as_uri())
         while not browser.execute_script("return window.report !== undefined"):
@@ -82,13 +81,13 @@ def look(page: Path) -> tuple[float, str]:
         faults = [line for line in browser.get_log("browser") if line["level"] == "SEVERE"]
         if faults:
             raise SystemExit(f"{page}: {faults[0]['message']}")
-        page.with_name("report.png").write_bytes(picture_of(browser))
+        page.with_name("report.png").write_bytes(capture_png(browser))
         verdict = browser.execute_script("return document.getElementById('verdict').innerText")
         return clock, str(verdict)
 
 
 def main() -> None:
-    """Read the command line and go through the commands."""
+    """Parse the command line and run the commands."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("first-run"))
     parser.add_argument("--frames", type=int, default=30, help="as many are taken from the video")

@@ -1,10 +1,10 @@
-"""Memory of a process that reconstructs a tiny scene again and again.
+"""Memory of a process that reconstructs a tiny scene repeatedly.
 
     python -m benchmarks.leaks [--count 200]
 
-Three photos of an analytic room, all stages, results written anew each time; what providers give
-comes from the cache after the first. Prints what the process holds as runs go on, and how that
-grows in the second half of the runs. Writes benchmarks/results/leaks.md.
+Three photos of an analytic room, all stages; provider results come from the cache after the first
+run. Prints memory, objects, files and threads of the process, and their slopes in the second half.
+Writes benchmarks/results/leaks.md.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def main() -> None:
         "",
         f"`python -m benchmarks.leaks --count {count}`",
         "",
-        f"In the second half memory grows by {1e3 * slopes.memory_mb:.1f} kB a run, the objects",
-        f"that Python knows by {slopes.objects:.2f}: slopes of lines through those runs.",
+        f"Slopes over the second half of the runs: memory {1e3 * slopes.memory_mb:.1f} kB per run, "
+        f"Python objects {slopes.objects:.2f} per run.",
         "",
         "| after run | resident MB | objects | open files | threads |",
         "| --- | --- | --- | --- | --- |",
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def reconstruction(folder: Path) -> Callable[[], object]:
-    """A reconstruction of photos made here, to be called again and again."""
+    """Return a function that reconstructs generated photos."""
     photos = folder / "photos"
     photos.mkdir()
     for number, pose in enumerate(arc_poses(3, 10.0)):

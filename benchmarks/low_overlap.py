@@ -1,11 +1,11 @@
-"""Low overlap from photos alone: quick matching before the networks, networks only, SIFT only.
+"""Low overlap from photos alone: with the fast pass, with networks only, with SIFT only.
 
     python -m benchmarks.low_overlap [--scenes rendered_kitchen ...] [--buckets minimal ...]
 
-`fast-cpu` as it is, without its quick matching (``fast_pass: null``), and `sift`, on the sets of each
-bucket; the mean of the sets' pose AUC in percent, convention `paper`. A set without a
-reconstruction counts as none registered. Seconds are of whole runs, features and depth from the
-cache where an earlier run made them.
+Compares `fast-cpu`, `fast-cpu` without its fast pass (``fast_pass: null``), and `sift` on the sets
+of each bucket, by the mean pose AUC of the sets in percent, convention `paper`. A set without a
+reconstruction has no registered image. Seconds are of whole runs, with cached features and depth of
+earlier runs.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ METHODS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "without fast pass": ("fast-cpu", ("fast_pass=null",)),
     "`sift`": ("sift", ()),
 }
-"""Label -> configuration and what is set in it."""
+"""Configuration and settings by label."""
 CONVENTION = CONVENTIONS["paper"]
 
 
 def main() -> None:
-    """Command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
     parser.add_argument("--buckets", nargs="+", help="default: all of a scene")
@@ -57,7 +57,7 @@ def main() -> None:
 def row(
     scene: SceneFolder, bucket: str, sets: Sequence[Sequence[str]], method: str, cache: Path
 ) -> str:
-    """One line of the table."""
+    """Format one row of the table."""
     started, registered, areas = time.perf_counter(), 0, []
     for names in sets:
         poses = found(scene, names, method, cache)
@@ -75,7 +75,7 @@ def row(
 
 
 def found(scene: SceneFolder, names: Sequence[str], method: str, cache: Path) -> Mapping[str, Pose]:
-    """Poses of the largest reconstruction of a set."""
+    """Return the poses of the largest reconstruction of a set."""
     config, settings = METHODS[method]
     overrides = ("dense.enabled=false", f"runtime.cache_dir={cache}", *settings)
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as listed:

@@ -1,11 +1,11 @@
-"""Mapping time beside COLMAP's incremental mapper on the same matches, and how both grow.
+"""Mapping time compared with COLMAP's incremental mapper on the same matches, and its growth.
 
     python -m benchmarks.mapping_time [--scenes rendered_kitchen ...] [--output DIR]
 
-Evenly spaced frames of a scene, twice as many in each set; matches are XFeat + LighterGlue, priors
-true depth, and none of that is timed. A small set comes first to load what is compiled. COLMAP runs
-without and with structure-less registration, its default since 4. Writes
-benchmarks/results/mapping_time.md. Run it on a quiet machine.
+Evenly spaced frames of a scene, twice as many in each set. Matches are XFeat + LighterGlue, priors
+are true depth; neither is timed. A small set runs first to load compiled code. COLMAP runs without
+and with structure-less registration, its default since version 4. Writes
+benchmarks/results/mapping_time.md. Needs an idle machine.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks._scenes import RESULTS, frame_names, shared_folder, tell, with_sets
-from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
-from mpsfm_core.evaluation.records import Record
+from benchmarks._scenes import RESULTS, frame_names, print_progress, shared_folder, with_sets
+from mpsfm_core.evaluation.benchmark import BenchmarkPlan, run_benchmark
+from mpsfm_core.evaluation.records import BenchmarkRecord
 
 SIZES = (7, 14, 28)
 PEERS = ("colmap", "colmap-structureless")
@@ -31,17 +31,17 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["rendered_kitchen", "hololens_room"])
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))
     arguments = parser.parse_args()
-    parts = ["# Mapping time", "Wall time and CPU time in seconds (images registered)."]
+    parts = ["# Mapping time", "Wall time and CPU time in seconds (registered images)."]
     for name in arguments.scenes:
         scene, output = shared_folder() / "data" / name, arguments.output / "mapping_time" / name
         frames = frame_names(scene)
         sizes = [size for size in SIZES if size <= len(frames)]
         sets = {f"{n:03d}": [_spaced(frames, n)] for n in sizes}
         folder = with_sets(scene, output / name, {"000": [frames[:4]], **sets})
-        plan = Plan(
+        plan = BenchmarkPlan(
             (folder,), priors=("sensor",), peers=PEERS, overrides=("runtime.workers=1",), workers=1
         )
-        records = run_benchmark(plan, output, done=tell)
+        records = run_benchmark(plan, output, done=print_progress)
         parts.append(f"## {name}\n\n{_table(sizes, records)}")
     text = "\n\n".join(parts) + "\n"
     RESULTS.mkdir(exist_ok=True)
@@ -53,8 +53,8 @@ def _spaced(frames: Sequence[str], count: int) -> list[str]:
     return [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]
 
 
-def _table(sizes: Sequence[int], records: Sequence[Record]) -> str:
-    """A row for each number of images, and the exponents of growth below."""
+def _table(sizes: Sequence[int], records: Sequence[BenchmarkRecord]) -> str:
+    """Format a row for each number of images, and the exponents of growth."""
     found = {(record.bucket, record.label): record for record in records}
     lines = [
         f"| images | {' | '.join(METHODS)} | ours / colmap | ours / colmap-structureless |",

@@ -1,11 +1,11 @@
-"""Halls that nothing was tuned on: other seeds, worse matches, fewer pairs, worse priors.
+"""Halls that no option was tuned on: other seeds, worse matches, fewer pairs, worse priors.
 
     python -m benchmarks.other_halls [--views 49] [--seeds 1 2 3 4] [--matches NAME ...]
         [--priors NAME ...] [--workers 2] [--output FILE]
 
-As :mod:`benchmarks.everyday`, whose halls all have the same matches of one kind, but for accuracy:
-our mapper beside COLMAP's incremental one on the same verified matches, images summed and pose AUC
-over the pairs of all seeds. CPU time is summed, of so many processes at a time as workers.
+Extends :mod:`benchmarks.everyday`, whose halls have one kind of matches. Our mapper and COLMAP's
+incremental mapper use the same verified matches; images are summed and pose AUC is over the pairs
+of all seeds. CPU time is summed over concurrent processes.
 """
 
 from __future__ import annotations
@@ -21,23 +21,32 @@ import numpy as np
 from benchmarks._scenes import percent
 from benchmarks.everyday import CONVENTION, PEER
 from mpsfm_core.data import MappingProblem
-from mpsfm_core.evaluation.methods import OURS, MethodRun, Outcome, run_tasks
+from mpsfm_core.evaluation.methods import OURS, MethodRun, MethodResult, run_methods
 from mpsfm_core.evaluation.pose_auc import pose_auc, pose_errors_deg
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.testing.synthetic.halls import CALIBRATED_PRIORS, QUALITIES, HallProblem, PriorErrors, make_hall_problem
+from mpsfm_core.testing.synthetic.halls import (
+    CALIBRATED_PRIORS,
+    QUALITIES,
+    HallProblem,
+    PriorErrors,
+    make_hall_problem,
+)
 
 
 @dataclass(frozen=True)
 class Matches:
-    """What sets the matches of halls apart. ``options``: of :func:`make_hall_problem`. ``share``: of the
-    pairs that are kept, at random. ``reach``: views along the walk up to which pairs are kept."""
+    """Kind of matches of a hall.
+
+    ``options``: of :func:`make_hall_problem`. ``share``: share of random pairs that are kept.
+    ``reach``: maximum distance of kept pairs in views along the walk.
+    """
 
     options: Mapping[str, float] = field(default_factory=dict)
     share: float = 1.0
     reach: int = 10**9
 
     def hall(self, views: int, errors: PriorErrors, seed: int) -> HallProblem:
-        """A hall of this kind."""
+        """Create a hall of this kind."""
         hall = make_hall_problem(views, errors, seed=seed, **self.options)  # type: ignore[arg-type]
         rng = np.random.default_rng(seed)
         kept = [
@@ -63,7 +72,7 @@ PRIORS = QUALITIES | {
 
 
 def main() -> None:
-    """Command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--views", type=int, default=49)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4])
@@ -90,14 +99,14 @@ def main() -> None:
 
 
 def compared(halls: Sequence[HallProblem], workers: int) -> str:
-    """Cells of a line: images, accuracy and time of both on some halls."""
+    """Compute the cells of a row: images, accuracy and time of both mappers."""
     tasks = [
         MethodRun(f"{number}", method, hall.problem, MapperOptions())
         for number, hall in enumerate(halls)
         for method in (PEER, OURS)
     ]
-    found: dict[str, list[tuple[HallProblem, Outcome]]] = {PEER: [], OURS: []}
-    for task, outcome in run_tasks(tasks, workers):
+    found: dict[str, list[tuple[HallProblem, MethodResult]]] = {PEER: [], OURS: []}
+    for task, outcome in run_methods(tasks, workers):
         found[task.method].append((halls[int(task.label)], outcome))
     of_peer, of_ours = _summed(found[PEER]), _summed(found[OURS])
     total = sum(len(hall.truth) for hall in halls)
@@ -106,7 +115,7 @@ def compared(halls: Sequence[HallProblem], workers: int) -> str:
     return " | ".join([*cells, f"{of_ours['seconds'] / of_peer['seconds']:.2f}x"])
 
 
-def _summed(outcomes: Sequence[tuple[HallProblem, Outcome]]) -> dict[str, Any]:
+def _summed(outcomes: Sequence[tuple[HallProblem, MethodResult]]) -> dict[str, Any]:
     models = [outcome.models[0] if outcome.models else {} for _, outcome in outcomes]
     errors = [
         pose_errors_deg(model, hall.truth, CONVENTION)

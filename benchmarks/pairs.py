@@ -1,16 +1,16 @@
-"""Which true pairs of photos ``pairs.mode: auto`` finds, how many it proposes, and its time.
+"""Recall, number and time of the pairs of ``pairs.mode: auto``.
 
     python -m benchmarks.pairs [--scenes rendered_kitchen ...] [--output DIR]
 
-The real scenes are those in $MPSFM_SHARED or ../shared, with XFeat as in `fast-cpu`; `hall` is an
-analytic one of 200 views (mpsfm_core/testing/synthetic/halls.py) with random descriptors: a view
-finds half of the points it sees, with noise as long as half of the descriptor, and as many others
-that are its own; so at most a quarter of its keypoints is found again, as XFeat does on
-rendered_kitchen (18 to 25 %). A pair is true when its views overlap by more than a limit
-(mpsfm_core/evaluation/overlap.py). *Matched*, the pairs that a reconstruction can miss: on real
-photos those that overlap by 0.15 and, given to LighterGlue, are verified with a rotation within 10
-degrees of the truth; in the hall those with 30 points that look alike from both. Writes
-benchmarks/results/pairs.md."""
+Real scenes are in $MPSFM_SHARED or ../shared, with XFeat as in `fast-cpu`. `hall` is an analytic
+hall of 200 views (mpsfm_core/testing/synthetic/halls.py) with random descriptors: a view detects
+half of its points, with descriptor noise of half the descriptor length, and as many outliers. At
+most a quarter of its keypoints is repeated, as for XFeat on rendered_kitchen (18 to 25 %). A pair
+is true if its views overlap by more than a limit (mpsfm_core/evaluation/overlap.py). *Matched*
+pairs can contribute to a reconstruction: for real photos, pairs with an overlap of 0.15 whose
+LighterGlue matches are verified with a rotation error below 10 degrees; in the hall, pairs with 30
+points that look alike from both views. Writes benchmarks/results/pairs.md.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ VIEWS = 200
 
 
 class Case(NamedTuple):
-    """``overlap``: (n, n). ``matched``: those of the true pairs that can be matched, if known."""
+    """``overlap``: (n, n). ``matched``: true pairs that can be matched, if known."""
 
     names: Sequence[str]
     descriptors: Sequence[Float32]
@@ -65,14 +65,14 @@ def main() -> None:
     arguments = parser.parse_args()
     limits = " | ".join(f"overlap > {limit}" for limit in OVERLAPS)
     lines = [
-        f"| scene | photos | pairs a photo | of all pairs | {limits} | matched | CPU seconds |",
+        f"| scene | photos | pairs per photo | of all pairs | {limits} | matched | CPU seconds |",
         "|---" * (len(OVERLAPS) + 6) + "|",
     ]
     for name in arguments.scenes:
         case = _hall() if name == "hall" else _real(name, arguments.output / "pairs")
         lines.append(_row(name, case))
         print(lines[-1], flush=True)
-    text = "# Pairs found by a first look\n\nRecall of true pairs.\n\n" + "\n".join(lines) + "\n"
+    text = "# Recall of `pairs.mode: auto`\n\n" + "\n".join(lines) + "\n"
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "pairs.md").write_text(text, encoding="utf-8")
     print(text)
@@ -139,7 +139,7 @@ def _real(name: str, output: Path) -> Case:
 
 
 def _hall(seed: int = 0) -> Case:
-    """The views of a hall, in no order that their names tell."""
+    """Create the views of a hall in random order."""
     hall = make_hall_problem(VIEWS, seed=seed)
     images = hall.problem.images
     depths = {image.name: image.depth.depth for image in images}

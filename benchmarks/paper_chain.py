@@ -1,11 +1,11 @@
-"""The chain of ``paper-mast3r`` with the real architectures on random weights, from end to end.
+"""``paper-mast3r`` with the real architectures and random weights, end to end.
 
     python -m benchmarks.paper_chain PHOTOS [--mast3r DIR --dsine DIR] [--work DIR]
 
-What ``mpsfm models export ... --checkpoint random`` and ``mpsfm reconstruct`` do to a folder of
-photos: SuperPoint's keypoints (of transformers), MASt3R's matches and depth (ViT-L), DSINE's
-normals with a mirrored pass (EfficientNet-B5), mapper. Random weights match nothing, so exit code
-3 with a report is what to expect. The run tells the time of its steps; its peak memory is below.
+Runs ``mpsfm models export ... --checkpoint random`` and ``mpsfm reconstruct`` on a folder of
+photos: SuperPoint (of transformers), MASt3R (ViT-L) matches and depth, DSINE (EfficientNet-B5)
+normals with a mirrored pass, mapper. Random weights give no matches, so exit code 3 with a report
+is expected. Prints the time of each step and the peak memory.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from benchmarks._scenes import MPSFM
 
 
 def main() -> None:
-    """Command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("photos", type=Path)
     parser.add_argument("--mast3r", type=Path, nargs="*", help="Checkouts for its export.")
@@ -75,7 +75,7 @@ def _random_superpoint(folder: Path) -> Path:
 
 
 def _measured(command: list[str], what: str, allowed: tuple[int, ...] = (0,)) -> None:
-    """Run a command of ours; time and largest memory of its processes together."""
+    """Run a command; measure time and peak memory of its processes."""
     start, peak = time.perf_counter(), 0
     running = subprocess.Popen([*MPSFM, *command])
     process = psutil.Process(running.pid)

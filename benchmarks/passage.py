@@ -1,8 +1,8 @@
-"""What it costs that a provider lives in another environment: ``python -m benchmarks.passage``.
+"""Cost of a provider in another environment: ``python -m benchmarks.passage``.
 
-A provider that only returns what it holds, asked through a worker process: CPU time of both
-processes for a view of a megapixel and a depth map of a megapixel, without and with its variance.
-The best of some rounds. How an answer is validated is not in it: that is so for all providers.
+Calls a provider with a constant result through a worker process. Measures CPU time of both
+processes for a view of a megapixel and a depth map of a megapixel, without and with variance; the
+best of several rounds. Validation of the result is not included.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _CALLS, _ROUNDS = 100, 5
 
 
 class _Holding:
-    """The provider."""
+    """Provider with constant results."""
 
     def __init__(self) -> None:
         depth = np.random.default_rng(0).uniform(1, 2, (_SIDE, _SIDE))
@@ -34,7 +34,7 @@ class _Holding:
         }
 
     def predict(self, view: View) -> DepthPrior:
-        """What the view's name asks for."""
+        """Return the result that the name of the view selects."""
         return self._answers[view.name]
 
 
@@ -68,7 +68,7 @@ def _cpu_ms(asked: Worker, call: dict[str, Any]) -> float:
         return sum(sum(process.cpu_times()[:2]) for process in processes)
 
     rounds = []
-    for _ in range(1 + _ROUNDS):  # the first makes the memory
+    for _ in range(1 + _ROUNDS):  # the first call allocates the memory
         begin = spent()
         for _ in range(_CALLS):
             asked.ask(call, 60)

@@ -1,8 +1,8 @@
 """All pictures of the documentation, from the sample scene: ``python -m benchmarks.pictures``.
 
-Reconstructs the sample scene on a pseudo terminal, and two of its photos that share nothing, which
-fails; then looks at both reports and at the viewer in headless Chromium. Needs chromium,
-chromedriver, selenium and mpsfm-viser.
+Reconstructs the sample scene on a pseudo terminal, and two of its photos without overlap, which
+fails. Then captures both reports and the viewer in headless Chromium. Needs chromium, chromedriver,
+selenium and mpsfm-viser.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from benchmarks._browser import headless, picture_of
+from benchmarks._browser import capture_png, start_browser
 from benchmarks._scenes import MPSFM
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = ROOT / "docs" / "pictures"
 WIDTH = 1100
-"""Of a picture, in pixels."""
+"""Width of a picture in pixels."""
 _APART = ("view_0.jpg", "view_4.jpg")
-"""They look at opposite walls."""
+"""Two photos of opposite walls."""
 _COLUMNS = 118
 _MAPS = ("photo", "prior", "refined", "std", "normals")
 
 
 def on_terminal(*arguments: str, code: int = 0) -> str:
-    """What a command prints on a terminal."""
+    """Return the output of a command on a terminal."""
     ours, theirs = pty.openpty()
     environment = {**os.environ, "COLUMNS": str(_COLUMNS), "TERM": "xterm-256color"}
     process = subprocess.Popen(
@@ -62,7 +62,7 @@ def on_terminal(*arguments: str, code: int = 0) -> str:
 
 
 def draw_terminal(said: str, command: str, path: Path) -> None:
-    """As SVG, by rich. Bars that were drawn again and again are there once, as they ended."""
+    """Render terminal output as SVG with rich; progress bars appear once, in their final state."""
     lines = [""]
     for part in re.split(r"(\x1b\[1A|\x1b\[2K|\r|\n)", said):
         if part == "\x1b[1A":
@@ -83,8 +83,8 @@ def draw_terminal(said: str, command: str, path: Path) -> None:
 
 
 def shoot(browser: Any, name: str) -> None:
-    """The window as JPEG."""
-    png = np.frombuffer(picture_of(browser), np.uint8)
+    """Capture the window as JPEG."""
+    png = np.frombuffer(capture_png(browser), np.uint8)
     picture = cv2.imdecode(png, cv2.IMREAD_COLOR)
     size = (WIDTH, round(picture.shape[0] * WIDTH / picture.shape[1]))
     picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
@@ -97,7 +97,7 @@ def _write(name: str, picture: np.ndarray) -> None:
 
 
 def wait_for(browser: Any, script: str) -> None:
-    """Until an expression is true."""
+    """Wait until an expression is true."""
     end = time.monotonic() + 300
     while not browser.execute_script(f"return {script}"):
         if time.monotonic() > end:
@@ -106,7 +106,7 @@ def wait_for(browser: Any, script: str) -> None:
 
 
 def shoot_report(browser: Any, folder: Path) -> None:
-    """The first screen, a photo, and the points in each of their colours."""
+    """Capture the first screen, a photo, and the points in each coloring."""
     browser.get((folder / "report.html").resolve().as_uri())
     wait_for(browser, "window.report !== undefined")
     time.sleep(3)  # textures
@@ -137,7 +137,7 @@ def _colour(browser: Any, color: str) -> None:
 
 
 def draw_maps(folder: Path, row: int = 5) -> None:
-    """Side by side what a run knows of a photo, from the data in its report."""
+    """Draw the maps of a photo side by side, from the data of the report."""
     text = (folder / "report.html").read_text(encoding="utf-8")
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
     assert found is not None
@@ -151,7 +151,7 @@ def draw_maps(folder: Path, row: int = 5) -> None:
 
 
 def shoot_viewer(browser: Any, folder: Path) -> None:
-    """``mpsfm view`` as people see it."""
+    """Capture ``mpsfm view``."""
     environment = {**os.environ, "MPSFM_VIEWER_PORT": "18790", "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(
         [*MPSFM, "view", str(folder)], stdout=subprocess.PIPE, text=True, env=environment
@@ -173,7 +173,7 @@ def shoot_viewer(browser: Any, folder: Path) -> None:
 
 
 def main() -> None:
-    """Make them all."""
+    """Create all pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "--output", type=Path, help="keeps results; those that are there are not made again"
@@ -193,7 +193,7 @@ def main() -> None:
             ours = ("--offline", "--set", "depth.use=compact")
             on_terminal("reconstruct", str(photos), *ours, "-o", str(failed), code=3)
         draw_maps(out)
-        with headless() as browser:
+        with start_browser() as browser:
             browser.get((failed / "report.html").resolve().as_uri())
             wait_for(browser, "document.querySelector('#photo img.main') !== null")
             time.sleep(1)

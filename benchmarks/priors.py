@@ -1,14 +1,13 @@
-"""How good depth and normal networks are where the truth is known, as they are shipped.
+"""Accuracy of depth and normal networks, as shipped.
 
     python -m benchmarks.priors [--scenes NAME ...] [--set KEY=VALUE ...] [--json FILE]
 
-On hololens_room (the sensor's depth), rendered_kitchen (exact depth and normals) and fountain
-(points triangulated from the true poses, up to scale). Depth after each image is scaled by the
-ratio of the medians: AbsRel and delta < 1.25, and the scale itself. What the declared std says of
-the errors of log depth after each image's own scale: share of errors within it, and area between
-its sparsification curve and the ideal one (AUSE) beside that of a constant std, which sorts at
-random. Normals: median angle to the truth. Every image counts the same; time a photo is CPU and
-wall time, in one thread. Writes benchmarks/results/priors.md; scenes and FastDepth are in
+Scenes are hololens_room (sensor depth), rendered_kitchen (exact depth and normals) and fountain
+(points triangulated with true poses, up to scale). Depth is scaled per image by the ratio of the
+medians: AbsRel, delta < 1.25, and the scale. Uncertainty of log depth: share of errors within one
+std, and area between the sparsification curve and the ideal one (AUSE), compared with that of a
+constant std. Normals: median angular error. Every image has equal weight; time per photo is CPU and
+wall time in one thread. Writes benchmarks/results/priors.md; scenes and FastDepth are in
 $MPSFM_SHARED or ../shared.
 """
 
@@ -44,13 +43,16 @@ from mpsfm_core.support.yaml_text import write_yaml
 SCENES = ("hololens_room", "rendered_kitchen", "fountain")
 _MILLIMETRE = {"scale": 0.001}
 _TIMED = 8
-"""Photos whose time is measured, after one that is not."""
+"""Number of timed photos, after one warm-up."""
 
 
 @dataclass(frozen=True)
 class DepthRow:
-    """Of a depth network on a scene; ``scale``: median over images of truth over prediction, None
-    where the truth has no unit; ``ause_constant``: of a std that is the same share everywhere."""
+    """Metrics of a depth network on a scene.
+
+    ``scale``: median over images of truth / prediction, None if the truth has no unit;
+    ``ause_constant``: AUSE of a constant relative std.
+    """
 
     prior: str
     scene: str
@@ -65,7 +67,7 @@ class DepthRow:
 
 @dataclass(frozen=True)
 class NormalsRow:
-    """Of normals on a scene, in degrees and shares."""
+    """Metrics of normals on a scene, in degrees and shares."""
 
     prior: str
     scene: str
@@ -168,7 +170,7 @@ def _normals_row(name: str, folder: Path, config: str, registry: Registry) -> No
 
 
 def _triangulated(folder: Path, work: Path) -> Path:
-    """Points of SIFT matches, triangulated by COLMAP with the true cameras and poses."""
+    """Triangulate SIFT matches with COLMAP, with true cameras and poses."""
     model = work / "triangulated"
     if not (model / "points3D.bin").exists():
         model.mkdir(parents=True, exist_ok=True)
@@ -185,7 +187,7 @@ def _triangulated(folder: Path, work: Path) -> Path:
 
 
 def _as_in_database(truth: pycolmap.Reconstruction, path: Path) -> pycolmap.Reconstruction:
-    """The true poses with the numbers that the database gave to cameras and images."""
+    """Renumber true poses as in the database."""
     known = pycolmap.Reconstruction()
     poses = {image.name: image.cam_from_world() for image in truth.images.values()}
     with pycolmap.Database.open(path) as database:
@@ -200,7 +202,7 @@ def _as_in_database(truth: pycolmap.Reconstruction, path: Path) -> pycolmap.Reco
 
 
 def _time(block: Mapping[str, Any], folder: Path, registry: Registry) -> tuple[float, float]:
-    """CPU and wall seconds a photo, in one thread; medians."""
+    """Measure CPU and wall seconds per photo in one thread; medians."""
     scene = read_scene(folder)
     images = load_images(scene.images, scene.intrinsics)
     context = ProviderContext(resolve_weights=WeightStore().resolve)
@@ -226,11 +228,13 @@ def _config(depth: Mapping[str, Any], normals: Mapping[str, Any], stem: Path) ->
 def _tables(
     depth: list[DepthRow], normals: list[NormalsRow], times: Mapping[str, tuple[float, float]]
 ) -> Iterator[str]:
-    yield "# Depth and normals of networks, as shipped"
+    yield "# Accuracy of depth and normal priors"
     yield ""
-    yield "`python -m benchmarks.priors`; what the columns mean stands in its docstring."
+    yield "`python -m benchmarks.priors`; columns: see its docstring."
     yield ""
-    columns = "AbsRel | delta < 1.25 | truth / prediction | within 1 std | AUSE | of a constant"
+    columns = (
+        "AbsRel | delta < 1.25 | truth / prediction | within 1 std | AUSE | AUSE of a constant std"
+    )
     yield f"| scene | depth | {columns} |"
     yield "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"
     for row in sorted(depth, key=lambda r: SCENES.index(r.scene)):
@@ -249,7 +253,7 @@ def _tables(
         )
     yield ""
     shown = ", ".join(f"{name} {1e3 * c:.0f} / {1e3 * w:.0f} ms" for name, (c, w) in times.items())
-    yield f"CPU / wall time a photo of 640 x 480: {shown}."
+    yield f"CPU / wall time per photo of 640 x 480: {shown}."
 
 
 if __name__ == "__main__":

@@ -1,13 +1,12 @@
-"""A long run that is killed again and again, beside the same run left alone.
+"""A long run that is killed repeatedly, compared with an undisturbed run.
 
     python -m benchmarks.soak [--photos 300] [--kills 10] [--gap 30] [--seed 0] [--output DIR]
 
-The photos are copies with noise of the frames of hololens_room in their order, reduced, with SIFT
-features, pairs of neighbours and `compact` priors. Both runs go on at the same time, so that they
-share the machine alike. The disturbed one gets SIGKILL after a random CPU time, uniform up to
-twice `--gap` seconds, and is started again with the same command, until it was killed so often;
-then it is left alone. What is compared: all files of the results, and CPU time of the processes
-and their children. Writes benchmarks/results/soak.md. Linux only.
+The photos are noisy copies of the frames of hololens_room, with SIFT features, pairs of neighbors
+and `compact` priors. Both runs are concurrent and share the machine. One gets SIGKILL after a
+random CPU time, uniform up to twice `--gap` seconds, and is restarted with the same command, until
+it was killed often enough. All files of the results, and CPU time including child processes are
+compared. Writes benchmarks/results/soak.md. Linux only.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from tests.support.result_files import content
 
 SCENE = "hololens_room"
 NOISE = 4.0
-"""Std of grey values (of 255)."""
+"""Std of the image noise in gray values (of 255)."""
 POLL_S = 0.05
 CONFIG = """
 features: {{use: sift, options: {{max_keypoints: 2048}}}}
@@ -47,7 +46,7 @@ runtime: {{workers: {workers}, cache_dir: {cache}}}
 
 @dataclass(frozen=True)
 class Life:
-    """One process: its CPU seconds, its return code, and what it said."""
+    """One process: its CPU seconds, its return code, and its output."""
 
     seconds: float
     code: int
@@ -55,13 +54,13 @@ class Life:
 
     @property
     def doing(self) -> str:
-        """What came after the last stage that it finished."""
+        """Return the stage after the last completed one."""
         finished = [line.partition(":")[0] for line in self.said if line.endswith(" s")]
         return f"after {finished[-1]}" if finished else "at the start"
 
     @property
     def resumed(self) -> str:
-        """Where its mapping went on."""
+        """Return the message about the resumed mapping."""
         return next((line for line in self.said if "goes on from a checkpoint" in line), "")
 
 
@@ -93,7 +92,7 @@ def main() -> None:
 
 
 def make_photos(folder: Path, count: int, width: int, seed: int) -> None:
-    """Photos and intrinsics: each frame as often as is needed, with other noise each time."""
+    """Write photos and intrinsics: repeated frames with different noise."""
     scene = shared_folder() / "data" / SCENE
     frames = sorted((scene / "images").iterdir())
     rng = np.random.default_rng(seed)
@@ -112,7 +111,7 @@ def make_photos(folder: Path, count: int, width: int, seed: int) -> None:
 
 
 def run(folder: Path, name: str, limits: list[float], workers: int) -> list[Life]:
-    """Start the command until it ends by itself; each life but the last has a limit."""
+    """Start the command until it completes; each process except the last has a limit."""
     cache, output = folder / name / "cache", folder / name / "out"
     cache.mkdir(parents=True)
     config = folder / name / "config.yaml"
@@ -133,7 +132,7 @@ def run(folder: Path, name: str, limits: list[float], workers: int) -> list[Life
 
 
 def live(command: list[str], log: Path, limit: float) -> Life:
-    """Run a process, killed once it has used ``limit`` CPU seconds."""
+    """Run a process, and kill it after ``limit`` CPU seconds."""
     with log.open("w") as file:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=file)
         while cpu_seconds(process.pid) < limit:
@@ -149,37 +148,37 @@ def live(command: list[str], log: Path, limit: float) -> Life:
 
 
 def cpu_seconds(pid: int) -> float:
-    """User and system time that a process and its finished children have used so far."""
+    """Return user and system time of a process and its finished children."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 def report(folder: Path, alone: Life, lives: list[Life], arguments: argparse.Namespace) -> str:
-    """The table, with what differs."""
+    """Format the table and the differences."""
     expected, found = (content(folder / name / "out") for name in ("alone", "disturbed"))
     names = expected.keys() | found.keys()
     different = sorted(name for name in names if expected.get(name) != found.get(name))
     left = [p.name for p in (folder / "disturbed" / "cache" / "mapping").rglob("*") if p.is_file()]
     left += [p.name for p in (folder / "disturbed" / "out").glob(".mpsfm-*")]
     total = sum(life.seconds for life in lives)
-    verdict = "all the same" if not different else f"different: {', '.join(different[:10])}"
+    verdict = "all identical" if not different else f"different: {', '.join(different[:10])}"
     lines = [
         "# Killed and resumed",
         "",
         f"`python -m benchmarks.soak --photos {arguments.photos} --width {arguments.width} "
         f"--kills {arguments.kills} --gap {arguments.gap:g} --seed {arguments.seed} "
         f"--workers {arguments.workers}`: {arguments.photos} photos, killed "
-        f"{len(lives) - 1} times. CPU seconds of the process and its children.",
+        f"{len(lives) - 1} times. CPU seconds include child processes.",
         "",
-        f"* Undisturbed: {alone.seconds:.0f} s. Killed and resumed: {total:.0f} s, "
+        f"* Without kills: {alone.seconds:.0f} s. Killed and resumed: {total:.0f} s, "
         f"**{total / alone.seconds:.2f} times** as much.",
-        f"* Result: {len(expected)} files, {verdict}. Leftovers: {', '.join(left) or 'none'}.",
+        f"* Result: {len(expected)} files, {verdict}. Leftover files: {', '.join(left) or 'none'}.",
         "",
-        "| life | CPU s | killed | mapping went on from |",
+        "| process | CPU s | killed | mapping resumed from |",
         "| --- | --- | --- | --- |",
     ]
     for number, life in enumerate(lives, start=1):
-        end = life.doing if life.code else "ended by itself"
+        end = life.doing if life.code else "finished"
         place = life.resumed.partition(": ")[2].partition(" (")[0]
         lines.append(f"| {number} | {life.seconds:.1f} | {end} | {place} |")
     return "\n".join(lines) + "\n"

@@ -1,11 +1,11 @@
-"""The depth check on two rooms that look alike: what it rejects, and what that is worth.
+"""Depth check on two rooms that look alike: rejected hypotheses and pose accuracy.
 
     python -m benchmarks.symmetry [--seeds 9] [--placed-only] [--output FILE]
 
-*Placed*: all views stand at their true poses with refined depth; each view of a room is then judged
-where it belongs, beside all others, and a room too far, beside the views of the other room and the
-corridor. *Mapped*: the whole mapper, with and without the check; a registration is wrong when
-it is nearer to the twin of its place than to its place, as seen from the first pair.
+*Placed*: all views have true poses and refined depth. Each view is checked at its true pose against
+all others, and at the corresponding pose in the twin room against the views of that room and the
+corridor. *Mapped*: the whole mapper, with and without the check. A registration is wrong if it is
+nearer to the twin position than to the true position, relative to the first pair.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ HEADER_MAPPED = (
 
 
 def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
-    """For each placement: whether it is wrong, whether it is rejected, and the check's seconds."""
+    """Return for each placement if it is wrong, if it is rejected, and the seconds."""
     views = zip(case.problem.images, case.poses, strict=True)
     images = tuple(replace(i, known_pose=(p[:, :3].copy(), p[:, 3].copy())) for i, p in views)
     pairs = tuple(p for p, false in zip(case.problem.pairs, case.false, strict=True) if not false)
@@ -62,7 +62,7 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
             if pose is not None:
                 scene.registered = everything & (room != room[image])
                 scene.translations[image] = truth + pose[:, 3] - case.poses[image][:, 3]
-                # the points that it sees stay where it was
+                # its observed points do not move with it
                 scene.tracks.point_of[scene.graph.keypoints_of(int(image))] = NO_POINT
             start = time.perf_counter()
             check = DepthConsistencyCheck(scene, options.consistency).check_image(
@@ -75,7 +75,7 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
 
 
 class Observed(ModelMaintenance):
-    """A scene with a list of every check: whether the pose was wrong, and the verdict."""
+    """Scene that records every check: if the pose was wrong, and the result."""
 
     case: SymmetricProblem
     verdicts: list[tuple[bool, bool]]
@@ -87,7 +87,7 @@ class Observed(ModelMaintenance):
         return reason
 
     def _misplaced(self, image: int) -> bool:
-        """Whether an image is nearer to its twin's place, the first image being in its own."""
+        """Return if an image is nearer to its twin position, relative to the first image."""
         scene, poses = self.scene, np.array(self.case.poses)
         if self.first is None or self.size == 2:
             others = scene.registered.copy()
@@ -101,7 +101,7 @@ class Observed(ModelMaintenance):
 
 
 def mapped(case: SymmetricProblem, enabled: bool) -> tuple[np.ndarray, int, list, float]:  # type: ignore[type-arg]
-    """Pose errors of the largest component, its size, verdicts, and seconds."""
+    """Return pose errors of the largest component, its size, check results, and seconds."""
     options = MapperOptions.model_validate({"consistency": {"enabled": enabled}})
     verdicts: list[tuple[bool, bool]] = []
     mapper = Mapper(case.problem, options, NullMappingEvents())
@@ -117,7 +117,7 @@ def mapped(case: SymmetricProblem, enabled: bool) -> tuple[np.ndarray, int, list
 
 
 def shares(verdicts: list[tuple[bool, bool]]) -> str:
-    """Share rejected of wrong and of correct ones, as two cells."""
+    """Format the rejected shares of wrong and of correct hypotheses as two cells."""
     cells = []
     for kind in (True, False):
         chosen = [rejected for wrong, rejected in verdicts if wrong == kind]

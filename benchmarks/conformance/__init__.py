@@ -1,4 +1,4 @@
-"""Our adapters against the authors' code: same random weights, same photos, same answers.
+"""Comparison of our adapters with the authors' code on the same random weights and photos.
 
 ``python -m benchmarks.conformance [NETWORK ...] --checkouts DIR``; see :mod:`__main__`.
 """

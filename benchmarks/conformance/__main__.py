@@ -1,11 +1,11 @@
-"""``python -m benchmarks.conformance [NETWORK ...] [--checkouts DIR] [--environment NAME]``.
+"""Compare networks: ``... conformance [NETWORK ...] [--checkouts DIR] [--environment NAME]``.
 
-DIR (by default ``$MPSFM_CHECKOUTS``) has a checkout of each network's repository in a folder of the
-export's name, at the commit that its plugin names, and of the libraries that it needs beside it.
-What is not there is skipped, with the commands that get it. The packages that the authors' code
-needs are looked for in this environment and in ``DIR/packages`` (``pip install --target``).
-RoMa and NetVLAD run in the environment NAME (``vismatch``; as ``mpsfm env create`` makes it, with
-mpsfm-vismatch, vismatch and onnx).
+DIR (default ``$MPSFM_CHECKOUTS``) contains a checkout of each network's repository in a folder
+named after the export, at the commit of the plugin, and of required libraries. Missing ones are
+skipped with the commands that create them. Packages of the authors' code are imported from this
+environment and from ``DIR/packages`` (``pip install --target``). RoMa and NetVLAD run in the
+environment NAME (default ``vismatch``, created by ``mpsfm env create`` with mpsfm-vismatch,
+vismatch and onnx).
 """
 
 from __future__ import annotations
@@ -33,15 +33,16 @@ from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 
 Compared: TypeAlias = Callable[[Path], dict[str, float]]
-"""The largest differences, for the folder of the checkouts."""
+"""Function from the folder of the checkouts to the largest differences."""
 _HOLDS = {"normals, deg": 0.06, "positions, px": 1e-2, APART: np.inf}
 _TOLERANCE = 1e-3
-"""Relative; of angles the same in radians. Both sides compute in float32, by other kernels. RoMa's
-positions are on photos 640 pixels wide: 2e-5 of a view."""
+"""Maximum relative difference; for angles in radians. Both sides compute in float32. For RoMa in
+views of 640 pixels: 2e-5 of the width.
+"""
 
 
 def main() -> int:
-    """Compare, print the table, return how many networks differ."""
+    """Compare, print the table, and return how many networks differ."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("networks", nargs="*")
     parser.add_argument("--checkouts", type=Path, default=os.environ.get("MPSFM_CHECKOUTS"))
@@ -73,8 +74,10 @@ def main() -> int:
 
 
 def _missing(wanted: Mapping[str, tuple[str, str]], checkouts: Path | None) -> str:
-    """Why it cannot be compared here, or an empty text. ``wanted``: repository and commit of each
-    folder."""
+    """Return the reason why a network cannot be compared, or an empty text.
+
+    ``wanted``: repository and commit of each folder.
+    """
     if checkouts is None:
         return "skipped: no --checkouts"
     for folder, (repository, commit) in wanted.items():
@@ -113,11 +116,14 @@ def _through_file(network: Network, checkouts: Path) -> dict[str, float]:
         except ProviderError as error:
             needs = f" (needs {', '.join(network.packages)})" if network.packages else ""
             raise ProviderError(f"the authors' code fails: {error}{needs}") from None
-        return {"file": max(compare_with_original(made).values()), **_differences(network, made, views)}
+        return {
+            "file": max(compare_with_original(made).values()),
+            **_differences(network, made, views),
+        }
 
 
 def _differences(network: Network, made: Path, views: Sequence[View]) -> dict[str, float]:
-    """The largest over the photos, each with those after it where several are seen at once."""
+    """Compute the largest differences over the photos, or groups of consecutive photos."""
     kind, name, options = network.provider(made)
     store = WeightStore(made.parent / "cache", offline=True)
     context = ProviderContext(resolve_weights=store.resolve)

@@ -1,5 +1,7 @@
-"""NetVLAD against hloc's, which the reference uses: their code exports itself with random weights,
-and ``global-onnx`` runs the file."""
+"""Comparison of NetVLAD in ``global-onnx`` with hloc's, which the reference uses.
+
+hloc's code exports itself with random weights, and ``global-onnx`` runs the file.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,13 @@ from mpsfm_core.providers.registry import Registry
 
 _CAMERAS = ((640, 480, 500.0), (333, 500, 500.0), (1601, 1203, 500.0), (900, 1300, 500.0))
 _LARGEST = 1024
-"""Longer side in pixels that hloc shrinks photos to."""
+"""Longer side in pixels to which hloc shrinks photos."""
 APART = "(two photos)"
-"""How far the descriptors of two photos are apart, beside which the others are to be seen."""
+"""Distance between the descriptors of two photos, as a scale for the differences."""
 
 
 def compare(environment: Environment, checkout: Path) -> dict[str, float]:
-    """Largest distances of unit descriptors, of photos as they are and of those that are shrunk."""
+    """Compute the largest distances of unit descriptors, of original and of shrunk photos."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         views = photos(folder, _CAMERAS, cv2.INTER_CUBIC)

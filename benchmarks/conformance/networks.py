@@ -1,4 +1,4 @@
-"""The networks: which code of their authors is run, and how our provider's answer compares."""
+"""Networks under comparison: the authors' code, and the metric of the differences."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ Differences = dict[str, float]
 
 @dataclass(frozen=True)
 class Network:
-    """A network under comparison.
+    """Network under comparison.
 
-    ``export``: what ``mpsfm models export`` knows it as, with the authors' repository and the
-    commit. ``script``: in ``authors/``. ``size``, ``described``: which of its sizes, for the
-    export and for people. ``libraries``: further checkouts that it needs, folder -> repository and
-    commit; ``packages``: what ``pip install --no-deps`` gets. ``provider``: ours, as kind, name and
-    options for a model file. ``ask``: calls it with ``views`` photos. ``compare``: the largest
-    differences from the authors' arrays.
+    ``export``: name for ``mpsfm models export``, with repository and commit. ``script``: in
+    ``authors/``. ``size``, ``described``: size for the export, and as text. ``libraries``: further
+    checkouts, folder -> repository and commit; ``packages``: for ``pip install --no-deps``.
+    ``provider``: our provider as kind, name and options for a model file. ``ask``: calls it with
+    ``views`` photos. ``compare``: largest differences from the authors' arrays.
     """
 
     export: str
@@ -46,10 +45,10 @@ class Network:
 
 @dataclass(frozen=True)
 class Hosted:
-    """A network whose authors' code needs an environment of its own: torchvision in it.
+    """Network whose authors' code needs an environment of its own with torchvision.
 
-    ``repository``, ``commit``: of the authors' code; ``described``: which of its sizes.
-    ``compare``: the largest differences, for an environment and a checkout.
+    ``repository``, ``commit``: the authors' code; ``described``: its size as text. ``compare``:
+    largest differences for an environment and a checkout.
     """
 
     name: str
@@ -60,12 +59,12 @@ class Hosted:
 
 
 def relative(ours: NDArray[Any], theirs: NDArray[Any], where: Bool) -> float:
-    """Largest relative difference, NaN of nothing."""
+    """Compute the largest relative difference; NaN for empty arrays."""
     return float(np.abs(ours[where] / theirs[where] - 1).max()) if where.any() else np.nan
 
 
 def angle_deg(ours: NDArray[Any], theirs: NDArray[Any], where: Bool) -> float:
-    """Largest angle between unit vectors, in degrees; NaN of none."""
+    """Compute the largest angle between unit vectors in degrees; NaN for empty arrays."""
     if not where.any():
         return np.nan
     a, b = ours[where].astype(np.float64), theirs[where].astype(np.float64)
@@ -97,7 +96,7 @@ def _dsine(answer: NormalPrior, theirs: Arrays) -> Differences:
 
 
 def _mast3r(answer: PairMatches, theirs: Arrays) -> Differences:
-    """Depth and std where the authors' crop is; matches as pixels of their crops."""
+    """Compare depth and std inside the authors' crop, and matches in pixels of their crops."""
     assert answer.dense is not None and answer.depth is not None
     found: Differences = {"depth": np.nan, "std": np.nan, "pixels behind": 0.0}
     cells = []

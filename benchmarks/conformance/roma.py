@@ -1,8 +1,8 @@
-"""RoMa through an environment against its authors' repository.
+"""Comparison of RoMa in an environment with its authors' repository.
 
-RoMa has no ONNX file to compare, so both sides run in the environment: the collection's copy of the
-code by our provider, and the repository by its own ``match`` and ``to_pixel_coordinates``, both
-with the real architecture and the same random weights.
+RoMa has no ONNX file, so both sides run in the environment with the real architecture and the same
+random weights: the copy of the collection through our provider, and the repository through its
+``match`` and ``to_pixel_coordinates``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mpsfm_core.providers.registry import Registry
 
 
 def compare(environment: Environment, checkout: Path) -> dict[str, float]:
-    """Largest differences of the matches of pairs of photos."""
+    """Compute the largest differences of the matches of photo pairs."""
     options = {"network": "mpsfm_vismatch.seeded_roma:Matcher", "cell": 1, "min_certainty": 0.05}
     context = ProviderContext(resolve_weights=lambda uri, sha256: Path(uri))
     name = f"vismatch-roma@{environment.name}"

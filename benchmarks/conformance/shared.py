@@ -1,4 +1,4 @@
-"""What the comparisons share: the photos that both sides look at, and how the authors' is run."""
+"""Photos and script runner of the comparisons."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _CAMERAS = ((640, 480, 620.0), (333, 500, 410.0), (517, 389, 900.0))
 def photos(
     folder: Path, cameras: Sequence[tuple[int, int, float]] = _CAMERAS, how: int = cv2.INTER_AREA
 ) -> list[View]:
-    """Of the sample scene, resized, and written for the authors' script as arrays and images."""
+    """Resize photos of the sample scene, and write them for the authors' script."""
     views, entries = [], []
     for index, (path, (width, height, focal)) in enumerate(
         zip(sorted(_SAMPLES.glob("*.jpg")), cameras, strict=False)
@@ -43,7 +43,7 @@ def run_authors(environment: Environment, script: str, *arguments: Path) -> None
     """Run a script of ``authors/`` in an environment.
 
     Raises:
-        ProviderError: it fails; the message is its last line.
+        ProviderError: The script fails; the message is its last line.
     """
     command = [str(part) for part in (environment.python, AUTHORS / script, *arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

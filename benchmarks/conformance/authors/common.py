@@ -1,9 +1,10 @@
-"""What the scripts beside it share: photos in, the authors' answers out.
+"""Input and output of the authors' scripts.
 
-Each is run as a plugin's export script is, see :mod:`mpsfm_core.providers.model_export.author_script`,
-and exports the network as that does. In the folder of its output it finds ``photos.json`` and the
-photos that this names, and writes what the authors' own steps of inference give of the same network
-as ``reference_N.npz``. """
+Each script runs like a plugin's export script
+(:mod:`mpsfm_core.providers.model_export.author_script`) and exports the network. It reads
+``photos.json`` and the photos in its output folder, and writes the result of the authors' inference
+with the same network to ``reference_N.npz``.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +20,13 @@ from mpsfm_core.providers.model_export.author_script import ExportJob
 
 
 def photos(job: ExportJob) -> Iterator[tuple[Any, Mapping[str, float]]]:
-    """Each photo, (h, w, 3) uint8 RGB, with its camera: width, height, fx, fy, cx, cy."""
+    """Yield each photo, (h, w, 3) uint8 RGB, with its camera: width, height, fx, fy, cx, cy."""
     folder = job.output.parent
     for entry in json.loads((folder / "photos.json").read_text(encoding="utf-8")):
         yield np.load(folder / entry["file"]), entry["camera"]
 
 
 def save(job: ExportJob, name: str, **tensors: torch.Tensor) -> None:
-    """Tensors as NAME.npz."""
+    """Save tensors as NAME.npz."""
     arrays = {key: tensor.detach().cpu().numpy() for key, tensor in tensors.items()}
     np.savez(Path(job.output.parent, f"{name}.npz"), **arrays)

@@ -1,4 +1,4 @@
-"""MASt3R, by its authors' code: see ``common.py``. Each photo is shown with the next one."""
+"""MASt3R on pairs of consecutive photos, with its authors' code; see ``common.py``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from PIL import Image
 
 from mpsfm_core.providers.model_export.author_script import ExportJob
 
-for name in ("torchvision", "torchvision.transforms"):  # of it the authors' code uses these three
+for name in (
+    "torchvision",
+    "torchvision.transforms",
+):  # the authors' code only uses these three attributes
     sys.modules[name] = ModuleType(name)
 sys.modules["torchvision.transforms"].__dict__.update(
     Compose=lambda steps: lambda image: steps[1](steps[0](image)),
@@ -25,11 +28,11 @@ sys.modules["torchvision.transforms"].__dict__.update(
 from dust3r.utils.image import load_images  # noqa: E402
 from mast3r.cloud_opt.sparse_ga import extract_correspondences, symmetric_inference  # noqa: E402
 
-_SIZE = 256  # comparing all descriptors of larger ones takes the authors' code minutes on a CPU
+_SIZE = 256  # the authors' descriptor comparison takes minutes for larger images on a CPU
 
 
 def answers(model: Any, first: Any, second: Any) -> dict[str, Any]:
-    """Depth of both in their own frames, and matches with the descriptors of both passes."""
+    """Compute the depth of both views in their own frames, and matches of both passes."""
     with torch.inference_mode():
         found = symmetric_inference(model, first, second, "cpu")  # 11, 21, 22, 12
     features, certainties = ([view[key][0] for view in found] for key in ("desc", "desc_conf"))

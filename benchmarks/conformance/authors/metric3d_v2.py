@@ -1,4 +1,4 @@
-"""Metric3D v2, by its authors' code: see ``common.py``."""
+"""Metric3D v2, with its authors' code; see ``common.py``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MoGe-2, by its authors' code: see ``common.py``."""
+"""MoGe-2, with its authors' code; see ``common.py``."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ _SHIFT, _FOCAL = 0.7, 1.4
 
 
 class Seeing(MoGeModel):
-    """What random weights lack: points near the rays that pixels see, so that the shift has an
-    answer."""
+    """Network whose points are moved near the pixel rays, so that the shift of z is defined."""
 
     def _remap_points(self, points):
         points = super()._remap_points(points)
@@ -29,7 +28,7 @@ class Seeing(MoGeModel):
 
 job = ExportJob.from_arguments()
 model = Seeing(**small_with_normals()).eval()
-for block in model.encoder.backbone.blocks:  # else it starts as the identity
+for block in model.encoder.backbone.blocks:  # otherwise it is initialized as identity
     torch.nn.init.constant_(block.ls1.gamma, 1.0)
     torch.nn.init.constant_(block.ls2.gamma, 1.0)
 last = [module for module in model.normal_head.modules() if isinstance(module, torch.nn.Conv2d)]

@@ -1,7 +1,7 @@
-"""NetVLAD as hloc has it (the reference's): ``python netvlad.py CHECKOUT OUTPUT.onnx PHOTO ...``.
+"""NetVLAD of hloc: ``python netvlad.py CHECKOUT OUTPUT.onnx PHOTO ...``.
 
-Run where torchvision is. Random weights in the layout of the published file; without whitening, a
-matrix of half a gigabyte. Writes the network, and what it says of the photos as hloc loads them.
+Needs torchvision. Uses random weights in the layout of the published file, without whitening.
+Writes the network, and its descriptors of the photos as hloc loads them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 checkout, output, *photos = sys.argv[1:]
-package = ModuleType("hloc")  # its own imports all that it can do
+package = ModuleType("hloc")  # the package itself imports all extractors
 package.__path__ = [f"{checkout}/hloc"]
 sys.modules["hloc"] = package
 from hloc.extractors import netvlad  # noqa: E402
@@ -25,7 +25,7 @@ rng = np.random.default_rng(0)
 
 
 def published(*_: object, **__: object) -> dict[str, object]:
-    """As loadmat gives the published file."""
+    """Return random weights in the structure that loadmat returns for the published file."""
     layers = [SimpleNamespace(weights=None) for _ in range(34)]
     places = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
     for place, (into, out) in zip(places, pairwise(CHANNELS), strict=True):
@@ -49,10 +49,10 @@ exec(source[source.index("def resize_image(") : source.index("class ImageDataset
 
 
 class Exported(torch.nn.Module):
-    """Of an image (1, 3, h, w) in [0, 1]."""
+    """Network from an image (1, 3, h, w) in [0, 1] to its descriptor."""
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Its descriptor."""
+        """Compute the descriptor."""
         found: torch.Tensor = model._forward({"image": image})["global_descriptor"]
         return found
 
@@ -62,7 +62,7 @@ with torch.inference_mode():
     for path in photos:
         image = scope["cv2"].imread(path)[..., ::-1].astype(np.float32)
         size = image.shape[:2][::-1]
-        if max(size) > 1024:  # as ImageDataset, with the configuration "netvlad"
+        if max(size) > 1024:  # as hloc's ImageDataset, with the configuration "netvlad"
             new = tuple(round(x * (1024 / max(size))) for x in size)
             image = scope["resize_image"](image, new, "cv2_area")
         batch = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)) / 255)[None]

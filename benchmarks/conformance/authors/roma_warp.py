@@ -1,6 +1,6 @@
-"""RoMa's warp by its authors' code: ``python roma_warp.py CHECKOUT PHOTO PHOTO OUTPUT``.
+"""RoMa's warp, with its authors' code: ``python roma_warp.py CHECKOUT PHOTO PHOTO OUTPUT``.
 
-Run where torchvision is. The matches are as their ``to_pixel_coordinates`` gives them.
+Needs torchvision. Matches are converted by the authors' ``to_pixel_coordinates``.
 """
 
 from __future__ import annotations
@@ -21,4 +21,4 @@ with torch.inference_mode():
     warp, certainty = model.match(first, second, device="cpu")
     sizes = [Image.open(path).size[::-1] for path in (first, second)]
     a, b = model.to_pixel_coordinates(warp.reshape(-1, 4), *sizes[0], *sizes[1])
-np.savez(output, a=a, b=b, certainty=np.squeeze(certainty))  # newer code has a batch dimension
+np.savez(output, a=a, b=b, certainty=np.squeeze(certainty))  # newer versions have a batch dimension

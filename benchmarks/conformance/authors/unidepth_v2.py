@@ -1,4 +1,4 @@
-"""UniDepth V2, by its authors' code: see ``common.py``."""
+"""UniDepth V2, with its authors' code; see ``common.py``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mpsfm_core.providers.model_export.author_script import ExportJob
 job = ExportJob.from_arguments()
 model = network(job.size)
 last = model.pixel_decoder.depth_layer.to_confidence_hr[-1]
-torch.nn.init.constant_(last.bias, 1.0)  # an error, which is positive
+torch.nn.init.constant_(last.bias, 1.0)  # the output is an error, which is positive
 model.resolution_level = 9
 model.shape_constraints |= {"pixels_min": 0, "pixels_max": SIZE[0] * SIZE[1]}
 mean, std = (torch.tensor(v)[:, None, None] for v in (IMAGENET_DATASET_MEAN, IMAGENET_DATASET_STD))
