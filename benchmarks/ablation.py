@@ -17,7 +17,7 @@ from pathlib import Path
 from benchmarks._scenes import RESULTS, print_progress, shared_folder
 from mpsfm_core.evaluation.benchmark import BenchmarkPlan, run_benchmark
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS
-from mpsfm_core.evaluation.report import Row, make_rows
+from mpsfm_core.evaluation.report import BenchmarkRow, build_rows
 from mpsfm_core.optimize.options import Loss
 from mpsfm_core.support.yaml_text import write_yaml
 
@@ -73,7 +73,7 @@ def main() -> None:
         overrides=("runtime.workers=1",),
         workers=arguments.workers,
     )
-    rows = make_rows(run_benchmark(plan, output, done=print_progress))
+    rows = build_rows(run_benchmark(plan, output, done=print_progress))
     text = _table(arguments.scene, rows, configs)
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"ablation-{arguments.scene}.md").write_text(text, encoding="utf-8")
@@ -91,7 +91,7 @@ def _file_name(variant: str) -> str:
     return variant.replace(",", "").replace(" ", "-")
 
 
-def _table(scene: str, rows: Sequence[Row], configs: Mapping[str, str]) -> str:
+def _table(scene: str, rows: Sequence[BenchmarkRow], configs: Mapping[str, str]) -> str:
     """Format one table per prior: a row per variant, a column per bucket."""
     convention = CONVENTIONS["paper"]
     parts = [
@@ -110,7 +110,7 @@ def _table(scene: str, rows: Sequence[Row], configs: Mapping[str, str]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _cell(row: Row) -> str:
+def _cell(row: BenchmarkRow) -> str:
     failed = f", {row.failed} failed" if row.failed else ""
     return f"{'/'.join(f'{v:.1f}' for v in row.auc.values())} ({row.registered:.0%}{failed})"
 

@@ -138,7 +138,7 @@ def test_support_and_inlier_ratio_are_weighted_and_num_inliers_is_not() -> None:
     correspondences = PoseCorrespondences(
         keypoints, keypoints, points, points, points, references, known, scores
     )
-    options = RegistrationOptions(depth_deviations=1e6)
+    options = RegistrationOptions(max_depth_deviation=1e6)
     pose = score_pose(
         scene, correspondences, PoseHypothesis(np.eye(3), np.zeros(3), "PnP"), options
     )

@@ -65,7 +65,7 @@ def find_correspondences(
         scene: The scene with the registered images.
         image: The image to register.
         references: Registered images whose matches are used.
-        options: ``lifting``, ``min_point_angle_deg`` and ``depth_deviations`` apply.
+        options: ``lifting``, ``min_point_angle_deg`` and ``max_depth_deviation`` apply.
     """
     graph, tracks = scene.graph, scene.tracks
     edges = graph.edges_of(image)
@@ -113,7 +113,7 @@ def _depth_ranges(
     image has none.
     """
     depth, known = scene.depth_at(keypoints)
-    log_range = options.depth_deviations * scene.keypoint_log_std[keypoints]
+    log_range = options.max_depth_deviation * scene.keypoint_log_std[keypoints]
     images = scene.graph.image_of[keypoints]
     for image in map(int, np.unique(images[~known])):
         depth_map = scene.maps[image]

@@ -250,5 +250,5 @@ class IncrementalRegistration:
             rows = correspondences.references == reference
             scored = score_pose(self._scene, correspondences.select(rows), pose.hypothesis, options)
             self._history.excluded_references[image, reference] |= (
-                scored.inlier_ratio >= options.min_inlier_share
+                scored.inlier_ratio >= options.min_pose_inlier_ratio
             )

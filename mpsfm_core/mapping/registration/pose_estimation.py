@@ -54,7 +54,7 @@ class AbsolutePoseEstimator:
         """
         options = self._options.registration
         poses = self.estimate_unrefined_poses(image, correspondences, attempt=attempt)
-        if len(poses) == 1 and poses[0].inlier_ratio >= options.confident_share:
+        if len(poses) == 1 and poses[0].inlier_ratio >= options.confident_inlier_ratio:
             return poses
         return self.refine_poses(image, poses, correspondences)
 
@@ -80,7 +80,9 @@ class AbsolutePoseEstimator:
         scene, options = self.scene, self._options
         scene.register(image, pose.rotation, pose.translation)
         triangulate_image(scene, image, options.triangulation)
-        self._refiner.adjust([image], local=True, max_iterations=options.registration.polishing)
+        self._refiner.adjust(
+            [image], local=True, max_iterations=options.registration.max_bundle_iterations
+        )
         rotation, translation = scene.rotations[image].copy(), scene.translations[image].copy()
         scene.restore(snapshot)
         adjusted = PoseHypothesis(rotation, translation, pose.source)
@@ -109,7 +111,7 @@ def estimate_candidate_poses(
         options: Thresholds and numbers of hypotheses.
         seed: Seed of RANSAC.
         attempt: Number of earlier attempts at the image. Each of the first attempts draws other
-            halves; from ``resampled_attempts`` on none are drawn.
+            halves; from ``max_resampled_attempts`` on none are drawn.
     """
     poses: list[ScoredPose] = []
     generator = PoseHypothesisGenerator(scene, image, correspondences, options, seed)
@@ -118,16 +120,16 @@ def estimate_candidate_poses(
         def add_poses(estimators: Iterator[HypothesisEstimator]) -> None:
             hypotheses = pool.map(lambda estimate: estimate(), estimators)
             scored = [score_pose(scene, correspondences, h, options) for h in hypotheses if h]
-            distinct = select_distinct_poses(scored, options.num_improved)
+            distinct = select_distinct_poses(scored, options.num_locally_optimized)
             maximize = partial(maximize_support, scene, correspondences, options=options)
             poses.extend([*scored, *pool.map(maximize, distinct)])
 
         add_poses(generator.generate_from_all())
         best = max(poses, key=lambda pose: pose.support, default=None)
-        is_confident = best is not None and best.inlier_ratio >= options.confident_share
-        if options.lifting and not is_confident and attempt < options.resampled_attempts:
+        is_confident = best is not None and best.inlier_ratio >= options.confident_inlier_ratio
+        if options.lifting and not is_confident and attempt < options.max_resampled_attempts:
             add_poses(replace(generator, seed=seed + attempt).generate_from_halves())
-    return select_distinct_poses(poses, options.num_polished)
+    return select_distinct_poses(poses, options.num_bundle_adjusted)
 
 
 def select_distinct_poses(

@@ -60,7 +60,7 @@ def score_pose(
         scene: The scene with the registered images.
         correspondences: Correspondences of the image.
         hypothesis: The pose.
-        options: ``max_support_error_px`` and ``depth_deviations`` are the inlier thresholds.
+        options: ``max_support_error_px`` and ``max_depth_deviation`` are the inlier thresholds.
     """
     residuals = _compute_residuals(scene, correspondences, hypothesis, options)
     inlier = residuals < 1
@@ -87,7 +87,7 @@ def maximize_support(
     pose: ScoredPose,
     options: RegistrationOptions,
 ) -> ScoredPose:
-    """Refine a pose to minimize the distances of keypoints to their projected segments.
+    """Locally optimize a pose: minimize the distances of keypoints to their segments.
 
     The objective is Tukey's biweight (see :func:`mpsfm_core.optimize.resection.refine_pose`). The
     pose is returned unchanged if there are no correspondences.
@@ -165,7 +165,7 @@ def _compute_depth_residuals(
         log_ratio = np.log(depths[known] / scene.maps[image].prior_at_keypoints(rows[known]))
         image_std = scene.keypoint_log_std[correspondences.keypoints[known]]
         reference_std = scene.keypoint_log_std[correspondences.matched_keypoints[known]]
-        limit = options.depth_deviations * np.hypot(image_std, reference_std)
+        limit = options.max_depth_deviation * np.hypot(image_std, reference_std)
         log_scale = np.median(log_ratio[is_near[known]])
         residuals[known] = np.abs(log_ratio - log_scale) / limit
     return residuals

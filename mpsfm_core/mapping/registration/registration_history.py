@@ -54,7 +54,7 @@ class RegistrationHistory:
 
         The first searches differ because each draws other subsets of the matches.
         """
-        is_resampled = self._num_searches[image] >= self._options.resampled_attempts
+        is_resampled = self._num_searches[image] >= self._options.max_resampled_attempts
         last = self._last_attempts.get(image)
         return is_resampled and last is not None and last.references == references
 

@@ -29,7 +29,7 @@ class ThresholdSchedule:
     @property
     def min_inlier_ratio(self) -> float:
         """Share of the correspondences that must be inliers now."""
-        return self._options.min_inlier_share / self._factor
+        return self._options.min_pose_inlier_ratio / self._factor
 
     def tighten_violations(self, max_violations: float) -> float:
         """Return the present limit of the violation ratio, given its initial value."""
@@ -40,10 +40,10 @@ class ThresholdSchedule:
 
         Args:
             pose: The pose with its inliers.
-            confident: Require the inlier ratio ``confident_share`` of the options.
+            confident: Require the inlier ratio ``confident_inlier_ratio`` of the options.
         """
         min_inliers = self.min_inliers
-        min_ratio = self._options.confident_share if confident else self.min_inlier_ratio
+        min_ratio = self._options.confident_inlier_ratio if confident else self.min_inlier_ratio
         if pose.num_inliers < min_inliers:
             return ImageReason.TOO_FEW_INLIERS.because(
                 num_inliers=pose.num_inliers, min_inliers=min_inliers

@@ -88,7 +88,7 @@ def test_surface_in_empty_space_is_violation_and_occluded_one_is_not() -> None:
 
 
 def test_by_target_area_weights_violations_by_projected_area() -> None:
-    """What fills one image has few pixels in an image ten meters behind."""
+    """A surface that fills one image covers few pixels of an image ten meters behind."""
     behind = np.eye(3, 4)
     behind[2, 3] = 10.0
     scene = posed_scene([wall(1.0), wall(20.0)], [HERE, behind], SMALL)
@@ -122,7 +122,7 @@ def test_large_depth_std_gives_no_violation() -> None:
 
 @pytest.mark.parametrize(("gap", "contradicts"), [(0.34, False), (0.40, True)])
 def test_errors_of_both_images_explain_gap(gap: float, contradicts: bool) -> None:
-    """On one ray with std s in both images, a gap g has the likelihood exp(-g^2 / 4 s^2) / 2^.5.
+    """A gap g on one ray has the likelihood exp(-g^2 / 4 s^2) / 2^.5 for std s in both images.
 
     It equals the likelihood of ``max_deviation`` at g = 3.63 s.
     """
@@ -143,7 +143,7 @@ def test_depth_error_explains_lateral_shift_at_right_angle(std: float, contradic
 
 
 def test_error_past_depth_edge_counts_by_its_likelihood() -> None:
-    """Errors of 2.025 std move pixels past a depth edge and explain them; those of 2.7 std do not.
+    """Errors of 2.025 std that move pixels past a depth edge explain them; 2.7 std do not.
 
     The weight of an error of 2.7 std is 0.007, below the limit of 1 in 38.
     """
@@ -256,12 +256,12 @@ def test_quarter_of_pixels_decides_like_all_pixels() -> None:
         scene.translations[image] = shift_pose(poses[image], 1)[:, 3]
     check, limit = DepthConsistencyCheck(scene, OPTIONS), OPTIONS.max_violations
     pairs = list(combinations(range(len(poses)), 2))
-    every = np.array([check.measure_violation_ratio(a, b) for a, b in pairs])
-    enough = np.array([check.measure_violation_ratio(a, b, limit=limit) for a, b in pairs])
-    assert ((every > limit) == (enough > limit)).all()
-    assert 0.05 < (every > limit).mean() < 0.95
-    assert (every != enough).any()
-    assert np.abs(every - enough).max() < 0.1
+    all_pixels = np.array([check.measure_violation_ratio(a, b) for a, b in pairs])
+    quarter = np.array([check.measure_violation_ratio(a, b, limit=limit) for a, b in pairs])
+    assert ((all_pixels > limit) == (quarter > limit)).all()
+    assert 0.05 < (all_pixels > limit).mean() < 0.95
+    assert (all_pixels != quarter).any()
+    assert np.abs(all_pixels - quarter).max() < 0.1
 
 
 def test_find_conflicting_images_removes_image_with_most_conflicts() -> None:

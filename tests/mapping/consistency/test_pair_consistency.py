@@ -36,10 +36,10 @@ def checker(problem: MappingProblem, kind: type[Check]) -> Check:
 def test_check_pair_accepts_correct_pairs_and_rejects_look_alikes() -> None:
     """Twin rooms look alike except for some objects."""
     case = make_twin_room_problem(0)
-    check, false = checker(case.problem, PairConsistencyCheck), np.array(case.false)
+    check, is_false = checker(case.problem, PairConsistencyCheck), np.array(case.false)
     shares = np.array([check.check_pair(pair).support_ratio for pair in case.problem.pairs])
-    assert (shares[~false] > 0).mean() > 0.97
-    assert (shares[false] == 0).mean() > 0.5
+    assert (shares[~is_false] > 0).mean() > 0.97
+    assert (shares[is_false] == 0).mean() > 0.5
 
 
 class FixedResults(PairConsistencyCheck):
@@ -77,8 +77,8 @@ def reweighted_problem(
 
 
 def test_pair_that_depth_and_consistent_pairs_contradict_is_removed() -> None:
-    problem, left = reweighted_problem([60, 50, 60], share=0.0, turn_deg=90.0)
-    assert left.pairs == (problem.pairs[0], problem.pairs[2])
+    problem, reweighted = reweighted_problem([60, 50, 60], share=0.0, turn_deg=90.0)
+    assert reweighted.pairs == (problem.pairs[0], problem.pairs[2])
 
 
 @pytest.mark.parametrize(
@@ -87,15 +87,15 @@ def test_pair_that_depth_and_consistent_pairs_contradict_is_removed() -> None:
     ids=["same rotation", "fewer matches", "too few consistent matches", "too few own matches"],
 )
 def test_pair_that_only_depth_contradicts_stays(counts: list[int], turn_deg: float) -> None:
-    problem, left = reweighted_problem(counts, share=0.0, turn_deg=turn_deg)
-    assert left.pairs == problem.pairs
+    problem, reweighted = reweighted_problem(counts, share=0.0, turn_deg=turn_deg)
+    assert reweighted.pairs == problem.pairs
 
 
 def test_match_scores_are_multiplied_by_support_ratio() -> None:
-    problem, left = reweighted_problem([60, 50, 60], share=0.5, turn_deg=90.0)
-    assert [len(pair) for pair in left.pairs] == [60, 50, 60]
-    np.testing.assert_allclose(left.pairs[1].scores, 0.5 * problem.pairs[1].scores)
-    assert left.pairs[0] is problem.pairs[0]
+    problem, reweighted = reweighted_problem([60, 50, 60], share=0.5, turn_deg=90.0)
+    assert [len(pair) for pair in reweighted.pairs] == [60, 50, 60]
+    np.testing.assert_allclose(reweighted.pairs[1].scores, 0.5 * problem.pairs[1].scores)
+    assert reweighted.pairs[0] is problem.pairs[0]
 
 
 def test_only_pairs_of_candidate_images_are_checked() -> None:
@@ -103,13 +103,15 @@ def test_only_pairs_of_candidate_images_are_checked() -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
     check = checker(problem, FixedResults)
     check.results = {(1, 2): PairConsistency(np.eye(3), 0.5)}
-    left = check.reweight_pairs(problem, np.array([False, True, True]))
-    assert left.pairs[:2] == problem.pairs[:2]
-    np.testing.assert_allclose(left.pairs[2].scores, 0.5 * problem.pairs[2].scores)
+    reweighted = check.reweight_pairs(problem, np.array([False, True, True]))
+    assert reweighted.pairs[:2] == problem.pairs[:2]
+    np.testing.assert_allclose(reweighted.pairs[2].scores, 0.5 * problem.pairs[2].scores)
 
 
 def test_globally_initialized_images_need_no_pair_check(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(self: PairConsistencyCheck, problem: MappingProblem, left: Bool) -> MappingProblem:
+    def refuse(
+        self: PairConsistencyCheck, problem: MappingProblem, reweighted: Bool
+    ) -> MappingProblem:
         raise AssertionError("must not be called")
 
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(4, 10.0))

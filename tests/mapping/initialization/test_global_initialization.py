@@ -33,9 +33,9 @@ def hall() -> HallProblem:
     return make_hall_problem(VIEWS, CALIBRATED_PRIORS, seed=2)
 
 
-def place(problem: MappingProblem, left: Float64 | None = None) -> GlobalPoses | None:
+def place(problem: MappingProblem, candidates: Float64 | None = None) -> GlobalPoses | None:
     everything = np.ones(len(problem.images), dtype=np.bool_)
-    return estimate_global_poses(Scene(problem), everything if left is None else left)
+    return estimate_global_poses(Scene(problem), everything if candidates is None else candidates)
 
 
 def worst_deg(placed: GlobalPoses, hall: HallProblem) -> float:
@@ -65,9 +65,9 @@ def test_wrong_pair_is_removed(hall: HallProblem) -> None:
 
 
 def test_images_that_are_no_candidates_are_left_out(hall: HallProblem) -> None:
-    left = np.ones(VIEWS, dtype=np.bool_)
-    left[3] = False
-    placed = place(hall.problem, left)
+    candidates = np.ones(VIEWS, dtype=np.bool_)
+    candidates[3] = False
+    placed = place(hall.problem, candidates)
     assert placed is not None
     assert 3 not in placed.images
 
@@ -132,12 +132,12 @@ def test_average_differences_with_outlier_recovers_values() -> None:
     a, b = (np.array(ends) for ends in np.tril_indices(6, -1))
     steps = truth[b] - truth[a]
     steps[4] += 5
-    found = average_differences(a, b, steps, np.ones(len(a)), 6)
-    np.testing.assert_allclose(found, truth - truth.mean(axis=0), atol=1e-3)
+    values = average_differences(a, b, steps, np.ones(len(a)), 6)
+    np.testing.assert_allclose(values, truth - truth.mean(axis=0), atol=1e-3)
 
 
 def test_average_rotations_with_outliers_recovers_rotations() -> None:
-    """A third of the pairs are wrong with fewer matches; the others have an error of 1 degree."""
+    """A third of the pairs are wrong with fewer matches; the rest has an error of 1 degree."""
     rng = np.random.default_rng(0)
     count = 16
     truth = Rotation.random(count, rng).as_matrix()
@@ -146,24 +146,24 @@ def test_average_rotations_with_outliers_recovers_rotations() -> None:
     turns = noise.as_matrix() @ truth[b] @ truth[a].transpose(0, 2, 1)
     wrong = rng.random(len(a)) < 0.33
     turns[wrong] = Rotation.random(int(wrong.sum()), rng).as_matrix()
-    found = average_rotations(a, b, turns, np.where(wrong, 30.0, 100.0), count)
-    world = found[0].T @ truth[0]
-    off = rotation_angle_deg(found @ world @ truth.transpose(0, 2, 1))
+    rotations = average_rotations(a, b, turns, np.where(wrong, 30.0, 100.0), count)
+    world = rotations[0].T @ truth[0]
+    off = rotation_angle_deg(rotations @ world @ truth.transpose(0, 2, 1))
     assert off.max() < 2.5
 
 
 def test_global_initialization_is_as_accurate_as_initial_pair(hall: HallProblem) -> None:
     errors = {}
-    for at_once in (True, False):
+    for global_first in (True, False):
         options = MapperOptions.model_validate(
-            {"initialization": {"global_initialization": at_once}}
+            {"initialization": {"global_initialization": global_first}}
         )
         result = reconstruct(hall.problem, options)
-        found = result.reconstructions[0].poses
-        assert len(found) == VIEWS
-        errors[at_once] = np.median(pose_errors_deg(found, hall.truth, CONVENTIONS["paper"]))
-        assert ("global start" in result.report.counts) == at_once
-        assert ("local refinement" in result.report.counts) != at_once
+        poses = result.reconstructions[0].poses
+        assert len(poses) == VIEWS
+        errors[global_first] = np.median(pose_errors_deg(poses, hall.truth, CONVENTIONS["paper"]))
+        assert ("global start" in result.report.counts) == global_first
+        assert ("local refinement" in result.report.counts) != global_first
     assert errors[True] < 1.1 * errors[False]
 
 

@@ -95,12 +95,12 @@ def test_rank_pairs_orders_largest_pairs_by_support() -> None:
             matches[wrong, 1] = rng.permutation(matches[wrong, 1])
             count = len(matches)
         pairs[k] = replace(pair, matches=matches[:count], scores=pair.scores[:count])
-    doubtful = pairs[largest]
-    options, starts = MapperOptions(), InitialPairSelector(MapperOptions())
+    wrong_pair = pairs[largest]
+    options, selector = MapperOptions(), InitialPairSelector(MapperOptions())
     scene = Scene(replace(problem, pairs=tuple(pairs)))
     refiner = Refiner(scene, options, compute_pair_scores(scene, "match-scores"))
-    search = AbsolutePoseEstimator(scene, refiner, options)
-    assert rank_initial_pairs(scene)[0] is doubtful
-    assert starts.rank_pairs(search, np.ones(3, dtype=np.bool_))[-1] is doubtful
-    left = np.isin(np.arange(3), [doubtful.image_a, doubtful.image_b])
-    assert starts.rank_pairs(search, left) == [doubtful]
+    pose_estimator = AbsolutePoseEstimator(scene, refiner, options)
+    assert rank_initial_pairs(scene)[0] is wrong_pair
+    assert selector.rank_pairs(pose_estimator, np.ones(3, dtype=np.bool_))[-1] is wrong_pair
+    candidates = np.isin(np.arange(3), [wrong_pair.image_a, wrong_pair.image_b])
+    assert selector.rank_pairs(pose_estimator, candidates) == [wrong_pair]

@@ -9,7 +9,7 @@ from mpsfm_core.mapping.registration.threshold_schedule import ThresholdSchedule
 
 
 def test_relax_lowers_inlier_thresholds_and_tightens_depth_threshold() -> None:
-    options = RegistrationOptions(min_inliers=36, min_inlier_share=0.72, max_relaxations=2)
+    options = RegistrationOptions(min_inliers=36, min_pose_inlier_ratio=0.72, max_relaxations=2)
     schedule = ThresholdSchedule(options)
     found = []
     while True:
