@@ -1,4 +1,4 @@
-"""Incremental mapper with depth and normal priors: poses, points and refined depth of all images.
+"""Incremental mapper with depth and normal priors.
 
 Usage::
 
@@ -12,7 +12,7 @@ What :func:`reconstruct` does, compared with COLMAP's ``IncrementalMapper``::
         while images are unregistered:
             component = new component
             component.initialize_from_known_poses()     # poses that came with the images, or
-            component.initialize_globally()             # all well connected images at once, or
+            component.initialize_globally()             # all well connected images, or
             component.initialize_from_pair()            # one pair, best first
             while an image registers:                   # component.register_images()
                 select the next image, estimate its pose, verify it by depth, triangulate
@@ -140,7 +140,7 @@ class Mapper:
 
     @property
     def is_deterministic(self) -> bool:
-        """Whether known poses stay fixed, so that another seed changes nothing."""
+        """True if known poses stay fixed, so that another seed changes nothing."""
         return self._uses_known_poses and self.options.known_poses == "fixed"
 
     def run(self, save_checkpoint: Callable[[], None] = do_nothing) -> MapperRun:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core.mapping.refinement.keypoint_noise import (
-    EFFICIENT,
+    EFFICIENT_SCALE,
     MAX_RESIDUAL,
     compute_epipolar_residuals,
     measure_loss_scale,
@@ -40,7 +40,7 @@ def test_distances_of_matches_have_the_std_of_the_keypoints() -> None:
 @pytest.mark.parametrize("wrong", [0.0, 0.05])
 def test_clean_keypoints_get_a_loss_near_least_squares(wrong: float) -> None:
     scale = measure_loss_scale(scene_of(0.7, wrong=wrong), SCALE)
-    assert scale == pytest.approx(EFFICIENT, rel=0.1)
+    assert scale == pytest.approx(EFFICIENT_SCALE, rel=0.1)
 
 
 def test_keypoints_with_tails_keep_their_loss() -> None:

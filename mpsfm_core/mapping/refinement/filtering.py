@@ -1,4 +1,4 @@
-"""Removing what does not fit: observations, points, images."""
+"""Filtering of observations and points, and detection of images without enough points."""
 
 from __future__ import annotations
 
@@ -11,60 +11,66 @@ from mpsfm_core.mapping.options import TriangulationOptions
 from mpsfm_core.mapping.scene.scene import Scene
 
 MIN_IMAGE_POINTS = 3
-"""An image that observes fewer points has no pose worth the name."""
+"""Number of points below which an image has no determined pose."""
 
 
 def filter_points(
     scene: Scene, options: TriangulationOptions, images: list[int] | None = None
 ) -> int:
-    """Remove observations that reproject badly, and points that neither rays nor depth support.
+    """Remove outlier observations, and points that neither parallax nor depth determines.
 
-    A point of low triangulation angle stays only if some image that sees it has valid depth
-    there. ``images``: only points that one of them sees; all by default. Returns the number of
-    observations removed.
+    A point with a small triangulation angle stays only if one of its images has valid depth there.
+
+    Args:
+        scene: The scene.
+        options: ``max_error_px`` and ``min_angle_deg`` are used.
+        images: Filter only points that one of these images observes; None filters all points.
+
+    Returns:
+        Number of removed observations.
     """
     tracks, graph = scene.tracks, scene.graph
-    points = _points_of(scene, images)
+    points = _find_points(scene, images)
     keypoints, rows = tracks.observations_of(points)
-    errors, _ = scene.project(keypoints, tracks.xyz[points[rows]])
-    limit = options.max_error_px * scene.keypoint_std_px[graph.image_of[keypoints]]
-    removed = tracks.remove_observations(keypoints[~(errors <= limit)])
+    errors_px, _ = scene.project(keypoints, tracks.xyz[points[rows]])
+    max_errors_px = options.max_error_px * scene.keypoint_std_px[graph.image_of[keypoints]]
+    num_removed = tracks.remove_observations(keypoints[~(errors_px <= max_errors_px)])
     keypoints, rows = tracks.observations_of(points)
-    supported = np.bincount(rows, scene.keypoint_valid[keypoints], minlength=len(points))
-    angles, lengths = scene.angles_deg_of(points)
-    unstable = (angles < options.min_angle_deg) & (supported == 0)
-    removed += int(lengths[unstable].sum())
-    gone = np.zeros(len(tracks.xyz), dtype=np.bool_)
-    gone[points[unstable]] = True
-    tracks.delete(gone)
-    return removed
+    num_depths = np.bincount(rows, scene.keypoint_valid[keypoints], minlength=len(points))
+    angles_deg, lengths = scene.angles_deg_of(points)
+    is_unstable = (angles_deg < options.min_angle_deg) & (num_depths == 0)
+    num_removed += int(lengths[is_unstable].sum())
+    is_deleted = np.zeros(len(tracks.xyz), dtype=np.bool_)
+    is_deleted[points[is_unstable]] = True
+    tracks.delete(is_deleted)
+    return num_removed
 
 
-def _points_of(scene: Scene, images: list[int] | None) -> Int64:
-    """(m,) points that some images see, ascending; all by default."""
+def _find_points(scene: Scene, images: list[int] | None) -> Int64:
+    """Return the points (m,) that some images observe, ascending; all points for None."""
     tracks = scene.tracks
     if images is None:
         return np.arange(len(tracks.xyz))
-    seen = np.concatenate([tracks.point_of[scene.graph.keypoints_of(image)] for image in images])
-    return np.unique(seen[seen >= 0])
+    points = np.concatenate([tracks.point_of[scene.graph.keypoints_of(image)] for image in images])
+    return np.unique(points[points >= 0])
 
 
 def find_lost_images(scene: Scene) -> list[int]:
-    """Registered images that observe too few points to keep their pose."""
+    """Return the registered images that observe fewer than ``MIN_IMAGE_POINTS`` points."""
     observed = np.flatnonzero(scene.tracks.point_of >= 0)
     counts = np.bincount(scene.graph.image_of[observed], minlength=scene.num_images)
     return [int(i) for i in scene.registered_images() if counts[i] < MIN_IMAGE_POINTS]
 
 
 def find_disconnected_images(scene: Scene) -> list[int]:
-    """Registered images that share no chain of points with the largest group of images."""
+    """Return the registered images that no chain of points connects to the largest component."""
     observations = scene.tracks.observations()
     points = scene.tracks.point_of[observations]
     images = scene.graph.image_of[observations]
-    nodes = scene.num_images + len(scene.tracks.xyz)
-    links = coo_matrix(
-        (np.ones(len(points)), (images, scene.num_images + points)), shape=(nodes, nodes)
+    num_nodes = scene.num_images + len(scene.tracks.xyz)
+    edges = coo_matrix(
+        (np.ones(len(points)), (images, scene.num_images + points)), shape=(num_nodes, num_nodes)
     )
-    group = connected_components(links, directed=False)[1][: scene.num_images]
-    sizes = np.bincount(group[scene.registered])
-    return [int(i) for i in scene.registered_images() if group[i] != sizes.argmax()]
+    component = connected_components(edges, directed=False)[1][: scene.num_images]
+    sizes = np.bincount(component[scene.registered])
+    return [int(i) for i in scene.registered_images() if component[i] != sizes.argmax()]

@@ -1,14 +1,12 @@
-"""How keypoints err in this scene, measured by how matches meet: clean, or with heavy tails.
+"""Measurement of the noise of keypoints: normal errors, or errors with heavy tails.
 
-Two explanations compete for the distances of matches from meeting. Keypoints are *clean*: errors
-are normal, and a loss near least squares uses them best. Or they have *tails*, as learned ones do,
-of which the loss of the options knows: Cauchy's loss of scale ``c`` is the likelihood of Student's
-t distribution with ``c^2 = nu s^2``, ``nu`` its degrees of freedom and ``s`` the std of its core.
-The likelier one counts.
+Two models of the epipolar errors of matches compete by likelihood. If the errors are normal, a loss
+near least squares is efficient. If they have heavy tails, as those of learned keypoints often have,
+the Cauchy loss of the options is kept: with scale ``c`` it is the likelihood of Student's t
+distribution, ``c^2 = nu s^2``, with ``nu`` degrees of freedom and scale ``s``.
 
-Residuals of points would tell wrong: a robust fit of a point passes through some of its keypoints,
-and looks the more exact the smaller the scale is. So matches are held against their epipolar
-lines, which hang on the poses alone.
+Reprojection errors of points would be biased, because a robustly fitted point passes through some
+of its keypoints. Epipolar errors depend on the poses alone.
 """
 
 from __future__ import annotations
@@ -22,78 +20,90 @@ from mpsfm_core.data import Float64, Int64
 from mpsfm_core.mapping.scene.scene import Scene
 
 MAX_MATCHES = 4000
-"""That are looked at, evenly spaced: a std is known within 1 % then (ours)."""
+"""Number of matches that are evaluated, evenly spaced. [ours]"""
 MIN_MATCHES = 100
-"""Fewer say too little of tails: the loss stays as it is (ours)."""
+"""Number of matches below which the loss is kept. [ours]"""
 MAX_RESIDUAL = 4.0
-"""Stds of a keypoint beyond which bundle adjustment sees no residual, as observations that are
-farther from their point are filtered (COLMAP)."""
-EFFICIENT = 3.644
-"""Scale of Cauchy's loss in stds of normal errors of both coordinates at which it is as good as
-least squares on 98 % of the observations (2.549 for 95 %; Holland and Welsch, Communications in
-Statistics A6, 1977, have 2.385 for errors of one coordinate). Ours: at 2.385 200 views of a hall
-reach 92.2 at 1 degree, at 3.644 92.5, COLMAP's least squares 92.9. Wrong matches are no reason for
-less: they are filtered at :data:`MAX_RESIDUAL`."""
-FREEDOMS = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0])
-"""Degrees of freedom that are tried for the tails."""
+"""Largest residual in standard deviations of a keypoint; larger ones are filtered as outliers.
+[COLMAP filter_max_reproj_error]"""
+EFFICIENT_SCALE = 3.644
+"""Scale of the Cauchy loss, in standard deviations of normal errors of two coordinates, with 98 %
+efficiency (2.549 has 95 %; Holland and Welsch, Communications in Statistics A6, 1977).
+[tuned: benchmarks.everyday]"""
+DEGREES_OF_FREEDOM = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0])
+"""Degrees of freedom that the fit of Student's t distribution tries."""
 
 
-def measure_loss_scale(scene: Scene, scale: float) -> float:
-    """Scale of Cauchy's loss, in stds of a keypoint, that suits the matches of registered images.
+def measure_loss_scale(scene: Scene, default_scale: float) -> float:
+    """Measure the scale of the Cauchy loss that suits the matches of registered images.
 
-    ``scale``: that for keypoints with tails, or where too few matches tell.
+    Args:
+        scene: The scene.
+        default_scale: Scale for keypoints with heavy tails, and without enough matches.
+
+    Returns:
+        The scale in standard deviations of a keypoint, at least ``default_scale``.
     """
     residuals = compute_epipolar_residuals(scene)
     if len(residuals) < MIN_MATCHES:
-        return scale
+        return default_scale
     std = float(np.sqrt((residuals**2).mean()))
-    if compute_normal_log_likelihood(residuals, std) > compute_student_log_likelihood(
-        residuals, scale
-    ):
-        return max(scale, EFFICIENT * std)
-    return scale
+    normal = compute_normal_log_likelihood(residuals, std)
+    if normal > compute_student_log_likelihood(residuals, default_scale):
+        return max(default_scale, EFFICIENT_SCALE * std)
+    return default_scale
 
 
 def compute_normal_log_likelihood(residuals: Float64, std: float) -> float:
-    """Mean log likelihood of residuals (m,) below :data:`MAX_RESIDUAL`, were they normal."""
+    """Compute the mean log likelihood of residuals under a truncated normal distribution.
+
+    Args:
+        residuals: (m,) float64 residuals below ``MAX_RESIDUAL``.
+        std: Standard deviation of the distribution.
+    """
     norm = std * np.sqrt(np.pi / 2) * erf(MAX_RESIDUAL / (std * np.sqrt(2)))
     return float(-0.5 * (residuals**2).mean() / std**2 - np.log(norm))
 
 
 def compute_student_log_likelihood(residuals: Float64, scale: float) -> float:
-    """The same for the t distribution of that scale, with the best degrees of freedom."""
+    """Compute the mean log likelihood under the best truncated Student's t distribution.
+
+    Args:
+        residuals: (m,) float64 residuals below ``MAX_RESIDUAL``.
+        scale: Scale of the corresponding Cauchy loss.
+    """
     spread = np.log1p((residuals / scale) ** 2).mean()
-    return float((-(FREEDOMS + 1) / 2 * spread - _log_norms(scale)).max())
+    return float((-(DEGREES_OF_FREEDOM + 1) / 2 * spread - _log_norms(scale)).max())
 
 
 def compute_epipolar_residuals(scene: Scene) -> Float64:
-    """(m,) distances of matches of registered images from meeting, in stds of a keypoint.
+    """Compute Sampson errors (m,) of matches of registered images below ``MAX_RESIDUAL``.
 
-    To first order how far both keypoints of a match must move for their rays to meet (Sampson).
+    The unit is the standard deviation of a keypoint.
     """
-    source, target = _some_matches(scene)
+    source, target = _sample_matches(scene)
     centers, images = scene.centers(), scene.graph.image_of
     baseline = centers[images[target]] - centers[images[source]]
     ray_a, ray_b = scene.world_rays(source), scene.world_rays(target)
-    gap = np.einsum("na,na->n", ray_a, np.cross(baseline, ray_b))
-    variance = _variance_of_gap(scene, source, np.cross(baseline, ray_b))
-    variance += _variance_of_gap(scene, target, np.cross(ray_a, baseline))
-    residuals: Float64 = np.abs(gap) / np.sqrt(np.maximum(variance, 1e-300))
+    error = np.einsum("na,na->n", ray_a, np.cross(baseline, ray_b))
+    variance = _propagate_variance(scene, source, np.cross(baseline, ray_b))
+    variance += _propagate_variance(scene, target, np.cross(ray_a, baseline))
+    residuals: Float64 = np.abs(error) / np.sqrt(np.maximum(variance, 1e-300))
     return residuals[residuals < MAX_RESIDUAL]
 
 
-def _some_matches(scene: Scene) -> tuple[Int64, Int64]:
-    """Keypoints of matches of registered images, each match once."""
+def _sample_matches(scene: Scene) -> tuple[Int64, Int64]:
+    """Return the keypoints of matches of registered images, each match once."""
     graph = scene.graph
-    both = scene.registered[graph.image_of[graph.source]]
-    both &= scene.registered[graph.image_of[graph.target]] & (graph.source < graph.target)
-    rows = np.flatnonzero(both)
+    is_used = scene.registered[graph.image_of[graph.source]]
+    is_used &= scene.registered[graph.image_of[graph.target]] & (graph.source < graph.target)
+    rows = np.flatnonzero(is_used)
     rows = rows[:: len(rows) // MAX_MATCHES + 1]
     return graph.source[rows], graph.target[rows]
 
 
-def _variance_of_gap(scene: Scene, keypoints: Int64, normals: Float64) -> Float64:
-    """(m,) variance of ``ray * normal`` from the noise of the ray's keypoint."""
+def _propagate_variance(scene: Scene, keypoints: Int64, normals: Float64) -> Float64:
+    """Return the variance (m,) of ``ray . normal`` from the noise of the keypoint of the ray."""
     images = scene.graph.image_of[keypoints]
     local = np.einsum("nij,nj->ni", scene.rotations[images], normals)
     slope = local[:, :2] / scene.intrinsics[images, :2]
@@ -103,9 +113,9 @@ def _variance_of_gap(scene: Scene, keypoints: Int64, normals: Float64) -> Float6
 
 @cache
 def _log_norms(scale: float) -> Float64:
-    """(freedoms,) logarithm of the integral of each distribution's shape."""
-    steps = 4000
-    residuals = (np.arange(steps) + 0.5) * MAX_RESIDUAL / steps
-    shapes = np.log1p((residuals[:, None] / scale) ** 2) * -(FREEDOMS + 1) / 2
-    norms: Float64 = np.log(np.exp(shapes).sum(axis=0) * MAX_RESIDUAL / steps)
+    """Return the log normalization of each truncated t distribution, by the midpoint rule."""
+    num_steps = 4000
+    residuals = (np.arange(num_steps) + 0.5) * MAX_RESIDUAL / num_steps
+    log_densities = np.log1p((residuals[:, None] / scale) ** 2) * -(DEGREES_OF_FREEDOM + 1) / 2
+    norms: Float64 = np.log(np.exp(log_densities).sum(axis=0) * MAX_RESIDUAL / num_steps)
     return norms

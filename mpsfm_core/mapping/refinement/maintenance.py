@@ -67,7 +67,7 @@ class ModelMaintenance:
 
     @property
     def is_checked(self) -> bool:
-        """Whether the depth of all registered images was compared with each other."""
+        """True if the depth of all registered images was compared with each other."""
         return bool(self._checked[self.scene.registered].all())
 
     def state(self) -> ModelState:

@@ -1,8 +1,8 @@
-"""Local and global refinement: bundle adjustment beside depth, and depth integration (section 3.3).
+"""Local and global refinement by bundle adjustment and depth integration (paper 3.3).
 
-The paper does both in turn, each beside what the other made. A map refined on points agrees with
-them, and holds them where they are; so, unless ``bundle_depth`` says otherwise, bundle adjustment
-works beside the scaled priors and maps are refined on what comes out.
+The paper alternates both, each with the result of the other. A map that was refined with points
+agrees with them and keeps them where they are. Therefore bundle adjustment uses the scaled priors,
+and maps are refined with its result, unless ``bundle_depth`` is ``refined``.
 """
 
 from __future__ import annotations
@@ -31,22 +31,48 @@ from mpsfm_core.optimize.subsampling import (
 )
 from mpsfm_core.support.threads import parallel_map
 
-LOCAL_MAX_TRACK_LENGTH = 15
-"""Longer tracks stay fixed in local bundle adjustment (COLMAP, reference)."""
-NOISE_CHANGE = 1.25
-"""Factor of the measured noise from which on the integration is set up anew (ours)."""
+MAX_LOCAL_TRACK_LENGTH = 15
+"""Track length above which a point stays fixed in local bundle adjustment.
+[COLMAP max_num_observations]"""
+MAX_LOCAL_REFINEMENTS = 2
+"""Iterations of local refinement. [COLMAP ba_local_max_refinements]"""
+MAX_LOCAL_CHANGE = 0.001
+"""Share of changed observations below which local refinement stops.
+[COLMAP ba_local_max_refinement_change]"""
+MAX_GLOBAL_REFINEMENTS = 5
+"""Iterations of global refinement. [COLMAP ba_global_max_refinements]"""
+MAX_GLOBAL_CHANGE = 0.0005
+"""Share of changed observations below which global refinement stops.
+[COLMAP ba_global_max_refinement_change]"""
+FINAL_DEPTH_SCALE = 0.125
+"""Factor on the scale of the depth loss in the final robust refinement.
+[reference final_robustification]"""
+MIN_FOCAL_IMAGES = 3
+"""Number of registered images from which estimated focal lengths are refined. [ours]"""
+MIN_FOCAL_ANGLE_DEG = 2.0
+"""Median triangulation angle from which estimated focal lengths are refined. [ours]"""
+MAX_DEPTH_RATIO = 1.5
+"""Largest ratio of a point's depth and the map for which the observation of depth counts.
+[reference scale_filter]"""
+MIN_ANCHOR_ANGLE_DEG = 2.0
+"""Smallest triangulation angle of a point that constrains depth integration.
+[reference robust_triangles]"""
+MAX_NOISE_CHANGE = 1.25
+"""Factor of the measured noise above which the integrators are set up again. [ours]"""
 MIN_SCALE_POINTS = 20
-"""Fewer well triangulated points do not change a scale again (ours)."""
+"""Number of well triangulated points from which a shared scale is estimated again. [ours]"""
 
 
 class Refiner:
-    """Refines a scene; remembers the integrators and how well depth and points agree.
+    """Bundle adjustment and depth integration of a scene.
 
-    ``noise``: how good the priors are in this scene; ``loss_scale``: of the reprojection loss, in
-    stds of a keypoint. Both are refreshed by global refinement.
-    ``clean_matches``: whether all pairs were heard before an image was placed, so that the loss may
-    be as wide as keypoints are clean; while images join one by one it holds wrong ones off.
-    ``fixed``: (n,) bool, images whose pose never changes.
+    Attributes:
+        fixed: (n,) bool, images whose pose never changes.
+        noise: Measured noise of the depth priors; global refinement updates it.
+        loss_scale: Scale of the reprojection loss, in standard deviations of a keypoint; global
+            refinement updates it.
+        adapts_reprojection_loss: Whether global refinement may widen the reprojection loss. While
+            images are registered one by one, the narrow loss protects against wrong matches.
     """
 
     def __init__(self, scene: Scene, options: MapperOptions, scores: Float64) -> None:
@@ -60,33 +86,37 @@ class Refiner:
         self.noise = DepthNoise()
         self.loss_scale = options.refinement.bundle.reprojection_scale
         self.adapts_reprojection_loss = False
-        self._assumed = DepthNoise()
+        self._integrator_noise = DepthNoise()
         self._integrators: dict[int, DepthIntegrator] = {}
 
     @property
     def _alternates(self) -> bool:
-        """Whether maps are also refined before each bundle adjustment, for it to agree with."""
+        """True if depth integration and bundle adjustment alternate, as in the paper."""
         return self.options.bundle_depth == "refined"
 
     @property
     def std_factor(self) -> float:
-        """How many times its declaration the std of depth is where a decision hangs on it.
+        """Factor on the declared standard deviation of depth for decisions.
 
-        Never below 1: that priors agree where points are does not make them better elsewhere.
+        The factor is at least 1, because priors that agree at points may be worse between them.
         """
         return max(1.0, self.noise.multiplier)
 
     def estimate_scale(self, image: int, others: list[int]) -> None:
-        """Scale an image's prior so that it agrees with its points (paper eq. 1).
+        """Estimate the scale of a depth prior from the points that the image observes.
 
-        Points whose scale is far from that of the ``others`` are ignored if the prior is metric;
-        if none is left, the image takes their mean. A registered image whose depth has the same
-        unit has its scale already.
+        The scale is the median ratio of point depth and prior (paper eq. 1). If a registered image
+        has depth in the same unit, its scale is taken.
+
+        Args:
+            image: A registered image.
+            others: Images whose scales a metric prior is compared with. Points whose scale differs
+                by more than ``MAX_DEPTH_RATIO`` are ignored; without points the mean is taken.
         """
         scene = self.scene
         depth_map = scene.maps[image]
-        same = scene.registered & (scene.depth_group_of == scene.depth_group_of[image])
-        for other in map(int, np.flatnonzero(same)):
+        shares_unit = scene.registered & (scene.depth_group_of == scene.depth_group_of[image])
+        for other in map(int, np.flatnonzero(shares_unit)):
             if other != image and scene.maps[other].active:
                 depth_map.set_scale(scene.maps[other].scale)
                 return
@@ -102,10 +132,7 @@ class Refiner:
             depth_map.set_scale(float(np.exp(np.median(log_scales))))
 
     def estimate_scales(self, images: list[int]) -> None:
-        """Scale the priors of posed images to their triangulated points.
-
-        An image that sees none takes the median scale of the others.
-        """
+        """Estimate the scales of several images; an image without points takes the median."""
         for image in images:
             self.estimate_scale(image, [])
         scales = [scene_map.scale for scene_map in self.scene.maps if scene_map.active]
@@ -114,13 +141,13 @@ class Refiner:
                 self.scene.maps[image].set_scale(float(np.median(scales)))
 
     def estimate_shared_scales(self) -> None:
-        """Estimate scales that several images share anew, from points that rays determine.
+        """Estimate the scales that several images share, from well triangulated points.
 
-        Those of single images are unknowns of bundle adjustment.
+        Scales of single images are parameters of bundle adjustment.
         """
         scene, tracks = self.scene, self.scene.tracks
-        stable = scene.track_angles_deg() >= self.options.anchor_min_angle_deg
-        found: dict[int, list[Float64]] = {}
+        is_stable = scene.track_angles_deg() >= MIN_ANCHOR_ANGLE_DEG
+        log_ratios: dict[int, list[Float64]] = {}
         for image in map(int, np.flatnonzero(self._shares_scale & scene.registered)):
             depth_map = scene.maps[image]
             if not depth_map.active:
@@ -129,21 +156,21 @@ class Refiner:
             rows = keypoints - scene.graph.offsets[image]
             prior = depth_map.prior_at_keypoints(rows)
             good = depth_map.keypoint_valid[rows] & (z > 0) & (prior > 0)
-            good &= stable[tracks.point_of[keypoints]]
+            good &= is_stable[tracks.point_of[keypoints]]
             good[good] &= self._near(z[good] / (depth_map.scale * prior[good]))
             group = int(scene.depth_group_of[image])
-            found.setdefault(group, []).append(np.log(z[good] / prior[good]))
-        for group, parts in found.items():
-            together = np.concatenate(parts)
-            if len(together) >= MIN_SCALE_POINTS:
+            log_ratios.setdefault(group, []).append(np.log(z[good] / prior[good]))
+        for group, parts in log_ratios.items():
+            log_scales = np.concatenate(parts)
+            if len(log_scales) >= MIN_SCALE_POINTS:
                 for image in map(int, np.flatnonzero(scene.depth_group_of == group)):
                     if scene.maps[image].active:
-                        scene.maps[image].set_scale(float(np.exp(np.median(together))))
+                        scene.maps[image].set_scale(float(np.exp(np.median(log_scales))))
 
     def integrate(self, images: list[int]) -> None:
-        """Refine the depth maps of some images against the current points.
+        """Refine the depth maps of images with the current points.
 
-        Those whose scale is unknown stay as they are.
+        Images whose scale is unknown are skipped.
         """
         if not self.options.integrate:
             return
@@ -161,11 +188,17 @@ class Refiner:
         depth_scale: float = 1.0,
         max_iterations: int | None = None,
     ) -> None:
-        """Bundle-adjust poses of some images, scales of their depth and the points they see.
+        """Adjust the poses and depth scales of images, and the points that they observe.
 
-        ``local``: long tracks stay. ``focal``: guessed focal lengths
-        are refined too. ``reprojection_scale``, ``depth_scale`` multiply the scales of the losses.
-        ``max_iterations``: at most, instead of the options'.
+        Other images that observe these points stay fixed.
+
+        Args:
+            variable: Images to adjust.
+            local: Keep points with long tracks fixed.
+            focal: Also refine estimated focal lengths.
+            reprojection_scale: Factor on the scale of the reprojection loss.
+            depth_scale: Factor on the scale of the depth loss.
+            max_iterations: Maximum number of iterations; None takes the option.
         """
         scene, tracks = self.scene, self.scene.tracks
         observations = tracks.observations()
@@ -180,7 +213,7 @@ class Refiner:
         moving = (scene.mask(variable) & ~self.fixed)[images]
         if moving.all():
             moving[0] = False
-        long_track = np.bincount(point_rows) >= LOCAL_MAX_TRACK_LENGTH
+        long_track = np.bincount(point_rows) >= MAX_LOCAL_TRACK_LENGTH
         log_depth, log_std = self._depth_observations(observations, self._alternates and not focal)
         regularized = self.options.depth_regularization and bool(np.isfinite(log_depth).any())
         free_scale = not regularized and moving.any() and np.count_nonzero(~moving) == 1
@@ -230,52 +263,55 @@ class Refiner:
             depth_map.set_scale(depth_map.scale * float(np.exp(result.log_scales[row])))
 
     def refine_locally(self, image: int) -> None:
-        """Refine an image and its neighbours until little changes.
+        """Adjust the local bundle of an image and update its tracks until little changes.
 
-        Its map was refined when it was registered, and will be again with all others.
+        The depth map of the image is not refined again; global refinement does that.
         """
         options = self.options
         bundle = find_local_bundle(self.scene, image, options.local_images - 1, self.scores)
         complete_and_merge_tracks(self.scene, self.triangulation, images=bundle)
-        for _ in range(options.local_iterations):
+        for _ in range(MAX_LOCAL_REFINEMENTS):
             bundle = find_local_bundle(self.scene, image, options.local_images - 1, self.scores)
             if self._alternates:
                 self.integrate([image])
             self.adjust(bundle, local=True)
             changed = filter_points(self.scene, self.triangulation, bundle)
             changed += complete_and_merge_tracks(self.scene, self.triangulation, images=bundle)
-            if changed < options.local_max_change * max(self._num_observations(), 1):
+            if changed < MAX_LOCAL_CHANGE * max(self._num_observations(), 1):
                 break
 
     def refine_globally(self, *, final: bool = False) -> None:
-        """Refine everything until little changes; ``final`` sharpens the depth loss."""
-        options = self.options
+        """Adjust all images and update all tracks until little changes; refine depth maps.
+
+        Args:
+            final: Sharpen the depth loss by ``FINAL_DEPTH_SCALE``.
+        """
         images = [int(i) for i in self.scene.registered_images()]
         complete_and_merge_tracks(self.scene, self.triangulation, create=True)
         lift_low_parallax(self.scene, self.triangulation)
         if self.focal_is_stable():
             self.adjust(images, focal=True)
-        for _ in range(options.global_iterations):
+        for _ in range(MAX_GLOBAL_REFINEMENTS):
             self.estimate_shared_scales()
             self._measure_keypoint_noise()
             self._measure_noise()
             if self._alternates:
                 self.integrate(images)
-            self.adjust(images, depth_scale=options.final_depth_scale if final else 1.0)
+            self.adjust(images, depth_scale=FINAL_DEPTH_SCALE if final else 1.0)
             changed = filter_points(self.scene, self.triangulation)
             changed += complete_and_merge_tracks(self.scene, self.triangulation)
-            if changed < options.global_max_change * max(self._num_observations(), 1):
+            if changed < MAX_GLOBAL_CHANGE * max(self._num_observations(), 1):
                 break
         self.integrate(images)
 
     def discard_integrator(self, image: int) -> None:
-        """Drop what is remembered of an image that left the scene."""
+        """Discard the cached integrator of a deregistered image."""
         self._integrators.pop(image, None)
 
     def reset(self) -> None:
-        """Drop what is remembered of the scene, which starts anew."""
+        """Discard all measurements and integrators, for an empty scene."""
         self._integrators.clear()
-        self.noise = self._assumed = DepthNoise()
+        self.noise = self._integrator_noise = DepthNoise()
         self.loss_scale = self.options.bundle.reprojection_scale
         self.adapts_reprojection_loss = False
 
@@ -288,7 +324,7 @@ class Refiner:
         rotation = np.broadcast_to(scene.rotations[image], (len(points), 3, 3))
         variance = propagate_depth_variance(covariances[points], rotation)
         ratio = z / np.maximum(depth_map.scale * depth_map.prior_at_keypoints(rows), 1e-12)
-        good = (angles[points] >= self.options.anchor_min_angle_deg) & (z > 0)
+        good = (angles[points] >= MIN_ANCHOR_ANGLE_DEG) & (z > 0)
         good &= np.isfinite(variance) & (variance > 0)
         good &= ~depth_map.keypoint_valid[rows] | self._near(ratio)
         xy = subsample_pixels(depth_map.keypoints[rows][good], self._step(image))
@@ -299,21 +335,25 @@ class Refiner:
         depth_map.set_refined(refined)
 
     def _guessed(self, images: Int64) -> Bool:
-        """(m,) bool, images whose focal length is a guess."""
+        """Return (m,) bool, images whose focal length is an estimate."""
         known = [self.scene.problem.images[i].focal_known for i in images]
         return ~np.array(known, dtype=np.bool_)
 
     def focal_is_stable(self) -> bool:
-        """Whether guessed focal lengths can be told from the images registered so far."""
+        """Return whether the registered images constrain estimated focal lengths."""
         images, options = self.scene.registered_images(), self.options
-        if not options.refine_focal or len(images) < options.focal_min_images:
+        if not options.refine_focal or len(images) < MIN_FOCAL_IMAGES:
             return False
         angles = self.scene.track_angles_deg()[self.scene.tracks.lengths() > 0]
-        wide = len(angles) > 0 and float(np.median(angles)) >= options.focal_min_angle_deg
-        return wide and bool(self._guessed(images).any())
+        is_wide = len(angles) > 0 and float(np.median(angles)) >= MIN_FOCAL_ANGLE_DEG
+        return is_wide and bool(self._guessed(images).any())
 
     def _take_focal(self, images: Int64, intrinsics: Float64) -> bool:
-        """Use refined focal lengths, also for images not yet registered; no if one ran away."""
+        """Apply refined focal lengths to all images of their cameras.
+
+        Returns:
+            False, and no change, if one changed by more than ``focal_max_change``.
+        """
         scene, limit = self.scene, self.options.focal_max_change
         rows = np.flatnonzero(self._guessed(images))
         guesses = np.array([scene.problem.images[image].camera.fx for image in images[rows]])
@@ -325,49 +365,51 @@ class Refiner:
         return True
 
     def _measure_keypoint_noise(self) -> None:
-        """Let the reprojection loss suit the keypoints, whose tails Cauchy's loss knows."""
+        """Measure the scale of the Cauchy loss from the epipolar errors of matches."""
         bundle = self.options.bundle
-        measure = self.options.measure_keypoint_noise and self.adapts_reprojection_loss
-        if measure and bundle.reprojection_loss == Loss.CAUCHY:
+        is_enabled = self.options.measure_keypoint_noise and self.adapts_reprojection_loss
+        if is_enabled and bundle.reprojection_loss == Loss.CAUCHY:
             self.loss_scale = measure_loss_scale(self.scene, bundle.reprojection_scale)
 
     def _measure_noise(self) -> None:
-        """Measure how good the priors are; integrators that assumed much else are made anew."""
+        """Measure the noise of the priors; discard integrators that assumed a different noise."""
         if not self.options.measure_depth_noise:
             return
         self.noise = measure_depth_noise(self.scene)
-        ratio = self.noise.multiplier / self._assumed.multiplier
-        if not 1 / NOISE_CHANGE < ratio < NOISE_CHANGE:
-            self._assumed = self.noise
+        ratio = self.noise.multiplier / self._integrator_noise.multiplier
+        if not 1 / MAX_NOISE_CHANGE < ratio < MAX_NOISE_CHANGE:
+            self._integrator_noise = self.noise
             self._integrators.clear()
 
     def _integrator(self, image: int) -> DepthIntegrator:
-        """The integrator of an image; the measured noise scales what its depth prior is worth."""
+        """Return the integrator of an image, with the variance scaled by the measured noise."""
         depth_map, step = self.scene.maps[image], self._step(image)
         camera = subsample_camera(depth_map.camera, step)
         integrator = self._integrators.get(image)
         if integrator is not None and integrator.camera == camera:
             return integrator
-        prior, noise = subsample_prior(depth_map.prior, step), self._assumed
+        prior, noise = subsample_prior(depth_map.prior, step), self._integrator_noise
         assert prior.variance is not None  # MappingImage checks it
         options = self.options.integration
-        worth = max(noise.independent_pixels(prior.depth.size), options.independent_depths)
+        independent_depths = max(
+            noise.independent_pixels(prior.depth.size), options.independent_depths
+        )
         integrator = self._integrators[image] = DepthIntegrator(
             replace(prior, variance=prior.variance * np.float32(noise.multiplier**2)),
             subsample_prior(depth_map.normals, step),
             camera,
-            options.model_copy(update={"independent_depths": worth}),
+            options.model_copy(update={"independent_depths": independent_depths}),
         )
         return integrator
 
     def _step(self, image: int) -> int:
-        """How far apart the pixels are on which an image's depth is refined."""
+        """Return the subsampling step of the depth map of an image."""
         return compute_subsampling_step(
             self.scene.maps[image].prior.shape[1], self.options.map_width
         )
 
     def _observed_depth(self, image: int) -> tuple[Int64, Float64]:
-        """Keypoints of an image that observe points, and the points' depth in the image."""
+        """Return the keypoints of an image that observe points, and the depth of these points."""
         scene, tracks = self.scene, self.scene.tracks
         of_image = scene.graph.keypoints_of(image)
         keypoints = of_image.start + np.flatnonzero(tracks.point_of[of_image] >= 0)
@@ -376,7 +418,7 @@ class Refiner:
         return keypoints, z
 
     def _depth_observations(self, observations: Int64, refined: bool) -> tuple[Float64, Float64]:
-        """Log depth of the maps at observations (NaN where not to be used) and its std."""
+        """Return log depth of the maps at observations, NaN if unusable, and its std."""
         scene, tracks = self.scene, self.scene.tracks
         _, z = scene.project(observations, tracks.xyz[tracks.point_of[observations]])
         if refined:
@@ -392,52 +434,60 @@ class Refiner:
         return log_depth, np.maximum(log_std, 1e-6)
 
     def _has_free_scale(self, variable: list[int]) -> Bool:
-        """(n,) bool, images of whose depth bundle adjustment estimates the scale."""
+        """Return (n,) bool, images whose depth scale is a parameter of bundle adjustment."""
         if not self.options.free_scales:
             return np.zeros(self.scene.num_images, dtype=np.bool_)
         return self.scene.mask(variable) & ~self._shares_scale
 
     def _expected_log_scales(self, images: Int64) -> tuple[Float64, Float64]:
-        """By how much the logarithms of some images' scales are expected to change, and the std of
-        that: (m,) each.
+        """Return the expected change of the log scales of images, and its standard deviation.
 
-        Metric priors agree on a metre, the mean of what registered images take for it (the median
-        would pull at all of them, and nothing else holds the unit), give or take their spread.
-        What priors declare, by the measured noise, counts as one more of them (a unit information
-        prior). Of relative ones nothing is known.
+        Metric priors share one unit: the mean log scale of the registered images. The mean keeps
+        the unit of the world, which nothing else fixes; a median would move it. The standard
+        deviation is the spread of these log scales, with the declared noise as one more sample (a
+        unit information prior). Relative priors have an infinite standard deviation.
+
+        Returns:
+            ``(expected, std)``, both (m,).
         """
         maps, scene = self.scene.maps, self.scene
-        metric = np.array([m.prior.metric and m.typical_log_std > 0 for m in maps], dtype=np.bool_)
-        posed = np.array([m.active for m in maps], dtype=np.bool_) & metric & scene.registered
+        is_metric = np.array(
+            [m.prior.metric and m.typical_log_std > 0 for m in maps], dtype=np.bool_
+        )
+        is_used = np.array([m.active for m in maps], dtype=np.bool_) & is_metric & scene.registered
         log_scales = np.log(scene.scales())
         expected, std = np.zeros(len(images)), np.full(len(images), np.inf)
-        if posed.any():
-            mean = log_scales[posed].mean()
-            off = log_scales[posed] - mean
+        if is_used.any():
+            mean = log_scales[is_used].mean()
+            deviations = log_scales[is_used] - mean
             declared = np.median(
-                [m.typical_log_std for m, of in zip(maps, posed, strict=True) if of]
+                [m.typical_log_std for m, used in zip(maps, is_used, strict=True) if used]
             )
-            squares = (self.noise.multiplier * declared) ** 2 + (off**2).sum()
-            std[metric[images]] = np.sqrt(squares / len(off))
+            squares = (self.noise.multiplier * declared) ** 2 + (deviations**2).sum()
+            std[is_metric[images]] = np.sqrt(squares / len(deviations))
             expected[:] = mean - log_scales[images]
         return expected, std
 
     def _near(self, ratio: Float64) -> Bool:
-        limit = self.options.max_depth_ratio
+        limit = MAX_DEPTH_RATIO
         near: Bool = (ratio > 1 / limit) & (ratio < limit)
         return near
 
-    def _covariances(self, seen_by: list[int]) -> tuple[Float64, Float64]:
-        """Covariance (p, 3, 3) of points by reprojection alone, and their angle (p,).
+    def _covariances(self, observed_by: list[int]) -> tuple[Float64, Float64]:
+        """Return point covariances from reprojection errors alone, and triangulation angles.
 
-        Only those of points that some image of ``seen_by`` observes mean something.
+        Args:
+            observed_by: Images; only the values of points that one of them observes are valid.
+
+        Returns:
+            Covariances (p, 3, 3) and angles in degrees (p,).
         """
         scene, tracks = self.scene, self.scene.tracks
         observations = tracks.observations()
         images = scene.graph.image_of[observations]
-        wanted = np.zeros(len(tracks.xyz), dtype=np.bool_)
-        wanted[tracks.point_of[observations[scene.mask(seen_by)[images]]]] = True
-        observations = observations[wanted[tracks.point_of[observations]]]
+        is_observed = np.zeros(len(tracks.xyz), dtype=np.bool_)
+        is_observed[tracks.point_of[observations[scene.mask(observed_by)[images]]]] = True
+        observations = observations[is_observed[tracks.point_of[observations]]]
         images = scene.graph.image_of[observations]
         covariances = compute_point_covariances(
             BundleProblem(

@@ -1,1 +1,1 @@
-"""The state of a reconstruction and its finished form."""
+"""Scene of the mapper (poses, tracks, depth maps) and its conversion to a reconstruction."""

@@ -1,4 +1,4 @@
-"""From the working scene to the convert_scene reconstruction, in metres when that can be trusted."""
+"""Conversion of the scene of the mapper to a reconstruction, in meters if depth is metric."""
 
 from __future__ import annotations
 
@@ -10,15 +10,20 @@ from mpsfm_core.mapping.scene.reconstruction import MetricScale, Reconstruction,
 from mpsfm_core.mapping.scene.scene import Scene
 
 MAX_METRIC_SPREAD = 0.15
-"""Above this relative spread of the per-image scales the priors do not agree on a metre (ours)."""
+"""Largest relative spread of the scales of images for which the unit is trusted. [ours]"""
 MIN_METRIC_IMAGES = 3
-"""Fewer images cannot show a spread (ours)."""
+"""Number of images below which the unit is not trusted. [ours]"""
 
 
 def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | None:
-    """Metres per world unit, from the scales of the registered images' metric priors.
+    """Estimate meters per world unit from the scales of metric priors.
 
-    ``keep_units``: the world is the user's; the scale is told, but not trusted to be applied.
+    Args:
+        scene: The scene.
+        keep_units: Do not apply the scale, because the user defines the world.
+
+    Returns:
+        The scale, ``trusted`` if it is to be applied; None without metric priors.
     """
     images = [int(i) for i in scene.registered_images()]
     maps = [scene.maps[i] for i in images if scene.maps[i].active and scene.maps[i].prior.metric]
@@ -33,7 +38,12 @@ def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | No
 
 
 def convert_scene(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
-    """The reconstruction as results are written from it; metres if the scale is trusted."""
+    """Convert the scene to a reconstruction, in meters if the scale is trusted.
+
+    Args:
+        scene: The scene; deleted points are removed from its tracks.
+        keep_units: Keep the unit of the world.
+    """
     scene.tracks.compact()
     metric = estimate_metric_scale(scene, keep_units=keep_units)
     in_metres = metric is not None and metric.trusted
@@ -42,9 +52,9 @@ def convert_scene(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
     observations = tracks.observations()
     points = tracks.point_of[observations]
     errors, _ = scene.project(observations, tracks.xyz[points])
-    count = len(tracks.xyz)
-    lengths = np.bincount(points, minlength=count)
-    mean_errors = np.bincount(points, errors, minlength=count) / np.maximum(lengths, 1)
+    num_points = len(tracks.xyz)
+    lengths = np.bincount(points, minlength=num_points)
+    mean_errors = np.bincount(points, errors, minlength=num_points) / np.maximum(lengths, 1)
     images = tuple(
         convert_image(scene, int(i), factor, in_metres) for i in scene.registered_images()
     )
@@ -52,18 +62,25 @@ def convert_scene(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
 
 
 def capture_scene_state(scene: Scene) -> SceneState:
-    """The scene as it is now, in its own units."""
+    """Copy poses, points and depth of the scene, in world units."""
     images = (convert_image(scene, int(i), 1.0, False) for i in scene.registered_images())
     tracks = scene.tracks
-    used = np.unique(tracks.point_of[tracks.observations()])
+    observed = np.unique(tracks.point_of[tracks.observations()])
     return SceneState(
         tuple(PosedImage(i.name, i.camera, i.rotation, i.translation, i.depth) for i in images),
-        tracks.xyz[used].copy(),
+        tracks.xyz[observed].copy(),
     )
 
 
 def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> RegisteredImage:
-    """An image as the scene has it, in units that are ``factor`` times smaller than the scene's."""
+    """Convert a registered image.
+
+    Args:
+        scene: The scene.
+        index: Index of the image in the problem.
+        factor: Output units per world unit.
+        in_metres: Whether the output unit is the meter.
+    """
     image, depth_map = scene.problem.images[index], scene.maps[index]
     depth = depth_map.depth * np.float32(factor)
     variance = (depth_map.log_std * depth) ** 2

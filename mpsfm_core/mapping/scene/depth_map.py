@@ -1,4 +1,4 @@
-"""The depth of one image: its prior, its scale in the world, and its refined form."""
+"""Depth map of one image: prior, scale and refined depth."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample,
 
 
 class DepthMap:
-    """Prior depth of an image and what the reconstruction has made of it.
-
-    The prior is ``scale`` times itself in world units. Once refined, ``refined`` stands for it.
+    """Depth of an image in world units: the scaled prior, or the refined map once it exists.
 
     Attributes:
-        camera: intrinsics of the map's grid.
-        keypoints: (n, 2) float64, the image's keypoints in pixels of the grid.
-        keypoint_valid: (n,) bool, the prior is valid around the keypoint.
-        active: whether the scale has been set, so that the depth means something in the world.
-        keypoint_log_std: (n,) float64, std of the prior's log depth at the keypoints.
-        typical_log_std: its median where the prior is valid; NaN without such a keypoint.
+        prior: Depth prior in its own unit.
+        normals: Normal prior.
+        camera: Intrinsics of the grid of the map.
+        scale: World units per unit of the prior.
+        active: Whether the scale is estimated.
+        refined: Refined depth, or None.
+        log_std: (h, w) float32 standard deviation of the log depth of the prior; 0 where invalid.
+        keypoints: (n, 2) float64 keypoints in pixels of the grid.
+        keypoint_valid: (n,) bool, whether the prior is valid around the keypoint.
+        keypoint_log_std: (n,) float64 standard deviation of the log depth at the keypoints.
+        typical_log_std: Median of ``keypoint_log_std`` where valid; NaN without valid keypoints.
     """
 
     def __init__(self, image: MappingImage) -> None:
@@ -46,38 +49,38 @@ class DepthMap:
 
     @property
     def valid(self) -> Bool:
-        """(h, w) bool, where the prior is valid."""
+        """(h, w) bool, pixels where the prior is valid."""
         return self.prior.valid
 
     @property
     def depth(self) -> Float32:
-        """(h, w) float32, the best depth known, world units."""
+        """(h, w) float32 refined depth, or the scaled prior, in world units."""
         depth: Float32 = self._best * np.float32(self._factor)
         return depth
 
     @property
     def variance(self) -> Float32:
-        """(h, w) float32, variance of :attr:`depth` by the prior's declaration, world units^2."""
+        """(h, w) float32 declared variance of :attr:`depth`, in squared world units."""
         variance: Float32 = (self.log_std * self.depth) ** 2
         return variance
 
     def prior_at_keypoints(self, rows: Int64 | slice = slice(None)) -> Float64:
-        """Unscaled prior depth at keypoints; meaningful where :attr:`keypoint_valid`."""
+        """Return the unscaled prior (m,) at keypoints; defined where :attr:`keypoint_valid`."""
         return self._prior_at[rows]
 
     def at_keypoints(self, rows: Int64 | slice = slice(None)) -> Float64:
-        """Best depth at keypoints, world units; meaningful where :attr:`keypoint_valid`."""
+        """Return depth (m,) at keypoints in world units; defined where :attr:`keypoint_valid`."""
         return self._best_at[rows] * self._factor
 
     def set_scale(self, scale: float) -> None:
-        """Change the prior's scale; a refined map is scaled along."""
+        """Set the scale of the prior; a refined map is scaled by the same factor."""
         self.scale, self.active = scale, True
         self._factor = scale / self.refined.scale if self.refined else scale
 
     def set_refined(self, refined: RefinedDepth) -> None:
-        """Let a refined map stand for the prior.
+        """Replace the scaled prior by refined depth.
 
-        Of a map refined on a thinned grid, the change of the prior is interpolated.
+        If the depth was refined on a subsampled grid, its log ratio to the prior is interpolated.
         """
         self.refined = refined
         self._best = refined.depth
@@ -91,12 +94,12 @@ class DepthMap:
         self.set_scale(refined.scale)
 
     def set_camera(self, camera: PinholeCamera) -> None:
-        """Use other intrinsics, given for the image's own grid."""
+        """Set the intrinsics, given for the grid of the image."""
         rows, columns = self.prior.shape
         self.camera = camera.resized(columns, rows)
 
     def reset(self) -> None:
-        """Forget scale and refinement."""
+        """Discard the scale and the refined depth."""
         self.scale, self.active, self.refined = 1.0, False, None
         self._use_prior()
 

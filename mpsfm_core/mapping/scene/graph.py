@@ -1,4 +1,4 @@
-"""The correspondence graph: verified matches between the keypoints of all images."""
+"""Correspondence graph: verified matches between the keypoints of all images."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ import numpy as np
 from mpsfm_core.data import Float64, Int64, MappingProblem, VerifiedPair
 
 MIN_SCORE = 0.05
-"""A match of a lower score counts like one of this: it passed geometric verification (ours)."""
+"""Lower bound of match scores, since every match passed geometric verification. [ours]"""
 
 
 class CorrespondenceGraph:
-    """Keypoints of all images numbered through, and the matches between them.
+    """Matches as an edge list over globally numbered keypoints.
 
-    Keypoint ``k`` of image ``i`` has the global number ``offsets[i] + k``. Each match stands in
-    the edge list twice, once from each end; edges are sorted by their source, so the edges of an
-    image are one slice.
+    Keypoint ``k`` of image ``i`` has the global number ``offsets[i] + k``. The edge list contains
+    each match in both directions, sorted by source, so that the edges of an image are one slice.
 
     Attributes:
-        offsets: (n + 1,) int64, first global keypoint of each image.
-        source, target: (e,) int64, global keypoints.
-        score: (e,) float64 in [0.05, 1], what the matcher thinks of the match.
-        pair_scores: (p,) float64, summed match scores of each pair.
-        pairs_of: for each image the pairs it is in, in their order.
-        keypoint_weight: (k,) float64, the weight of a keypoint's squared reprojection error: score
-            of its best match in terms of the mean score of all matches, and by how much adjustment
-            made its variance smaller. Of XFeat + LighterGlue's matches the fifth of lowest score
-            misses the true epipolar line by 2.3 px in the median on rendered_kitchen and by 7 px on
-            hololens_room, the highest fifth by 0.3 and 0.9 px.
+        offsets: (n + 1,) int64 first global keypoint of each image.
+        num_images: Number of images.
+        image_of: (k,) int64 image of each global keypoint.
+        source: (e,) int64 global keypoint at the start of each edge.
+        target: (e,) int64 global keypoint at the end of each edge.
+        score: (e,) float64 score of the match in [0.05, 1].
+        pair_scores: (p,) float64 summed match scores of each pair.
+        pairs_of: For each image, the pairs that contain it.
+        keypoint_weight: (k,) float64 weight of the squared reprojection error of a keypoint: the
+            score of its best match relative to the mean score, divided by the reduction of its
+            variance by keypoint adjustment.
     """
 
     def __init__(self, problem: MappingProblem, *, weigh_by_score: bool = True) -> None:
@@ -69,9 +69,9 @@ class CorrespondenceGraph:
                 self.keypoint_weight[self.keypoints_of(index)] /= image.keypoint_std_factor**2
 
     def edges_of(self, image: int) -> slice:
-        """The edges that start in an image."""
+        """Return the edges that start in an image."""
         return slice(int(self._first_edge[image]), int(self._first_edge[image + 1]))
 
     def keypoints_of(self, image: int) -> slice:
-        """The global keypoints of an image."""
+        """Return the global keypoints of an image."""
         return slice(int(self.offsets[image]), int(self.offsets[image + 1]))

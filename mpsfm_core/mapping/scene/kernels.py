@@ -1,4 +1,4 @@
-"""Compiled loops over tracks."""
+"""Compiled kernels over tracks."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from mpsfm_core.support import jit
 
 @jit.kernel()
 def sort_keypoints_by_point(point_of: Int64, num_points: int) -> Int64:
-    """Keypoints that observe a point, sorted by point, then keypoint (counting sort).
+    """Return the keypoints that observe a point, by point, then keypoint (counting sort).
 
-    ``point_of``: (k,) point of each keypoint or negative, below ``num_points``.
+    Args:
+        point_of: (k,) int64 point of each keypoint, below ``num_points``, or negative.
+        num_points: Number of points.
     """
     first = np.zeros(num_points + 1, np.int64)
     for point in point_of:
@@ -34,14 +36,15 @@ def sort_keypoints_by_point(point_of: Int64, num_points: int) -> Int64:
 def compute_max_triangulation_angles(
     points: Float64, observation_points: Int64, centers: Float64
 ) -> Float64:
-    """Largest angle in degrees between any two rays of each point's track.
+    """Compute the largest angle between two rays of the track of each point.
 
     Args:
-        points: (p, 3). observation_points: (o,) row of each observation, sorted. centers: (o, 3)
-            camera centre of each observation.
+        points: (p, 3) float64 world points.
+        observation_points: (o,) int64 row of the point of each observation, sorted.
+        centers: (o, 3) float64 camera center of each observation.
 
     Returns:
-        (p,) float64 in [0, 90]; 0 for points with fewer than two observations.
+        (p,) float64 in degrees, in [0, 90]; 0 for points with fewer than two observations.
     """
     angles = np.zeros(len(points))
     count = len(observation_points)

@@ -1,4 +1,4 @@
-"""The finished reconstruction, as the mapper hands it to the results room."""
+"""Reconstruction: the result of the mapper."""
 
 from __future__ import annotations
 
@@ -15,94 +15,95 @@ _NO_ROWS = np.zeros(0, np.int64)
 
 @dataclass(frozen=True, eq=False)
 class RegisteredImage:
-    """One posed image.
-
-    ``index``: position in :attr:`mpsfm_core.data.MappingProblem.images`. ``camera``: undistorted
-    intrinsics, refined if that was asked for. ``rotation`` (3, 3), ``translation`` (3,) float64:
-    ``cam_from_world``. ``point_ids``: (n,) int64, for each keypoint of the problem's image its
-    row in :attr:`Reconstruction.points` or -1. ``depth``: refined depth in world units, on the
-    grid of the prior, with the relative variance that the prior declares. ``scale``: world units
-    per unit of the prior.
-    ``confirmed``: False if it lies where its matches fit best, though nothing confirms that.
-    """
+    """One registered image."""
 
     index: int
+    """Index in :attr:`mpsfm_core.data.MappingProblem.images`."""
     name: str
     camera: PinholeCamera
+    """Undistorted intrinsics, with the refined focal length."""
     rotation: Float64
+    """(3, 3) float64 rotation of ``cam_from_world``."""
     translation: Float64
+    """(3,) float64 translation of ``cam_from_world``, in world units."""
     point_ids: Int64
+    """(n,) int64 row in :attr:`Reconstruction.points` of each keypoint, or -1."""
     depth: DepthPrior
+    """Refined depth in world units on the grid of the prior, with its relative variance."""
     scale: float
+    """World units per unit of the prior."""
     confirmed: bool = True
+    """False if the image was registered tentatively, without verification."""
 
 
 @dataclass(frozen=True)
 class MetricScale:
-    """World units to metres, from the per-image scales of metric priors, or from GPS.
-
-    ``metres_per_unit``: the factor already applied when ``trusted``. ``spread``: robust relative
-    standard deviation (1.4826 MAD) of the per-image estimates. ``by``: what told it, for people.
-    """
+    """Estimate of the meter, from the scales of metric priors or from GPS."""
 
     metres_per_unit: float
+    """Meters per world unit before scaling; it has been applied if ``trusted``."""
     spread: float
+    """Robust relative standard deviation (1.4826 MAD) of the estimates of the images."""
     num_images: int
+    """Number of images with an estimate."""
     trusted: bool
+    """Whether the coordinates are meters."""
     by: str = "depth maps"
+    """Source of the estimate, for the report."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """Posed images and points.
-
-    ``points``: (p, 3) float64. ``errors_px``: (p,) float64, mean reprojection error of each point.
-    ``metric``: None when the priors are not metric; the coordinates are metres when trusted.
-    """
+    """Registered images and points of one component."""
 
     images: tuple[RegisteredImage, ...]
+    """Registered images by index."""
     points: Float64
+    """(p, 3) float64 world points."""
     errors_px: Float64
+    """(p,) float64 mean reprojection error of each point."""
     metric: MetricScale | None = None
+    """Estimate of the meter; None without metric priors."""
 
     @property
     def poses(self) -> dict[str, Pose]:
-        """Pose of each image by its name."""
+        """Image name -> pose."""
         return {image.name: (image.rotation, image.translation) for image in self.images}
 
     def num_multi_view_points(self) -> Int64:
-        """(n,) how many points of each image three images or more see."""
-        seen = [np.unique(image.point_ids[image.point_ids >= 0]) for image in self.images]
-        views = np.bincount(np.concatenate([*seen, _NO_ROWS]), minlength=len(self.points))
-        return np.array([(views[rows] >= 3).sum() for rows in seen], dtype=np.int64)
+        """Return the number (n,) of points of each image that at least three images observe."""
+        observed = [np.unique(image.point_ids[image.point_ids >= 0]) for image in self.images]
+        num_views = np.bincount(np.concatenate([*observed, _NO_ROWS]), minlength=len(self.points))
+        return np.array([(num_views[rows] >= 3).sum() for rows in observed], dtype=np.int64)
 
     @property
     def confirmed_images(self) -> tuple[RegisteredImage, ...]:
-        """The images whose pose is more than a guess."""
+        """Images that are not registered tentatively."""
         return tuple(image for image in self.images if image.confirmed)
 
 
 @dataclass(frozen=True)
 class MappingReport:
-    """What happened, for people and for summary.json.
-
-    ``image_reasons``: image name -> why it is not registered. ``pair_reasons``: "a b" -> why the
-    pair could not start a reconstruction. ``seconds``: step -> time. ``counts``: step -> calls,
-    both of all ``runs``.
-    """
+    """Report of the mapper, for ``summary.json``."""
 
     image_reasons: Mapping[str, Reason] = field(default_factory=dict)
+    """Image name -> why the image is not registered."""
     pair_reasons: Mapping[str, Reason] = field(default_factory=dict)
+    """``"name_a name_b"`` -> why the pair could not initialize a component."""
     seconds: Mapping[str, float] = field(default_factory=dict)
+    """Step -> time, summed over all runs."""
     counts: Mapping[str, int] = field(default_factory=dict)
+    """Step -> number of calls, summed over all runs."""
     runs: int = 1
+    """Number of runs with different seeds."""
 
 
 @dataclass(frozen=True, eq=False)
 class MappingResult:
-    """``reconstructions``: disconnected components, largest first; empty when none was possible."""
+    """Result of the mapper."""
 
     reconstructions: tuple[Reconstruction, ...]
+    """Disconnected components, the largest first; empty if no initialization succeeded."""
     report: MappingReport
 
 
@@ -113,18 +114,25 @@ def transform_reconstruction(
     translation: Float64,
     metric: MetricScale | None,
 ) -> Reconstruction:
-    """The reconstruction in another world, ``x' = scale * rotation x + translation``, whose unit
-    ``metric`` describes."""
+    """Transform a reconstruction to another world, ``x' = scale * rotation @ x + translation``.
+
+    Args:
+        reconstruction: The reconstruction.
+        scale: Scale of the similarity transform.
+        rotation: (3, 3) rotation.
+        translation: (3,) translation in units of the new world.
+        metric: Estimate of the meter in the new world.
+    """
     images = []
     for image in reconstruction.images:
-        turned = image.rotation @ rotation.T
+        rotated = image.rotation @ rotation.T
         depth = image.depth
         variance = None if depth.variance is None else depth.variance * np.float32(scale**2)
         images.append(
             replace(
                 image,
-                rotation=turned,
-                translation=scale * image.translation - turned @ translation,
+                rotation=rotated,
+                translation=scale * image.translation - rotated @ translation,
                 depth=replace(depth, depth=depth.depth * np.float32(scale), variance=variance),
                 scale=image.scale * scale,
             )

@@ -1,4 +1,4 @@
-"""The state of a reconstruction in progress: poses, points with tracks, depth maps."""
+"""Scene of the mapper: poses, points with tracks, and depth maps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mpsfm_core.optimize.depth_integration import RefinedDepth
 
 
 class Snapshot(NamedTuple):
-    """A copy of what registering an image changes in a :class:`Scene`; opaque to others."""
+    """Copy of the state of a :class:`Scene`, for a rollback."""
 
     rotations: Float64
     translations: Float64
@@ -30,22 +30,29 @@ class Snapshot(NamedTuple):
 
 
 class Scene:
-    """Everything the mapper changes.
+    """Poses, tracks, depth maps and intrinsics of all images, registered or not.
 
-    ``weigh_by_score``: matches count by their scores, else all the same.
+    Args:
+        problem: Images with priors, and verified matches.
+        weigh_by_score: Weight matches by their scores; False weights them equally.
 
     Attributes:
-        rotations: (n, 3, 3), translations: (n, 3) float64, ``cam_from_world`` of each image.
+        graph: Correspondence graph; its global numbers index keypoints here.
+        tracks: Points and their observations.
+        rotations: (n, 3, 3) float64 rotation of ``cam_from_world`` of each image.
+        translations: (n, 3) float64 translation of ``cam_from_world``.
         registered: (n,) bool.
-        intrinsics: (n, 4) float64, fx, fy, cx, cy of each image.
-        camera_of: (n,) int64, images of the same number have the same camera: those whose focal
-            length is a guess, and the same guess.
-        depth_group_of: (n,) int64, images of the same number have depth in one unit: they share
-            the scale of their priors.
-        keypoints: (k, 2) float64, of all images, numbered as in :attr:`graph`.
-        maps: the depth map of each image.
-        keypoint_prior, keypoint_log_std, keypoint_valid: (k,) unscaled prior depth at the
-            keypoints, std of its logarithm, and where they mean something.
+        intrinsics: (n, 4) float64 fx, fy, cx, cy of each image in pixels.
+        camera_of: (n,) int64 camera of each image. Images with the same estimated focal length
+            share a camera.
+        depth_group_of: (n,) int64; images of a group have depth in the same unit and share the
+            scale of their priors.
+        keypoints: (k, 2) float64 keypoints of all images in pixels.
+        keypoint_std_px: (n,) float64 standard deviation of the keypoints of each image.
+        maps: Depth map of each image.
+        keypoint_prior: (k,) float64 unscaled prior depth at the keypoints.
+        keypoint_log_std: (k,) float64 standard deviation of its logarithm.
+        keypoint_valid: (k,) bool, keypoints where the prior is valid.
     """
 
     def __init__(self, problem: MappingProblem, *, weigh_by_score: bool = True) -> None:
@@ -80,62 +87,67 @@ class Scene:
         return len(self.registered)
 
     def registered_images(self) -> Int64:
-        """Registered images in ascending order."""
+        """Return the registered images in ascending order."""
         return np.flatnonzero(self.registered)
 
     def mask(self, images: Sequence[int] | Int64) -> Bool:
-        """(n,) bool, true for the images."""
+        """Return (n,) bool, True for the images."""
         chosen = np.zeros(self.num_images, dtype=np.bool_)
         chosen[images] = True
         return chosen
 
     def register(self, image: int, rotation: Float64, translation: Float64) -> None:
-        """Give an image a pose."""
+        """Register an image with a pose ``cam_from_world``."""
         self.rotations[image], self.translations[image] = rotation, translation
         self.registered[image] = True
 
     def deregister(self, image: int) -> None:
-        """Take an image out, with its observations and the points only it kept alive."""
+        """Deregister an image; remove its observations and points left with fewer than two."""
         self.registered[image] = False
         self.maps[image].reset()
         keypoints = self.graph.keypoints_of(image)
         self.tracks.remove_observations(np.arange(keypoints.start, keypoints.stop))
 
     def camera(self, image: int) -> PinholeCamera:
-        """Intrinsics of an image, as refined so far."""
+        """Return the current intrinsics of an image."""
         size = self.problem.images[image].camera.size
         return PinholeCamera(*size, *map(float, self.intrinsics[image]))
 
     def set_focal(self, image: int, fx: float, fy: float) -> None:
-        """Change the focal length of one image, in pixels."""
+        """Set the focal length of one image, in pixels."""
         self.intrinsics[image, :2] = fx, fy
         self.maps[image].set_camera(self.camera(image))
 
     def set_shared_focal(self, image: int, fx: float, fy: float) -> None:
-        """Change the focal length of an image and of all that have its camera."""
-        same = self.camera_of == self.camera_of[image]
-        for other in np.flatnonzero(same & (self.intrinsics[:, :2] != (fx, fy)).any(axis=1)):
+        """Set the focal length of all images that share the camera of an image, in pixels."""
+        shares_camera = self.camera_of == self.camera_of[image]
+        for other in np.flatnonzero(
+            shares_camera & (self.intrinsics[:, :2] != (fx, fy)).any(axis=1)
+        ):
             self.set_focal(int(other), fx, fy)
 
     def centers(self) -> Float64:
-        """(n, 3) camera centres in the world."""
+        """Return the camera centers (n, 3) in world coordinates."""
         return camera_center(self.rotations, self.translations)
 
     def rays(self, keypoints: Int64) -> Float64:
-        """Rays with z = 1 through keypoints (m,) in their camera frames, (m, 3)."""
+        """Return the rays (m, 3) with z = 1 through keypoints (m,), in camera frames."""
         fx, fy, cx, cy = self.intrinsics[self.graph.image_of[keypoints]].T
         xy = self.keypoints[keypoints]
         return np.stack([(xy[:, 0] - cx) / fx, (xy[:, 1] - cy) / fy, np.ones(len(xy))], axis=1)
 
     def world_rays(self, keypoints: Int64) -> Float64:
-        """The same rays in the world's frame, (m, 3)."""
+        """Return the rays (m, 3) through keypoints (m,) in the world frame."""
         rotations = self.rotations[self.graph.image_of[keypoints]]
         rays: Float64 = np.einsum("nji,nj->ni", rotations, self.rays(keypoints))
         return rays
 
     def depth_at(self, keypoints: Int64) -> tuple[Float64, Bool]:
-        """Best depth (m,) of keypoints in their images, world units, 0 where not valid; and where
-        it is."""
+        """Return the depth of keypoints (m,) in world units.
+
+        Returns:
+            ``(depth, valid)``, both (m,); the depth is 0 where invalid.
+        """
         images = self.graph.image_of[keypoints]
         depth = np.zeros(len(keypoints))
         for image in map(int, np.unique(images)):
@@ -148,7 +160,7 @@ class Scene:
         return np.maximum(depth, 0.0), depth > 0
 
     def at_depth(self, keypoints: Int64, depth: Float64) -> Float64:
-        """World points (m, 3) on the rays of keypoints at a depth (m,) in their images."""
+        """Return the world points (m, 3) of keypoints (m,) at given depths (m,)."""
         images = self.graph.image_of[keypoints]
         camera_points = self.rays(keypoints) * depth[:, None]
         rotations, translations = self.rotations[images], self.translations[images]
@@ -156,15 +168,15 @@ class Scene:
         return world
 
     def lift(self, keypoints: Int64) -> tuple[Float64, Bool]:
-        """World points (m, 3) of keypoints at the best depth of their image, and where valid."""
+        """Lift keypoints (m,) to world points (m, 3) by depth; also return where it is valid."""
         depth, valid = self.depth_at(keypoints)
         return self.at_depth(keypoints, depth), valid
 
     def project(self, keypoints: Int64, points: Float64) -> tuple[Float64, Float64]:
-        """Reproject world points (m, 3) into the images of keypoints (m,).
+        """Project world points (m, 3) into the images of keypoints (m,).
 
         Returns:
-            ``(errors_px, depth)``, both (m,) float64; the error is inf behind the camera.
+            ``(errors_px, depth)``, both (m,) float64; the reprojection error is inf behind the camera.
         """
         images = self.graph.image_of[keypoints]
         camera = np.einsum("nij,nj->ni", self.rotations[images], points)
@@ -177,17 +189,17 @@ class Scene:
         return np.where(front, np.hypot(dx, dy), np.inf), camera[:, 2]
 
     def scales(self) -> Float64:
-        """(n,) of the priors, 1 where not set yet."""
+        """Return the scales (n,) of the priors; 1 where not estimated."""
         return np.array([depth_map.scale for depth_map in self.maps])
 
     def explained_edges(self) -> Bool:
-        """(e,) bool, edges of the graph whose two keypoints see the same point."""
+        """Return (e,) bool, edges whose keypoints observe the same point."""
         points = self.tracks.point_of[self.graph.source]
         same: Bool = (points >= 0) & (points == self.tracks.point_of[self.graph.target])
         return same
 
     def track_angles_deg(self) -> Float64:
-        """(p,) largest triangulation angle of each point of the tracks, degrees."""
+        """Return the largest triangulation angle (p,) of each point, in degrees."""
         observations = self.tracks.observations()
         centers = self.centers()[self.graph.image_of[observations]]
         angles: Float64 = compute_max_triangulation_angles(
@@ -196,14 +208,14 @@ class Scene:
         return angles
 
     def angles_deg_of(self, points: Int64) -> tuple[Float64, Int64]:
-        """Largest triangulation angle of some points (m,), each once, in degrees; track lengths."""
+        """Return triangulation angles in degrees and track lengths of distinct points (m,)."""
         keypoints, rows = self.tracks.observations_of(points)
         centers = self.centers()[self.graph.image_of[keypoints]]
         angles: Float64 = compute_max_triangulation_angles(self.tracks.xyz[points], rows, centers)
         return angles, np.bincount(rows, minlength=len(points)).astype(np.int64)
 
     def resume(self, reconstruction: Reconstruction) -> None:
-        """Start from a finished reconstruction: its poses, focal lengths, scales and points."""
+        """Load poses, focal lengths, scales and points of a reconstruction."""
         self.tracks.xyz = reconstruction.points.copy()
         for image in reconstruction.images:
             self.register(image.index, image.rotation, image.translation)
@@ -212,7 +224,7 @@ class Scene:
             self.set_shared_focal(image.index, image.camera.fx, image.camera.fy)
 
     def snapshot(self) -> Snapshot:
-        """What :meth:`restore` needs to undo everything that happens from now on."""
+        """Return a copy of the state for :meth:`restore`."""
         maps = [(m.scale, m.active, m.refined) for m in self.maps]
         return Snapshot(
             self.rotations.copy(),
@@ -225,7 +237,7 @@ class Scene:
         )
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Return to an earlier state."""
+        """Roll back to an earlier state."""
         self.rotations = snapshot.rotations.copy()
         self.translations = snapshot.translations.copy()
         self.registered = snapshot.registered.copy()
@@ -234,8 +246,8 @@ class Scene:
         self.tracks.xyz = snapshot.xyz.copy()
         self.tracks.point_of = snapshot.point_of.copy()
         for depth_map, (scale, active, refined) in zip(self.maps, snapshot.maps, strict=True):
-            same = (depth_map.scale, depth_map.active) == (scale, active)
-            if not same or depth_map.refined is not refined:
+            is_same = (depth_map.scale, depth_map.active) == (scale, active)
+            if not is_same or depth_map.refined is not refined:
                 depth_map.reset()
                 if refined is not None:
                     depth_map.set_refined(refined)
@@ -244,16 +256,18 @@ class Scene:
 
 
 def _depth_groups(problem: MappingProblem) -> Int64:
-    alone = len(problem.images)
+    """Number the depth groups; images without a group form groups of one."""
+    first_single = len(problem.images)
     numbers: dict[int, int] = {}
     keys = [
-        alone + number if image.depth_group is None else image.depth_group
+        first_single + number if image.depth_group is None else image.depth_group
         for number, image in enumerate(problem.images)
     ]
     return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)
 
 
 def _shared_cameras(problem: MappingProblem) -> Int64:
+    """Number the cameras; estimated cameras with equal intrinsics are shared."""
     numbers: dict[object, int] = {}
     keys = [
         number if image.focal_known else image.camera for number, image in enumerate(problem.images)

@@ -1,7 +1,7 @@
-"""3D points and their tracks, stored as one point number per keypoint.
+"""3D points and their tracks, stored as one point row per keypoint.
 
-That single array is the whole state: a keypoint observes at most one point, and a track is the
-set of keypoints with the same number. Everything else (track lists, lengths) is derived.
+A keypoint observes at most one point. A track is the set of keypoints with the same row. Track
+lists and lengths are derived.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ class Tracks:
     """Points and the keypoints that observe them.
 
     Attributes:
-        xyz: (p, 3) float64 world coordinates; rows of deleted points stay until :meth:`compact`.
-        point_of: (k,) int64, for each global keypoint its row in ``xyz`` or -1.
+        xyz: (p, 3) float64 world points; rows of deleted points stay until :meth:`compact`.
+        point_of: (k,) int64 row in ``xyz`` of each global keypoint, or -1.
     """
 
     def __init__(self, num_keypoints: int) -> None:
@@ -27,32 +27,42 @@ class Tracks:
         self.point_of: Int64 = np.full(num_keypoints, NO_POINT, dtype=np.int64)
 
     def __len__(self) -> int:
-        """Number of points that are observed."""
+        """Return the number of observed points."""
         return int((self.lengths() > 0).sum())
 
     def lengths(self) -> Int64:
-        """(p,) int64, track length of each point; 0 for deleted ones."""
+        """Return the track length (p,) int64 of each point; 0 for deleted points."""
         observed = self.point_of[self.point_of >= 0]
         return np.bincount(observed, minlength=len(self.xyz)).astype(np.int64)
 
     def observations(self) -> Int64:
-        """Global keypoints that observe a point, sorted by point, then keypoint."""
+        """Return the global keypoints that observe a point, by point, then keypoint."""
         keypoints: Int64 = sort_keypoints_by_point(self.point_of, len(self.xyz))
         return keypoints
 
     def observations_of(self, points: Int64) -> tuple[Int64, Int64]:
-        """Global keypoints that observe some points (m,), each named once, and the row in 0..m-1
-        of the point that each observes; sorted by row, then keypoint."""
+        """Return the observations of distinct points (m,).
+
+        Returns:
+            ``(keypoints, rows)``: global keypoints, and the row in 0..m-1 of the point that each
+            observes; sorted by row, then keypoint.
+        """
         row_of = np.full(len(self.xyz) + 1, NO_POINT, dtype=np.int64)
         row_of[points] = np.arange(len(points))
-        row_of_keypoint = row_of[self.point_of]  # of those without a point, the last entry
+        row_of_keypoint = row_of[self.point_of]  # keypoints without a point index the last entry
         keypoints = sort_keypoints_by_point(row_of_keypoint, len(points))
         return keypoints, row_of_keypoint[keypoints]
 
     def add(self, xyz: Float64, keypoints: Int64, track: Int64) -> Int64:
-        """New points (m, 3) observed by ``keypoints`` (o,); ``track`` (o,) in 0..m-1 says which.
+        """Add points with their observations.
 
-        Returns the new rows (m,).
+        Args:
+            xyz: (m, 3) world points.
+            keypoints: (o,) global keypoints that observe them.
+            track: (o,) row in 0..m-1 of the point that each keypoint observes.
+
+        Returns:
+            New rows (m,) in :attr:`xyz`.
         """
         first = len(self.xyz)
         self.xyz = np.concatenate([self.xyz, xyz])
@@ -60,22 +70,26 @@ class Tracks:
         return np.arange(first, first + len(xyz))
 
     def delete(self, points: Bool) -> None:
-        """Delete the points marked in ``points`` (p,)."""
+        """Delete the points marked in ``points`` (p,) bool."""
         observed = self.point_of >= 0
-        gone = np.zeros_like(observed)
-        gone[observed] = points[self.point_of[observed]]
-        self.point_of[gone] = NO_POINT
+        is_removed = np.zeros_like(observed)
+        is_removed[observed] = points[self.point_of[observed]]
+        self.point_of[is_removed] = NO_POINT
 
     def remove_observations(self, keypoints: Int64, min_length: int = 2) -> int:
-        """Remove observations, and points whose tracks become too short; returns how many went."""
-        before = int((self.point_of >= 0).sum())
+        """Remove observations, and points with fewer than ``min_length`` remaining ones.
+
+        Returns:
+            Number of removed observations.
+        """
+        num_before = int((self.point_of >= 0).sum())
         self.point_of[keypoints] = NO_POINT
         lengths = self.lengths()
         self.delete(lengths < min_length)
-        return before - int((self.point_of >= 0).sum())
+        return num_before - int((self.point_of >= 0).sum())
 
     def compact(self) -> None:
-        """Forget deleted points; the order of the others stays."""
+        """Remove the rows of deleted points; the order of the remaining points stays."""
         alive = self.lengths() > 0
         renumber = np.cumsum(alive) - 1
         observed = self.point_of >= 0
