@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.data.result_layout import SUMMARY
 from mpsfm_core.inputs.image_decoding import EXTENSIONS
+from mpsfm_core.inputs.text_files import read_text_file
 from mpsfm_core.inputs.video import EXTENSIONS as VIDEO_EXTENSIONS
 
 _log = logging.getLogger(__name__)
@@ -126,7 +127,7 @@ def read_image_list(path: Path) -> list[str]:
         InputError: the file cannot be read.
     """
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_text_file(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"image list {path} cannot be read: {error}") from error
     return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]

@@ -269,8 +269,8 @@ def load_images(
             names = select_listed_images(image_list, names, folder)
         require_two_images(folder, names, image_list or folder)
     masks = {} if options.masks is None else find_masks(options.masks, names, folder)
-    given = _read_cameras(intrinsics, names)
-    partial = _read_cameras(model, names) if given is None else None
+    given = _read_cameras(intrinsics, names, folder)
+    partial = _read_cameras(model, names, folder) if given is None else None
     with ThreadPoolExecutor(min(_READERS, thread_limit())) as pool:
         files = list(pool.map(lambda name: _probe(folder / name, options), names))
     left_out = {name: file.fault for name, file in zip(names, files, strict=True) if file.fault}
@@ -311,8 +311,8 @@ def _exclude_masks(names: Sequence[str], folder: Path, masks: Path) -> list[str]
     return [name for name in names if not name.startswith(prefix)]
 
 
-def _read_cameras(path: Path | None, names: Sequence[str]) -> Intrinsics | None:
-    return None if path is None else read_intrinsics(path).for_images(names)
+def _read_cameras(path: Path | None, names: Sequence[str], folder: Path) -> Intrinsics | None:
+    return None if path is None else read_intrinsics(path, folder).for_images(names)
 
 
 @dataclass(frozen=True)

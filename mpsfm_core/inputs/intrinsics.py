@@ -22,7 +22,8 @@ import yaml
 
 from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.inputs.colmap_database import read_database
-from mpsfm_core.inputs.models import match_names, read_model
+from mpsfm_core.inputs.models import match_names, read_image_lines, read_model
+from mpsfm_core.inputs.text_files import read_text_file
 
 _DEFAULT_MODELS = {3: "SIMPLE_PINHOLE", 4: "PINHOLE"}
 _KEYS = ("model", "params", "width", "height", "images")
@@ -135,12 +136,13 @@ class Intrinsics:
         )
 
 
-def read_intrinsics(path: Path) -> Intrinsics:
+def read_intrinsics(path: Path, images_folder: Path | None = None) -> Intrinsics:
     """Read cameras from a file or folder.
 
     Args:
         path: ``intrinsics.yaml``, a COLMAP model, its ``cameras.txt``, a COLMAP database (``.db``)
             or ``transforms.json``.
+        images_folder: folder of the images, for a ``transforms.json`` without image sizes.
 
     Raises:
         InputError: the file cannot be read; the message names file, camera and fault.
@@ -148,9 +150,9 @@ def read_intrinsics(path: Path) -> Intrinsics:
     try:
         if path.is_dir():
             text = path / "cameras.txt"
-            entries = _from_text(text) if text.is_file() else _from_model(path)
+            entries = _from_text(text) if text.is_file() else _from_model(path, images_folder)
         elif path.suffix == ".json":
-            entries = _from_model(path)
+            entries = _from_model(path, images_folder)
         elif path.suffix == ".db":
             entries = _from_database(path)
         elif path.suffix == ".txt":
@@ -165,7 +167,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 def _from_yaml(path: Path) -> tuple[CameraEntry, ...]:
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = yaml.safe_load(read_text_file(path))
     except UnicodeDecodeError as error:
         known = "a COLMAP model, database (.db) or transforms.json"
         raise InputError(f"{path} is binary, and neither a YAML file nor {known}") from error
@@ -205,12 +207,10 @@ def _from_text(path: Path) -> tuple[CameraEntry, ...]:
     names: dict[int, list[str]] = {}
     listing = path.with_name("images.txt")
     if listing.is_file():
-        for line in _lines(listing)[::2]:
-            fields = line.split(maxsplit=9)
-            if len(fields) != 10:
-                raise InputError(f"{listing}: {line!r} is not an image line of a COLMAP model")
-            names.setdefault(int(fields[8]), []).append(fields[9])
-    cameras = [line.split() for line in _lines(path) if line]
+        for camera_id, name in read_image_lines(listing).values():
+            names.setdefault(camera_id, []).append(name)
+    lines = (line.strip() for line in read_text_file(path).splitlines())
+    cameras = [line.split() for line in lines if line and not line.startswith("#")]
     entries = []
     for fields in cameras:
         where = f"{path}, camera {fields[0]}"
@@ -224,11 +224,6 @@ def _from_text(path: Path) -> tuple[CameraEntry, ...]:
     return tuple(entries)
 
 
-def _lines(path: Path) -> list[str]:
-    lines = (line.strip() for line in path.read_text(encoding="utf-8").splitlines())
-    return [line for line in lines if not line.startswith("#")]
-
-
 def _from_database(path: Path) -> tuple[CameraEntry, ...]:
     database = read_database(path)
     names: dict[int, list[str]] = {}
@@ -237,8 +232,8 @@ def _from_database(path: Path) -> tuple[CameraEntry, ...]:
     return _from_cameras(path, database.cameras, names)
 
 
-def _from_model(path: Path) -> tuple[CameraEntry, ...]:
-    model = read_model(path)
+def _from_model(path: Path, images_folder: Path | None) -> tuple[CameraEntry, ...]:
+    model = read_model(path, images_folder)
     names: dict[int, list[str]] = {}
     for image in model.images.values():
         names.setdefault(image.camera_id, []).append(image.name)

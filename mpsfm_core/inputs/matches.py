@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from mpsfm_core.inputs.colmap_database import read_database
 from mpsfm_core.inputs.hloc import HlocFiles
 from mpsfm_core.inputs.image_decoding import apply_orientation_to_pixels
 from mpsfm_core.inputs.images import ImageSet, SourceImage
-from mpsfm_core.inputs.models import match_names
+from mpsfm_core.inputs.models import describe_name_difference, match_names
 
 Pair = tuple[int, int]
 
@@ -43,7 +43,7 @@ def matches_from_database(path: Path, images: ImageSet) -> ImportedMatches:
     """
     database = read_database(path)
     matched = match_names(images.names, database.images)
-    builder = _Builder(str(path), images)
+    builder = _Builder(str(path), database.images, images)
     for index, image in enumerate(images):
         number = database.images.get(matched.get(image.name, ""), -1)
         if number in database.keypoints:
@@ -62,8 +62,9 @@ def matches_from_database(path: Path, images: ImageSet) -> ImportedMatches:
 def matches_from_hloc(features: Path, matches: Path, images: ImageSet) -> ImportedMatches:
     """Import keypoints and matches of hloc; raise as :func:`matches_from_database`."""
     files = HlocFiles(features, matches)
-    matched = match_names(images.names, files.names())
-    builder = _Builder(f"{features} and {matches}", images)
+    names = files.names()
+    matched = match_names(images.names, names)
+    builder = _Builder(f"{features} and {matches}", names, images)
     for index, image in enumerate(images):
         if image.name in matched:
             keypoints, std_px = files.keypoints(matched[image.name])
@@ -77,7 +78,8 @@ def matches_from_hloc(features: Path, matches: Path, images: ImageSet) -> Import
 class _Builder:
     """Converts keypoints and matches of stored images to those of undistorted views."""
 
-    def __init__(self, source: str, images: ImageSet) -> None:
+    def __init__(self, source: str, source_names: Collection[str], images: ImageSet) -> None:
+        self._source_names = source_names
         self._source = source
         self._images = images
         self._keypoints: list[Float64] = [np.empty((0, 2))] * len(images)
@@ -121,7 +123,8 @@ class _Builder:
     def finish(self) -> ImportedMatches:
         """Return the imported matches; raise :class:`InputError` if there are none."""
         if not self._rows:
-            raise InputError(f"{self._source}: has keypoints of none of the images, names differ")
+            difference = describe_name_difference(self._images.names, self._source_names)
+            raise InputError(f"{self._source}: has keypoints of none of the images; {difference}")
         if not self._matches:
             raise InputError(f"{self._source}: has no matches of these images")
         return ImportedMatches(

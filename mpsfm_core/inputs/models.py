@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+import tempfile
+from collections.abc import Collection, Iterable
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -12,29 +14,45 @@ from mpsfm_core.data import Pose
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.colmap_files import check_binary_model
 from mpsfm_core.inputs.nerfstudio import read_transforms
+from mpsfm_core.inputs.text_files import read_text_file
+
+_TEXT_FILES = ("cameras", "images", "points3D", "frames", "rigs")
+_NUM_IMAGE_FIELDS = 10
+"""Fields of an image line in ``images.txt``; the last one is the name."""
 
 
-def read_poses(path: Path) -> dict[str, Pose]:
+def read_poses(path: Path, images_folder: Path | None = None) -> dict[str, Pose]:
     """Read ``cam_from_world`` of the registered images of a model, by image name.
+
+    Args:
+        path: as :func:`read_model`.
+        images_folder: as :func:`read_model`.
 
     Raises:
         InputError: as :func:`read_model`.
     """
-    return reconstruction_poses(read_model(path))
+    return reconstruction_poses(read_model(path, images_folder))
 
 
-def read_model(path: Path) -> pycolmap.Reconstruction:
+def read_model(path: Path, images_folder: Path | None = None) -> pycolmap.Reconstruction:
     """Read a COLMAP model (see :func:`find_model_folder`) or a ``transforms.json``.
+
+    Args:
+        path: folder of the model, or the file.
+        images_folder: folder of the images, for a ``transforms.json`` without image sizes.
 
     Raises:
         InputError: the model does not exist or cannot be read.
     """
     if path.suffix == ".json":
-        return read_transforms(path)
+        return read_transforms(path, images_folder)
     folder = find_model_folder(path)
     try:
         check_binary_model(folder)
-        model = pycolmap.Reconstruction(str(folder))
+        if (folder / "images.bin").is_file():
+            model = pycolmap.Reconstruction(str(folder))
+        else:
+            model = _read_text_model(folder)
         for image in model.images.values():
             str(image.name)  # pycolmap decodes a name on access, and this can fail
     except (OSError, RuntimeError, ValueError, IndexError) as error:
@@ -54,6 +72,62 @@ def find_model_folder(folder: Path) -> Path:
     raise InputError(f"{folder} has no COLMAP model (images.bin or images.txt)")
 
 
+def read_image_lines(path: Path) -> dict[int, tuple[int, str]]:
+    """Read camera id and name of the images in COLMAP's ``images.txt``, by image id.
+
+    Names may contain spaces, which COLMAP's reader does not support.
+
+    Raises:
+        ValueError: a line is not an image line.
+    """
+    images: dict[int, tuple[int, str]] = {}
+    lines = iter(read_text_file(path).splitlines())
+    for line in lines:
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        fields = line.split(maxsplit=_NUM_IMAGE_FIELDS - 1)
+        if len(fields) != _NUM_IMAGE_FIELDS:
+            raise ValueError(f"{path}: {line!r} is not an image line of a COLMAP model")
+        images[int(fields[0])] = int(fields[-2]), fields[-1].strip()
+        next(lines, None)  # the observations of the image; the line may be empty
+    return images
+
+
+def _read_text_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a text model, also with byte-order marks, spaces in names, and without points."""
+    images = read_image_lines(folder / "images.txt")
+    texts = {
+        name: read_text_file(path) if (path := folder / f"{name}.txt").is_file() else None
+        for name in _TEXT_FILES
+    }
+    texts["points3D"] = texts["points3D"] or ""
+    if any(re.search(r"\s", name) for _, name in images.values()):
+        texts["images"] = _replace_names(texts["images"] or "", images)
+    with tempfile.TemporaryDirectory() as copy:
+        for name, text in texts.items():
+            if text is not None:
+                Path(copy, f"{name}.txt").write_text(text, encoding="utf-8", newline="\n")
+        model = pycolmap.Reconstruction(copy)
+    for image_id, image in model.images.items():
+        image.name = images[image_id][1]
+    return model
+
+
+def _replace_names(text: str, images: dict[int, tuple[int, str]]) -> str:
+    """Replace the names in ``images.txt`` by image ids."""
+    for image_id, (camera_id, name) in images.items():
+        text = text.replace(f" {camera_id} {name}", f" {camera_id} {image_id}", 1)
+    return text
+
+
+def describe_name_difference(ours: Collection[str], theirs: Collection[str]) -> str:
+    """Describe that names do not match, with an example of each side."""
+    if not theirs:
+        return "it has no images"
+    example, other = min(ours, default="none"), min(theirs)
+    return f"its names differ from ours: {other!r} there, {example!r} here"
+
+
 def reconstruction_poses(model: pycolmap.Reconstruction) -> dict[str, Pose]:
     """Return ``cam_from_world`` of the registered images by name, sorted by name."""
     poses = {}
@@ -68,7 +142,8 @@ def match_names(wanted: Iterable[str], available: Iterable[str]) -> dict[str, st
     """Match image names to the names in another source, such as a model or a database.
 
     A name matches itself, else the same name with another extension, else the same name in another
-    folder. An available name that is itself wanted matches nothing else.
+    folder, else a name that differs only in case. Backslashes of Windows paths count as slashes. An
+    available name that is itself wanted matches nothing else.
 
     Args:
         wanted: names of the images of the run.
@@ -77,19 +152,35 @@ def match_names(wanted: Iterable[str], available: Iterable[str]) -> dict[str, st
     Returns:
         Wanted name -> available name, without names that have no match or an ambiguous one.
     """
-    asked, names = list(wanted), set(available)
+    remaining = list(wanted)
+    names = {name: name.replace("\\", "/") for name in available}
+    matched = _match_names(remaining, names)
+    unmatched = [name for name in remaining if name not in matched]
+    if unmatched:
+        used = set(matched.values())
+        folded = {name: form.casefold() for name, form in names.items() if name not in used}
+        by_folded = {name.casefold(): name for name in unmatched}
+        if len(by_folded) == len(unmatched):
+            loose = _match_names(list(by_folded), folded)
+            matched |= {by_folded[form]: name for form, name in loose.items()}
+    return matched
+
+
+def _match_names(wanted: list[str], available: dict[str, str]) -> dict[str, str]:
+    """Match names to the forms of available names; return wanted name -> available name."""
+    exact = {form: name for name, form in available.items()}
     by_stem: dict[str, list[str]] = {}
     by_tail: dict[str, list[str]] = {}
-    for name in names - set(asked):
-        by_stem.setdefault(_stem(name), []).append(name)
-        parts = _stem(name).split("/")
+    for form in exact.keys() - set(wanted):
+        by_stem.setdefault(_stem(form), []).append(exact[form])
+        parts = _stem(form).split("/")
         for start in range(1, len(parts)):
-            by_tail.setdefault("/".join(parts[start:]), []).append(name)
+            by_tail.setdefault("/".join(parts[start:]), []).append(exact[form])
     matched = {}
-    for name in asked:
+    for name in wanted:
         forms = name, _stem(name)
         loose = next((d[form] for d in (by_stem, by_tail) for form in forms if form in d), [])
-        candidates = [name] if name in names else loose
+        candidates = [exact[name]] if name in exact else loose
         if len(candidates) == 1:
             matched[name] = candidates[0]
     return matched

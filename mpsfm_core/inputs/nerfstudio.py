@@ -22,6 +22,7 @@ from mpsfm_core.geometry.pycolmap_conversion import camera_key
 from mpsfm_core.inputs.image_decoding import EXTENSIONS, check_size, read_bytes, upright_size
 from mpsfm_core.inputs.image_header import read_header
 from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.inputs.text_files import read_text_file
 
 DISTORTION_KEYS: Mapping[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": (),
@@ -44,16 +45,20 @@ _ROTATION_TOLERANCE = 1e-3
 """Tolerance of the entries of ``R^T R - I``: files have few digits."""
 
 
-def read_transforms(path: Path) -> pycolmap.Reconstruction:
+def read_transforms(path: Path, images_folder: Path | None = None) -> pycolmap.Reconstruction:
     """Read cameras and poses of all frames; image names are the ``file_path`` values.
 
     Intrinsics are per frame or shared. If the file has no image size, the image file is read.
+
+    Args:
+        path: the file.
+        images_folder: folder with the images, if they are not at their ``file_path``.
 
     Raises:
         InputError: the file is damaged or a frame is invalid; the message names the frame.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(read_text_file(path))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} cannot be read: {error}") from error
     frames = data.get("frames") if isinstance(data, dict) else None
@@ -72,7 +77,7 @@ def read_transforms(path: Path) -> pycolmap.Reconstruction:
         if name in names:
             raise InputError(f"{where}: an earlier frame has the same file_path")
         names.add(name)
-        camera = _camera(where, {**shared, **frame}, path.parent / name)
+        camera = _camera(where, {**shared, **frame}, _find_image(path.parent / name, images_folder))
         key = camera_key(camera)
         if key not in cameras:
             camera.camera_id = cameras[key] = len(cameras) + 1
@@ -96,14 +101,34 @@ def _world_from_camera(where: str, value: object) -> Float64:
     rotation = pose[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(rotation.T @ rotation - np.eye(3)).max()
+        scale = float(np.cbrt(abs(np.linalg.det(rotation))))
     if not off <= _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise InputError(f"{where}: the left 3x3 block of 'transform_matrix' is not a rotation")
+        advice = _explain_matrix(rotation, scale)
+        raise InputError(
+            f"{where}: the left 3x3 block of 'transform_matrix' is not a rotation{advice}"
+        )
     left, _, right = np.linalg.svd(rotation)
     pose[:3, :3] = left @ right
     return pose @ OPENGL_FROM_OPENCV
 
 
-def _camera(where: str, values: Mapping[str, Any], picture: Path) -> pycolmap.Camera:
+def _explain_matrix(rotation: Float64, scale: float) -> str:
+    """Return what is wrong with a matrix that is not a rotation, and what to do."""
+    if not np.isfinite(scale) or scale < 1e-12:
+        return ""
+    unscaled = rotation / scale
+    if np.abs(unscaled.T @ unscaled - np.eye(3)).max() > _ROTATION_TOLERANCE:
+        return "; its axes are scaled differently or not perpendicular: export the poses again"
+    if np.linalg.det(rotation) < 0:
+        return "; it is mirrored: negate the axis that the exporting program flipped"
+    return (
+        f" but a rotation times {scale:.6g}: the camera is scaled. In Blender apply the scale of "
+        f"the camera and its parents (Ctrl+A, Scale) and export again, or divide the block by "
+        f"{scale:.6g}"
+    )
+
+
+def _camera(where: str, values: Mapping[str, Any], picture: Path | None) -> pycolmap.Camera:
     numbers = _numbers(where, values)
     if "w" not in numbers or "h" not in numbers:
         numbers.update(_picture_size(where, picture))
@@ -144,13 +169,26 @@ def _numbers(where: str, values: Mapping[str, Any]) -> dict[str, float]:
     return numbers
 
 
-def _picture_size(where: str, picture: Path) -> dict[str, float]:
-    """Return width and height of the image file; its extension may be missing."""
-    named = (picture.with_name(picture.name + ending) for ending in sorted(EXTENSIONS))
-    candidates = [picture, *named]
-    file = next((path for path in candidates if path.is_file()), None)
+def _find_image(path: Path, images_folder: Path | None) -> Path | None:
+    """Find the image file of a frame; the extension and leading folders may differ."""
+    candidates = [path]
+    if images_folder is not None:
+        parts = path.parts
+        candidates += [images_folder.joinpath(*parts[i:]) for i in range(1, len(parts))]
+    for candidate in candidates:
+        named = (candidate.with_name(candidate.name + ending) for ending in sorted(EXTENSIONS))
+        file = next((file for file in (candidate, *named) if file.is_file()), None)
+        if file is not None:
+            return file
+    return None
+
+
+def _picture_size(where: str, file: Path | None) -> dict[str, float]:
+    """Return width and height of the image file."""
     if file is None:
-        raise InputError(f"{where}: 'w' and 'h' are missing, and so is the image file")
+        raise InputError(
+            f"{where}: 'w' and 'h' are missing, and so is the image file; add them to the file"
+        )
     data = read_bytes(file)
     check_size(data, file, InputOptions().max_pixels)
     width, height = upright_size(data, read_header(data), file)

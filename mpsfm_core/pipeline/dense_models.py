@@ -68,7 +68,7 @@ def densify_model(
 def _densify_model(
     model: Path, images: Path, output: Path, options: DenseOptions | None
 ) -> DenseReport:
-    colmap, poses = read_model(model), read_poses(model)
+    colmap, poses = read_model(model, images), read_poses(model, images)
     matched = match_names(find_images(images), poses)
     if len(matched) < 2:
         raise InputError(f"{images}: has {len(matched)} of the photos of {model}, two are needed")

@@ -30,7 +30,7 @@ from mpsfm_core.inputs.matches import (
     matches_from_database,
     matches_from_hloc,
 )
-from mpsfm_core.inputs.models import match_names, read_poses
+from mpsfm_core.inputs.models import describe_name_difference, match_names, read_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
@@ -244,7 +244,7 @@ class _Run:
             )
             self._check_resources(images)
             if source.poses is not None:
-                self._known_poses = _read_known_poses(source.poses, images)
+                self._known_poses = _read_known_poses(source.poses, images, self._image_folder)
             self._imported = _read_matches(source.matches, images)
         return images
 
@@ -537,12 +537,13 @@ def _read_matches(files: tuple[Path, ...], images: ImageSet) -> ImportedMatches 
     return matches_from_hloc(files[0], files[1], images)
 
 
-def _read_known_poses(model: Path, images: ImageSet) -> dict[str, Pose]:
+def _read_known_poses(model: Path, images: ImageSet, images_folder: Path) -> dict[str, Pose]:
     """Read the poses of a model, by the names of our images."""
-    poses = read_poses(model)
+    poses = read_poses(model, images_folder)
     matched = match_names(images.names, poses)
     if not matched:
-        raise InputError(f"{model}: has a pose of none of the images, names differ")
+        difference = describe_name_difference(images.names, poses)
+        raise InputError(f"{model}: has a pose of none of the images; {difference}")
     if len(matched) < 2:
         raise InputError(f"{model}: has a pose of {next(iter(matched))} only, two are needed")
     unmatched = sorted(poses.keys() - set(matched.values()))
