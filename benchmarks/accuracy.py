@@ -20,7 +20,7 @@ from pathlib import Path
 from benchmarks._scenes import RESULTS, frame_names, print_progress, shared_folder, with_sets
 from mpsfm_core.evaluation.benchmark import BenchmarkPlan, run_benchmark
 from mpsfm_core.evaluation.records import BenchmarkRecord
-from mpsfm_core.evaluation.report import Row, make_rows, markdown, write_report
+from mpsfm_core.evaluation.report import BenchmarkRow, build_rows, format_markdown, write_report
 
 PRIORS = ("sensor", "degraded", "config")
 """Depth priors; ``config`` is FastDepth."""
@@ -145,13 +145,13 @@ def main() -> int:
         records = run_benchmark(plan, output, done=print_progress)
         write_report(output, records)
         pooled = [_pooled(record) for record in records]
-        rows = make_rows(pooled)
+        rows = build_rows(pooled)
         targets = _compare_with_targets(rows) if name == "rendered_kitchen" else []
         missed += sum("missed" in line for line in targets)
         shown = [row for row in rows if _is_shown(row, comparison)]
         file = RESULTS / f"accuracy-{name}.md"
         note = _written_note(file) or comparison.note
-        parts = [f"# {name}", note, markdown(shown), "\n".join(targets)]
+        parts = [f"# {name}", note, format_markdown(shown), "\n".join(targets)]
         text = "\n\n".join(part.strip() for part in parts if part)
         RESULTS.mkdir(exist_ok=True)
         file.write_text(text.rstrip() + "\n", encoding="utf-8")
@@ -159,7 +159,7 @@ def main() -> int:
     return missed > 0
 
 
-def _is_shown(row: Row, comparison: Comparison) -> bool:
+def _is_shown(row: BenchmarkRow, comparison: Comparison) -> bool:
     """Return if a page shows a row; the report in --output has all rows."""
     if row.method.startswith("chained-pnp"):
         return False
@@ -188,7 +188,7 @@ def _low_parallax(scene: Path, folder: Path) -> Path:
     return with_sets(scene, folder, {"low_parallax": windows})
 
 
-def _compare_with_targets(rows: Sequence[Row]) -> list[str]:
+def _compare_with_targets(rows: Sequence[BenchmarkRow]) -> list[str]:
     """Format a table of targets and results."""
     lines = ["| bucket | method | target | measured | |", "| --- | --- | --- | --- | --- |"]
     for row in rows:

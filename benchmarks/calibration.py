@@ -24,8 +24,8 @@ from mpsfm_core.calibration.study import judge
 from mpsfm_core.config import load_config
 from mpsfm_core.evaluation.benchmark import BenchmarkPlan, run_benchmark
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS
-from mpsfm_core.evaluation.prior_quality import prior_settings
-from mpsfm_core.evaluation.report import Row, make_rows
+from mpsfm_core.evaluation.prior_quality import prior_overrides
+from mpsfm_core.evaluation.report import BenchmarkRow, build_rows
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
@@ -75,7 +75,7 @@ def main() -> None:
 def _priors(scene: SceneFolder, fastdepth: Path, output: Path) -> Iterator[Prior]:
     yield Prior("FastDepth", {"use": "onnx", "options": {"model": str(fastdepth)}})
     degraded = (output / "degraded").resolve()
-    prior_settings("degraded", scene, scene.truth, degraded)
+    prior_overrides("degraded", scene, scene.truth, degraded)
     # The declared std is negligible, so that only the calibration determines the variance.
     options = {"directory": str(degraded), "scale": 0.001, "relative_std": 1e-6}
     yield Prior("degraded sensor depth", {"use": "files", "options": options})
@@ -125,7 +125,7 @@ def _poses(
     declared: Mapping[str, DepthCalibration],
     output: Path,
     arguments: argparse.Namespace,
-) -> dict[tuple[str, str], Row]:
+) -> dict[tuple[str, str], BenchmarkRow]:
     """Compute the pose accuracy over all sets by declaration and depth weighting."""
     configs = {
         (name, weighing): _config(
@@ -148,7 +148,7 @@ def _poses(
     rows = {}
     for key, path in configs.items():
         own = [replace(r, bucket="all") for r in records if r.config == Path(path).stem]
-        rows[key] = make_rows(own)[0]
+        rows[key] = build_rows(own)[0]
     return rows
 
 
@@ -173,7 +173,7 @@ def _table(
     prior: Prior,
     calibrated: DepthCalibration,
     coverage: Mapping[str, Mapping[str, Any]],
-    rows: Mapping[tuple[str, str], Row],
+    rows: Mapping[tuple[str, str], BenchmarkRow],
 ) -> Iterator[str]:
     values = {n: v for n, v in calibrated.model_dump().items() if isinstance(v, float) and v}
     yield f"## {prior.name}"

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
+from mpsfm_core.evaluation.read_true_surface import true_depth_file
 
 from benchmarks._scenes import shared_folder
 from benchmarks.accuracy import FASTDEPTH, PRIORS
@@ -35,13 +36,12 @@ from mpsfm_core.dense.depth_range import depth_prior_from_points
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.evaluation.alignment import trajectory_errors
-from mpsfm_core.evaluation.benchmark import SetPairFilter, PreparedSets, prepare_sets
-from mpsfm_core.evaluation.dense_geometry import dense_accuracy
-from mpsfm_core.evaluation.depth_accuracy import depth_beside_truth
+from mpsfm_core.evaluation.benchmark import PreparedSets, SetPairFilter, prepare_sets
+from mpsfm_core.evaluation.dense_geometry import evaluate_dense_geometry
+from mpsfm_core.evaluation.depth_accuracy import sample_depth_at_truth
 from mpsfm_core.evaluation.prior_quality import read_depth
-from mpsfm_core.evaluation.report import CLOUD
+from mpsfm_core.evaluation.report import CLOUD_METRICS
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
-from mpsfm_core.evaluation.true_surface import depth_file
 from mpsfm_core.geometry import (
     camera_center,
     project,
@@ -234,18 +234,18 @@ def set_errors(
         assert problem is not None
         return points_near(problem, scene.truth, maps, scale)
     beside = [
-        MapBesideTruth.of(depth, read_depth(depth_file(scene.depth, name)), seen.get(name))
+        MapBesideTruth.of(depth, read_depth(true_depth_file(scene.depth, name)), seen.get(name))
         for name, depth in maps.items()
     ]
     own = own_scale(beside)
     found = [map_errors(each, scale, own) for each in beside]
     cameras = {photo.name: photo.pinhole for photo in photos}
-    accuracy = dense_accuracy(reconstruction, cloud, scene, cameras, TOLERANCES)
+    accuracy = evaluate_dense_geometry(reconstruction, cloud, scene, cameras, TOLERANCES)
     assert accuracy is not None  # guaranteed by scale and true depth
     result = {"abs_rel": accuracy["depth"]["abs_rel"], **_means(found)}
     for tolerance in map(str, TOLERANCES):
         centimetres = round(100 * float(tolerance))
-        for key in CLOUD:
+        for key in CLOUD_METRICS:
             result[f"{key}_{centimetres}cm"] = accuracy["cloud"][key][tolerance]
     result["points"] = accuracy["cloud"]["points"]
     return result
@@ -266,7 +266,7 @@ class MapBesideTruth(NamedTuple):
     def of(cls, depth: DepthPrior, truth: Float32, seen: Bool | None) -> MapBesideTruth:
         """Collect the common pixels of a map and the true map; ``seen`` (h, w): measured pixels."""
         assert depth.variance is not None  # refined maps always have a std
-        xy, found, true = depth_beside_truth(depth.depth, depth.valid, truth)
+        xy, found, true = sample_depth_at_truth(depth.depth, depth.valid, truth)
         variance, _ = sample_bilinear(depth.variance, depth.valid, xy)
         own = np.zeros(depth.shape, np.bool_) if seen is None else seen
         return cls(found, np.sqrt(np.maximum(variance, 0)), true, sample_nearest(own, xy))

@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from mpsfm_core.evaluation.read_true_surface import true_depth_file
 
 from benchmarks._scenes import shared_folder
 from benchmarks.dense import view_of
@@ -26,7 +27,6 @@ from mpsfm_core.dense.densify import densify
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.scene_folder import read_scene
-from mpsfm_core.evaluation.true_surface import depth_file
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.options import InputOptions
@@ -76,7 +76,7 @@ def measured(count: int) -> dict[str, float | None]:
         copy = len(images) // len(photos)
         photo = photos[len(images) % len(photos)]
         rotation, translation = scene.truth[photo.name]
-        depth = read_depth(depth_file(scene.depth, photo.name)).astype(np.float32)
+        depth = read_depth(true_depth_file(scene.depth, photo.name)).astype(np.float32)
         small = resize_map(depth, depth.shape[1] // 4, depth.shape[0] // 4, linear=False)
         known = DepthPrior.from_arrays(small, (_STD * small) ** 2, small > 0)
         moved = translation - rotation @ np.array([_APART * copy, 0, 0])

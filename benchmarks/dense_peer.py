@@ -24,6 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
+from mpsfm_core.evaluation.read_true_surface import true_depth_file
 
 from benchmarks._scenes import shared_folder
 from benchmarks.dense import CASES, TOLERANCES, mapped_sets, table, view_of, without_prior
@@ -32,12 +33,11 @@ from mpsfm_core.dense.densify import densify
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.evaluation.alignment import trajectory_errors
-from mpsfm_core.evaluation.dense_geometry import dense_accuracy
-from mpsfm_core.evaluation.depth_accuracy import depth_beside_truth
+from mpsfm_core.evaluation.dense_geometry import evaluate_dense_geometry
+from mpsfm_core.evaluation.depth_accuracy import sample_depth_at_truth
 from mpsfm_core.evaluation.prior_quality import read_depth
-from mpsfm_core.evaluation.report import CLOUD
+from mpsfm_core.evaluation.report import CLOUD_METRICS
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
-from mpsfm_core.evaluation.true_surface import depth_file
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.inputs.images import load_images
@@ -149,11 +149,11 @@ def depth_errors(
     assert scene.depth is not None
     total, errors = 0, [np.zeros(0)]
     for name in names:
-        truth = read_depth(depth_file(scene.depth, name))
+        truth = read_depth(true_depth_file(scene.depth, name))
         total += int((truth > 0).sum())
         if name not in maps:
             continue
-        xy, found, true = depth_beside_truth(maps[name].depth, maps[name].valid, truth)
+        xy, found, true = sample_depth_at_truth(maps[name].depth, maps[name].valid, truth)
         errors.append(np.abs(scale * found / true - 1)[sample_nearest(chosen[name], xy)])
     relative = np.concatenate(errors)
     return {
@@ -193,11 +193,11 @@ def main() -> None:
                 seconds = time.process_time() - started, time.perf_counter() - clock
                 scale = errors.truth_from_estimate.scale
                 found = depth_errors(scene, maps, seen, [i.name for i in model.images], scale)
-                judged = dense_accuracy(model, cloud, scene, cameras, TOLERANCES)
+                judged = evaluate_dense_geometry(model, cloud, scene, cameras, TOLERANCES)
                 assert judged is not None
                 row: dict[str, Any] = {"case": case, "set": number, "way": way, **found}
                 for tolerance in map(str, TOLERANCES):
-                    for key in CLOUD:
+                    for key in CLOUD_METRICS:
                         row[f"{key} {tolerance}"] = judged["cloud"][key][tolerance]
                 row["points"] = judged["cloud"]["points"]
                 per_photo = [each / len(model.images) for each in seconds]

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks._scenes import percent
-from mpsfm_core.evaluation.methods import OURS, MethodRun, MethodResult, run_methods
+from mpsfm_core.evaluation.methods import OURS, MethodResult, MethodRun, run_methods
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.synthetic.halls import QUALITIES, HallProblem, make_hall_problem

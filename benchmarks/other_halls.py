@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks._scenes import percent
 from benchmarks.everyday import CONVENTION, PEER
 from mpsfm_core.data import MappingProblem
-from mpsfm_core.evaluation.methods import OURS, MethodRun, MethodResult, run_methods
+from mpsfm_core.evaluation.methods import OURS, MethodResult, MethodRun, run_methods
 from mpsfm_core.evaluation.pose_auc import pose_auc, pose_errors_deg
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.synthetic.halls import (

@@ -10,7 +10,7 @@ import typer
 from mpsfm_core.cli.arguments import Distances, Overrides, Quiet, distance_thresholds
 
 if TYPE_CHECKING:
-    from mpsfm_core.evaluation.records import Record
+    from mpsfm_core.evaluation.records import BenchmarkRecord
 
 
 def benchmark(
@@ -78,17 +78,17 @@ def benchmark(
     if not scenes or output is None:
         raise InputError("benchmark needs scene folders and --output DIR, or else --compare A B")
     from mpsfm_core.cli.progress import show_progress
-    from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
-    from mpsfm_core.evaluation.methods import OTHERS
-    from mpsfm_core.evaluation.report import make_rows, markdown, write_report
+    from mpsfm_core.evaluation.benchmark import BenchmarkPlan, run_benchmark
+    from mpsfm_core.evaluation.methods import PEER_METHODS
+    from mpsfm_core.evaluation.report import build_rows, format_markdown, write_report
     from mpsfm_core.providers.registry import Registry
 
-    plan = Plan(
+    plan = BenchmarkPlan(
         tuple(scenes),
         tuple(configs or ("benchmark",)),
         None if sets is None else _split_list(sets),
         _split_list(prior),
-        OTHERS if peers is None else () if peers == "none" else _split_list(peers),
+        PEER_METHODS if peers is None else () if peers == "none" else _split_list(peers),
         tuple(overrides or ()),
         workers,
         dict(_parse_result(text) for text in results or ()),
@@ -98,10 +98,10 @@ def benchmark(
     with show_progress(registry, quiet):
         records = run_benchmark(plan, output, registry, None if quiet else _print_record)
     write_report(output, records)
-    typer.echo(markdown(make_rows(records)), nl=False)
+    typer.echo(format_markdown(build_rows(records)), nl=False)
 
 
-def _print_record(record: Record, cached: bool) -> None:
+def _print_record(record: BenchmarkRecord, cached: bool) -> None:
     """Print a line on stderr for a finished run."""
     images = f"{len(record.estimated)}/{len(record.truth)} images"
     end = "cached" if cached else record.error or f"{record.cpu_seconds:.1f} s"
@@ -113,12 +113,12 @@ def _parse_result(text: str) -> tuple[str, Path]:
     import re
 
     from mpsfm_core.data.errors import InputError
-    from mpsfm_core.evaluation.methods import OTHERS, OURS
+    from mpsfm_core.evaluation.methods import OURS, PEER_METHODS
 
     name, _, folder = text.partition("=")
     if not (folder and re.fullmatch(r"[\w.-]+", name) and Path(folder).is_dir()):
         raise InputError(f"--result {text}: must be NAME=FOLDER with an existing folder")
-    if name.split("-")[0] == OURS or name in OTHERS:
+    if name.split("-")[0] == OURS or name in PEER_METHODS:
         raise InputError(
             f"--result {text}: {name!r} is a method of the benchmark; choose another name"
         )
@@ -132,6 +132,11 @@ def _split_list(text: str) -> tuple[str, ...]:
 
 def _compare(first: str, second: str) -> None:
     """Print the comparison of two finished benchmarks."""
-    from mpsfm_core.evaluation.comparison import compare, describe, read_side
+    from mpsfm_core.evaluation.comparison import (
+        compare_benchmarks,
+        format_differences,
+        read_benchmark,
+    )
 
-    typer.echo(describe(compare(read_side(first), read_side(second))), nl=False)
+    differences = compare_benchmarks(read_benchmark(first), read_benchmark(second))
+    typer.echo(format_differences(differences), nl=False)

@@ -25,8 +25,13 @@ def show(
     name: Annotated[str, typer.Argument(metavar="[NAME_OR_FILE]")] = "default",
     overrides: Overrides = None,
     offline: Offline = False,
+    expert: Annotated[
+        bool, typer.Option("--expert", help="Also print expert settings that have their default.")
+    ] = False,
 ) -> None:
-    """Print the effective configuration as YAML, with all defaults.
+    """Print the effective configuration as YAML.
+
+    Expert settings appear if they differ from their default, or with --expert.
 
     Comments at the end list the providers that a run on this machine would use. Downloads nothing.
     """
@@ -37,7 +42,7 @@ def show(
 
     registry = Registry.discover()
     config = load_config(name, config_overrides(overrides, offline), registry, complete=False)
-    typer.echo(config.to_yaml(), nl=False)
+    typer.echo(config.to_yaml(expert_settings=expert), nl=False)
     typer.echo("\n# providers on this machine:")
     try:
         for choice in preview_providers(config, registry).choices:

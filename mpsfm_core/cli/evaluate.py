@@ -63,11 +63,11 @@ def evaluate(
     poses, true_poses = read_poses(model), read_poses(truth)
     report = evaluate(poses, true_poses, names, CONVENTIONS[convention])
     if gt_depth is not None or scan is not None:
-        from mpsfm_core.evaluation.output_folder import (
+        from mpsfm_core.evaluation.result_folder import (
             evaluate_cloud,
             evaluate_depth,
             read_points,
-            true_surface,
+            read_true_surface,
         )
 
         within, cloud = distance_thresholds(distance), model / "dense.ply"
@@ -76,7 +76,7 @@ def evaluate(
         if scan is not None:
             surface = read_points(scan)
         elif gt_depth is not None and cloud.is_file():
-            surface = true_surface(truth, gt_depth, sorted(poses), within)
+            surface = read_true_surface(truth, gt_depth, sorted(poses), within)
         else:
             surface = None
         if surface is not None:

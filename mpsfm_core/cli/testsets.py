@@ -34,7 +34,7 @@ def build(
 
     In leq5, the three-view overlap of any three photos of a set is at most 5 %.
     """
-    from mpsfm_core.evaluation.build_sets import build_sets
+    from mpsfm_core.evaluation.build_test_sets import build_test_sets
     from mpsfm_core.evaluation.sampling import SamplingOptions
 
     options = SamplingOptions(
@@ -44,7 +44,7 @@ def build(
         max_images=max_images,
         seed=seed,
     )
-    for bucket, count in build_sets(scene, source, options, replace=replace).items():
+    for bucket, count in build_test_sets(scene, source, options, replace=replace).items():
         typer.echo(f"{bucket}: {count} set{'s' if count > 1 else ''}")
 
 

@@ -12,7 +12,7 @@ from mpsfm_core.geometry import camera_center, rotation_angle_deg
 
 
 @dataclass(frozen=True, eq=False)
-class Similarity:
+class SimilarityTransform:
     """``x_b = scale * rotation @ x_a + translation``; (3, 3), (3,), > 0."""
 
     scale: float
@@ -36,7 +36,7 @@ class TrajectoryErrors:
     its rotation. These two are the relative pose error.
     """
 
-    truth_from_estimate: Similarity
+    truth_from_estimate: SimilarityTransform
     centers: Float64
     rotations_deg: Float64
     steps: Float64
@@ -58,7 +58,7 @@ class TrajectoryErrors:
         return _rms(self.step_turns_deg)
 
 
-def umeyama(a: Float64, b: Float64) -> Similarity:
+def umeyama(a: Float64, b: Float64) -> SimilarityTransform:
     """The similarity from points a (n, 3) to points b (n, 3) with the least squared error.
 
     Umeyama, PAMI 1991. Raises ``ValueError`` when all points of either set coincide, where the
@@ -72,7 +72,7 @@ def umeyama(a: Float64, b: Float64) -> Similarity:
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * signs) @ vt
     scale = float((singular * signs).sum() / (spread_a**2).sum())
-    return Similarity(scale, rotation, mean_b - scale * rotation @ mean_a)
+    return SimilarityTransform(scale, rotation, mean_b - scale * rotation @ mean_a)
 
 
 def trajectory_errors(

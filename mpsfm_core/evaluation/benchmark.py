@@ -19,18 +19,18 @@ from mpsfm_core.config import Config, load_config
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES
-from mpsfm_core.evaluation.dense_geometry import DenseTask
-from mpsfm_core.evaluation.external_results import records_of
+from mpsfm_core.evaluation.dense_geometry import DenseEvaluation
+from mpsfm_core.evaluation.external_results import read_external_records
 from mpsfm_core.evaluation.methods import (
-    OTHERS,
     OURS,
-    USING_PRIORS,
+    PEER_METHODS,
+    PRIOR_METHODS,
+    MethodResult,
     MethodRun,
-    Outcome,
-    run_tasks,
+    run_methods,
 )
-from mpsfm_core.evaluation.prior_quality import QUALITIES, error_seed, prior_settings
-from mpsfm_core.evaluation.records import Record, read_record, record_file, write_record
+from mpsfm_core.evaluation.prior_quality import QUALITIES, parse_error_seed, prior_overrides
+from mpsfm_core.evaluation.records import BenchmarkRecord, read_record, record_file, write_record
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
 from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.runner import adjust_problem, extract
@@ -41,17 +41,17 @@ from mpsfm_core.providers import hookimpl
 from mpsfm_core.providers.registry import Registry, core_version
 from mpsfm_core.support.files import write_file
 
-Done = Callable[[Record, bool], None]
+RecordCallback = Callable[[BenchmarkRecord, bool], None]
 """Is told of each record, and whether it was there already."""
 
 
 @dataclass(frozen=True)
-class Plan:
+class BenchmarkPlan:
     """What to run.
 
     ``configs``: names or files. ``buckets``: None for all. ``priors``: of
     :data:`~mpsfm_core.evaluation.prior_quality.QUALITIES` or ``degraded-N``, our mapper runs with
-    each. ``peers``: of :data:`~mpsfm_core.evaluation.methods.OTHERS`. ``overrides``: settings
+    each. ``peers``: of :data:`~mpsfm_core.evaluation.methods.PEER_METHODS`. ``overrides``: settings
     ``KEY=VALUE`` of all configurations. ``workers``: sets that are mapped at the same time.
     ``results``: label -> folder of models that another program made
     (:mod:`~mpsfm_core.evaluation.external_results`). ``distances``: metres, at which clouds are
@@ -62,7 +62,7 @@ class Plan:
     configs: tuple[str, ...] = ("benchmark",)
     buckets: tuple[str, ...] | None = None
     priors: tuple[str, ...] = ("config",)
-    peers: tuple[str, ...] = OTHERS
+    peers: tuple[str, ...] = PEER_METHODS
     overrides: tuple[str, ...] = ()
     workers: int = 1
     results: Mapping[str, Path] = field(default_factory=dict)
@@ -70,20 +70,23 @@ class Plan:
 
 
 def run_benchmark(
-    plan: Plan, output: Path, registry: Registry | None = None, done: Done | None = None
-) -> list[Record]:
+    plan: BenchmarkPlan,
+    output: Path,
+    registry: Registry | None = None,
+    done: RecordCallback | None = None,
+) -> list[BenchmarkRecord]:
     """Run a plan and return the records of all its runs, old and new.
 
     What a method raises is in its record. Raises :class:`InputError` (or another
     :class:`~mpsfm_core.data.errors.MpsfmError` of the extraction) for what no run could do without.
     """
     registry = registry or Registry.discover()
-    _check_names("prior", [p for p in plan.priors if error_seed(p) is None], QUALITIES)
-    _check_names("peer", plan.peers, OTHERS)
+    _check_names("prior", [p for p in plan.priors if parse_error_seed(p) is None], QUALITIES)
+    _check_names("peer", plan.peers, PEER_METHODS)
     scenes = [read_scene(path) for path in plan.scenes]
     if len({scene.name for scene in scenes}) < len(scenes):
         raise InputError("two scene folders have the same name, as their results would")
-    only = PairsOfSets()
+    only = SetPairFilter()
     registry.register(only, name="pairs of sets")
     records = []
     for scene in scenes:
@@ -98,7 +101,7 @@ def run_benchmark(
                     done(record, known)
             records += sorted(own, key=_order(sets, plan))
             for label, folder in plan.results.items():
-                for record in records_of(label, folder, scene, sets, Path(config).stem):
+                for record in read_external_records(label, folder, scene, sets, Path(config).stem):
                     write_record(output, record)
                     records.append(record)
                     if done is not None:
@@ -106,7 +109,7 @@ def run_benchmark(
     return records
 
 
-class PairsOfSets:
+class SetPairFilter:
     """Plugin that lets only pairs be matched whose images are in one set together."""
 
     def __init__(self) -> None:
@@ -145,7 +148,7 @@ class PreparedSets(NamedTuple):
         )
 
 
-def problem_of_sets(
+def prepare_sets(
     scene: SceneFolder,
     sets: Sequence[EvaluationSet],
     prior: str,
@@ -160,7 +163,7 @@ def problem_of_sets(
     depth of that quality.
     """
     names = sorted({name for item in sets for name in item.images})
-    settings = prior_settings(prior, scene, names, work / f"{prior}-depth")
+    settings = prior_overrides(prior, scene, names, work / f"{prior}-depth")
     stages = Stages(registry)
     loaded = load_config(config, (*settings, *overrides), registry=registry)
     loaded = resolve_providers(loaded, registry, stages).config
@@ -182,7 +185,7 @@ class _SceneRuns:
         scene: SceneFolder,
         sets: Sequence[EvaluationSet],
         config: str,
-        plan: Plan,
+        plan: BenchmarkPlan,
         output: Path,
         registry: Registry,
     ) -> None:
@@ -194,10 +197,10 @@ class _SceneRuns:
         self._output = output
         self._registry = registry
 
-    def __call__(self) -> Iterator[tuple[Record, bool]]:
+    def __call__(self) -> Iterator[tuple[BenchmarkRecord, bool]]:
         """Records and whether they were there already."""
         for number, prior in enumerate(self._plan.priors):
-            prepared = problem_of_sets(
+            prepared = prepare_sets(
                 self._scene,
                 self._sets,
                 prior,
@@ -209,7 +212,7 @@ class _SceneRuns:
             methods = {
                 _label(method, prior): method
                 for method in (OURS, *self._plan.peers)
-                if method in USING_PRIORS or number == 0
+                if method in PRIOR_METHODS or number == 0
             }
             options, dense = prepared.config.mapper_options(), self._dense(prepared)
             places: dict[MethodRun, tuple[EvaluationSet, str]] = {}
@@ -225,19 +228,19 @@ class _SceneRuns:
                         yield known, True
                     else:
                         places[task] = item, key
-            for task, outcome in run_tasks(list(places), self._plan.workers):
+            for task, outcome in run_methods(list(places), self._plan.workers):
                 record = self._record(*places[task], task, outcome)
                 write_record(self._output, record)
                 yield record, False
 
-    def _dense(self, prepared: PreparedSets) -> DenseTask | None:
+    def _dense(self, prepared: PreparedSets) -> DenseEvaluation | None:
         config = prepared.config
         if not config.dense.enabled or self._scene.depth is None:
             return None
         settings = config.dense, config.results, self._scene, self._plan.distances
-        return DenseTask(prepared.images, *settings)
+        return DenseEvaluation(prepared.images, *settings)
 
-    def _known(self, item: EvaluationSet, label: str, key: str) -> Record | None:
+    def _known(self, item: EvaluationSet, label: str, key: str) -> BenchmarkRecord | None:
         path = self._output / record_file(self._scene.name, self._config_name, item.name, label)
         try:
             record = read_record(path) if path.is_file() else None
@@ -247,8 +250,10 @@ class _SceneRuns:
             return None  # what failed may have lacked memory, and is tried again
         return record
 
-    def _record(self, item: EvaluationSet, key: str, task: MethodRun, outcome: Outcome) -> Record:
-        return Record(
+    def _record(
+        self, item: EvaluationSet, key: str, task: MethodRun, outcome: MethodResult
+    ) -> BenchmarkRecord:
+        return BenchmarkRecord(
             self._scene.name,
             self._config_name,
             item.bucket,
@@ -266,7 +271,9 @@ class _SceneRuns:
         )
 
 
-def _order(sets: Sequence[EvaluationSet], plan: Plan) -> Callable[[Record], tuple[int, int]]:
+def _order(
+    sets: Sequence[EvaluationSet], plan: BenchmarkPlan
+) -> Callable[[BenchmarkRecord], tuple[int, int]]:
     """Sorts records by set, then ours before the peers: runs end in no particular order."""
     places = {item.name: number for number, item in enumerate(sets)}
     labels = [_label(m, prior) for m in (OURS, *plan.peers) for prior in plan.priors]
@@ -274,7 +281,7 @@ def _order(sets: Sequence[EvaluationSet], plan: Plan) -> Callable[[Record], tupl
 
 
 def _label(method: str, prior: str) -> str:
-    return f"{method}-{prior}" if method in USING_PRIORS else method
+    return f"{method}-{prior}" if method in PRIOR_METHODS else method
 
 
 def _key(task: MethodRun) -> str:
@@ -285,7 +292,7 @@ def _key(task: MethodRun) -> str:
     if task.dense is not None:
         settings = (task.dense.dense, task.dense.results)
         parts += [[each.model_dump(mode="json") for each in settings], task.dense.distances]
-    if task.method in USING_PRIORS:
+    if task.method in PRIOR_METHODS:
         parts += [digest(image) for image in task.problem.images]
     else:
         parts += [

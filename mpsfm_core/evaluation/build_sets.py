@@ -16,7 +16,7 @@ from mpsfm_core.inputs.options import InputOptions
 SOURCES = ("auto", "depth", "model")
 
 
-def build_sets(
+def build_test_sets(
     folder: Path,
     source: str = "auto",
     options: SamplingOptions | None = None,

@@ -27,7 +27,7 @@ class _Link(NamedTuple):
     num_inliers: int
 
 
-def chained_poses(problem: MappingProblem, seed: int = 0) -> list[dict[str, Pose]]:
+def estimate_chained_poses(problem: MappingProblem, seed: int = 0) -> list[dict[str, Pose]]:
     """Poses by image name, one dictionary for each connected group of images, largest first."""
     options = RegistrationOptions()
     scene = Scene(problem)  # no image has a pose: lifts are in the frame of their camera

@@ -24,7 +24,7 @@ def cloud_accuracy(
     """Compare points (n, 3) with a scan (m, 3) in the same frame; plain data, ready for JSON.
 
     ``accuracy``: tolerance -> share of the points that have the scan within it; ``completeness``:
-    of the scan that has a point within it; ``f1``: their harmonic mean. Both clouds are thinned to
+    of the scan that has a point within it; ``f1``: their harmonic mean. Both clouds are thin_points to
     one point a cube of half the smallest tolerance, so that no place counts twice. Points where
     the scanner saw nothing count as wrong: crop the cloud first if the scan is partial.
 
@@ -32,7 +32,7 @@ def cloud_accuracy(
     """
     if not len(points) or not len(scan):
         raise InputError("a point cloud is empty, there is nothing to compare")
-    points, scan = (thinned(cloud, min(tolerances) / 2) for cloud in (points, scan))
+    points, scan = (thin_points(cloud, min(tolerances) / 2) for cloud in (points, scan))
     to_scan, median_to_scan = _distances(points, scan, max(tolerances))
     to_points, median_to_points = _distances(scan, points, max(tolerances))
     accuracy = {str(t): float((to_scan <= t).mean()) for t in tolerances}
@@ -64,7 +64,7 @@ def _distances(points: Float64, others: Float64, limit: float) -> tuple[Float64,
     return found, float(np.median(sample))
 
 
-def thinned(points: Float64, size: float) -> Float64:
+def thin_points(points: Float64, size: float) -> Float64:
     """The first point of each cube of a grid of this size."""
     cells: Int64 = np.floor(points / size).astype(np.int64)
     order = np.lexsort(cells.T)

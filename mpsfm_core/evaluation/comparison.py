@@ -25,7 +25,7 @@ from mpsfm_core.evaluation.pose_auc import (
     PoseConvention,
     pose_auc,
 )
-from mpsfm_core.evaluation.records import Record, read_records
+from mpsfm_core.evaluation.records import BenchmarkRecord, read_records
 
 MIN_SETS = 6
 """Fewer sets have too few different resamples to tell a 95 % interval (ours)."""
@@ -35,7 +35,7 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class Difference:
+class AucDifference:
     """Second side minus first, in percent points of AUC.
 
     ``auc``: threshold -> (first, second). ``interval``: threshold -> 95 % interval of the
@@ -55,12 +55,12 @@ class Difference:
     p_value: Mapping[int, float]
 
 
-def read_side(place: str) -> dict[str, list[Record]]:
+def read_benchmark(place: str) -> dict[str, list[BenchmarkRecord]]:
     """Records of a benchmark by method; ``DIR``, or ``DIR:METHOD`` for one method, called ``*``."""
     folder, colon, method = place.rpartition(":")
     if not colon or Path(place).is_dir():
         folder, method = place, ""
-    sides: dict[str, list[Record]] = {}
+    sides: dict[str, list[BenchmarkRecord]] = {}
     for record in read_records(Path(folder)):
         sides.setdefault(record.label, []).append(record)
     if not method:
@@ -70,14 +70,14 @@ def read_side(place: str) -> dict[str, list[Record]]:
     return {"*": sides[method]}
 
 
-def compare(
-    first: Mapping[str, Sequence[Record]],
-    second: Mapping[str, Sequence[Record]],
+def compare_benchmarks(
+    first: Mapping[str, Sequence[BenchmarkRecord]],
+    second: Mapping[str, Sequence[BenchmarkRecord]],
     convention: PoseConvention = CONVENTIONS["paper"],
     *,
     resamples: int = RESAMPLES,
     seed: int = 0,
-) -> list[Difference]:
+) -> list[AucDifference]:
     """Differences for each scene, configuration, bucket and method that both sides have.
 
     Raises :class:`InputError` when they share nothing.
@@ -97,8 +97,8 @@ def compare(
     return differences
 
 
-def describe(
-    differences: Sequence[Difference], convention: PoseConvention = CONVENTIONS["paper"]
+def format_differences(
+    differences: Sequence[AucDifference], convention: PoseConvention = CONVENTIONS["paper"]
 ) -> str:
     """A Markdown table, the convention in words above it."""
     head = ["scene", "bucket", "method", "sets", "drawn"]
@@ -124,11 +124,11 @@ _SetErrors = tuple[Float64, ...]
 
 
 def _matched(
-    first: Iterable[Record], second: Iterable[Record]
-) -> dict[tuple[str, str, str], list[tuple[Record, Record]]]:
+    first: Iterable[BenchmarkRecord], second: Iterable[BenchmarkRecord]
+) -> dict[tuple[str, str, str], list[tuple[BenchmarkRecord, BenchmarkRecord]]]:
     """Records of the same set of images, by scene, configuration and bucket."""
     others = {record.name[:3]: record for record in second}
-    matched: dict[tuple[str, str, str], list[tuple[Record, Record]]] = {}
+    matched: dict[tuple[str, str, str], list[tuple[BenchmarkRecord, BenchmarkRecord]]] = {}
     for record in first:
         other = others.get(record.name[:3])
         if other is not None and set(other.truth) == set(record.truth):
@@ -137,11 +137,11 @@ def _matched(
     return matched
 
 
-def _name(method: str, pair: tuple[Record, Record]) -> str:
+def _name(method: str, pair: tuple[BenchmarkRecord, BenchmarkRecord]) -> str:
     return f"{pair[0].label} → {pair[1].label}" if method == "*" else method
 
 
-def _unordered(record: Record, convention: PoseConvention) -> Float64:
+def _unordered(record: BenchmarkRecord, convention: PoseConvention) -> Float64:
     """Errors (pairs, orders): those of both orders of a pair in one row."""
     errors = record.errors_deg(convention)
     count = len(record.truth)
@@ -158,7 +158,7 @@ def _difference(
     convention: PoseConvention,
     resamples: int,
     rng: np.random.Generator,
-) -> Difference:
+) -> AucDifference:
     units = list(errors) if len(errors) >= MIN_SETS else _pairs(errors)
     drawn = _gains((_drawn(units, rng) for _ in range(resamples)), convention)
     swapped = _gains((_swapped(units, rng) for _ in range(resamples)), convention)
@@ -167,7 +167,7 @@ def _difference(
     extreme = np.abs(swapped) >= np.abs(both[1] - both[0]) - _ROUNDING
     p_value = (1 + extreme.sum(axis=0)) / (1 + resamples)
     columns = list(enumerate(THRESHOLDS_DEG))
-    return Difference(
+    return AucDifference(
         *place,
         sets=len(errors),
         unit="sets" if len(errors) >= MIN_SETS else "pairs",

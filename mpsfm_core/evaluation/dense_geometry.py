@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from mpsfm_core.data import Float64, MappingProblem, PinholeCamera
+from mpsfm_core.dense.densify import densify
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
-from mpsfm_core.dense.densify import densify
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy
 from mpsfm_core.evaluation.depth_accuracy import depth_accuracy, mean_accuracy
 from mpsfm_core.evaluation.prior_quality import read_depth
+from mpsfm_core.evaluation.read_true_surface import build_true_surface, true_depth_file
 from mpsfm_core.evaluation.scene_folder import SceneFolder
-from mpsfm_core.evaluation.true_surface import depth_file, surface_of_depth
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.results.options import ResultOptions
@@ -23,7 +23,7 @@ from mpsfm_core.results.original_images import OriginalImages
 
 
 @dataclass(frozen=True, eq=False)
-class DenseTask:
+class DenseEvaluation:
     """What a mapped set takes to be measured and compared.
 
     ``images``: the photos of the set, maybe among others. ``dense``, ``results``: settings of the
@@ -38,15 +38,15 @@ class DenseTask:
     distances: tuple[float, ...]
 
     def measure(self, model: Reconstruction, problem: MappingProblem) -> dict[str, Any] | None:
-        """Run the dense stage on a model of the problem; what :func:`dense_accuracy` says of it."""
+        """Run the dense stage on a model of the problem; what :func:`evaluate_dense_geometry` says of it."""
         photos = OriginalImages(self.images, problem)
         dense, _ = densify(model, photos.view, self.dense)
         cloud = fuse_depth_maps(dense, photos.view, self.results).points
         cameras = {image.name: image.pinhole for image in self.images}
-        return dense_accuracy(dense, cloud, self.scene, cameras, self.distances)
+        return evaluate_dense_geometry(dense, cloud, self.scene, cameras, self.distances)
 
 
-def dense_accuracy(
+def evaluate_dense_geometry(
     model: Reconstruction,
     cloud: Float64,
     scene: SceneFolder,
@@ -69,14 +69,14 @@ def dense_accuracy(
         return None
     aligned, found = errors.truth_from_estimate, []
     for image in model.images:
-        file = depth_file(scene.depth, image.name)
+        file = true_depth_file(scene.depth, image.name)
         if file.is_file():
             depth = image.depth
             true = depth_accuracy(depth.depth, depth.valid, read_depth(file), scale=aligned.scale)
             found += [] if true is None else [true]
     if not found:
         return None
-    surface = surface_of_depth(
+    surface = build_true_surface(
         scene.depth, tuple(model.poses), cameras, scene.truth, min(distances) / 2
     )
     return {

@@ -41,7 +41,7 @@ def depth_accuracy(
     ``scale``: the map is multiplied with it; None for the one that makes the median of
     ``truth / depth`` one. Returns None when no pixel can be compared.
     """
-    _, predicted, true = depth_beside_truth(depth, valid, truth)
+    _, predicted, true = sample_depth_at_truth(depth, valid, truth)
     if not len(true):
         return None
     if scale is None:
@@ -60,7 +60,7 @@ def depth_accuracy(
     )
 
 
-def depth_beside_truth(
+def sample_depth_at_truth(
     depth: Float32, valid: Bool, truth: Float32
 ) -> tuple[Float64, Float64, Float64]:
     """A map (h, w) at the pixels of the truth (H, W), 0 where unknown.

@@ -11,16 +11,16 @@ from pathlib import Path
 
 from mpsfm_core.data import Pose
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.evaluation.records import Record
+from mpsfm_core.evaluation.records import BenchmarkRecord
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder
 from mpsfm_core.inputs.models import match_names, read_poses
 
 TRANSFORMS = "transforms.json"
 
 
-def records_of(
+def read_external_records(
     label: str, folder: Path, scene: SceneFolder, sets: Sequence[EvaluationSet], config: str
-) -> list[Record]:
+) -> list[BenchmarkRecord]:
     """A record for each set. Where there is no model of a set, all its images are unregistered.
 
     ``folder``: holds ``SCENE/SET/``, ``SET/`` or, of a single set, ``SCENE/`` or the model itself.
@@ -40,7 +40,7 @@ def records_of(
 
 def _record(
     label: str, scene: SceneFolder, item: EvaluationSet, place: Path | None, config: str
-) -> Record:
+) -> BenchmarkRecord:
     truth = {name: scene.truth[name] for name in item.images}
     models: list[dict[str, Pose]] = []
     for path in _models(place) if place is not None else ():
@@ -48,7 +48,7 @@ def _record(
         models.append({name: poses[own] for name, own in match_names(truth, poses).items()})
     models.sort(key=lambda model: -len(model))
     error = "" if place is not None else "no model of this set"
-    return Record(
+    return BenchmarkRecord(
         scene.name,
         config,
         item.bucket,

@@ -17,8 +17,8 @@ from typing import Any
 import pycolmap
 
 from mpsfm_core.data import MappingProblem, PinholeCamera, Pose
-from mpsfm_core.evaluation.chained_pnp import chained_poses
-from mpsfm_core.evaluation.dense_geometry import DenseTask
+from mpsfm_core.evaluation.chained_pnp import estimate_chained_poses
+from mpsfm_core.evaluation.dense_geometry import DenseEvaluation
 from mpsfm_core.evaluation.peers import PEERS, run_peer
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
@@ -29,23 +29,23 @@ from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 OURS = "ours"
-CHAIN = "chained-pnp"
+CHAINED_PNP = "chained-pnp"
 """A reference point without a mapper (:mod:`~mpsfm_core.evaluation.chained_pnp`)."""
-USING_PRIORS = (OURS, CHAIN)
+PRIOR_METHODS = (OURS, CHAINED_PNP)
 """Methods that run once with each prior."""
-OTHERS = (CHAIN, *PEERS)
+PEER_METHODS = (CHAINED_PNP, *PEERS)
 """All that ours is compared with."""
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class MethodResult:
     """What a method made of a set.
 
     ``models``: poses by image name, of the largest model first. ``seconds``: wall clock;
     ``cpu_seconds``: of the process, which other jobs on the machine do not stretch.
     ``peak_mib``: most memory that the process held, its problem and earlier tasks included; 0
     where the system does not tell. ``error``: why it failed, empty if it did not. ``dense``: what
-    :meth:`DenseTask.measure` says of the largest model; its time is not in the seconds.
+    :meth:`DenseEvaluation.measure` says of the largest model; its time is not in the seconds.
     """
 
     models: Sequence[dict[str, Pose]] = ()
@@ -58,7 +58,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class MethodRun:
-    """One run: ``method`` is :data:`OURS`, :data:`CHAIN` or the name of a peer. ``dense``: how the
+    """One run: ``method`` is :data:`OURS`, :data:`CHAINED_PNP` or the name of a peer. ``dense``: how the
     depth of ours is measured and compared, None where it is not. ``threads``: at most, one unless
     wall time with more is what is compared; results of a peer may depend on them."""
 
@@ -66,16 +66,20 @@ class MethodRun:
     method: str
     problem: MappingProblem
     options: MapperOptions
-    dense: DenseTask | None = None
+    dense: DenseEvaluation | None = None
     threads: int = 1
 
 
-def run_tasks(tasks: Sequence[MethodRun], workers: int) -> Iterator[tuple[MethodRun, Outcome]]:
+def run_methods(
+    tasks: Sequence[MethodRun], workers: int
+) -> Iterator[tuple[MethodRun, MethodResult]]:
     """Run tasks in ``workers`` processes; yields them as they are done."""
-    lanes = _Lanes()
+    lanes = _WorkerProcesses()
     pool = ThreadPoolExecutor(max(1, workers), thread_name_prefix="mpsfm-benchmark")
     try:
-        futures: dict[Future[Outcome], MethodRun] = {pool.submit(lanes.run, t): t for t in tasks}
+        futures: dict[Future[MethodResult], MethodRun] = {
+            pool.submit(lanes.run, t): t for t in tasks
+        }
         for future in as_completed(futures):
             yield futures[future], future.result()
     finally:
@@ -83,7 +87,7 @@ def run_tasks(tasks: Sequence[MethodRun], workers: int) -> Iterator[tuple[Method
         lanes.close()
 
 
-def run_method(task: MethodRun) -> Outcome:
+def run_method(task: MethodRun) -> MethodResult:
     """Run a task here and now; what it raises becomes the outcome's error."""
     started, cpu_started = time.perf_counter(), time.process_time()
     models: list[dict[str, Pose]] = []
@@ -91,8 +95,8 @@ def run_method(task: MethodRun) -> Outcome:
     dense, error = None, ""
     try:
         with limit_threads(task.threads):
-            if task.method == CHAIN:
-                models = chained_poses(task.problem, task.options.seed)
+            if task.method == CHAINED_PNP:
+                models = estimate_chained_poses(task.problem, task.options.seed)
             elif task.method != OURS:
                 models = run_peer(task.method, task.problem)
             else:
@@ -107,10 +111,10 @@ def run_method(task: MethodRun) -> Outcome:
                 dense = task.dense.measure(found[0], task.problem)
         except Exception as raised:  # the poses stand
             error = f"dense: {type(raised).__name__}: {raised}"
-    return Outcome(models, seconds, cpu_seconds, peak_memory_mb() or 0.0, error, dense)
+    return MethodResult(models, seconds, cpu_seconds, peak_memory_mb() or 0.0, error, dense)
 
 
-class _Lanes:
+class _WorkerProcesses:
     """A process for each thread that asks for one, and a new one when it died."""
 
     def __init__(self) -> None:
@@ -118,14 +122,14 @@ class _Lanes:
         self._lock = threading.Lock()
         self._processes: list[ProcessPoolExecutor] = []
 
-    def run(self, task: MethodRun) -> Outcome:
+    def run(self, task: MethodRun) -> MethodResult:
         """Run a task in the process of the calling thread."""
         process = getattr(self._local, "process", None) or self._start()
         try:
             return process.submit(run_method, task).result()
         except BrokenProcessPool:
             self._start()
-            return Outcome(error="its process died")
+            return MethodResult(error="its process died")
 
     def close(self) -> None:
         """End all processes."""

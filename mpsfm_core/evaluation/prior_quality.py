@@ -4,7 +4,7 @@
 the errors of :mod:`mpsfm_core.testing.synthetic.degraded_depth`, declared honestly, which means as
 large as they are after the best scale of each image: stands for a good monocular network;
 ``degraded-N`` is the same with the errors of seed N, which is 0 otherwise. ``config``: what the
-configuration's own provider predicts. """
+configuration's own provider predicts."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ import numpy as np
 from mpsfm_core.data import Float32
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.scene_folder import SceneFolder
-from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.image_decoding import check_size, read_bytes
+from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.support.files import write_file
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors, degrade_depth
 
@@ -30,13 +30,13 @@ SENSOR_STD = 0.01
 _MILLIMETRE = 0.001
 
 
-def error_seed(quality: str) -> int | None:
+def parse_error_seed(quality: str) -> int | None:
     """Seed of the errors of degraded depth; None for other qualities."""
     found = re.fullmatch(r"degraded(?:-(\d+))?", quality)
     return int(found[1] or 0) if found else None
 
 
-def prior_settings(
+def prior_overrides(
     quality: str, scene: SceneFolder, images: Iterable[str], work: Path
 ) -> tuple[str, ...]:
     """Settings ``KEY=VALUE`` that make a configuration use depth of a quality.
@@ -46,7 +46,7 @@ def prior_settings(
     """
     if quality == "config":
         return ()
-    seed = error_seed(quality)
+    seed = parse_error_seed(quality)
     if scene.depth is None:
         raise InputError(f"{scene.path}: prior {quality!r} needs true depth in gt_depth/")
     if quality == "sensor":

@@ -26,14 +26,14 @@ RUNS = "runs"
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class BenchmarkRecord:
     """What a method made of a set of images.
 
     ``label``: the method, ours with its prior. ``key``: names all it depends on. ``estimated``,
     ``truth``: ``cam_from_world`` by image name; images that only ``truth`` has are unregistered.
     ``estimated`` is the largest model, ``others`` are further ones. ``pairs``: number of verified
     pairs. ``error``: why it failed, empty if it did not. ``dense``: what
-    :func:`~mpsfm_core.evaluation.dense_geometry.dense_accuracy` says, None where that was not
+    :func:`~mpsfm_core.evaluation.dense_geometry.evaluate_dense_geometry` says, None where that was not
     asked or cannot be told.
     """
 
@@ -75,7 +75,7 @@ def record_file(scene: str, config: str, set_name: str, label: str) -> Path:
     return Path(RUNS, scene, config, set_name, f"{label}.json")
 
 
-def write_record(output: Path, record: Record) -> None:
+def write_record(output: Path, record: BenchmarkRecord) -> None:
     """Write a record; a reader sees the whole of it or nothing."""
     path = output / record.file
     content = {VERSION: FORMAT, **asdict(record)}
@@ -85,7 +85,7 @@ def write_record(output: Path, record: Record) -> None:
     write_file(path, json.dumps(content, indent=1))
 
 
-def read_record(path: Path) -> Record:
+def read_record(path: Path) -> BenchmarkRecord:
     """Read a record; raises :class:`InputError` when it is damaged or of a newer version."""
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -94,12 +94,12 @@ def read_record(path: Path) -> Record:
         content["estimated"] = _unpacked(content["estimated"])
         content["others"] = [_unpacked(model) for model in content["others"]]
         content["truth"] = _unpacked(content["truth"])
-        return Record(**content)
+        return BenchmarkRecord(**content)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{path}: no record of a benchmark: {error}") from error
 
 
-def read_records(output: Path) -> list[Record]:
+def read_records(output: Path) -> list[BenchmarkRecord]:
     """All records of a benchmark in the order of their files' names.
 
     Raises :class:`InputError` when there are none.

@@ -18,14 +18,14 @@ from mpsfm_core.evaluation.pose_auc import (
     PoseConvention,
     pose_auc,
 )
-from mpsfm_core.evaluation.records import Record
+from mpsfm_core.evaluation.records import BenchmarkRecord
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.format_versions import VERSION
 
 FORMAT = 1
 """Of ``report.json``."""
 ALL_SCENES = "all scenes"
-CLOUD = ("accuracy", "completeness", "f1")
+CLOUD_METRICS = ("accuracy", "completeness", "f1")
 """What a dense column says of a cloud at a distance."""
 _COLORS = ("#1b6ca8", "#d1495b", "#2e8b57", "#e08e0b", "#7b4fa3", "#5c5c5c", "#17a2b8", "#a0522d")
 _PLOT = (440, 260)
@@ -38,12 +38,12 @@ _DENSE_NOTE = (
     "depth as the scan."
 )
 
-Group = tuple[str, str, str, str]
+GroupKey = tuple[str, str, str, str]
 """Scene, configuration, bucket and method."""
 
 
 @dataclass(frozen=True)
-class Row:
+class BenchmarkRow:
     """A method on a bucket.
 
     ``auc``: threshold in degrees -> percent, errors of all sets pooled. ``registered``: share of
@@ -67,21 +67,21 @@ class Row:
     dense: Mapping[str, Any] | None = None
 
     @property
-    def place(self) -> Group:
+    def place(self) -> GroupKey:
         """Which group of records the row is about."""
         return self.scene, self.config, self.bucket, self.method
 
 
-def errors_of(records: Iterable[Record], convention: PoseConvention) -> Float64:
+def pool_errors(records: Iterable[BenchmarkRecord], convention: PoseConvention) -> Float64:
     """Errors in degrees of all image pairs of some records, one after the other."""
     return np.concatenate([record.errors_deg(convention) for record in records])
 
 
-def grouped(records: Iterable[Record]) -> dict[Group, list[Record]]:
+def group_records(records: Iterable[BenchmarkRecord]) -> dict[GroupKey, list[BenchmarkRecord]]:
     """Records by scene, configuration, bucket and method; if there are several scenes, also
     pooled over them as the scene :data:`ALL_SCENES`."""
     records = list(records)
-    groups: dict[Group, list[Record]] = {}
+    groups: dict[GroupKey, list[BenchmarkRecord]] = {}
     several = len({record.scene for record in records}) > 1
     for scene in (None, ALL_SCENES) if several else (None,):
         for r in records:
@@ -89,16 +89,16 @@ def grouped(records: Iterable[Record]) -> dict[Group, list[Record]]:
     return groups
 
 
-def make_rows(
-    records: Iterable[Record], convention: PoseConvention = CONVENTIONS["paper"]
-) -> list[Row]:
+def build_rows(
+    records: Iterable[BenchmarkRecord], convention: PoseConvention = CONVENTIONS["paper"]
+) -> list[BenchmarkRow]:
     """The table's rows, in the order of the records."""
     rows = []
-    for key, group in grouped(records).items():
-        areas = pose_auc(errors_of(group, convention), convention)
+    for key, group in group_records(records).items():
+        areas = pose_auc(pool_errors(group, convention), convention)
         images = sum(len(record.truth) for record in group)
         rows.append(
-            Row(
+            BenchmarkRow(
                 *key,
                 sets=len(group),
                 pairs=sum(record.pairs for record in group),
@@ -118,13 +118,15 @@ def _mean_dense(sets: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
         return None
     means: dict[str, Any] = {"sets": len(sets)}
     means["abs_rel"] = float(np.mean([each["depth"]["abs_rel"] for each in sets]))
-    for key in CLOUD:
+    for key in CLOUD_METRICS:
         distances = sets[0]["cloud"][key]
         means[key] = {d: float(np.mean([s["cloud"][key][d] for s in sets])) for d in distances}
     return means
 
 
-def markdown(rows: Sequence[Row], convention: PoseConvention = CONVENTIONS["paper"]) -> str:
+def format_markdown(
+    rows: Sequence[BenchmarkRow], convention: PoseConvention = CONVENTIONS["paper"]
+) -> str:
     """A table for each scene and configuration, the convention in words above it."""
     parts = [f"Pose AUC in percent, convention `{convention.name}`: {convention.description}."]
     if any(row.dense for row in rows):
@@ -137,16 +139,16 @@ def markdown(rows: Sequence[Row], convention: PoseConvention = CONVENTIONS["pape
     return "\n\n".join(parts) + "\n"
 
 
-def failures(records: Iterable[Record]) -> list[str]:
+def list_failures(records: Iterable[BenchmarkRecord]) -> list[str]:
     """A line for each run that raised, with its reason."""
     return [f"{' / '.join(record.name)}: {record.error}" for record in records if record.error]
 
 
-def write_report(output: Path, records: Sequence[Record]) -> None:
+def write_report(output: Path, records: Sequence[BenchmarkRecord]) -> None:
     """Write ``report.md``, ``report.json`` and ``report.html``; the JSON has all conventions."""
     convention = CONVENTIONS["paper"]
-    rows, failed = make_rows(records), failures(records)
-    text = markdown(rows, convention)
+    rows, failed = build_rows(records), list_failures(records)
+    text = format_markdown(rows, convention)
     if failed:
         text += "\n### Failed\n\n" + "".join(f"- {line}\n" for line in failed)
     write_file(output / "report.md", text)
@@ -154,7 +156,7 @@ def write_report(output: Path, records: Sequence[Record]) -> None:
         name: {
             "description": other.description,
             "auc_unit": "percent",
-            "rows": [asdict(row) for row in make_rows(records, other)],
+            "rows": [asdict(row) for row in build_rows(records, other)],
         }
         for name, other in CONVENTIONS.items()
     }
@@ -164,7 +166,7 @@ def write_report(output: Path, records: Sequence[Record]) -> None:
     write_file(output / "report.html", _page(rows, records, convention))
 
 
-def _lines(rows: Sequence[Row]) -> list[list[str]]:
+def _lines(rows: Sequence[BenchmarkRow]) -> list[list[str]]:
     """Head and cells of a table; dense columns where a row has them, one a distance."""
     head = ["bucket", "sets", "method", *(f"AUC@{t}°" for t in THRESHOLDS_DEG)]
     head += ["registered", "CPU s / set", "failed"]
@@ -175,23 +177,26 @@ def _lines(rows: Sequence[Row]) -> list[list[str]]:
     return [head, *(_cells(row) + (_dense_cells(row, distances) if dense else []) for row in rows)]
 
 
-def _cells(row: Row) -> list[str]:
+def _cells(row: BenchmarkRow) -> list[str]:
     areas = [f"{row.auc[t]:.1f}" for t in THRESHOLDS_DEG]
     rest = [f"{row.registered:.0%}", f"{row.cpu_seconds:.2f}", str(row.failed or "")]
     return [row.bucket, str(row.sets), row.method, *areas, *rest]
 
 
-def _dense_cells(row: Row, distances: Sequence[str]) -> list[str]:
+def _dense_cells(row: BenchmarkRow, distances: Sequence[str]) -> list[str]:
     if row.dense is None:
         return [""] * (1 + len(distances))
     means = row.dense
     shares = [
-        " / ".join(f"{100 * means[key].get(d, np.nan):.0f}" for key in CLOUD) for d in distances
+        " / ".join(f"{100 * means[key].get(d, np.nan):.0f}" for key in CLOUD_METRICS)
+        for d in distances
     ]
     return [f"{means['abs_rel']:.3f}", *shares]
 
 
-def _page(rows: Sequence[Row], records: Sequence[Record], convention: PoseConvention) -> str:
+def _page(
+    rows: Sequence[BenchmarkRow], records: Sequence[BenchmarkRecord], convention: PoseConvention
+) -> str:
     """One self-contained page: a table and recall curves for each bucket."""
     parts = [
         "<!doctype html><meta charset='utf-8'><title>Benchmark</title>",
@@ -202,22 +207,22 @@ def _page(rows: Sequence[Row], records: Sequence[Record], convention: PoseConven
     ]
     if any(row.dense for row in rows):
         parts.append(f"<p>{html.escape(_DENSE_NOTE)}</p>")
-    groups = grouped(records)
+    groups = group_records(records)
     for place in dict.fromkeys((row.scene, row.config, row.bucket) for row in rows):
         here = [row for row in rows if (row.scene, row.config, row.bucket) == place]
         parts.append(f"<h3>{html.escape(', '.join(place))}</h3>")
         parts.append(_table(here))
         curves = {}
         for row in here:
-            curves[row.method] = errors_of(groups[row.place], convention)
+            curves[row.method] = pool_errors(groups[row.place], convention)
         parts.append(_curves(curves))
-    if failed := failures(records):
+    if failed := list_failures(records):
         lines = "".join(f"<li>{html.escape(line)}</li>" for line in failed)
         parts.append(f"<h3>Failed</h3><ul>{lines}</ul>")
     return "\n".join(parts) + "\n"
 
 
-def _table(rows: Sequence[Row]) -> str:
+def _table(rows: Sequence[BenchmarkRow]) -> str:
     head, *cells = _lines(rows)
     lines = ["".join(f"<th>{cell}</th>" for cell in head[2:])]
     lines += ["".join(f"<td>{html.escape(c)}</td>" for c in line[2:]) for line in cells]

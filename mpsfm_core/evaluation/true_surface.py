@@ -9,17 +9,17 @@ import numpy as np
 
 from mpsfm_core.data import Float64, PinholeCamera, Pose
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.evaluation.cloud_accuracy import thinned
+from mpsfm_core.evaluation.cloud_accuracy import thin_points
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.geometry import camera_center, pixel_centers, unproject
 
 
-def depth_file(folder: Path, image: str) -> Path:
+def true_depth_file(folder: Path, image: str) -> Path:
     """Where the true depth of an image is: named as the photo, with ``.png``."""
     return folder / PurePosixPath(image).with_suffix(".png")
 
 
-def surface_of_depth(
+def build_true_surface(
     folder: Path,
     images: Collection[str],
     cameras: Mapping[str, PinholeCamera],
@@ -34,7 +34,7 @@ def surface_of_depth(
     """
     parts = []
     for name in images:
-        file = depth_file(folder, name)
+        file = true_depth_file(folder, name)
         if name not in poses or name not in cameras or not file.is_file():
             continue
         depth = read_depth(file)
@@ -43,7 +43,7 @@ def surface_of_depth(
         camera = cameras[name].resized(width, height)
         local = unproject(camera, pixel_centers(width, height)[known], depth[known])
         rotation, translation = poses[name]
-        parts.append(thinned(local @ rotation + camera_center(rotation, translation), spacing))
+        parts.append(thin_points(local @ rotation + camera_center(rotation, translation), spacing))
     if not sum(map(len, parts)):
         raise InputError(f"{folder}: has no true depth of an image with a true pose")
     return np.concatenate(parts)

@@ -14,8 +14,8 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation import read_poses
 from mpsfm_core.evaluation.cloud_accuracy import cloud_accuracy
 from mpsfm_core.evaluation.depth_accuracy import depth_accuracy, mean_accuracy
-from mpsfm_core.evaluation.output_folder import true_surface
 from mpsfm_core.evaluation.prior_quality import write_depth
+from mpsfm_core.evaluation.result_folder import read_true_surface
 from mpsfm_core.results.ply import read_ply, write_ply
 
 TRUTH = np.array([[2, 2, 4, 0]], dtype=np.float32).repeat(3, axis=0)
@@ -161,7 +161,7 @@ def test_true_depth_is_the_scan_where_there_is_none(scene_folder: Path, tmp_path
     (tmp_path / "sparse").symlink_to(gt)
     flat = np.full((24, 32), 2.0, dtype=np.float32)
     np.savez(tmp_path / "depth" / "0001.png.npz", depth=flat, valid=flat > 0)
-    surface = true_surface(gt, depth, sorted(read_poses(gt)), [0.05])
+    surface = read_true_surface(gt, depth, sorted(read_poses(gt)), [0.05])
     far = surface + np.array([0, 0, 50])
     cloud = np.concatenate([surface, far])
     write_ply(tmp_path / "dense.ply", cloud, np.zeros((len(cloud), 3), dtype=np.uint8))

@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 from mpsfm_core.cli import build_app
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation import methods
-from mpsfm_core.evaluation.benchmark import Plan, run_benchmark
-from mpsfm_core.evaluation.methods import MethodRun, run_method, run_tasks
+from mpsfm_core.evaluation.benchmark import BenchmarkPlan, run_benchmark
+from mpsfm_core.evaluation.methods import MethodRun, run_method, run_methods
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.records import read_record, read_records
-from mpsfm_core.evaluation.report import CLOUD
+from mpsfm_core.evaluation.report import CLOUD_METRICS
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
@@ -95,7 +95,7 @@ def test_dense_columns_are_of_ours_where_there_is_true_depth(output) -> None:
         assert found["f1"]["0.02"] < found["f1"]["0.1"]
     lines = {line.split(" | ")[2]: line for line in out.splitlines() if line.startswith("| ")}
     assert lines["method"].endswith("| failed | AbsRel | 0.02 m | 0.1 m |")
-    shares = " / ".join(f"{100 * exact[key]['0.1']:.0f}" for key in CLOUD)
+    shares = " / ".join(f"{100 * exact[key]['0.1']:.0f}" for key in CLOUD_METRICS)
     assert lines["ours-sensor"].endswith(f"| {shares} |")
     assert f"| {exact['abs_rel']:.3f} |" in lines["ours-sensor"]
     assert lines["colmap"].endswith("|  |  |  |  |")
@@ -147,7 +147,7 @@ def test_what_changed_or_broke_is_computed_again(output, scene_folder: Path, con
     damaged = folder / "runs" / "room" / "sift" / "all-00" / "colmap.json"
     damaged.write_text(damaged.read_text()[:100])
     known = {}
-    plan = Plan(
+    plan = BenchmarkPlan(
         (scene_folder,),
         (str(config),),
         ("all",),
@@ -166,7 +166,7 @@ def test_what_changed_or_broke_is_computed_again(output, scene_folder: Path, con
 def test_two_workers_give_the_same_poses(
     output, scene_folder: Path, config: Path, tmp_path
 ) -> None:
-    plan = Plan((scene_folder,), (str(config),), None, ("sensor",), ("colmap",), workers=2)
+    plan = BenchmarkPlan((scene_folder,), (str(config),), None, ("sensor",), ("colmap",), workers=2)
     records = {r.name: r for r in run_benchmark(plan, tmp_path / "out")}
     assert len(records) == 6
     # Pairs of the first set contain those of the others, so that its matches are the same.
@@ -187,14 +187,14 @@ def test_two_workers_give_the_same_poses(
     ],
 )
 def test_wrong_names_are_explained(scene_folder: Path, config: Path, tmp_path, change, message):
-    plan = Plan((scene_folder,), (str(config),), **change)
+    plan = BenchmarkPlan((scene_folder,), (str(config),), **change)
     with pytest.raises(InputError, match=message):
         run_benchmark(plan, tmp_path)
 
 
 def test_two_scenes_of_one_name_are_refused(scene_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="same name"):
-        run_benchmark(Plan((scene_folder, scene_folder)), tmp_path)
+        run_benchmark(BenchmarkPlan((scene_folder, scene_folder)), tmp_path)
 
 
 def small_task(method: str = "ours") -> MethodRun:
@@ -214,7 +214,9 @@ def test_what_a_method_raises_is_its_outcome(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_method_that_kills_its_process_is_recorded_and_the_rest_goes_on() -> None:
     dies = MethodRun("dies", "ours", Deadly(), MapperOptions())  # type: ignore[arg-type]
-    outcomes = {task.label: outcome for task, outcome in run_tasks([dies, small_task("colmap")], 1)}
+    outcomes = {
+        task.label: outcome for task, outcome in run_methods([dies, small_task("colmap")], 1)
+    }
     assert outcomes["dies"].error == "its process died"
     assert len(outcomes["colmap"].models[0]) == 3
 

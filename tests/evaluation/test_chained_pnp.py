@@ -6,8 +6,8 @@ import numpy as np
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.evaluation import CONVENTIONS, pose_errors_deg
-from mpsfm_core.evaluation.chained_pnp import chained_poses
-from mpsfm_core.evaluation.records import Record
+from mpsfm_core.evaluation.chained_pnp import estimate_chained_poses
+from mpsfm_core.evaluation.records import BenchmarkRecord
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -21,24 +21,26 @@ def problem(links: list[tuple[int, int]]) -> MappingProblem:
 
 
 def test_a_chain_carries_poses_from_pair_to_pair_in_either_direction() -> None:
-    (model,) = chained_poses(problem([(0, 2), (1, 2), (1, 4), (3, 4)]))
+    (model,) = estimate_chained_poses(problem([(0, 2), (1, 2), (1, 4), (3, 4)]))
     assert set(model) == set(TRUTH)
     assert pose_errors_deg(model, TRUTH, CONVENTIONS["paper"]).max() < 0.5
 
 
 def test_groups_are_models_of_their_own_and_lone_images_none() -> None:
-    models = chained_poses(problem([(0, 1), (2, 3), (3, 4), (2, 4)]))
+    models = estimate_chained_poses(problem([(0, 1), (2, 3), (3, 4), (2, 4)]))
     assert [sorted(model) for model in models] == [
         ["view_2.png", "view_3.png", "view_4.png"],
         ["view_0.png", "view_1.png"],
     ]
-    assert len(chained_poses(problem([(0, 1)]))) == 1
-    assert chained_poses(problem([])) == []
+    assert len(estimate_chained_poses(problem([(0, 1)]))) == 1
+    assert estimate_chained_poses(problem([])) == []
 
 
 def test_every_model_counts_by_the_convention_of_that_name() -> None:
-    largest, other = chained_poses(problem([(0, 1), (2, 3), (3, 4), (2, 4)]))
-    record = Record("s", "c", "b", "b-00", "m", "", largest, TRUTH, 4, 0.0, 0.0, others=[other])
+    largest, other = estimate_chained_poses(problem([(0, 1), (2, 3), (3, 4), (2, 4)]))
+    record = BenchmarkRecord(
+        "s", "c", "b", "b-00", "m", "", largest, TRUTH, 4, 0.0, 0.0, others=[other]
+    )
     largest_only = (record.errors_deg(CONVENTIONS["paper"]) < 1).sum()
     assert largest_only == 6  # ordered pairs of three images
     assert (record.errors_deg(CONVENTIONS["models"]) < 1).sum() == 8

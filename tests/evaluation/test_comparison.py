@@ -11,14 +11,14 @@ from typer.testing import CliRunner
 
 from mpsfm_core.cli import build_app
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.evaluation.comparison import compare, read_side
-from mpsfm_core.evaluation.records import Record, write_record
-from mpsfm_core.evaluation.report import ALL_SCENES, make_rows, markdown, write_report
+from mpsfm_core.evaluation.comparison import compare_benchmarks, read_benchmark
+from mpsfm_core.evaluation.records import BenchmarkRecord, write_record
+from mpsfm_core.evaluation.report import ALL_SCENES, build_rows, format_markdown, write_report
 
 
 def records(
     noise_deg: float, *, sets: int = 8, label: str = "ours", seed: int = 0, scene: str = "room"
-) -> list[Record]:
+) -> list[BenchmarkRecord]:
     """Sets of five cameras whose orientations are off by about ``noise_deg``."""
     truth_rng, rng = np.random.default_rng(99), np.random.default_rng(seed)
     made = []
@@ -28,13 +28,15 @@ def records(
         turns = Rotation.from_rotvec(np.radians(noise_deg) * rng.normal(size=(5, 3))).as_matrix()
         poses = {n: (turns[i] @ r, turns[i] @ t) for i, (n, (r, t)) in enumerate(truth.items())}
         made.append(
-            Record(scene, "c", "leq10", f"leq10-{number:02d}", label, "", poses, truth, 4, 2.0, 1.0)
+            BenchmarkRecord(
+                scene, "c", "leq10", f"leq10-{number:02d}", label, "", poses, truth, 4, 2.0, 1.0
+            )
         )
     return made
 
 
-def difference(a: list[Record], b: list[Record], resamples: int = 400):
-    [found] = compare({"ours": a}, {"ours": b}, resamples=resamples)
+def difference(a: list[BenchmarkRecord], b: list[BenchmarkRecord], resamples: int = 400):
+    [found] = compare_benchmarks({"ours": a}, {"ours": b}, resamples=resamples)
     return found
 
 
@@ -72,7 +74,7 @@ def test_only_sets_of_both_sides_count() -> None:
     found = difference(records(1.0, sets=8), records(1.0, sets=6, seed=1)[1:])
     assert found.sets == 5
     with pytest.raises(InputError, match="no set and method in common"):
-        compare({"ours": records(1.0)}, {"colmap": records(1.0)})
+        compare_benchmarks({"ours": records(1.0)}, {"colmap": records(1.0)})
 
 
 def test_the_command_compares_folders_and_methods(tmp_path: Path) -> None:
@@ -89,15 +91,15 @@ def test_the_command_compares_folders_and_methods(tmp_path: Path) -> None:
     result = CliRunner().invoke(build_app(), within)
     assert "ours → colmap" in result.stdout
     with pytest.raises(InputError, match="no method 'openmvg'; it has"):
-        read_side(f"{tmp_path / 'a'}:openmvg")
+        read_benchmark(f"{tmp_path / 'a'}:openmvg")
     with pytest.raises(InputError, match="no results of a benchmark"):
-        read_side(str(tmp_path))
+        read_benchmark(str(tmp_path))
 
 
 def test_rows_pool_errors_and_several_scenes() -> None:
     first = records(1.0, sets=3)
-    lost = Record(**{**vars(first[0]), "estimated": {}, "error": "RuntimeError: no"})
-    rows = make_rows([lost, *first[1:], *records(1.0, sets=2, scene="hall")])
+    lost = BenchmarkRecord(**{**vars(first[0]), "estimated": {}, "error": "RuntimeError: no"})
+    rows = build_rows([lost, *first[1:], *records(1.0, sets=2, scene="hall")])
     assert [row.scene for row in rows] == ["room", "hall", ALL_SCENES]
     room = rows[0]
     assert (room.sets, room.failed, room.pairs) == (3, 1, 12)
@@ -106,13 +108,15 @@ def test_rows_pool_errors_and_several_scenes() -> None:
     assert rows[2].sets == 5
     pooled = (3 * room.auc[5] + 2 * rows[1].auc[5]) / 5  # sets of equal size
     assert rows[2].auc[5] == pytest.approx(pooled)
-    text = markdown(rows)
+    text = format_markdown(rows)
     assert "### all scenes, configuration `c`" in text and "| 67% | 1.00 | 1 |" in text
 
 
 def test_what_failed_is_listed_with_its_reason(tmp_path: Path) -> None:
     good, other = records(1.0, sets=2)
-    lost = Record(**{**vars(other), "estimated": {}, "error": "RuntimeError: 3 < 5 points"})
+    lost = BenchmarkRecord(
+        **{**vars(other), "estimated": {}, "error": "RuntimeError: 3 < 5 points"}
+    )
     write_report(tmp_path, [good, lost])
     line = "room / c / leq10-01 / ours: RuntimeError: 3 < 5 points"
     assert f"### Failed\n\n- {line}\n" in (tmp_path / "report.md").read_text()

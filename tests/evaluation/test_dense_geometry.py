@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mpsfm_core.evaluation.read_true_surface import build_true_surface
 
 from mpsfm_core.data import DepthPrior, Float64
-from mpsfm_core.evaluation.dense_geometry import dense_accuracy
+from mpsfm_core.evaluation.dense_geometry import evaluate_dense_geometry
 from mpsfm_core.evaluation.prior_quality import read_depth
-from mpsfm_core.evaluation.records import Record
-from mpsfm_core.evaluation.report import make_rows
+from mpsfm_core.evaluation.records import BenchmarkRecord
+from mpsfm_core.evaluation.report import build_rows
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
-from mpsfm_core.evaluation.true_surface import surface_of_depth
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from tests.evaluation.conftest import CAMERA, NAMES
 
@@ -44,11 +44,11 @@ def model(scene: SceneFolder, factor: float = 1.0, images: int = len(NAMES)) -> 
 
 def cloud_of(scene: SceneFolder) -> Float64:
     assert scene.depth is not None
-    return SCALE * surface_of_depth(scene.depth, NAMES, CAMERAS, scene.truth, 0.01)
+    return SCALE * build_true_surface(scene.depth, NAMES, CAMERAS, scene.truth, 0.01)
 
 
 def test_what_is_right_but_for_the_unit_is_right(scene: SceneFolder) -> None:
-    found = dense_accuracy(model(scene), cloud_of(scene), scene, CAMERAS, (0.02, 0.05))
+    found = evaluate_dense_geometry(model(scene), cloud_of(scene), scene, CAMERAS, (0.02, 0.05))
     assert found is not None
     assert found["depth"]["abs_rel"] < 1e-4 and found["depth"]["images"] == len(NAMES)
     assert found["depth"]["scale"] == pytest.approx(1 / SCALE)
@@ -56,7 +56,7 @@ def test_what_is_right_but_for_the_unit_is_right(scene: SceneFolder) -> None:
 
 
 def test_depth_off_by_a_tenth_is_not_scaled_away(scene: SceneFolder) -> None:
-    found = dense_accuracy(model(scene, 1.1), cloud_of(scene), scene, CAMERAS, (0.02,))
+    found = evaluate_dense_geometry(model(scene, 1.1), cloud_of(scene), scene, CAMERAS, (0.02,))
     assert found is not None and found["depth"]["abs_rel"] == pytest.approx(0.1, abs=1e-3)
 
 
@@ -64,19 +64,21 @@ def test_without_true_depth_or_scale_there_is_nothing_to_say(scene: SceneFolder,
     cloud = cloud_of(scene)
     (tmp_path / "gt_depth").mkdir()
     for other in (replace(scene, path=tmp_path / "nowhere"), replace(scene, path=tmp_path)):
-        assert dense_accuracy(model(scene), cloud, other, CAMERAS, (0.02,)) is None
-    assert dense_accuracy(model(scene, images=2), cloud, scene, CAMERAS, (0.02,)) is None
+        assert evaluate_dense_geometry(model(scene), cloud, other, CAMERAS, (0.02,)) is None
+    assert evaluate_dense_geometry(model(scene, images=2), cloud, scene, CAMERAS, (0.02,)) is None
 
 
 def test_a_row_has_the_mean_of_the_sets_that_were_compared(scene: SceneFolder) -> None:
-    found = dense_accuracy(model(scene), cloud_of(scene), scene, CAMERAS, (0.02,))
-    other = dense_accuracy(model(scene, 1.1), cloud_of(scene)[:1], scene, CAMERAS, (0.02,))
+    found = evaluate_dense_geometry(model(scene), cloud_of(scene), scene, CAMERAS, (0.02,))
+    other = evaluate_dense_geometry(model(scene, 1.1), cloud_of(scene)[:1], scene, CAMERAS, (0.02,))
     records = [
-        Record("room", "sift", "all", f"all-0{k}", "ours", "", {}, scene.truth, 0, 1, 1, dense=each)
+        BenchmarkRecord(
+            "room", "sift", "all", f"all-0{k}", "ours", "", {}, scene.truth, 0, 1, 1, dense=each
+        )
         for k, each in enumerate((found, other, None))
     ]
-    (row,) = make_rows(records)
+    (row,) = build_rows(records)
     assert row.sets == 3 and row.dense is not None and row.dense["sets"] == 2
     assert row.dense["abs_rel"] == pytest.approx(0.05, abs=1e-3)
     assert row.dense["completeness"]["0.02"] == pytest.approx(0.5, abs=0.01)
-    assert make_rows(records[2:])[0].dense is None
+    assert build_rows(records[2:])[0].dense is None

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from mpsfm_core.cli import build_app
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.evaluation.external_results import records_of
+from mpsfm_core.evaluation.external_results import read_external_records
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS
 from mpsfm_core.evaluation.records import read_record, write_record
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder
@@ -43,7 +43,7 @@ def test_a_colmap_model_of_each_set(model: pycolmap.Reconstruction, tmp_path: Pa
     scene = scene_of(model, tmp_path)
     for item in scene.sets:
         write_text(moved(model), tmp_path / "theirs" / "room" / item.name / "sparse" / "0")
-    records = records_of("theirs", tmp_path / "theirs", scene, scene.sets, "benchmark")
+    records = read_external_records("theirs", tmp_path / "theirs", scene, scene.sets, "benchmark")
     assert [len(record.estimated) for record in records] == [3, 5]
     for record in records:
         assert record.errors_deg(CONVENTIONS["paper"]).max() < 1e-4
@@ -58,7 +58,9 @@ def test_several_models_count_as_ours_do(model: pycolmap.Reconstruction, tmp_pat
         small.deregister_frame(small.images[image].frame_id)
     write_text(small, tmp_path / "theirs" / "all-00" / "sparse" / "0")
     write_text(model, tmp_path / "theirs" / "all-00" / "sparse" / "1")
-    (record,) = records_of("theirs", tmp_path / "theirs", scene, scene.sets[1:], "benchmark")
+    (record,) = read_external_records(
+        "theirs", tmp_path / "theirs", scene, scene.sets[1:], "benchmark"
+    )
     assert (len(record.estimated), [len(other) for other in record.others]) == (5, [2])
 
 
@@ -67,7 +69,9 @@ def test_transforms_of_a_single_set(model: pycolmap.Reconstruction, tmp_path: Pa
     (tmp_path / "theirs").mkdir()
     files = {image.name: f"images/{image.name}" for image in model.images.values()}
     write_transforms(tmp_path / "theirs" / "transforms.json", moved(model), files)
-    (record,) = records_of("nerfstudio", tmp_path / "theirs", scene, scene.sets[1:], "benchmark")
+    (record,) = read_external_records(
+        "nerfstudio", tmp_path / "theirs", scene, scene.sets[1:], "benchmark"
+    )
     assert len(record.estimated) == 5
     assert record.errors_deg(CONVENTIONS["paper"]).max() < 1e-4
 
@@ -77,12 +81,14 @@ def test_a_set_without_a_model_counts_as_failed(
 ) -> None:
     scene = scene_of(model, tmp_path)
     write_text(model, tmp_path / "theirs" / "all-00")
-    first, second = records_of("theirs", tmp_path / "theirs", scene, scene.sets, "benchmark")
+    first, second = read_external_records(
+        "theirs", tmp_path / "theirs", scene, scene.sets, "benchmark"
+    )
     assert first.error == "no model of this set"
     assert (first.errors_deg(CONVENTIONS["paper"]) == 180).all()
     assert not second.error
     with pytest.raises(InputError, match=r"no model of a set of room; expected as .*minimal-00"):
-        records_of("theirs", tmp_path / "out", scene, scene.sets, "benchmark")
+        read_external_records("theirs", tmp_path / "out", scene, scene.sets, "benchmark")
 
 
 @pytest.mark.parametrize("text", ["theirs", "a/b=.", "theirs=nowhere", "ours-sensor=.", "colmap=."])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mpsfm_core.evaluation.prior_quality import error_seed, prior_settings, read_depth
+from mpsfm_core.evaluation.prior_quality import parse_error_seed, prior_overrides, read_depth
 from mpsfm_core.evaluation.scene_folder import read_scene
 
 
@@ -22,7 +22,7 @@ from mpsfm_core.evaluation.scene_folder import read_scene
     ],
 )
 def test_seeds_are_read_from_the_name(quality: str, seed: int | None) -> None:
-    assert error_seed(quality) == seed
+    assert parse_error_seed(quality) == seed
 
 
 def test_each_seed_draws_other_errors_of_the_same_size(scene_folder: Path, tmp_path: Path) -> None:
@@ -34,7 +34,7 @@ def test_each_seed_draws_other_errors_of_the_same_size(scene_folder: Path, tmp_p
     errors = []
     for quality in ("degraded", "degraded-0", "degraded-1"):
         folder = tmp_path / quality
-        settings = prior_settings(quality, scene, [image], folder)
+        settings = prior_overrides(quality, scene, [image], folder)
         assert "depth.options.relative_std=0.05" in settings
         known = truth > 0
         errors.append(np.log(read_depth(folder / f"{stem}.png")[known] / truth[known]))

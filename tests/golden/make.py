@@ -32,7 +32,7 @@ from mpsfm_core.data import (
     PinholeCamera,
     SparseMatches,
 )
-from mpsfm_core.evaluation.records import Record, write_record
+from mpsfm_core.evaluation.records import BenchmarkRecord, write_record
 from mpsfm_core.evaluation.scene_folder import write_sets
 from mpsfm_core.extraction.cache import Cache, digest
 from mpsfm_core.extraction.empty_results import JointPrior
@@ -163,7 +163,7 @@ def write_evaluation(output: Path) -> None:
     sets = {"minimal": [{"images": ["0.png", "1.png"]}], "triplets": {"0-5": [["0", "1", "2"]]}}
     write_sets(output, sets, "overlap from depth")  # type: ignore[arg-type]
     poses = {f"{k}.png": (np.eye(3), np.array([k, 0.0, 0.5])) for k in range(3)}
-    record = Record(
+    record = BenchmarkRecord(
         "room", "benchmark", "minimal", "minimal-00", "ours-config", KEY, poses, poses, 3, 1.0, 1.5,
         others=(poses,),
     )  # fmt: skip

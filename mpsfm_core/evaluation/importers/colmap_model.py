@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Float64, Int64
-from mpsfm_core.evaluation.importers.frames import Frame, Observations, photo_size
+from mpsfm_core.evaluation.importers.frames import Frame, FrameObservations, photo_size
 from mpsfm_core.inputs.models import read_model
 
 
@@ -37,11 +37,11 @@ def model_frames(folder: Path, photo_of: Callable[[str], Path]) -> list[Frame]:
 
 def _observations(
     model: pycolmap.Reconstruction, image: pycolmap.Image, scale: Float64
-) -> Observations:
+) -> FrameObservations:
     """Each point once."""
     seen = {int(point.point3D_id): point.xy for point in image.get_observation_points2D()}
     ids: Int64 = np.array(list(seen), dtype=np.int64)
-    return Observations(
+    return FrameObservations(
         np.array([xy * scale for xy in seen.values()]).reshape(-1, 2),
         ids,
         np.array([model.points3D[int(i)].xyz for i in ids]).reshape(-1, 3),

@@ -24,7 +24,7 @@ _DEPTH_COLUMNS = 1024
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class FrameObservations:
     """Points that a photo observes: pixels (p, 2), ids (p,) and world coordinates (p, 3)."""
 
     xy: Float64
@@ -45,7 +45,7 @@ class Frame:
     camera: pycolmap.Camera
     pose: Float64
     depth: Callable[[], Float32] | None = None
-    observations: Observations | None = None
+    observations: FrameObservations | None = None
 
 
 def write_frames(target: Path, frames: Sequence[Frame]) -> None:

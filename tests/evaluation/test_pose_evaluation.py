@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.evaluation.models import evaluate
+from mpsfm_core.evaluation.pose_evaluation import evaluate
 from mpsfm_core.inputs.models import read_poses
 
 

@@ -12,7 +12,7 @@ from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.cloud_accuracy import TOLERANCES, cloud_accuracy
 from mpsfm_core.evaluation.depth_accuracy import DepthAccuracy, depth_accuracy, mean_accuracy
 from mpsfm_core.evaluation.prior_quality import read_depth
-from mpsfm_core.evaluation.true_surface import depth_file, surface_of_depth
+from mpsfm_core.evaluation.read_true_surface import build_true_surface, true_depth_file
 from mpsfm_core.inputs.models import read_model, reconstruction_poses
 from mpsfm_core.inputs.undistortion import undistort_camera
 from mpsfm_core.results.depth_maps import load_depth_map
@@ -28,7 +28,7 @@ def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
     scales = {"raw": 1.0, "median_scaled": None}
     found: dict[str, list[DepthAccuracy]] = {name: [] for name in scales}
     for path in sorted((output / "depth").rglob("*.npz")):
-        file = depth_file(truth, path.relative_to(output / "depth").with_suffix("").as_posix())
+        file = true_depth_file(truth, path.relative_to(output / "depth").with_suffix("").as_posix())
         if not file.is_file():
             continue
         arrays = load_depth_map(path)
@@ -72,13 +72,15 @@ def read_points(path: Path) -> Float64:
     return points
 
 
-def true_surface(
+def read_true_surface(
     model: Path, depth: Path, images: Collection[str], tolerances: Sequence[float] = TOLERANCES
 ) -> Float64:
-    """What :func:`surface_of_depth` says with the cameras and poses of a true model."""
+    """What :func:`build_true_surface` says with the cameras and poses of a true model."""
     true = read_model(model)
     cameras = {
         str(image.name): undistort_camera(true.cameras[image.camera_id], 0.0)
         for image in true.images.values()
     }
-    return surface_of_depth(depth, images, cameras, reconstruction_poses(true), min(tolerances) / 2)
+    return build_true_surface(
+        depth, images, cameras, reconstruction_poses(true), min(tolerances) / 2
+    )
