@@ -81,7 +81,7 @@ def test_resumes_in_the_next_run(tmp_path: Path, server: Server, uri: str) -> No
 def _partial(cache: Path, server: Server, uri: str) -> Path:
     """Leaves 1000 bytes of a download behind, as a killed process does."""
     server.cut_after = 0
-    with pytest.raises(WeightsError, match="goes on after"):
+    with pytest.raises(WeightsError, match="continues after"):
         WeightStore(cache).resolve(uri)
     (part,) = cache.rglob("*.part")
     part.write_bytes(CONTENT[:1000])
@@ -177,7 +177,7 @@ def test_no_server_is_found_out_with_one_attempt(
 def test_a_server_that_does_not_answer_is_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(weights, "_OPENING_S", 0.05)
+    monkeypatch.setattr(weights, "_CONNECT_TIMEOUT_S", 0.05)
     monkeypatch.setattr(weights, "_RETRY_WAIT_S", 3600)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         uri = f"http://127.0.0.1:{silent.getsockname()[1]}/model.onnx"
@@ -379,7 +379,7 @@ def test_where_a_server_may_redirect_to(
     asked: str, target: str, host_may_change: bool, why: str
 ) -> None:
     request = urllib.request.Request(asked)
-    redirects = weights._Redirects(request, host_may_change)
+    redirects = weights._RedirectPolicy(request, host_may_change)
     if why:
         with pytest.raises(WeightsError, match=why):
             redirects.redirect_request(request, Answer(), 302, "Found", {}, target)
