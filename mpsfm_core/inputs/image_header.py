@@ -79,6 +79,21 @@ def read_declared_num_pixels(data: bytes) -> int | None:
     return None if sizes is None else sizes[0] * sizes[1]
 
 
+def is_plain_rgb(data: bytes) -> bool:
+    """Return whether an image is an 8-bit RGB JPEG or PNG, which all programs decode alike.
+
+    Gray, CMYK, palette, alpha and 16-bit images are not: many programs give them other shapes or
+    colors.
+    """
+    if data[:2] == b"\xff\xd8":
+        frames = (p for m, p in _jpeg_segments(data) if m in _JPEG_SOF and len(p) >= 6)
+        return next(((p[0], p[5]) for p in frames), None) == (8, 3)
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 26:
+        is_transparent = any(name == b"tRNS" for name, _ in _chunks(data, 8, ">"))
+        return (data[24], data[25]) == (8, 2) and not is_transparent
+    return False
+
+
 def is_cut_jpeg(data: bytes) -> bool:
     """Return whether a JPEG lacks its end marker; decoders fill missing pixels with gray."""
     if data[:2] != b"\xff\xd8":

@@ -9,13 +9,19 @@ import pycolmap
 
 from mpsfm_core.data import Float64, MappingProblem, View
 from mpsfm_core.inputs.image_decoding import read_bytes
-from mpsfm_core.inputs.image_header import read_header
+from mpsfm_core.inputs.image_header import is_plain_rgb, read_header
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.inputs.undistortion import is_pinhole
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 _PORTABLE = frozenset((".jpg", ".jpeg", ".png"))
 """Extensions of formats that all programs read."""
+_SIGNATURES = {
+    ".jpg": b"\xff\xd8\xff",
+    ".jpeg": b"\xff\xd8\xff",
+    ".png": b"\x89PNG\r\n\x1a\n",
+}
+"""First bytes of these formats: a name may have the extension of another one."""
 
 
 class OriginalImages:
@@ -70,14 +76,15 @@ def exported_image_name(name: str) -> str:
 def export_view(images: ImageSet, index: int, path: Path) -> None:
     """Write the upright, undistorted view of an image; the extension sets the format.
 
-    Copies the file if the image is already upright and undistorted and has this format.
+    Copies the file if it is an upright and undistorted 8-bit RGB image of this format.
     """
     image = images[index]
     path.parent.mkdir(parents=True, exist_ok=True)
-    unchanged = is_pinhole(image.camera) and image.pinhole.size == image.original_size
-    if unchanged and path.suffix == image.path.suffix:
+    if is_pinhole(image.camera) and image.pinhole.size == image.original_size:
         data = read_bytes(image.path)
-        if read_header(data).orientation == 1:
+        signature = _SIGNATURES.get(path.suffix.lower(), b"")
+        is_upright = read_header(data).orientation == 1
+        if is_upright and signature and data.startswith(signature) and is_plain_rgb(data):
             path.write_bytes(data)
             return
     bgr = cv2.cvtColor(images.view(index).image, cv2.COLOR_RGB2BGR)

@@ -19,6 +19,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -53,6 +54,8 @@ from mpsfm_core.results.ply import write_cloud, write_ply
 from mpsfm_core.results.transforms_json import supports_camera, write_transforms
 from mpsfm_core.results.views import write_views
 from mpsfm_core.support.files import replace_entries, write_file
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +112,7 @@ def write_results(
     with replace_entries(output, ENTRIES) as folder:
         write_model(folder / SPARSE, largest.model)
         if options.text_model:
-            write_model(folder / SPARSE_TEXT, largest.model, text=True)
+            _write_text_model(folder / SPARSE_TEXT, largest.model)
         for number, component in enumerate(others, start=1):
             subfolder = folder / COMPONENTS / str(number)
             write_model(subfolder, component.model)
@@ -123,6 +126,16 @@ def write_results(
         if options.report:
             write_views(folder / VIEWS, photos.problem, photos.view)
         _write_json(folder / SUMMARY, summarize())
+
+
+def _write_text_model(folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Write the text model, or warn if a name has a space: COLMAP would cut it off there."""
+    spaced = [name for i in model.images.values() if len((name := str(i.name)).split()) != 1]
+    if spaced:
+        text = "sparse_text is not written: COLMAP's text format allows no spaces in names (%s)"
+        _log.warning(text, min(spaced))
+        return
+    write_model(folder, model, text=True)
 
 
 def _write_dense(

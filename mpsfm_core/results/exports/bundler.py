@@ -10,7 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from mpsfm_core.results.exports.source import ExportSource
-from mpsfm_core.results.exports.tracks import describe_points, format_numbers, sort_images_by_name
+from mpsfm_core.results.exports.tracks import (
+    check_names_without_spaces,
+    describe_points,
+    format_numbers,
+    sort_images_by_name,
+)
 
 ENTRIES = ("bundle.out", "list.txt", "images")
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -20,11 +25,12 @@ def write(source: ExportSource, folder: Path) -> None:
     """Write the folder; the focal length is the mean of fx and fy.
 
     Raises:
-        InputError: the image files are missing.
+        InputError: the image files are missing, or a name has a space.
     """
     model = source.undistorted()
-    source.write_photos(folder / "images")
     images = sort_images_by_name(model)
+    check_names_without_spaces((str(image.name) for image in images), "Bundler")
+    source.write_photos(folder / "images")
     lines = ["# Bundle file v0.3", f"{len(images)} {model.num_points3D()}"]
     for image in images:
         pose = image.cam_from_world()

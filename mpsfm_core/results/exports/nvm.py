@@ -7,9 +7,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mpsfm_core.data.errors import InputError
 from mpsfm_core.results.exports.source import ExportSource
-from mpsfm_core.results.exports.tracks import describe_points, format_numbers, sort_images_by_name
+from mpsfm_core.results.exports.tracks import (
+    check_names_without_spaces,
+    describe_points,
+    format_numbers,
+    sort_images_by_name,
+)
 
 ENTRIES = ("reconstruction.nvm", "images")
 
@@ -22,11 +26,7 @@ def write(source: ExportSource, folder: Path) -> None:
     """
     model = source.undistorted()
     images = sort_images_by_name(model)
-    for image in images:
-        if len(str(image.name).split()) != 1:
-            raise InputError(
-                f"NVM does not allow spaces in names such as {image.name!r}; rename the photo"
-            )
+    check_names_without_spaces((str(image.name) for image in images), "NVM")
     source.write_photos(folder / "images")
     lines = [
         "NVM_V3 ",

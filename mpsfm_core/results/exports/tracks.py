@@ -1,4 +1,4 @@
-"""Points and tracks as text, shared by the exports to Bundler and VisualSFM."""
+"""Points and tracks as text, shared by the exports to text formats."""
 
 from __future__ import annotations
 
@@ -6,6 +6,18 @@ from collections.abc import Iterable
 
 import numpy as np
 import pycolmap
+
+from mpsfm_core.data.errors import InputError
+
+
+def check_names_without_spaces(names: Iterable[str], format_name: str) -> None:
+    """Raise :class:`InputError` for a name with a space, which separates fields in the format."""
+    for name in names:
+        if len(name.split()) != 1:
+            raise InputError(
+                f"{format_name} does not allow spaces in names such as {name!r}; rename the photo, "
+                f"or export to a format that allows them, such as colmap-db or nerfstudio"
+            )
 
 
 def sort_images_by_name(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
