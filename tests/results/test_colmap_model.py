@@ -89,7 +89,9 @@ def test_points_have_the_colour_of_the_photos(solved, model) -> None:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_checked_free_space_covers_all_files(model, tmp_path: Path, text: bool, monkeypatch) -> None:
+def test_checked_free_space_covers_all_files(
+    model, tmp_path: Path, text: bool, monkeypatch
+) -> None:
     sizes = []
     monkeypatch.setattr(colmap_model, "_check_free_space", lambda path, size: sizes.append(size))
     write_model(tmp_path, model, text=text)
