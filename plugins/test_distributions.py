@@ -1,4 +1,4 @@
-"""What every first-party plugin has to be as a package, whatever it does."""
+"""Tests of the packaging of all first-party plugins."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ else:
 
 PLUGINS = sorted(path.parent for path in Path(__file__).parent.glob("*/pyproject.toml"))
 DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "rerun": "rerun-sdk"}
-"""Of imports that are called otherwise."""
+"""Distribution by import name, if they differ."""
 WITH_THE_CORE = {"mpsfm_core", "pydantic"}
-"""Options are pydantic models."""
+"""Packages that come with the core; options are pydantic models."""
 WITHOUT_THEIR_DEPENDENCIES = {"depth_anything_3", "vismatch"}
-"""They ask for packages that fit beside nothing; a specification says how to get them."""
+"""Packages with conflicting dependencies; the specification states how to install them."""
 FOR_TESTS_ONLY = ("contract.py", "stand_in.py")
 BESIDE_THE_AUTHORS_CODE = ("export.py", "export_moge.py", "export_unidepth.py")
-"""Run where the authors' code is installed, with what it needs."""
+"""Export scripts, which run with the packages of the authors' code."""
 HEAVY = {"viser", "rerun", "torch", "transformers", "onnxruntime", "kornia", "cv2", "scipy", "onnx"}
 
 each_plugin = pytest.mark.parametrize("folder", PLUGINS, ids=lambda folder: folder.name)
@@ -62,7 +62,7 @@ def test_project(folder: Path) -> None:
 
 
 @each_plugin
-def test_what_is_imported_is_declared(folder: Path) -> None:
+def test_imports_are_declared(folder: Path) -> None:
     project, package = project_of(folder), package_of(folder)
     tests = project.get("optional-dependencies", {}).get("test", [])
     for module in package.rglob("*.py"):
@@ -77,7 +77,7 @@ def test_what_is_imported_is_declared(folder: Path) -> None:
 
 
 @each_plugin
-def test_announcing_is_light(folder: Path) -> None:
+def test_registration_imports_nothing_heavy(folder: Path) -> None:
     modules = list(project_of(folder)["entry-points"]["mpsfm.plugins"].values())
     code = (
         f"import importlib, sys; [importlib.import_module(name) for name in {modules!r}]; "

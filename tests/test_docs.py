@@ -1,4 +1,4 @@
-"""The documentation: its commands are ours, its links lead somewhere, it asks no other server."""
+"""Tests of the documentation: commands and links are valid, and pages load nothing external."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def commands_of(page: Path) -> list[str]:
-    """The lines of a page's shell blocks that run mpsfm."""
+    """Return the mpsfm commands in the shell blocks of a page."""
     text = page.read_text(encoding="utf-8")
     blocks = re.findall(r"^```(?:sh|bash|console)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     lines = "".join(blocks).replace("\\\n", " ").splitlines()
@@ -33,7 +33,7 @@ def commands_of(page: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_commands_are_understood(page: Path) -> None:
+def test_commands_are_valid(page: Path) -> None:
     for line in commands_of(page):
         if "..." in line:
             continue
@@ -45,13 +45,13 @@ def test_commands_are_understood(page: Path) -> None:
 
 
 def blocks_of(page: Path, language: str) -> list[str]:
-    """The blocks of a language in a page."""
+    """Return the code blocks of a language in a page."""
     text = page.read_text(encoding="utf-8")
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_configurations_are_understood(page: Path, tmp_path: Path) -> None:
+def test_configurations_are_valid(page: Path, tmp_path: Path) -> None:
     for number, block in enumerate(blocks_of(page, "yaml")):
         if block.startswith("extends:"):
             file = tmp_path / f"{number}.yaml"
@@ -60,7 +60,7 @@ def test_configurations_are_understood(page: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_python_asks_for_what_there_is(page: Path) -> None:
+def test_python_blocks_use_existing_names(page: Path) -> None:
     for block in blocks_of(page, "python"):
         for node in ast.walk(ast.parse(block)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mpsfm_core"):
@@ -85,8 +85,7 @@ def test_the_first_pages_have_commands() -> None:
 
 @pytest.mark.slow
 def test_first_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of the first run and of two how-tos, in their order, but the demo, which has its own
-    test. Three photos of the sample scene are the photos, and the video."""
+    """Run the commands of the first-run page and of two how-tos on three photos."""
     monkeypatch.setenv("MPSFM_OFFLINE", "1")
     monkeypatch.setenv("MPSFM_CACHE", str(tmp_path / "cache"))
     (tmp_path / "photos").mkdir()
@@ -111,7 +110,7 @@ def test_first_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert (tmp_path / "out" / "mesh.glb").is_file()
 
 
-def test_the_site_builds_and_asks_no_other_server(tmp_path: Path) -> None:
+def test_site_builds_and_loads_nothing_external(tmp_path: Path) -> None:
     for module in ("mkdocs", "material", "mkdocstrings"):
         if importlib.util.find_spec(module) is None:
             pytest.skip(f"{module} is not installed: pip install 'mpsfm-core[docs]'")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import io
 import re
 import tokenize
@@ -37,6 +38,14 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
                 and isinstance(statement.value.value, str)
             ):
                 yield statement.lineno, statement.value.value
+
+
+def split_docstring(text: str) -> Iterator[str]:
+    """Yield the paragraphs and section items of a docstring, without commands and code."""
+    for paragraph in re.split(r"\n\s*\n", inspect.cleandoc(text)):
+        if all(line.startswith("    ") for line in paragraph.splitlines()):
+            continue  # a command or code
+        yield from re.split(r"^\w+:\n    |\n    (?=\w+: )", paragraph)
 
 
 def messages(tree: ast.Module) -> Iterator[tuple[int, str]]:
@@ -89,7 +98,11 @@ def sentences_of(path: Path, root: Path) -> Iterator[Sentence]:
     texts: list[tuple[str, int, str]] = []
     if path.suffix == ".py":
         tree = ast.parse(source)
-        texts += [("docstring", line, text) for line, text in docstrings(tree)]
+        texts += [
+            ("docstring", line, part)
+            for line, text in docstrings(tree)
+            for part in split_docstring(text)
+        ]
         texts += [("message", line, text) for line, text in messages(tree)]
         texts += [("comment", line, text) for line, text in comments(source)]
     else:

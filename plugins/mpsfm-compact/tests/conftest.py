@@ -1,4 +1,4 @@
-"""The training code beside the package is no part of it: tests put it on the path."""
+"""Import path of the training code, which is not part of the package."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ PLUGIN = Path(__file__).parents[1]
 
 @pytest.fixture
 def training(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Makes ``training`` importable; skips where its packages are missing."""
+    """Make ``training`` importable; skip if its packages are missing."""
     pytest.importorskip("torch")
     monkeypatch.syspath_prepend(str(PLUGIN))

@@ -1,4 +1,4 @@
-"""The shipped network on the sample scene of the repository, which it was never trained on."""
+"""Tests of the shipped network on the sample scene, which is not part of its training data."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_weights_are_small() -> None:
 
 
 def test_depth_normals_and_their_std(views: list[View], context: ProviderContext) -> None:
-    """Better than no network by far; the std says how good, and where."""
+    """Check accuracy and coverage of depth and normals."""
     provider = CompactDepth(CompactOptions(), context)
     registry = Registry.discover()
     calibrations = {k: registry.spec(k, "compact").calibration for k in ("depth", "normals")}
@@ -77,7 +77,7 @@ def test_depth_normals_and_their_std(views: list[View], context: ProviderContext
 
 
 def test_kinds_agree(views: list[View], context: ProviderContext) -> None:
-    """Normals alone are those of the joint pass; the mask is where depth is valid."""
+    """Check that normals equal those of the joint pass, and that the mask equals valid depth."""
     options = CompactOptions()
     depth, normals = CompactDepth(options, context).predict_joint(views[0])
     alone = CompactNormals(options, context).predict(views[0])
@@ -88,8 +88,8 @@ def test_kinds_agree(views: list[View], context: ProviderContext) -> None:
     assert agree.mean() > 0.97
 
 
-def test_camera_is_told(views: list[View], context: ProviderContext) -> None:
-    """What looks the same through a longer lens is farther away."""
+def test_depth_follows_the_focal_length(views: list[View], context: ProviderContext) -> None:
+    """Check that depth of the same image grows with the focal length."""
     view = views[0]
     camera = replace(view.camera, fx=1.5 * view.camera.fx, fy=1.5 * view.camera.fy)
     provider = CompactDepth(CompactOptions(), context)
@@ -99,7 +99,7 @@ def test_camera_is_told(views: list[View], context: ProviderContext) -> None:
 
 
 def test_sky_is_no_surface(context: ProviderContext) -> None:
-    """A blue gradient over a textured ground: the upper part has no depth."""
+    """Check that a blue gradient above textured ground has no depth."""
     rng = np.random.default_rng(0)
     image = np.empty((480, 640, 3), np.uint8)
     image[:220] = (np.array([120, 170, 240]) + np.arange(220)[:, None, None] // 4).astype(np.uint8)
@@ -112,6 +112,6 @@ def test_sky_is_no_surface(context: ProviderContext) -> None:
 
 
 def load_view(image: np.ndarray) -> View:
-    """A view of an image with a usual focal length."""
+    """Load a view with a common focal length."""
     height, width = image.shape[:2]
     return View("made", image, PinholeCamera(width, height, 560.0, 560.0, width / 2, height / 2))

@@ -1,4 +1,4 @@
-"""The contract of the three kinds, on a stand-in that reads painted views."""
+"""Contract tests of depth, normals and mask with a stand-in network."""
 
 from mpsfm_core.testing import contract_tests
 

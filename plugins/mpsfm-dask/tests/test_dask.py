@@ -1,4 +1,4 @@
-"""The executor on a real cluster of several processes on this machine."""
+"""Tests of the executor on a real cluster of several processes."""
 
 from __future__ import annotations
 

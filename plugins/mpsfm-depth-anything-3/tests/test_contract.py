@@ -1,4 +1,4 @@
-"""The contract on the smallest network with random weights."""
+"""Contract tests of the smallest network with random weights."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The provider against the steps of the authors' own inference, on the same random weights."""
+"""Comparison of the provider with the authors' inference on the same random weights."""
 
 from __future__ import annotations
 
@@ -52,8 +52,10 @@ def view(photos: list[Any]) -> Callable[..., View]:
 
 
 def of_the_authors(file: Path, views: list[View]) -> Any:
-    """Depth, confidence, extrinsics and intrinsics as ``DepthAnything3.inference`` of theirs makes
-    them of photos that need no resizing (its loader needs torchvision), in float32."""
+    """Run the authors' ``DepthAnything3.inference`` in float32 on photos that need no resizing.
+
+    Their loader needs torchvision, so its steps are repeated here.
+    """
     network = network_of("da3-small")
     load_model(torch.nn.ModuleDict({"model": network}), file)
     mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
@@ -63,7 +65,7 @@ def of_the_authors(file: Path, views: list[View]) -> Any:
         return network(batch)
 
 
-def test_it_says_what_the_authors_network_says(
+def test_provider_equals_the_authors_inference(
     provider: DepthAnything3, file: Path, view: Callable[..., View]
 ) -> None:
     views = [view(index, 84, 56) for index in range(3)]
@@ -81,14 +83,14 @@ def test_it_says_what_the_authors_network_says(
 
 
 def test_intrinsics_are_of_the_view(provider: DepthAnything3, view: Callable[..., View]) -> None:
-    """A view that is resized and padded beside a higher one: its centre stays its centre."""
+    """Check that the center of a resized and padded view stays its center."""
     group = provider.predict_group([view(0, 168, 112), view(1, 84, 84)])
     assert group.intrinsics is not None
     np.testing.assert_allclose(group.intrinsics[:, 2:], [[84, 56], [42, 42]], atol=1e-3)
     assert [prior.shape for prior in group.depth] == [(56, 84), (84, 84)]
 
 
-def test_depth_has_no_metre_but_of_the_nested_network(
+def test_only_the_nested_network_is_metric(
     provider: DepthAnything3, view: Callable[..., View]
 ) -> None:
     (prior,) = provider.predict_group([view(0, 84, 56)]).depth
@@ -111,7 +113,7 @@ def test_other_files(
         DepthAnything3(DepthAnything3Options(weights=str(path), network=network), context)
 
 
-def test_published_weights_have_their_licence() -> None:
+def test_published_weights_have_their_license() -> None:
     (file,) = weights(DepthAnything3Options(network="da3-giant"))
     assert (file.uri, file.license) == (
         "hf://depth-anything/DA3-GIANT@main/model.safetensors",
@@ -121,7 +123,7 @@ def test_published_weights_have_their_licence() -> None:
     assert (own.uri, own.license) == ("a.safetensors", "unknown")
 
 
-def test_it_does_not_talk(
+def test_provider_prints_nothing(
     file: Path, context: ProviderContext, view: Callable[..., View], capfd: Any
 ) -> None:
     provider = DepthAnything3(DepthAnything3Options(weights=str(file), resize=28), context)

@@ -1,4 +1,4 @@
-"""The whole path on stand-ins with DSINE's tensors."""
+"""Tests of the provider with stand-ins that have DSINE's tensors."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def view_of(width, height, camera=None, colour=(0, 0, 0)):
 
 @pytest.mark.parametrize("size", [1200, 64])
 def test_intrinsics_follow_resizing_and_padding(model, size, context):
-    """150 x 90 is padded to 160 x 96, or shrunk to 64 x 38 and padded to 64 x 64."""
+    """Check 150 x 90 padded to 160 x 96, and shrunk to 64 x 38 with padding to 64 x 64."""
     view = view_of(150, 90, PinholeCamera(150, 90, 110.0, 120.0, 70.0, 48.0))
     prior = Dsine(DsineOptions(model=model, size=size), context).predict(view)
     height, width = prior.shape
@@ -76,7 +76,7 @@ def test_intrinsics_follow_resizing_and_padding(model, size, context):
 
 
 def test_black_padding_before_normalisation(write_onnx, context):
-    """The corner of the input, which is padding, as the x of all normals."""
+    """Check the padding with a stand-in that returns a corner pixel as the x of all normals."""
     text = """
     dsine (float[b,3,h,w] image, float[b,3,3] intrins) => (float[b,4,h,w] normal) {
         nothing = Mul (image, none)
@@ -97,7 +97,7 @@ def test_black_padding_before_normalisation(write_onnx, context):
     assert normal[2] < 0
 
 
-def test_an_export_without_intrinsics_is_told(write_onnx, context):
+def test_export_without_intrinsics_raises(write_onnx, context):
     text = "dsine (float[b,3,h,w] image) => (float[b,3,h,w] normal) { normal = Identity (image) }"
     with pytest.raises(ConfigError, match=r"needs inputs \['image', 'intrins'\]"):
         Dsine(DsineOptions(model=str(write_onnx(text))), context)

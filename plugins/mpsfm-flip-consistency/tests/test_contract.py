@@ -1,4 +1,4 @@
-"""The contract of the wrapper, around depth and around normals."""
+"""Contract tests of the wrapper around depth and normals."""
 
 from mpsfm_core.testing import contract_tests
 

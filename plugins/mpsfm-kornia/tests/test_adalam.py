@@ -1,4 +1,4 @@
-"""AdaLAM: on features whose matches are known, and with SIFT on real photos."""
+"""Tests of AdaLAM on synthetic features and with SIFT on real photos."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ def features_of(keypoints, descriptors, scales=None):
 
 @pytest.fixture
 def moved():
-    """Features that moved to the right and down by (8, 5), the first 100 of them to random places;
-    both sides in another order."""
+    """Create features that move by (8, 5), the first 100 of them to random positions."""
     rng = np.random.default_rng(0)
     keypoints, descriptors = rng.uniform(10, 170, (COUNT, 2)), rng.normal(size=(COUNT, 16))
     there = keypoints + np.array([8.0, 5.0])
@@ -34,7 +33,7 @@ def moved():
     return features_of(keypoints, descriptors), features_of(there[order], noisy[order]), order
 
 
-def test_keeps_what_moves_with_its_neighbours(blocks, moved, context):
+def test_matches_consistent_with_neighbors_are_kept(blocks, moved, context):
     a, b, order = moved
     found = AdalamMatcher(AdalamOptions(), context).match(blocks, blocks, a, b).sparse
     rows, partners = found.indices[:, 0], order[found.indices[:, 1]]
@@ -44,7 +43,7 @@ def test_keeps_what_moves_with_its_neighbours(blocks, moved, context):
     assert 0 <= found.scores.min() <= found.scores.max() <= 1
 
 
-def test_scales_that_disagree_are_left_out(blocks, moved, context):
+def test_matches_of_inconsistent_scale_are_dropped(blocks, moved, context):
     a, b, order = moved
     scales = np.ones(COUNT, dtype=np.float32)
     other = np.where(np.arange(COUNT) < 200, 1.0, 4.0).astype(np.float32)[order]
@@ -72,8 +71,8 @@ def test_errors_and_few_features(blocks, moved, context):
         matcher.match(blocks, blocks, a, other)
 
 
-def test_more_right_matches_than_the_ratio_test_on_real_photos(load_pair, context):
-    """SIFT on fountain 3-5."""
+def test_more_correct_matches_than_the_ratio_test_on_real_photos(load_pair, context):
+    """Check SIFT on fountain 3-5."""
     pair = load_pair("fountain", "0003.jpg", "0005.jpg")
     sift = Sift(SiftOptions(max_keypoints=3000, first_octave=0), context)
     a, b = sift.extract(pair.view_a), sift.extract(pair.view_b)

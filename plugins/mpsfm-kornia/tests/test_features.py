@@ -1,4 +1,4 @@
-"""The detectors: positions, options, and views of every shape."""
+"""Tests of the detectors: positions, options, and views of all shapes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def changed(view, image, mask=None):
 
 
 def offset_to(found, expected):
-    """Median of the differences to the nearest expected keypoint, for keypoints that have one."""
+    """Compute the median offset to the nearest expected keypoint."""
     distance, nearest = cKDTree(expected).query(found)
     near = distance < 1.5
     assert near.mean() > 0.35
@@ -38,7 +38,7 @@ def offset_to(found, expected):
 
 
 class BrightestPixel(KorniaFeatures):
-    """Reports the index of the brightest pixel of its image, as kornia's detectors would."""
+    """Detector that returns the index of the brightest pixel, in kornia's convention."""
 
     def _detect(self, image):
         row, column = divmod(int(image[0, 0].argmax()), image.shape[-1])
@@ -55,7 +55,7 @@ class BrightestPixel(KorniaFeatures):
     ],
 )
 def test_pixel_convention(context, size, longest, grid):
-    """The centre of pixel (c, r) of the network's image is (c + 0.5, r + 0.5), scaled."""
+    """Check that pixel (c, r) of the network input becomes (c + 0.5, r + 0.5), scaled."""
     image = np.zeros((size[1], size[0], 3), dtype=np.uint8)
     bright = np.array([size[0] // 3, size[1] // 2])
     image[bright[1], bright[0]] = 255
@@ -69,7 +69,7 @@ def test_pixel_convention(context, size, longest, grid):
 
 @pytest.mark.parametrize("factor", [2, 3])
 def test_resizing_moves_no_keypoint(make, blocks, name, factor):
-    """A view enlarged by pixel repetition, detected at its old size, has its old keypoints."""
+    """Check that a view enlarged by pixel repetition has the same keypoints at its old size."""
     large = changed(blocks, blocks.image.repeat(factor, axis=0).repeat(factor, axis=1))
     found = make("features", name, resize=256).extract(large)
     expected = make("features", name, resize=None).extract(blocks)
@@ -78,8 +78,8 @@ def test_resizing_moves_no_keypoint(make, blocks, name, factor):
     assert expected.std_px == 1
 
 
-def test_size_that_no_network_likes(make, blocks, name):
-    """Keypoints of a crop of odd size lie where they lie in the whole image."""
+def test_keypoints_of_views_of_odd_size(make, blocks, name):
+    """Check that keypoints of a crop of odd size equal those of the whole image."""
     crop = changed(blocks, blocks.image[:173, :241])
     detector = make("features", name)
     offset = offset_to(detector.extract(crop).keypoints, detector.extract(blocks).keypoints)
@@ -155,7 +155,7 @@ def test_missing_wheel_is_named(tmp_path):
 
 
 def test_sift_finds_blobs_where_they_are(context):
-    """Without weights; within half a pixel: kornia's octaves are not centred on each other."""
+    """Check blob positions within half a pixel, the accuracy of kornia's octaves."""
     centers = np.array([(60.3, 50.7), (200.1, 120.4), (130.8, 180.2), (250.5, 60.5)])
     xy = pixel_centers(320, 240)
     blobs = [np.exp(-((xy - center) ** 2).sum(-1) / (2 * 4.0**2)) for center in centers]

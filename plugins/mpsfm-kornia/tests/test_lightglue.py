@@ -1,4 +1,4 @@
-"""LightGlue and LighterGlue: real matches between views whose geometry is known."""
+"""Tests of LightGlue and LighterGlue on views with known geometry."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mpsfm_core.data.errors import ProviderError
 
 FAMILIES = {"xfeat": "lighterglue", "aliked": "lightglue-aliked", "disk": "lightglue-disk"}
 SHIFT = (32, 32)
-"""What all strides of the networks divide, so that they see the same."""
+"""Multiple of all strides of the networks, so that they see identical patches."""
 
 
 @pytest.fixture(params=FAMILIES)
@@ -20,7 +20,7 @@ def family(request):
 
 
 def shifted(view, dx, dy):
-    """The view moved right and down by whole pixels; what comes in repeats the border."""
+    """Shift a view right and down by whole pixels, with repeated borders."""
     padded = np.pad(view.image, ((dy, 0), (dx, 0), (0, 0)), mode="edge")
     return type(view)("shifted.png", padded[: -dy or None, : -dx or None].copy(), view.camera)
 
@@ -77,7 +77,7 @@ def test_features_of_another_family(make, blocks):
         matcher.match(blocks, blocks)
 
 
-def test_kornia_defaults_changed_by_others_do_no_harm(make, blocks, monkeypatch):
+def test_changed_kornia_defaults_have_no_effect(make, blocks, monkeypatch):
     features = make("features", "aliked").extract(blocks)
     before = make("matcher", "lightglue-aliked").match(blocks, blocks, features, features)
     foreign = {**LightGlue.default_conf, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1}

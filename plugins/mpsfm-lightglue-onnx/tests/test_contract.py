@@ -1,4 +1,4 @@
-"""The contract, on a stand-in detector of spots and a matcher by mutual nearest descriptors."""
+"""Contract tests with a blob detector and mutual nearest neighbors."""
 
 from mpsfm_core.testing import contract_tests
 

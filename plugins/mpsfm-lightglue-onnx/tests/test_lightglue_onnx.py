@@ -1,4 +1,4 @@
-"""The whole path on stand-ins whose answer is known."""
+"""Tests of the providers with stand-ins of known output."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def detector(write_onnx):
 
 
 def test_keypoints_become_pixels_of_the_view(detector, context):
-    """128 x 96 is shrunk to 32 x 24; what lies outside of it is left out."""
+    """Check 128 x 96 shrunk to 32 x 24; keypoints outside are dropped."""
     options = SuperPointOptions(model=detector(1), resize=32)
     found = SuperPoint(options, context).extract(view_of(128, 96))
     order = [1, 3, 0, 2]  # by score, without the one at (40, 5)
@@ -117,7 +117,7 @@ def test_both_forms_of_the_matches(form, write_onnx, context):
 
 
 def test_keypoints_are_normalised_by_the_longer_side(write_onnx, context):
-    """The scores of this stand-in are the first keypoint's x and y, plus a half."""
+    """Check with a stand-in whose scores are x and y of the first keypoint, plus a half."""
     constants = {"known": [[0, 1], [1, 0]], "all": [-1], "zero": [0], "two": [2]}
     arrays = {name: np.array(value) for name, value in constants.items()}
     model = write_onnx(ECHO, half=[0.5], **arrays)

@@ -1,4 +1,4 @@
-"""The contract, on a stand-in that matches by the pixels around each pixel."""
+"""Contract tests with a stand-in that matches patches."""
 
 from mpsfm_core.testing import contract_tests
 

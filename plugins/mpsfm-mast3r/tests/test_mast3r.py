@@ -1,4 +1,4 @@
-"""The whole path on stand-ins whose answer is known."""
+"""Tests of the matchers with stand-ins of known output."""
 
 from __future__ import annotations
 
@@ -64,8 +64,7 @@ def view_of(image, name="a.png"):
 
 @pytest.fixture
 def scattered():
-    """Two views with the same 12 blocks of distinct colours in other places, on black, and the
-    centres of the blocks in both."""
+    """Create two views with 12 blocks of distinct colors in different places, and their centers."""
     rng = np.random.default_rng(1)
     colours = rng.permutation(np.mgrid[5:255:80, 5:255:80, 5:255:80].reshape(3, -1).T)
     directions = colours / np.linalg.norm(colours, axis=1, keepdims=True)
@@ -111,7 +110,7 @@ class TestDense:
         np.testing.assert_allclose(found.scores, certainty / (1 + certainty), rtol=1e-5)
 
     def test_positions_lie_at_pixel_centres_of_the_cropped_view(self, model, context):
-        """100 x 61 becomes 64 x 39, of which the network sees 64 x 32 from row 3 on."""
+        """Check 100 x 61 resized to 64 x 39 and cropped to 64 x 32 from row 3 on."""
         rng = np.random.default_rng(0)
         image = rng.integers(30, 225, (61, 100, 3), dtype=np.uint8)
         view = view_of(image)
@@ -178,7 +177,7 @@ def test_reciprocal_search_finds_what_brute_force_finds():
     assert mutual(np.empty((0, 5))).shape == (0, 2)
 
 
-def test_another_model_is_told(write_onnx, context):
+def test_model_with_other_tensors_raises(write_onnx, context):
     text = "one (float[1,3,h,w] image) => (float[1,3,h,w] out) { out = Identity (image) }"
     with pytest.raises(ConfigError, match="MASt3R needs inputs"):
         DenseMatcher(DenseOptions(model=str(write_onnx(text))), context)

@@ -1,5 +1,4 @@
-"""The contract of one size, on a stand-in that reads painted views; the sizes differ in nothing
-but their weights and numbers."""
+"""Contract tests of one size; the sizes differ only in weights and calibration."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The whole path on a stand-in with the tensors of the public exports."""
+"""Tests of the providers with a stand-in that has the tensors of the public exports."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_confidence_becomes_the_variance_of_depth(model, context):
 
 
 def test_padding_has_the_mean_colour(write_onnx, context):
-    """The upper left corner of the input, which is padding, given as depth everywhere."""
+    """Check the padding with a stand-in that returns the upper left pixel as depth."""
     path = write_onnx(
         """
         corner (float[1,3,616,1064] pixel_values) => (
@@ -89,7 +89,7 @@ def test_depth_beyond_the_networks_range_is_invalid(model, context):
     assert not provider.predict(view_of(64, 48, (201, 0, 0))).valid.any()
 
 
-def test_missing_confidence_is_told(write_onnx, context):
+def test_missing_confidence_raises(write_onnx, context):
     without = STAND_IN.replace("float[b,1,616,1064] confidence,", "")
     without = without.replace("confidence = Mul (blue, k)", "")
     path = write_onnx(without, zero=np.float32([0]), twenty=np.float32([20]))
@@ -99,7 +99,7 @@ def test_missing_confidence_is_told(write_onnx, context):
 
 
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: size.name)
-def test_default_weights_are_asked_for_with_their_companions(size, context):
+def test_default_weights_include_their_companions(size, context):
     asked = []
 
     def resolve(uri, sha256):

@@ -1,4 +1,4 @@
-"""Descriptions of tiny networks, and views whose content is known."""
+"""Descriptions of tiny networks, and views with known content."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mpsfm_core import PinholeCamera, View
 
 @pytest.fixture
 def write_description(tmp_path: Path) -> Callable[..., str]:
-    """Writes a description file and returns its path."""
+    """Return a function that writes a description file."""
 
     def write(**fields: Any) -> str:
         path = tmp_path / "description.yaml"
@@ -28,7 +28,7 @@ def write_description(tmp_path: Path) -> Callable[..., str]:
 
 @pytest.fixture
 def make_view() -> Callable[..., View]:
-    """A view of a size, with a colour or an image."""
+    """Return a function that creates a view from a size, color or image."""
 
     def make(
         width: int,

@@ -1,4 +1,4 @@
-"""The contract, on a stand-in that reads painted views."""
+"""Contract tests with stand-in networks."""
 
 from mpsfm_core.testing import contract_tests
 

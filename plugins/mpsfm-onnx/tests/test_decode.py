@@ -1,4 +1,4 @@
-"""Formulas, each against an independent computation."""
+"""Tests of the formulas against independent computations."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def depth_rule(**fields):
 
 
 def camera_of(value):
-    """A camera for a map (h, w)."""
+    """Return a camera for a map (h, w)."""
     height, width = np.shape(value)[:2]
     return PinholeCamera(width, height, 0.8 * width, 0.9 * width, 0.45 * width, 0.6 * height)
 
 
 def decode(value, rule, *more):
-    """Of a map (h, w) or (h, w, c)."""
+    """Decode a map (h, w) or (h, w, c)."""
     value = np.asarray(value, dtype=np.float32)
     value = value[..., None] if value.ndim == 2 else value
     return decode_depth(value, rule, camera_of(value), *more)
@@ -44,7 +44,7 @@ def test_expected_angle_is_the_mean_of_the_density(kappa):
 
 
 def test_cautious_side_of_the_squared_angle():
-    """The density's variance along one tangent direction is 3/4 of it for large kappa."""
+    """Check that the variance of the density is 3/4 of the squared angle for large kappa."""
     kappa = 60.0
     density = [lambda a, p=p: a**p * np.exp(-kappa * a) * np.sin(a) for p in (0, 2)]
     norm, second = (quad(f, 0, np.pi, points=[1 / kappa])[0] for f in density)
@@ -93,7 +93,7 @@ def test_ray_length_becomes_z():
 
 
 @pytest.mark.parametrize("shift", [0.7, -0.4])
-def test_the_camera_tells_the_shift_of_points(shift):
+def test_shift_of_points_is_estimated_from_the_camera(shift):
     z = np.random.default_rng(0).uniform(1, 5, (6, 8))
     points = unproject(camera_of(z), pixel_centers(8, 6), z)
     points[..., 2] -= shift
@@ -106,7 +106,7 @@ def test_the_camera_tells_the_shift_of_points(shift):
 
 
 def test_the_shift_minimises_the_reprojection_error_of_noisy_points():
-    """As the authors of MoGe minimise it; a linear problem alone gives 8 % less here."""
+    """Check Gauss-Newton, as in MoGe; the linear solution alone is 8 % smaller here."""
     rng = np.random.default_rng(1)
     camera = PinholeCamera(64, 64, 60.0, 60.0, 32.0, 32.0)
     xy = rays(camera, pixel_centers(64, 64))[..., :2]

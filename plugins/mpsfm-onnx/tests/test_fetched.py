@@ -1,4 +1,4 @@
-"""MoGe-2 from a server: a tiny file with the tensors of the published one stands for it."""
+"""Tests of the download of MoGe-2, with a tiny file that has its tensors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PATH = "/moge-2/model.onnx"
 
 
 class Constant:
-    """Our own network where it is not installed: any prior will do."""
+    """Replacement for mpsfm-compact if it is not installed."""
 
     def __init__(self, options, context):
         pass
@@ -39,7 +39,7 @@ class Constant:
 
 @pytest.fixture
 def server(tmp_path, monkeypatch):
-    """Serves the file that the description asks for from here on."""
+    """Serve the file of the description from this machine."""
     monkeypatch.setattr(weights, "_RETRY_WAIT_S", 0.001)
     for name in weights.OFFLINE_VARIABLES:
         monkeypatch.delenv(name, raising=False)
@@ -102,7 +102,7 @@ def test_first_use_fetches_and_the_next_one_does_not(server, registry, config, p
 
 
 @pytest.mark.parametrize("fault", ["cut connection", "wrong hash", "offline"])
-def test_without_it_the_run_goes_on(server, registry, config, photos, tmp_path, fault):
+def test_failed_download_uses_the_fallback(server, registry, config, photos, tmp_path, fault):
     if fault == "cut connection":
         server.cut_after = 0
     elif fault == "wrong hash":

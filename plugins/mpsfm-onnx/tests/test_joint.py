@@ -1,4 +1,4 @@
-"""One network for depth and normals, from the configuration to the priors."""
+"""Tests of one network for depth and normals, from the configuration to the priors."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def photos(tmp_path):
 
 @pytest.fixture
 def runs(monkeypatch):
-    """How often the network was run for each image."""
+    """Count the forward passes per image."""
     counts = Counter()
     run = Network.run
 
@@ -48,7 +48,7 @@ def runs(monkeypatch):
 
 
 def priors(photos, folder, normals):
-    """Of the first image, with the network for depth and the provider ``normals`` of the same."""
+    """Compute the priors of the first image with a given provider of normals."""
     options = dict(contract.setup(folder).options)
     chosen = {
         "extends": "demo",
@@ -63,7 +63,7 @@ def priors(photos, folder, normals):
     return problem.images[0].depth, problem.images[0].normals
 
 
-def test_the_network_runs_once_an_image(photos, runs, tmp_path):
+def test_network_runs_once_per_image(photos, runs, tmp_path):
     once = priors(photos, tmp_path, "onnx-joint")
     assert runs == {"a.png": 1, "b.png": 1}
     twice = priors(photos, tmp_path, "onnx")

@@ -1,4 +1,4 @@
-"""Where a model runs."""
+"""Tests of the device selection."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ IDENTITY = "one (float[n] x) => (float[n] y) { y = Identity (x) }"
         ("cpu", [CUDA, CPU], [CPU]),
     ],
 )
-def test_on_the_gpu_where_it_is_wanted_and_there(
+def test_gpu_is_used_if_requested_and_available(
     monkeypatch, caplog, write_onnx, context, device, here, asked
 ):
-    """The session itself is made on the CPU: a GPU whose libraries do not load."""
+    """Check that the CPU is used if the libraries of the GPU do not load."""
     found = []
     session = onnxruntime.InferenceSession
 

@@ -1,4 +1,4 @@
-"""The whole path, on tiny networks made here and on FastDepth."""
+"""Tests of the providers on tiny networks and on FastDepth."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 IDENTITY_INPUT = {"size": {"mode": "longest", "side": 64, "enlarge": False}}
 RED = "tiny (float[1,3,h,w] image) => (float[1,1,h,w] out) { out = Gather <axis = 1> (image, red) }"
-"""Its output is the red channel."""
+"""Network that returns the red channel."""
 FIRST = np.array([0])
 
 
@@ -31,14 +31,14 @@ def depth(**fields):
 
 @pytest.fixture
 def red(write_onnx, write_description):
-    """Options of a network that takes the red channel for metres."""
+    """Return options of a network whose depth in meters is the red channel."""
     model = write_onnx(RED, red=FIRST)
     description = write_description(input=IDENTITY_INPUT, outputs=depth())
     return OnnxOptions(description=description, model=str(model))
 
 
-def test_content_lies_where_it_lies_in_the_view(write_onnx, write_description, make_view, context):
-    """A bright square found in the depth map is the square of the image (pad, half pixels)."""
+def test_depth_has_the_position_of_the_content(write_onnx, write_description, make_view, context):
+    """Check that a bright square has the same position in the depth map (padding, half pixels)."""
     description = write_description(
         input={"size": {"mode": "fixed", "width": 128, "height": 160, "fit": "pad"}},
         outputs=depth(),
@@ -58,7 +58,7 @@ def test_content_lies_where_it_lies_in_the_view(write_onnx, write_description, m
         assert centre == pytest.approx((start + stop) / 2, abs=0.05)
 
 
-def test_a_network_that_says_nothing_of_the_focal_length(red, make_view, context):
+def test_network_without_focal_length_output(red, make_view, context):
     assert OnnxDepth(red, context).estimate_focal(make_view(4, 4)) is None
 
 
@@ -81,8 +81,8 @@ def test_integer_models_get_rounded_integers(write_onnx, write_description, make
     np.testing.assert_array_equal(prior.depth, 6)  # of 6.5, to even
 
 
-def test_the_camera_and_constants_are_told(write_onnx, write_description, make_view, context):
-    """The calibration matrix in the pixels of the padded input, first pixel at 0."""
+def test_camera_and_constants_are_inputs(write_onnx, write_description, make_view, context):
+    """Check the calibration matrix in pixels of the padded input, first pixel at 0."""
     text = """
     tiny (float[1,3,h,w] image, float[1,3,3] K, int64 steps) => (float[1,c,32,48] out) {
         number = Cast <to = 1> (steps)
@@ -108,7 +108,7 @@ def test_the_camera_and_constants_are_told(write_onnx, write_description, make_v
 
 
 def test_guessed_focal_length_and_unit(write_onnx, write_description, make_view, context):
-    """Depth Pro's correction and MoGe's scale, on an input that changes the aspect ratio."""
+    """Check Depth Pro's correction and MoGe's scale for an input with another aspect ratio."""
     text = """
     tiny (float[1,3,h,w] image) => (float[1,1,h,w] out, float[1] focal, float[1,1] unit) {
         out = Gather <axis = 1> (image, red)
@@ -153,7 +153,7 @@ def test_mask_applies_to_depth_and_normals(write_onnx, write_description, make_v
     np.testing.assert_array_equal(normals.normals[0, 0], [0, 0, -1])
 
 
-def test_missing_weights_say_what_to_do(context):
+def test_missing_weights_name_the_next_step(context):
     with pytest.raises(WeightsError, match=r"--set depth\.options\.model=FILE"):
         OnnxDepth(OnnxOptions(), context)
     with pytest.raises(WeightsError, match=r"nowhere\.onnx does not exist"):
@@ -212,12 +212,12 @@ SHIPPED_STAND_INS = {
         "predicted_depth = Squeeze (meaning, axis) focallength_px = Identity (guess)",
     ),
 }
-"""Interfaces as documented, with red (0 to 1) as depth."""
+"""Documented interfaces, with red (0 to 1) as depth."""
 
 
 @pytest.mark.parametrize("name", SHIPPED_STAND_INS)
 def test_shipped_interfaces(name, write_onnx, make_view, context):
-    """Preprocessing undone by the stand-in, so that it sees the red of the view again."""
+    """Check with stand-ins that invert the preprocessing to return the red channel."""
     rule = load_description(name).input
     signature, body = SHIPPED_STAND_INS[name]
     red = f"red = Gather <axis = 1> ({rule.name}, first) a = Mul (red, std) meaning = Add (a, mean)"
@@ -238,8 +238,7 @@ def test_shipped_interfaces(name, write_onnx, make_view, context):
 
 
 def test_unidepth_interface(write_onnx, make_view, context):
-    """As the authors' export has it, of a size of its own: 0.4 is red, of points 4 m away on the
-    rays that the network is told, with an error of 1 m."""
+    """Check rays, fixed size and error of the authors' export: points at 4 m for red 0.4."""
     red = "r = Gather <axis = 1> (rgbs, first) a = Mul (r, std) b = Add (a, mean) c = Mul (b, ten)"
     model = write_onnx(
         f"""uni (float[b,3,28,42] rgbs, float[b,3,28,42] rays) => (
@@ -266,7 +265,7 @@ def test_unidepth_interface(write_onnx, make_view, context):
 
 
 def test_moge_interface(write_onnx, make_view, context):
-    """Points of a plane at z = 2, in half metres and 0.3 too near, with a hole in the mask."""
+    """Check points of a plane at z = 2, in half meters, shifted by 0.3, with a hole in the mask."""
     text = """
     moge (float[b,3,h,w] image, int64 num_tokens) => (
         float[b,h,w,3] points, float[b,h,w,3] normal, float[b,h,w] mask, float[b] scale) {
@@ -317,7 +316,7 @@ def test_listing_does_not_import_onnxruntime():
 
 
 def test_fastdepth_on_real_photos(shared_data, make_view, context):
-    """Against sensor depth, after median scaling: measured 0.18 and 0.72 on these frames."""
+    """Compare with sensor depth after median scaling: 0.18 and 0.72 (measured)."""
     model = shared_data / "models" / "fastdepth_224.onnx"
     provider = OnnxDepth(OnnxOptions(model=str(model)), context)
     scene = shared_data / "data" / "hololens_room"

@@ -1,4 +1,4 @@
-"""The filter alone, and among others in a registry."""
+"""Tests of the filter alone, and with other filters in a registry."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def scores(tmp_path, monkeypatch):
     return path
 
 
-def test_keeps_what_scores_high_or_has_no_score(scores, monkeypatch):
+def test_pairs_with_high_or_no_score_are_kept(scores, monkeypatch):
     assert mpsfm_filter_pairs(PAIRS) == PAIRS[:2]
     monkeypatch.setenv("MPSFM_PAIR_MIN_SCORE", "0.4")
     assert mpsfm_filter_pairs(PAIRS) == PAIRS
@@ -32,7 +32,7 @@ def test_keeps_what_scores_high_or_has_no_score(scores, monkeypatch):
     assert mpsfm_filter_pairs(PAIRS) == PAIRS[1:2]
 
 
-def test_says_nothing_without_a_file(monkeypatch):
+def test_no_file_keeps_all_pairs(monkeypatch):
     monkeypatch.delenv("MPSFM_PAIR_SCORES", raising=False)
     assert mpsfm_filter_pairs(PAIRS) is None
     registry = Registry.discover()
@@ -65,7 +65,7 @@ def test_a_wrong_line_is_named(scores, line):
         mpsfm_filter_pairs(PAIRS)
 
 
-def test_a_wrong_file_ends_no_run_but_is_told(scores, caplog):
+def test_invalid_file_gives_a_warning(scores, caplog):
     scores.unlink()
     assert Registry.discover().call_hook("mpsfm_filter_pairs", pairs=PAIRS) == []
     assert "cannot be read" in caplog.text

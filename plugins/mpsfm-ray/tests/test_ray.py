@@ -1,4 +1,4 @@
-"""The executor on a real cluster of several processes on this machine."""
+"""Tests of the executor on a real cluster of several processes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # of the cluster's own thread
 
 
 class TestOneCluster:
-    """Ray knows one cluster in a process; the tests below start their own, after this has ended."""
+    """Tests that share a cluster; Ray supports one per process, so other tests run afterwards."""
 
     @pytest.fixture(scope="class")
     def executor(self) -> Iterator[RayExecutor]:

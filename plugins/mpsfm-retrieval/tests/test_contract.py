@@ -1,4 +1,4 @@
-"""The contract: the network on a stand-in, the other descriptor as it is."""
+"""Contract tests: the network with a stand-in, and the descriptor without weights."""
 
 from mpsfm_core.testing import contract_tests
 

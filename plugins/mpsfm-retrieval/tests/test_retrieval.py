@@ -1,4 +1,4 @@
-"""Both descriptors against independent computations, and the weight-free one on a real scene."""
+"""Tests of both descriptors against independent computations and on a real scene."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def view_of(image, mask=None):
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("network", ["dinov2", "eigenplaces", "netvlad"])
 def test_forms_of_the_output(form, network, write_onnx, context):
-    """The mean colour as it is fed, as vector, as first of two tokens, or as half of a map."""
+    """Check the mean color as vector, as first of two tokens, and as half of a map."""
     signature, body = FORMS[form]
     text = f"net (float[b,3,h,w] image) => ({signature}) {{"
     text += f" mean = GlobalAveragePool (image) {body} }}"
@@ -76,7 +76,7 @@ def textured(seed):
 
 class TestAppearance:
     def test_approximates_the_mean_kernel_of_all_pairs_of_features(self, context):
-        """Cosine of two means of random features, and of the exact kernel's means."""
+        """Compare the cosine of two mean random features with that of the exact mean kernel."""
         first, second = textured(0), textured(0)
         second[:, 160:] = textured(1)[:, 160:]
         options = AppearanceOptions(dimensions=50_000, color_share=0, max_keypoints=60)
@@ -117,8 +117,7 @@ class TestAppearance:
         assert vector @ vector == pytest.approx(0.3)
 
     def test_neighbours_on_an_arc_of_photos(self, shared_data, context):
-        """The fountain is taken along an arc: the two most similar photos of each are the next
-        ones, nearly always."""
+        """Check that the most similar photos of the fountain are its neighbors on the arc."""
         folder = shared_data / "data" / "fountain" / "images"
         provider = Appearance(AppearanceOptions(), context)
         vectors = []

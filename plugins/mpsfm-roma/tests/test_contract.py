@@ -1,4 +1,4 @@
-"""The contract, on a stand-in that matches by the pixels around each pixel of a coarse grid."""
+"""Contract tests with a stand-in that matches patches on a coarse grid."""
 
 from mpsfm_core.testing import contract_tests
 

@@ -1,4 +1,4 @@
-"""The whole path on stand-ins whose warp is known."""
+"""Tests of the matchers with stand-ins of known warp."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from mpsfm_core import Features, PinholeCamera, View
 from mpsfm_core.data.errors import ConfigError, ProviderError
 
 ROWS, COLUMNS = 28, 42
-"""Of the network's input and of the warp."""
+"""Size of the network input and of the warp."""
 SHIFT = np.array([0.2, -0.1])
-"""Of normalised positions, from a to b; b is 20 % smaller on them."""
+"""Shift of normalized positions from a to b; b has a scale of 0.8."""
 SCALE = 0.8
 
 CONSTANT = """
@@ -38,13 +38,13 @@ A, B = view_of(120, 80, "a.png"), view_of(60, 100, "b.png")
 
 
 def b_from_a(xy):
-    """Pixels of b for pixels of a."""
+    """Convert pixels of a to pixels of b."""
     return ((xy / A.camera.size * 2 - 1) * SCALE + SHIFT + 1) / 2 * B.camera.size
 
 
 @pytest.fixture
 def options(write_onnx):
-    """``options(symmetric, certainty, **more)``: those of a model with the warp above."""
+    """Return a function of options for a model with the warp above."""
 
     def make(symmetric=True, certainty=None, **more):
         there = np.concatenate([grid(), grid() * SCALE + SHIFT], axis=-1)
@@ -126,7 +126,7 @@ def test_uncertain_keypoints_have_no_match(options, context):
 
 
 def test_what_is_fed_is_normalised(write_onnx, context):
-    """A model whose certainty is the red of the first view, undone."""
+    """Check with a model whose certainty is the red channel of the first view."""
     text = """
     roma (float[b,3,h,w] one, float[b,3,h,w] two) => (float[b,h,w,4] warp, float[b,h,w] sure) {
         warp = Identity (known_warp)

@@ -1,4 +1,4 @@
-"""The contract of the masks: the network on a stand-in, the rule of thumb as it is."""
+"""Contract tests: the network with a stand-in, and the rule-based mask."""
 
 from mpsfm_core.testing import contract_tests
 

@@ -1,4 +1,4 @@
-"""Both masks on made views, and the network on a real photo."""
+"""Tests of both masks on synthetic views, and of the network on a real photo."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BLUE = (
     "sky (float[1,3,h,w] image) => (float[1,1,h,w] d0) "
     "{ blue = Gather <axis = 1> (image, two) a = Mul (blue, std) d0 = Add (a, mean) }"
 )
-"""The probability of sky is the blue of the image, its normalisation undone."""
+"""Network whose sky probability is the blue channel."""
 NORMALISED = {"skyseg": (0.225, 0.406), "skysegsmall": (1.0, 0.0)}
 
 
@@ -27,7 +27,7 @@ def view_of(image):
 
 @pytest.fixture
 def landscape():
-    """(image, sky) of a textured skyline below a blue gradient, with a blue door and a cloud."""
+    """Create (image, sky): a textured skyline below a blue gradient, with a door and a cloud."""
     rng = np.random.default_rng(0)
     height, width = 240, 360
     skyline = (110 + 40 * np.sin(np.arange(width) / 30)).astype(int)
@@ -43,7 +43,7 @@ def landscape():
 
 class TestNetwork:
     @pytest.mark.parametrize("network", NORMALISED)
-    def test_keeps_what_is_at_most_as_likely_as_the_threshold(self, network, write_onnx, context):
+    def test_pixels_up_to_the_threshold_are_kept(self, network, write_onnx, context):
         std, mean = NORMALISED[network]
         model = write_onnx(BLUE, two=np.array([2]), std=np.float32(std), mean=np.float32(mean))
         image = np.zeros((60, 100, 3), dtype=np.uint8)
@@ -55,13 +55,13 @@ class TestNetwork:
             assert mask.dtype == np.bool_
             np.testing.assert_array_equal(mask, np.arange(60)[:, None] >= np.full(100, rows))
 
-    def test_another_kind_of_model_is_told(self, write_onnx, context):
+    def test_model_with_other_tensors_raises(self, write_onnx, context):
         text = "two (float[1] a, float[1] b) => (float[1] c) { c = Add (a, b) }"
         with pytest.raises(ConfigError, match="a sky network needs inputs"):
             SkyNetwork(SkyOptions(model=str(write_onnx(text))), context)
 
     def test_real_photo(self, shared_data, context):
-        """The one photo of the fountain with sky: a wedge at the upper right, 0.8 %."""
+        """Check the photo of the fountain with a wedge of sky at the upper right (0.8 %)."""
         model = shared_data / "models" / "skysegsmall_384.onnx"
         provider = SkyNetwork(SkyOptions(model=str(model), network="skysegsmall"), context)
         path = shared_data / "data" / "fountain" / "images" / "0010.jpg"

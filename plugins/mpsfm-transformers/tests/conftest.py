@@ -15,7 +15,7 @@ from mpsfm_core import PinholeCamera, View
 
 @pytest.fixture(scope="session")
 def photo() -> Callable[..., View]:
-    """Makes a view (width, height) of the sample scene, with a focal length."""
+    """Return a function that creates a view of the sample scene from a size and focal length."""
     path = Path(__file__).resolve().parents[3] / "examples" / "sample_scene" / "images"
     image = cv2.cvtColor(cv2.imread(str(min(path.glob("*.jpg")))), cv2.COLOR_BGR2RGB)
 
@@ -29,7 +29,7 @@ def photo() -> Callable[..., View]:
 
 @pytest.fixture(scope="session")
 def blocks() -> Callable[..., Any]:
-    """Random colours in blocks of 4 x 4 pixels, 256 x 192: texture everywhere."""
+    """Create 256 x 192 pixels of random colors in blocks of 4 x 4."""
     rng = np.random.default_rng(0)
     small = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
     return cv2.resize(small, (256, 192), interpolation=cv2.INTER_NEAREST)

@@ -1,4 +1,4 @@
-"""The contract on tiny models with random weights."""
+"""Contract tests of tiny models with random weights."""
 
 from mpsfm_core.testing import contract_tests
 

@@ -1,4 +1,4 @@
-"""Depth of every family against the library's own pipeline, and where it lies in the view."""
+"""Comparison of depth of every family with the library's pipeline, and its position in the view."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def models(tmp_path_factory):
 
 
 def of_the_library(folder, view):
-    """What transformers itself makes of the image: pixels in, the network's map out."""
+    """Run the library on an image; return network input and output."""
     with quiet(), torch.inference_mode():
         processor = AutoImageProcessor.from_pretrained(folder, backend="pil")
         network = AutoModelForDepthEstimation.from_pretrained(folder).eval()
@@ -52,7 +52,7 @@ def test_the_map_of_the_library(models, context, photo, name, size):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_depth_pro_as_the_library_computes_it(models, context, photo, size):
-    """The steps of its processor, which torchvision is needed for, written down here."""
+    """Compare with the steps of its processor, which needs torchvision."""
     view = photo(*size)
     provider = HubDepth(DepthOptions(model=str(models["depth-pro"])), context)
     with quiet(), torch.inference_mode():
@@ -71,8 +71,8 @@ def test_depth_pro_as_the_library_computes_it(models, context, photo, size):
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", stand_in.DEPTH)
-def test_a_map_lies_where_the_image_lay(models, context, photo, name, size):
-    """What is prepared, taken for the network's answer, is the image again."""
+def test_cut_map_covers_the_image(models, context, photo, name, size):
+    """Check that cutting the prepared image restores the image."""
     gray = np.add.outer(np.arange(size[1]) * 0.5, np.arange(size[0])).astype(np.uint8)
     view = photo(*size)
     view = View(view.name, np.repeat(gray[..., None], 3, axis=2), view.camera)
@@ -93,7 +93,7 @@ def test_a_map_lies_where_the_image_lay(models, context, photo, name, size):
 
 
 def test_zoedepth_as_the_library_cuts_it(models, context, photo):
-    """The library resizes to the padded image and cuts; half a pixel of the network is between."""
+    """Compare with the library, which crops after resizing (half a network pixel apart)."""
     view = photo(320, 240)
     _, outputs = of_the_library(models["zoedepth"], view)
     prior = HubDepth(DepthOptions(model=str(models["zoedepth"])), context).predict(view)
@@ -115,7 +115,7 @@ def test_what_a_model_predicts(models, context, tmp_path):
 
 
 def test_prompted_by_a_sensor(context, photo, tmp_path):
-    """The network denormalises by the prompt's range: a farther sensor, a farther depth."""
+    """Check that larger sensor depth gives larger depth."""
     model = stand_in.prompt_depth_anything(tmp_path / "model")
     view = photo()
     depth = np.linspace(1000, 3000, 23 * 32).reshape(23, 32)[:, ::-1].copy()

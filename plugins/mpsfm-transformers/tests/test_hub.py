@@ -1,4 +1,4 @@
-"""What is read of a model, from where, and what is said when something is wrong."""
+"""Tests of the files that are read of a model, and of error messages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def model(tmp_path_factory):
 
 @pytest.fixture
 def hub_cache(model, tmp_path, monkeypatch):
-    """The Hub's own cache with the model in it, as huggingface_hub lays it out."""
+    """Create the Hub's own cache with the model."""
     cache = tmp_path / "hub"
     folder = cache / "models--org--depth-model"
     snapshot = folder / "snapshots" / REVISION
@@ -45,7 +45,7 @@ def test_offline_from_the_cache_of_the_hub(hub_cache, context, photo, model, nam
 
 
 def test_files_of_two_caches(hub_cache, photo, tmp_path):
-    """The weights in one cache and the configuration in another are one model all the same."""
+    """Check that weights and configuration may be in different caches."""
     store = WeightStore(tmp_path / "ours", offline=True)
     uri = f"hf://{REPOSITORY}@{REVISION}/model.safetensors"
     moved = store._cached_path(uri)
@@ -57,7 +57,7 @@ def test_files_of_two_caches(hub_cache, photo, tmp_path):
     assert provider.predict(photo()).valid.all()
 
 
-def test_nothing_there(context):
+def test_missing_model_raises(context):
     with pytest.raises(WeightsError, match=r"mpsfm models fetch hf://org/none@main/config\.json"):
         HubDepth(DepthOptions(model="org/none"), context)
     with pytest.raises(WeightsError, match=r"config\.json does not exist"):
@@ -113,7 +113,7 @@ def test_dino(context, photo, tmp_path, make):
     assert vector @ vector == pytest.approx(1, abs=1e-5)
 
 
-def test_licences_by_name():
+def test_licenses_by_name():
     assert known("depth-anything/Depth-Anything-V2-Small-hf").license == "Apache-2.0"
     assert known("depth-anything/Depth-Anything-V2-Large-hf@abc").license == "CC-BY-NC-4.0"
     assert known("depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf").license == "Apache-2.0"

@@ -1,4 +1,4 @@
-"""A real server: its page answers, and its scene has what it was shown."""
+"""Tests of a real server: its page and its scene."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_scene_has_the_cameras_and_their_depth(viewer: ViserViewer) -> None:
     np.testing.assert_allclose(np.asarray(depth.points)[:, 2], 2, atol=1e-2)
 
 
-def test_an_image_that_is_taken_out_goes(viewer: ViserViewer) -> None:
+def test_removed_images_disappear(viewer: ViserViewer) -> None:
     viewer.show(scene(3))
     viewer.show(scene(2))
     assert viewer.frustums.keys() == {"room/0.jpg", "room/1.jpg"}
@@ -73,7 +73,7 @@ def test_the_final_cloud_takes_the_place_of_the_depth_maps(viewer: ViserViewer) 
             cloud.remove()
 
 
-def test_it_listens_to_a_run(viewer: ViserViewer) -> None:
+def test_viewer_receives_the_events_of_a_run(viewer: ViserViewer) -> None:
     registry = Registry()
     registry.register(viewer, name="viewer")
     registry.call_hook("mpsfm_stage_progress", stage="matching", done=3, total=28)

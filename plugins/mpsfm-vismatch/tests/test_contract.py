@@ -1,4 +1,4 @@
-"""The contract: on stand-ins with the collection's interface, on the collection where it is."""
+"""Contract tests with stand-ins, and with the collection if it is installed."""
 
 from dataclasses import replace
 

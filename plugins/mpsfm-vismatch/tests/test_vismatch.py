@@ -1,4 +1,4 @@
-"""What becomes of a network's answer, on networks whose answer is known."""
+"""Tests of the conversion of network outputs with networks of known output."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ B = np.array([[4.0, 3.0], [14.0, 8.0], [199.0, 20.0]])
 
 
 class Known:
-    """Gives the positions above; remembers what it was shown."""
+    """Network that returns the positions above, and records its input."""
 
     confidences: Any = np.array([0.25, 1.5, 0.5], dtype=np.float32)
     shown: tuple[Any, ...] = ()
@@ -47,7 +47,7 @@ class Known:
 
 
 class LoftrLike(Known):
-    """Whose scores are not known."""
+    """Network without scores."""
 
     confidences = None
 
@@ -78,13 +78,13 @@ def test_positions_in_pixels_of_views_of_other_sizes(context: ProviderContext) -
     assert found.scores.tolist() == [0.25, 1.0] and found.std_px == 1.0
 
 
-def test_the_same_answer_each_time(context: ProviderContext) -> None:
+def test_matches_are_deterministic(context: ProviderContext) -> None:
     made = matcher.DenseMatcher(CollectionOptions(network=NETWORK), context)
     first, again = (made.match(view(200, 60), view(200, 60)).dense for _ in range(2))
     np.testing.assert_array_equal(first.points_a, again.points_a)
 
 
-def test_keypoints_near_to_what_is_matched(context: ProviderContext) -> None:
+def test_keypoints_near_matched_positions(context: ProviderContext) -> None:
     options = SnapOptions(network=NETWORK, snap_px=1.0)
     a = np.array([[50.0, 50.0], [10.6, 5.4], [0.5, 0.5]])
     b = np.array([[14.0, 9.0], [30.0, 3.0]])
@@ -96,7 +96,7 @@ def test_keypoints_near_to_what_is_matched(context: ProviderContext) -> None:
     assert not len(made.match(view(200, 60), view(200, 60), none, none).sparse)
 
 
-def test_without_scores_all_are_certain(context: ProviderContext) -> None:
+def test_missing_scores_are_one(context: ProviderContext) -> None:
     options = CollectionOptions(network=NETWORK.replace("Known", "LoftrLike"))
     found = matcher.DenseMatcher(options, context).match(view(200, 60), view(200, 60)).dense
     assert found.scores.tolist() == [1.0, 1.0, 1.0]
@@ -107,7 +107,7 @@ def test_a_network_of_another_kind(context: ProviderContext) -> None:
         roma.DenseMatcher(RomaDenseOptions(network=NETWORK), context)
 
 
-def test_the_warp_is_the_networks(context: ProviderContext) -> None:
+def test_warp_equals_that_of_the_network(context: ProviderContext) -> None:
     options = RomaDenseOptions(network="mpsfm_vismatch.stand_in:Warping", min_certainty=0.5)
     shown = view(112, 84)
     found = roma.DenseMatcher(options, context).match(shown, shown).dense
