@@ -1,6 +1,13 @@
-"""Structure-from-Motion with monocular depth and normal priors from swappable plugins."""
+"""Structure-from-Motion with monocular depth and normal priors from exchangeable plugins.
+
+Everything that users and plugin authors need is exported here. Heavy modules are imported when a
+name is first used, because the light module of a plugin imports this package.
+"""
 
 from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from mpsfm_core.api import load_config, reconstruct
 from mpsfm_core.data import (
@@ -15,16 +22,25 @@ from mpsfm_core.data import (
     SparseMatches,
     View,
 )
-from mpsfm_core.data.errors import MpsfmError
+from mpsfm_core.data.errors import InputError, MpsfmError
 from mpsfm_core.data.options import Options
 from mpsfm_core.providers import ProviderContext, ProviderSpec, WeightsFile, hookimpl
 
+if TYPE_CHECKING:
+    from mpsfm_core.config import Config
+    from mpsfm_core.pipeline.run import ReconstructionResult
+    from mpsfm_core.providers.registry import Registry
+
+    __version__: str
+
 __all__ = [
+    "Config",
     "DenseMatches",
     "DepthPrior",
     "Features",
-    "MultiViewPrior",
+    "InputError",
     "MpsfmError",
+    "MultiViewPrior",
     "NormalPrior",
     "Options",
     "PairDepth",
@@ -32,10 +48,36 @@ __all__ = [
     "PinholeCamera",
     "ProviderContext",
     "ProviderSpec",
+    "ReconstructionResult",
+    "Registry",
     "SparseMatches",
     "View",
     "WeightsFile",
+    "__version__",
     "hookimpl",
     "load_config",
     "reconstruct",
 ]
+
+_LAZY_MODULES = {
+    "Config": "mpsfm_core.config",
+    "ReconstructionResult": "mpsfm_core.pipeline.run",
+    "Registry": "mpsfm_core.providers.registry",
+}
+"""Modules of the names that are imported at first use."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a lazy name, or read the version of the installed package."""
+    if name == "__version__":
+        value: Any = importlib.import_module("mpsfm_core.providers.registry").core_version()
+    elif name in _LAZY_MODULES:
+        value = getattr(importlib.import_module(_LAZY_MODULES[name]), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,6 +1,6 @@
-"""The public functions; :mod:`mpsfm_core` exports them.
+"""Public functions, exported by :mod:`mpsfm_core`.
 
-Each function imports what it needs when it is called: the light module of a plugin imports
+Each function imports what it needs when it is called, because the light module of a plugin imports
 ``mpsfm_core``, and listing plugins must not load the optimizers.
 """
 
@@ -19,7 +19,19 @@ if TYPE_CHECKING:
 def load_config(
     name_or_path: str | Path, overrides: Sequence[str] = (), registry: Registry | None = None
 ) -> Config:
-    """Read, merge and check a configuration; see :func:`mpsfm_core.config.load_config`."""
+    """Read, merge and check a configuration.
+
+    Args:
+        name_or_path: Name of a shipped configuration, or a YAML file.
+        overrides: Settings such as ``"runtime.workers=2"``, applied last.
+        registry: Providers to check against; default: those of all installed plugins.
+
+    Returns:
+        The configuration with all defaults.
+
+    Raises:
+        ConfigError: with file, line and the nearest valid key.
+    """
     from mpsfm_core.config import load_config
 
     return load_config(name_or_path, overrides, registry)
@@ -35,8 +47,38 @@ def reconstruct(
     poses: str | Path | None = None,
     overrides: Sequence[str] = (),
     registry: Registry | None = None,
+    fresh: bool = False,
+    database: str | Path | None = None,
+    hloc: tuple[str | Path, str | Path] | None = None,
 ) -> ReconstructionResult:
-    """Reconstruct a folder of photos; see :func:`mpsfm_core.pipeline.run.reconstruct`."""
+    """Reconstruct a folder of photos, or a video.
+
+    Args:
+        images: Folder of photos, including subfolders; or a video, whose keyframes are selected
+            by ``inputs.video`` and written into ``frames/`` of the output.
+        output: Result folder, used by one run at a time; None writes nothing.
+        config: Name of a shipped configuration, a YAML file, or a loaded configuration.
+        intrinsics: ``intrinsics.yaml``, a COLMAP model or ``transforms.json``. Default: the cameras
+            of ``poses``, else EXIF, else the estimate of the depth provider, else a default.
+        image_list: Text file with one image name per line; default: all images.
+        poses: COLMAP model or ``transforms.json`` with poses of some or all images;
+            ``mapping.known_poses`` chooses whether they are fixed or refined.
+        overrides: Settings such as ``"runtime.workers=2"``; not with a loaded configuration.
+        registry: Providers to choose from; default: those of all installed plugins.
+        fresh: Ignore the checkpoint of an interrupted run, and map from the start.
+        database: COLMAP database whose keypoints and matches replace features and matchers. They
+            are verified again. Its cameras are ignored unless it is also given as ``intrinsics``.
+        hloc: Features file and matches file of hloc, instead of ``database``.
+
+    Returns:
+        COLMAP models of the original photos, arrays of the mapper, and the summary.
+
+    Raises:
+        InputError: images, intrinsics, poses, configuration, weights or output are wrong. Missing
+            providers are found before any image is decoded.
+        ReconstructionError: no reconstruction was possible; ``summary.json`` has the reasons.
+        MpsfmError: a provider failed or broke its contract, or the disk is full.
+    """
     from mpsfm_core.pipeline.run import reconstruct
 
     return reconstruct(
@@ -48,4 +90,7 @@ def reconstruct(
         poses=poses,
         overrides=overrides,
         registry=registry,
+        fresh=fresh,
+        database=database,
+        hloc=hloc,
     )
