@@ -73,7 +73,7 @@ def main() -> None:
         overrides=("runtime.workers=1",),
         workers=arguments.workers,
     )
-    rows = build_rows(run_benchmark(plan, output, done=print_progress))
+    rows = build_rows(run_benchmark(plan, output, on_record=print_progress))
     text = _table(arguments.scene, rows, configs)
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"ablation-{arguments.scene}.md").write_text(text, encoding="utf-8")

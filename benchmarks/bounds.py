@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))
     arguments = parser.parse_args()
     scene = read_scene(shared_folder() / "data" / SCENE)
-    sets = scene.chosen(arguments.buckets)
+    sets = scene.select_sets(arguments.buckets)
     registry, only = Registry.discover(), SetPairFilter()
     only.allow(sets)
     registry.register(only, name="pairs of sets")

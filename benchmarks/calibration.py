@@ -56,7 +56,7 @@ def main() -> None:
     scene = read_scene(shared / "data" / "hololens_room")
     output: Path = arguments.output
     output.mkdir(parents=True, exist_ok=True)
-    in_sets = {name for item in scene.chosen(arguments.buckets) for name in item.images}
+    in_sets = {name for item in scene.select_sets(arguments.buckets) for name in item.images}
     lists = {True: output / "in_sets.txt", False: output / "others.txt"}
     for inside, path in lists.items():
         path.write_text("\n".join(n for n in sorted(scene.truth) if (n in in_sets) is inside))

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
-from mpsfm_core.evaluation.read_true_surface import true_depth_file
+from mpsfm_core.evaluation.true_surface import true_depth_file
 
 from benchmarks._scenes import shared_folder
 from benchmarks.accuracy import FASTDEPTH, PRIORS
@@ -143,7 +143,7 @@ def problem_of_case(name: str, output: Path) -> tuple[PreparedSets, list[Evaluat
     """Extract the mapping problems of a case, or read the stored ones."""
     case = CASES[name]
     scene = read_scene(shared_folder() / "data" / case.scene)
-    sets = scene.chosen([case.bucket])
+    sets = scene.select_sets([case.bucket])
     output.mkdir(parents=True, exist_ok=True)
     config = output / "fastdepth.yaml"
     model = shared_folder() / "models" / "fastdepth_224.onnx"

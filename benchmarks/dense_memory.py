@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from mpsfm_core.evaluation.read_true_surface import true_depth_file
+from mpsfm_core.evaluation.true_surface import true_depth_file
 
 from benchmarks._scenes import shared_folder
 from benchmarks.dense import view_of

@@ -24,7 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
-from mpsfm_core.evaluation.read_true_surface import true_depth_file
+from mpsfm_core.evaluation.true_surface import true_depth_file
 
 from benchmarks._scenes import shared_folder
 from benchmarks.dense import CASES, TOLERANCES, mapped_sets, table, view_of, without_prior
