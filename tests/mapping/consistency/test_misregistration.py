@@ -144,7 +144,7 @@ def test_failed_reregistration_restores_scene(
 ) -> None:
     misplace(component, 4)
     before, noise = component.scene.snapshot(), component.refiner.noise
-    monkeypatch.setattr(component, "grow", lambda available, *, wide: None)
+    monkeypatch.setattr(component, "register_images", lambda candidates, *, wide: None)
     component.reregister_images(np.ones(5, np.bool_))
     after = component.scene.snapshot()
     np.testing.assert_array_equal(after.rotations, before.rotations)
