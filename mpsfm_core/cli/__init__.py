@@ -8,8 +8,10 @@ code.
 
 from __future__ import annotations
 
+import io
 import logging
 import os
+import sys
 from typing import Annotated
 
 import typer
@@ -38,7 +40,15 @@ from mpsfm_core.cli.errors import CommandGroup
 
 def main() -> None:
     """Run the ``mpsfm`` command."""
+    _escape_unprintable_characters()
     build_app()(prog_name="mpsfm")
+
+
+def _escape_unprintable_characters() -> None:
+    """Print characters that the terminal's encoding lacks as escapes instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def build_app() -> typer.Typer:

@@ -47,8 +47,11 @@ def find_images(folder: Path, without: Path | None = None) -> list[str]:
                 f"{folder} is neither a folder of photos nor a video; give one of them"
             )
         raise InputError(f"images folder {folder} does not exist")
-    names, unread = [], []
+    names, unread, undecodable = [], [], []
     for name in _walk_input_files(folder, without):
+        if not is_utf8(name):
+            undecodable.append(name)
+            continue
         extension = PurePosixPath(name).suffix.lower()
         if extension in EXTENSIONS:
             names.append(name)
@@ -56,6 +59,13 @@ def find_images(folder: Path, without: Path | None = None) -> list[str]:
             unread.append(name)
     names = sorted(names, key=_natural_sort_key)
     masks = _find_mask_names(names)
+    if undecodable:
+        _log.warning(
+            "%s in %s: %s; rename them, for example with convmv",
+            _count(len(undecodable), "name is not UTF-8", "names are not UTF-8"),
+            escape(str(folder)),
+            escape(list_names(undecodable)),
+        )
     if unread:
         _log.warning(
             "%s in %s: %s; convert them to JPEG or PNG, with the extension in their names",
@@ -105,6 +115,10 @@ def require_two_images(folder: Path, names: list[str], source: Path) -> None:
 
 def check_output_folder(output: Path, folder: Path) -> None:
     """Raise :class:`InputError` if ``output`` is the images folder or a subfolder with images."""
+    if not is_utf8(str(output)):
+        raise InputError(
+            f"the name of the output folder {escape(str(output))} is not UTF-8; choose another one"
+        )
     if output.resolve() == folder.resolve():
         raise InputError(
             f"{output} is the folder of the photos, and results must not be mixed with them. "
@@ -172,6 +186,20 @@ def walk_files(folder: Path) -> Iterator[str]:
             path = Path(parent, name)
             if not name.startswith(".") and path.is_file():
                 yield path.relative_to(folder).as_posix()
+
+
+def is_utf8(name: str) -> bool:
+    """Return whether a file name is valid UTF-8; COLMAP and JSON files cannot have other names."""
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def escape(name: str) -> str:
+    r"""Replace bytes of a file name that are not UTF-8 by ``\xNN``."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def list_names(names: list[str]) -> str:

@@ -38,12 +38,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-import platformdirs
 from filelock import FileLock
 
 from mpsfm_core.data.errors import WeightsError
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.format_versions import VERSION, check_version
+from mpsfm_core.support.user_folders import user_cache_folder, user_data_folder
 
 FORMAT = 1
 """Version of ``hashes.json``."""
@@ -97,8 +97,8 @@ class WeightStore:
             offline: True forbids downloads; by default ``$MPSFM_OFFLINE`` or ``$HF_HUB_OFFLINE``.
             progress: Called during downloads.
         """
-        default = os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("mpsfm")
-        self.cache_dir = Path(cache_dir or default).expanduser() / "weights"
+        folder = Path(cache_dir).expanduser() if cache_dir else user_cache_folder()
+        self.cache_dir = folder / "weights"
         self.offline = _is_offline_by_environment() if offline is None else offline
         self._progress = progress
 
@@ -374,8 +374,8 @@ def _find_local_file(uri: str) -> Path:
 
 def exports_folder() -> Path:
     """Return ``$MPSFM_EXPORTS``, or ``exports`` in the user data folder."""
-    default = Path(platformdirs.user_data_dir("mpsfm")) / "exports"
-    return Path(os.environ.get(EXPORTS_VARIABLE) or default).expanduser()
+    variable = os.environ.get(EXPORTS_VARIABLE)
+    return Path(variable).expanduser() if variable else user_data_folder() / "exports"
 
 
 def _find_exported_file(uri: str) -> Path:

@@ -1,19 +1,25 @@
 """Numba decorators for inner loops: kernels for Python callers, helpers for kernels.
 
-Compiled kernels are cached in ``$NUMBA_CACHE_DIR``, next to the module, or in the user's cache if
-the package is not writable. Helpers are compiled into their kernels. Pass counters to helpers as
-``np.int64(0)``: a literal 0 has its own numba type, which would compile the helper twice.
+Compiled kernels are cached in ``$NUMBA_CACHE_DIR``, else next to the module. If the package is not
+writable, they are cached in ``kernels`` of the user's cache (``$MPSFM_CACHE``). Helpers are
+compiled into their kernels. Pass counters to helpers as ``np.int64(0)``: a literal 0 has its own
+numba type, which would compile the helper twice.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
+import numba
 from numba import njit
 from numba.extending import register_jitable
+
+from mpsfm_core.support.user_folders import user_cache_folder
 
 _log = logging.getLogger(__name__)
 
@@ -31,10 +37,11 @@ def kernel(**options: Any) -> Callable[[F], F]:
     """
 
     def decorate(function: F) -> F:
+        _choose_cache_folder()
         try:
             return _compiled(function, cache=True, **options)
-        except RuntimeError as error:  # no writable cache folder
-            _warn(str(error))
+        except RuntimeError:  # no writable cache folder
+            _warn_without_cache()
             return _compiled(function, **options)
 
     return decorate
@@ -53,6 +60,23 @@ def _compiled(function: F, **options: Any) -> F:
 
 
 @cache
-def _warn(reason: str) -> None:
-    text = "cannot cache compiled code (%s): set NUMBA_CACHE_DIR to a writable folder"
-    _log.warning(text, reason.split(":")[0])
+def _choose_cache_folder() -> None:
+    """Cache kernels in the user's cache if the package is not writable."""
+    if os.environ.get("NUMBA_CACHE_DIR") or os.access(Path(__file__).parent, os.W_OK):
+        return
+    folder = user_cache_folder() / "kernels"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(folder, os.W_OK):
+        os.environ["NUMBA_CACHE_DIR"] = str(folder)  # for the processes of workers
+        numba.config.CACHE_DIR = str(folder)
+
+
+@cache
+def _warn_without_cache() -> None:
+    _log.warning(
+        "compiled code cannot be kept, and every run compiles it again: set MPSFM_CACHE to a "
+        "writable folder"
+    )

@@ -1,0 +1,51 @@
+"""Folders for caches and data of the user, also for accounts without a home."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import platformdirs
+
+CACHE_VARIABLE = "MPSFM_CACHE"
+
+_log = logging.getLogger(__name__)
+
+
+def user_cache_folder() -> Path:
+    """Return ``$MPSFM_CACHE``, else the platform's cache folder, else a temporary folder."""
+    variable = os.environ.get(CACHE_VARIABLE)
+    if variable:
+        try:
+            return Path(variable).expanduser()
+        except RuntimeError:  # "~" of an account without a home
+            return Path(variable)
+    try:
+        return Path(platformdirs.user_cache_dir("mpsfm"))
+    except RuntimeError:
+        return _temporary_folder()
+
+
+def user_data_folder() -> Path:
+    """Return the platform's data folder, else ``data`` in :func:`user_cache_folder`.
+
+    The second case is an account without a home: a container's user id without a passwd entry.
+    """
+    try:
+        return Path(platformdirs.user_data_dir("mpsfm"))
+    except RuntimeError:
+        return user_cache_folder() / "data"
+
+
+@cache
+def _temporary_folder() -> Path:
+    folder = Path(tempfile.gettempdir()) / f"mpsfm-{os.getuid() if hasattr(os, 'getuid') else 0}"
+    _log.warning(
+        "this account has no home folder: caches go to %s; set %s or HOME to keep them elsewhere",
+        folder,
+        CACHE_VARIABLE,
+    )
+    return folder
