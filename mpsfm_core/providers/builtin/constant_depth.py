@@ -1,4 +1,4 @@
-"""Depth that knows nothing of the scene, so that there always is some."""
+"""Depth provider without any prior knowledge, the fallback if no network is installed."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from mpsfm_core.data.options import Options
 from mpsfm_core.providers import ProviderContext
 
 _GRID = (24, 32)
-"""Of a constant any grid is as good; normals from depth want a few pixels."""
+"""Rows and columns of the map; normals from depth need some pixels."""
 
 
 class ConstantDepth:
-    """A plane parallel to the image, at a distance of 1 in no known unit.
+    """Depth provider that returns a plane parallel to the image at distance 1, not metric.
 
-    With the large std that it declares the mapper can lift keypoints to begin with, and photos
-    that overlap well are reconstructed nearly as without priors.
+    With the large std that its specification declares, the mapper can lift keypoints for a first
+    pose. Images with much overlap are then reconstructed nearly as without priors.
     """
 
     def __init__(self, options: Options | None, context: ProviderContext) -> None:
         pass
 
     def predict(self, view: View) -> DepthPrior:
-        """Depth 1 everywhere, not metric."""
+        """Return depth 1 everywhere."""
         return DepthPrior.from_arrays(np.ones(_GRID), metric=False)

@@ -1,4 +1,4 @@
-"""Choices of depth that another block of the configuration gives."""
+"""Placeholders for depth that another block of the configuration predicts."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from mpsfm_core.providers import ProviderContext
 
 
 class MatcherDepth:
-    """Stands in the configuration as ``depth: {use: matcher}`` (the paper's MASt3R configuration).
+    """Placeholder for ``depth: {use: matcher}``: depth predicted by the matcher.
 
-    The extraction takes the depth from the pairs that the matcher has predicted, the most certain
-    pair of each image. One view alone has no pair, so that asking for it is an error.
+    The extraction takes the depth of each image from its most certain pair, as the MASt3R
+    configuration of the paper does. A single view has no pair, so that :meth:`predict` always
+    fails.
     """
 
     source = "the pairs of a matcher that predicts depth"
@@ -21,7 +22,11 @@ class MatcherDepth:
         pass
 
     def predict(self, view: View) -> DepthPrior:
-        """Always raises :class:`ProviderError`."""
+        """Raise an error: one view has no matches.
+
+        Raises:
+            ProviderError: Always.
+        """
         raise ProviderError(
             f"the depth of {view.name!r} comes from {self.source}; it cannot be predicted from one "
             f"view"
@@ -29,7 +34,9 @@ class MatcherDepth:
 
 
 class MultiViewDepth(MatcherDepth):
-    """Stands in the configuration as ``depth: {use: multiview}``: the extraction takes the depth
-    from the groups of photos that the multi-view network was shown."""
+    """Placeholder for ``depth: {use: multiview}``: depth of the multi-view network.
+
+    The extraction takes the depth from the groups of images that the network received.
+    """
 
     source = "a multi-view network"

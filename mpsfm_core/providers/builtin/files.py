@@ -1,4 +1,4 @@
-"""Depth, normals and masks from files: sensor data and priors computed elsewhere."""
+"""Depth, normals and masks from files: sensor data and predictions of other programs."""
 
 from __future__ import annotations
 
@@ -20,20 +20,27 @@ from mpsfm_core.providers.builtin.options import (
 )
 
 _MIN_ENCODED_LENGTH = 0.5
-"""A decoded normal is unit up to rounding; mid-grey, which means unknown, has nearly no length."""
+"""Smallest length of a decoded normal. Mid-gray, which means unknown, has a length near zero."""
 
 
 class DepthFiles:
-    """Depth maps from files, with the declared or stored uncertainty."""
+    """Depth provider that reads depth maps and their uncertainty from files."""
 
     def __init__(self, options: DepthFileOptions, context: ProviderContext) -> None:
         self._options = options
 
     def predict(self, view: View) -> DepthPrior:
-        """The view's depth on the file's grid.
+        """Read the depth of a view on the grid of its file.
 
-        Raises :class:`InputError` when the file is missing, unreadable, does not cover the view,
-        or has no variance and none is declared.
+        Args:
+            view: View whose name selects the file.
+
+        Returns:
+            Depth with variance.
+
+        Raises:
+            InputError: The file is missing, unreadable or does not cover the view, or it has no
+                variance and the options declare none.
         """
         path = find_file(self._options, view, "depth")
         arrays = read_arrays(path, "depth")
@@ -70,16 +77,23 @@ class DepthFiles:
 
 
 class NormalFiles:
-    """Normal maps from files."""
+    """Normals provider that reads normal maps from files."""
 
     def __init__(self, options: NormalFileOptions, context: ProviderContext) -> None:
         self._options = options
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """The view's normals on the file's grid.
+        """Read the normals of a view on the grid of their file.
 
-        Raises :class:`InputError` when the file is missing, unreadable or does not cover the
-        view.
+        Args:
+            view: View whose name selects the file.
+            depth: Not used.
+
+        Returns:
+            Normals in the camera frame.
+
+        Raises:
+            InputError: The file is missing, unreadable or does not cover the view.
         """
         path = find_file(self._options, view, "normals")
         arrays = read_arrays(path, "normals")
@@ -99,16 +113,22 @@ class NormalFiles:
 
 
 class MaskFiles:
-    """Masks from files, on a grid of any size that covers the view."""
+    """Mask provider that reads masks of any size from files."""
 
     def __init__(self, options: MaskFileOptions, context: ProviderContext) -> None:
         self._options = options
 
     def mask(self, view: View) -> Bool:
-        """(H, W) bool, True where the pixel may be used; the nearest pixel of the file counts.
+        """Read the mask of a view and resize it to the view by nearest neighbor.
 
-        Raises :class:`InputError` when the file is missing, unreadable or does not cover the
-        view.
+        Args:
+            view: View whose name selects the file.
+
+        Returns:
+            Mask (H, W) bool, True where a pixel may be used.
+
+        Raises:
+            InputError: The file is missing, unreadable or does not cover the view.
         """
         path = find_file(self._options, view, "mask")
         values = read_arrays(path, "mask")["mask"]
@@ -126,17 +146,18 @@ class MaskFiles:
 
 
 def _grayscale(path: Path, stored: NDArray[Any]) -> NDArray[Any]:
-    """A depth map that some program wrote as gray RGB; colours are no depth."""
+    """Return one channel of a depth map stored as gray RGB; colors are an error."""
     if stored.ndim == 3 and stored.shape[2] == 3:
         if (stored == stored[..., :1]).all():
             return np.asarray(stored[..., 0])
-        raise InputError(f"{path} is a colour image; depth has one channel")
+        raise InputError(f"{path} is a color image; depth has one channel")
     return stored
 
 
 def _optional(
     path: Path, arrays: dict[str, NDArray[Any]], name: str, view: View
 ) -> NDArray[Any] | None:
+    """Return an optional array after checking its shape."""
     values = arrays.get(name)
     if values is not None:
         check_map(path, values, view, 1)
@@ -144,7 +165,7 @@ def _optional(
 
 
 def _decoded(stored: NDArray[Any]) -> NDArray[Any]:
-    """Normals from their encoding as whole numbers; numbers with a fraction are not encoded."""
+    """Decode normals from unsigned integers; floating-point values are not encoded."""
     if np.issubdtype(stored.dtype, np.unsignedinteger):
         return stored.astype(np.float64) / np.iinfo(stored.dtype).max * 2 - 1
     return stored.astype(np.float64)

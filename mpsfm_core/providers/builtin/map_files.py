@@ -1,4 +1,4 @@
-"""Maps read from files of several formats, found by the name of their image."""
+"""Maps in files of several formats, found by the name of their image."""
 
 from __future__ import annotations
 
@@ -22,11 +22,23 @@ _SUFFIXES = (".npz", ".npy", ".exr", ".png", ".tif", ".tiff")
 _SINGLE_CHANNELS = ("Z", "Y", "depth.Z", "Depth.Z", "R", "V")
 _VECTOR_CHANNELS = (("X", "Y", "Z"), ("R", "G", "B"))
 _MAX_ASPECT_DIFFERENCE = 0.02
-"""Rounding of a reduced map's size stays below; a map of a cropped image does not."""
+"""Largest relative difference of aspect ratios. Rounding of a reduced size stays below."""
 
 
 def find_file(options: FileOptions, view: View, what: str) -> Path:
-    """The file of a view; raises :class:`InputError` that names what was looked for."""
+    """Find the file of a view.
+
+    Args:
+        options: Folder and suffix.
+        view: View whose name selects the file.
+        what: Name of the quantity for messages.
+
+    Returns:
+        Path of the file.
+
+    Raises:
+        InputError: There is no file; the message has the expected path.
+    """
     suffixes = _SUFFIXES if options.suffix is None else (options.suffix,)
     full = options.directory / view.name
     bases = [full, full.with_suffix("")]
@@ -51,9 +63,17 @@ def _find_ignoring_case(path: Path) -> Path | None:
 
 
 def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
-    """The arrays of an NPZ by name; of any other format its one map under the name ``main``.
+    """Read the arrays of a file by name.
 
-    Colours are in RGB order. Raises :class:`InputError` when the file cannot be read.
+    Args:
+        path: File in NPZ, NPY, EXR or an image format; colors are returned as RGB.
+        main: Name of the required array, and of the only array of formats other than NPZ.
+
+    Returns:
+        Arrays by name.
+
+    Raises:
+        InputError: The file cannot be read or lacks the required array.
     """
     try:
         if path.suffix in (".npz", ".npy"):
@@ -64,7 +84,7 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
             arrays = {main: _read_image(path)}
     except InputError:
         raise
-    except Exception as error:  # readers of damaged files raise what their parsers raise
+    except Exception as error:  # parsers raise any exception for a damaged file
         raise InputError(f"{path} cannot be read: {type(error).__name__}: {error}") from error
     if main not in arrays:
         raise InputError(f"{path} has no array {main!r}, it has {', '.join(arrays) or 'none'}")
@@ -72,8 +92,17 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
 
 
 def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> None:
-    """Raise :class:`InputError` unless the map is (h, w) or (h, w, channels) and covers the
-    view."""
+    """Require that a map has the right number of channels and covers the view.
+
+    Args:
+        path: File of the map, for messages.
+        values: Map (h, w) or (h, w, channels).
+        view: View that the map belongs to.
+        channels: Expected number of channels.
+
+    Raises:
+        InputError: The shape is wrong, or the aspect ratio differs from that of the view.
+    """
     expected = 2 if channels == 1 else 3
     if values.ndim != expected or (channels > 1 and values.shape[2] != channels):
         wanted = "one channel" if channels == 1 else f"{channels} channels"
@@ -90,7 +119,7 @@ def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> No
 def _read_numpy(path: Path, main: str) -> dict[str, NDArray[Any]]:
     if path.suffix == ".npz":
         return read_npz(path)
-    # From memory, because numpy leaves a damaged file open.
+    # From memory, because numpy does not close a damaged file.
     return {main: np.lib.format.read_array(io.BytesIO(path.read_bytes()), allow_pickle=False)}
 
 
@@ -122,7 +151,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
 
 
 def _choose_channels(channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
-    """(h, w, 3) of an X, Y, Z or R, G, B image, else (h, w) of its depth channel."""
+    """Return (h, w, 3) for channels X, Y, Z or R, G, B, else the depth channel (h, w)."""
     if len(channels) == 1:
         return next(iter(channels.values()))
     for names in _VECTOR_CHANNELS:

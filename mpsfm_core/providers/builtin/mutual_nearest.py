@@ -1,4 +1,4 @@
-"""Matching by mutual nearest neighbours of descriptors."""
+"""Matching of mutual nearest descriptors."""
 
 # mypy: allow-untyped-decorators
 
@@ -15,18 +15,17 @@ from mpsfm_core.providers.builtin.options import MutualNearestOptions
 from mpsfm_core.support.jit import kernel
 
 _BLOCK = 128
-"""Rows compared at once: 4 MB for 8192 features on the other side, which caches hold."""
+"""Number of rows per block: 4 MB for 8192 features on the other side, which fits into caches."""
 _ROUNDING = np.float32(1e-5)
-"""Squared distances that differ by less than this share of the descriptors' squared length count
-as equal: they are differences of squares in float32, a hundred times as exact, and the order of
-their sums depends on the processor."""
+"""Squared distances are equal up to this ratio of the squared descriptor length. The order of
+float32 sums depends on the processor."""
 
 
 class MutualNearest:
-    """For descriptors of any kind; compares them by Euclidean distance.
+    """Matcher of mutual nearest descriptors of any kind by Euclidean distance.
 
-    A match's score is ``1 - nearest / second nearest distance`` (the larger ratio of the two
-    directions), a measure of how distinct it is.
+    The score of a match is ``1 - nearest / second nearest distance``, with the larger ratio of both
+    directions.
     """
 
     def __init__(self, options: MutualNearestOptions, context: ProviderContext) -> None:
@@ -39,7 +38,20 @@ class MutualNearest:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Sparse matches, each feature in at most one."""
+        """Match the features of two views; each feature has at most one match.
+
+        Args:
+            view_a: First view, used for messages.
+            view_b: Second view, used for messages.
+            features_a: Features of the first view.
+            features_b: Features of the second view.
+
+        Returns:
+            Sparse matches.
+
+        Raises:
+            ProviderError: There are no features, or their descriptors differ in length.
+        """
         features_a, features_b = require_features(
             "mutual-nearest matches features", features_a, features_b
         )
@@ -57,43 +69,50 @@ class MutualNearest:
 
 
 def mutual_nearest(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
-    """Mutual nearest neighbours (m, 2), their distances (m,), and the larger of the ratios to the
-    second nearest in both directions (m,)."""
+    """Find mutual nearest neighbors.
+
+    Args:
+        a: Descriptors (n, d).
+        b: Descriptors (m, d).
+
+    Returns:
+        Rows (k, 2) of a and b, their distances (k,), and the ratio (k,) of nearest to second
+        nearest distance, the larger one of both directions.
+    """
     if not (len(a) and len(b)):
         empty = np.empty(0, dtype=np.float32)
         return np.empty((0, 2), dtype=np.int64), empty, empty
-    from_a, from_b = _Nearest.unknown(len(a)), _Nearest.unknown(len(b))
+    from_a, from_b = _Nearest.initialize(len(a)), _Nearest.initialize(len(b))
     transposed = np.ascontiguousarray(np.float32(-2) * b.T)
     norms_a, norms_b = (np.einsum("ij,ij->i", each, each) for each in (a, b))
     for start in range(0, len(a), _BLOCK):
         rows = slice(start, start + _BLOCK)
         products = a[rows] @ transposed
-        _compare(products, start, norms_a[rows], norms_b, *from_a.of(rows), *from_b)
+        _compare(products, start, norms_a[rows], norms_b, *from_a.select(rows), *from_b)
     rows_of_b = np.flatnonzero(from_a.best[from_b.best] == np.arange(len(b)))
     pairs = np.stack([from_b.best[rows_of_b], rows_of_b], axis=1)
     in_a, in_b = pairs.T
     nearest = np.maximum(from_a.nearest[in_a], 0)
     limit = np.maximum(np.minimum(from_a.second[in_a], from_b.second[in_b]), 0)
-    rounding = _ROUNDING * norms_a[in_a]  # equal ones have a ratio of 1
+    rounding = _ROUNDING * norms_a[in_a]  # equal distances have a ratio of 1
     ratio = np.sqrt((nearest + rounding) / (limit + rounding))
     return pairs, np.sqrt(nearest), ratio
 
 
 class _Nearest(NamedTuple):
-    """Of each row: the nearest row of the other side, the first of equal ones, its squared distance
-    and that of the second nearest (infinite where there is none)."""
+    """Nearest row of the other side per row, its squared distance and the second nearest one."""
 
     best: Int64
     nearest: Float32
     second: Float32
 
     @classmethod
-    def unknown(cls, count: int) -> _Nearest:
+    def initialize(cls, count: int) -> _Nearest:
         far = np.full(count, np.inf, np.float32)
         return cls(np.zeros(count, np.int64), far, far.copy())
 
-    def of(self, rows: slice) -> _Nearest:
-        """Views of some rows."""
+    def select(self, rows: slice) -> _Nearest:
+        """Return array views of some rows."""
         return _Nearest(self.best[rows], self.nearest[rows], self.second[rows])
 
 
@@ -110,8 +129,7 @@ def _compare(
     nearest_of_b: Float32,
     second_of_b: Float32,
 ) -> None:
-    """Take a block of ``-2 a b`` (n, m), of rows of a from ``start`` on, into what is known of
-    these rows (n,) and of those of b (m,)."""
+    """Update the nearest neighbors by a block of products ``-2 a b`` (n, m) of rows from start."""
     for i in range(len(norms_a)):
         best, nearest, second = 0, np.float32(np.inf), np.float32(np.inf)
         for j in range(len(norms_b)):

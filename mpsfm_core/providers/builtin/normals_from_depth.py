@@ -14,11 +14,12 @@ from mpsfm_core.providers import ProviderContext
 from mpsfm_core.providers.builtin.options import NormalsFromDepthOptions
 
 _MIN_SUPPORT = 0.5
-"""Share of a window's pixels that must be valid."""
+"""Smallest ratio of valid pixels in a window."""
 _MIN_SPREAD = 1e-3
-"""Determinant over squared trace of the pixels' covariance: 1/4 for a square, 0 on a line."""
+"""Smallest determinant over squared trace of the pixel covariance: 1/4 for a square, 0 on a
+line."""
 _NOISE_MARGIN = 6.0
-"""Standard deviations of the map's own roughness that no edge hides in."""
+"""Edge threshold in multiples of the std of the map's roughness."""
 _VARIANCE_RANGE = (1e-12, np.pi**2)
 _MEDIAN_BEND = 1.052
 """Median of the larger of two independent absolute errors of std 1."""
@@ -27,24 +28,24 @@ _BEND_NOISE = np.sqrt(1.5)
 
 
 class NormalsFromDepth:
-    """Least-squares planes in a window around each pixel, on the grid of the depth map.
+    """Normals of least-squares planes in a window around each pixel of the depth map.
 
-    The plane ``g . X = 1`` has the inverse depth ``1 / z = g . (x, y, 1)`` along the ray
-    ``(x, y, 1)``: it is linear, so ``g`` comes from a linear fit of the inverse depth, and the
-    normal is ``-g / |g|``. Windows shrink until they hold no depth edge.
+    A plane ``g . X = 1`` has the inverse depth ``1 / z = g . (x, y, 1)`` along the ray ``(x, y,
+    1)``. The inverse depth is linear in ``g``, so that ``g`` follows from a linear fit, and the
+    normal is ``-g / |g|``. Windows shrink until they contain no depth edge.
 
-    Uncertainty. Errors of a depth map are smooth over many pixels (a network bends a wall, it does
-    not roughen it), so differences of neighbours are far better than independent errors of the
-    declared size would allow. An error of relative std ``s`` that varies over an angle of ``a``
-    radians tilts a surface by about ``s / a``; ``slope_std`` is ``1 / a``. The residuals of the
-    fit add what is rough, with one independent error a pixel.
+    Uncertainty: errors of depth maps are smooth over many pixels, because a network bends a wall
+        instead of roughening it. Differences of neighbors are therefore more accurate than
+        independent errors of the declared size would imply. An error of relative std ``s`` that
+        varies over an angle of ``a`` radians tilts a surface by about ``s / a``; ``slope_std`` is
+        ``1 / a``. The residuals of the fit add the roughness, with one independent error per pixel.
     """
 
     def __init__(self, options: NormalsFromDepthOptions, context: ProviderContext) -> None:
         self._options = options
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """Normals with variance; invalid at depth edges, holes and the border of the map."""
+        """Return normals with variance; invalid at depth edges, holes and the border of the map."""
         if depth is None:
             raise ProviderError("from-depth needs a depth prior with its variance")
         return fit_normals(view.camera, depth, self._options)
@@ -53,9 +54,18 @@ class NormalsFromDepth:
 def fit_normals(
     camera: PinholeCamera, depth: DepthPrior, options: NormalsFromDepthOptions
 ) -> NormalPrior:
-    """What :class:`NormalsFromDepth` predicts for a depth map that covers the view of a camera.
+    """Fit normals to a depth map that covers the view of a camera.
 
-    Raises :class:`ProviderError` when the map has no variance.
+    Args:
+        camera: Camera of the view.
+        depth: Depth with variance.
+        options: Options of the fit.
+
+    Returns:
+        Normals with variance on the grid of the depth map.
+
+    Raises:
+        ProviderError: The depth has no variance.
     """
     if depth.variance is None:
         raise ProviderError("from-depth needs a depth prior with its variance")
@@ -70,7 +80,7 @@ def fit_normals(
     fit = _fit_without_edges(xy, inverse, noise, depth.valid & ~edges, edges, radius)
     squared_length = np.maximum((fit.plane**2).sum(axis=-1), 1e-300)
     relative = depth.variance / np.maximum(depth.depth.astype(np.float64), 1e-12) ** 2
-    # A surface seen at a grazing angle is tilted less by the same error along the ray.
+    # The same error along the ray tilts a surface less at a grazing angle.
     tilt = options.slope_std**2 * relative * inverse**2
     return NormalPrior.from_arrays(
         -fit.plane / np.sqrt(squared_length)[..., None],
@@ -81,7 +91,7 @@ def fit_normals(
 
 
 class _Fit(NamedTuple):
-    """Planes (h, w, 3), variance (h, w) of their vectors across themselves, and where they are."""
+    """Planes (h, w, 3), the variance (h, w) of their vectors across themselves, and validity."""
 
     plane: Float64
     variance: Float64
@@ -89,9 +99,10 @@ class _Fit(NamedTuple):
 
 
 def _relative_bends(inverse: Float64, valid: Bool) -> Float64:
-    """How much the inverse depth of a pixel deviates from the middle of its neighbours along its
-    row or column, relative: 0 on a plane, however slanted. 0 as well where a neighbour is
-    missing."""
+    """Return the relative deviation of inverse depth from the mean of its neighbors.
+
+    The deviation along rows and columns is 0 on any plane, and set to 0 if a neighbor is missing.
+    """
     largest = np.zeros(valid.shape)
     for axis in (0, 1):
         w, ok = np.moveaxis(inverse, axis, 0), np.moveaxis(valid, axis, 0)
@@ -104,8 +115,7 @@ def _relative_bends(inverse: Float64, valid: Bool) -> Float64:
 def _fit_without_edges(
     xy: Float64, inverse: Float64, noise: Float64, usable: Bool, edges: Bool, radius: int
 ) -> _Fit:
-    """The fit of each pixel's largest window of radius ``radius``, half of it, ... or 1 without an
-    edge."""
+    """Fit each pixel with the largest window, radius halved repeatedly, without an edge."""
     best = _fit_planes(xy, inverse, noise, usable, edges, radius)
     while radius > 1:
         radius //= 2
@@ -121,9 +131,9 @@ def _fit_without_edges(
 def _fit_planes(
     xy: Float64, inverse: Float64, noise: Float64, usable: Bool, edges: Bool, radius: int
 ) -> _Fit:
-    """Planes ``g`` with ``inverse = g . (x, y, 1)`` fitted to the usable pixels of windows.
+    """Fit planes ``g`` with ``inverse = g . (x, y, 1)`` to the usable pixels of windows.
 
-    ``noise``: (h, w), the least variance of the inverse depth of one pixel.
+    ``noise`` (h, w) is the smallest variance of the inverse depth of one pixel.
     """
     x, y = xy[..., 0], xy[..., 1]
     weight = usable.astype(np.float64)

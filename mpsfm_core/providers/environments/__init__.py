@@ -1,5 +1,6 @@
-"""Providers that live in other Python environments, used as if they were here.
+"""Providers in other Python environments, used through a worker process.
 
-A worker process of the other environment (:mod:`mpsfm_core.providers.environments.worker`) makes
-the provider and answers; :mod:`remote` is this side of it. Arrays pass through memory that both
-processes map. """
+A worker in the other environment (:mod:`mpsfm_core.providers.environments.worker`) constructs the
+provider and answers requests. :mod:`remote_provider` is the client in this process. Arrays pass
+through memory that both processes map.
+"""

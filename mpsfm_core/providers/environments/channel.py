@@ -1,8 +1,7 @@
-"""Messages between two processes: a text over a pipe, arrays through memory that both map.
+"""Messages between two processes: text through a pipe, arrays through memory that both map.
 
-As one side asks and the other answers, either says with its message into which of its blocks the
-next one is to be written. A block is a file, in memory where the system has a file system there,
-which grows as needed and is used again: fresh memory costs more than the copy into it.
+A block is a file, in memory if the system has a file system there. It grows as needed and is
+reused, because fresh memory costs more than the copy into it.
 """
 
 from __future__ import annotations
@@ -22,23 +21,20 @@ from mpsfm_core.providers.environments.codec import EncodedMessage, decode_messa
 
 _IN_MEMORY = Path("/dev/shm")
 _HEADER = struct.Struct("<IIQ")
-"""Bytes of text, number of the block for the answer, bytes of arrays. As of all versions of the
-protocol where the number is 0, so that the greeting is understood, which says the version."""
+"""Bytes of text, number of the block for the answer, bytes of arrays. All versions of the protocol
+start with this header, so that both sides can read the version in the greeting."""
 _LARGEST_TEXT = 1 << 28
 _EMPTY = np.empty(0, dtype=np.uint8)
 
 
 class ChannelClosed(Exception):
-    """The other side is gone."""
+    """The other process has ended or closed its pipe."""
 
 
 class Channel:
-    """One end. ``folder``: of the files; ``own``, ``other``: beginnings of the names of what either
-    side sends.
+    """One end of the connection between two processes.
 
-    ``lent``: how many messages can be looked into at once. Arrays that are received look into their
-    message's block for as long as they live; when all blocks are looked into, arrays are copies.
-    None: arrays are valid until the next message arrives.
+    Each message announces into which block of the receiver the next message has to be written.
     """
 
     def __init__(
@@ -50,43 +46,63 @@ class Channel:
         other: str,
         lent: int | None = None,
     ) -> None:
+        """Open one end on a pair of pipes.
+
+        Args:
+            reader: Pipe to read from.
+            writer: Pipe to write to.
+            folder: Folder of the block files.
+            own: Prefix of the block files that this end writes.
+            other: Prefix of the block files that the other end writes.
+            lent: Number of messages whose arrays may be alive at the same time. Received arrays are
+                views of their block; if all blocks are in use, they are copies. None: arrays are
+                valid until the next message arrives.
+        """
         self._reader, self._writer = reader, writer
         self._own, self._other = folder / own, folder / other
         self._written: dict[int, _Block] = {}
         self._inbox = [_Block(Path(f"{self._other}{i}")) for i in range(1 + (lent or 0))]
-        self._lends = lent is not None
-        self._target, self._wanted = 0, 0
+        self._lends_blocks = lent is not None
+        self._target, self._announced = 0, 0
 
     def send(self, value: Any) -> None:
-        """Send a value; raises :class:`ChannelClosed` when nobody is there."""
+        """Send a value.
+
+        Raises:
+            ChannelClosed: The other process has ended.
+        """
         packed = EncodedMessage(value)
         if packed.size:
             block = self._written.get(self._target) or _Block(Path(f"{self._own}{self._target}"))
             self._written[self._target] = block
             packed.write(block.for_writing(packed.size))
-        # the last block, whose content is copied, where all others are looked into
-        free = (i for i, block in enumerate(self._inbox) if not block.looked_into)
-        self._wanted = next(free, len(self._inbox) - 1)
+        # the last block, whose content is copied, if all others are in use
+        free = (i for i, block in enumerate(self._inbox) if not block.in_use)
+        self._announced = next(free, len(self._inbox) - 1)
         try:
-            header = _HEADER.pack(len(packed.text), self._wanted, packed.size)
+            header = _HEADER.pack(len(packed.text), self._announced, packed.size)
             self._writer.write(header + packed.text)
             self._writer.flush()
         except (OSError, ValueError) as error:
             raise ChannelClosed from error
 
     def receive(self) -> Any:
-        """The next value; raises :class:`ChannelClosed` when none comes any more."""
+        """Receive the next value.
+
+        Raises:
+            ChannelClosed: The other process has ended.
+        """
         length, self._target, size = _HEADER.unpack(self._read(_HEADER.size))
         if length > _LARGEST_TEXT:
-            raise ChannelClosed  # somebody else writes into the pipe
+            raise ChannelClosed  # foreign output in the pipe
         text = self._read(length)
-        block = self._inbox[self._wanted].for_reading(size) if size else _EMPTY
+        block = self._inbox[self._announced].for_reading(size) if size else _EMPTY
         return decode_message(
-            text, block, copy=self._lends and self._wanted == len(self._inbox) - 1
+            text, block, copy=self._lends_blocks and self._announced == len(self._inbox) - 1
         )
 
     def close(self) -> None:
-        """Give the memory back; the files go with their folder."""
+        """Unmap the blocks; their files are removed with their folder."""
         for block in (*self._written.values(), *self._inbox):
             block.close()
 
@@ -98,7 +114,7 @@ class Channel:
 
 
 class _Block:
-    """A file of bytes that both processes map."""
+    """File of bytes that both processes map."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -107,12 +123,12 @@ class _Block:
         self._read: weakref.ref[UInt8] | None = None
 
     @property
-    def looked_into(self) -> bool:
-        """Whether an array of what was read lives."""
+    def in_use(self) -> bool:
+        """Whether an array that views the block is alive."""
         return self._read is not None and self._read() is not None
 
     def for_writing(self, size: int) -> memoryview:
-        """Bytes to write to, made larger if need be; a full disk is found out here."""
+        """Return ``size`` bytes to write to, growing the file if necessary; may raise OSError."""
         if size > self._size:
             self.close()
             with self._path.open("a+b") as file:
@@ -122,13 +138,13 @@ class _Block:
         return memoryview(self._map)[:size]
 
     def for_reading(self, size: int) -> UInt8:
-        """What the other side wrote."""
+        """Return what the other process wrote."""
         if size > self._size:
             self.close()
             self._open(self._path.stat().st_size)
         assert self._map is not None
         content = np.frombuffer(self._map, dtype=np.uint8, count=size)
-        self._read = weakref.ref(content)  # views of it keep it alive
+        self._read = weakref.ref(content)  # views of the array keep it alive
         return content
 
     def close(self) -> None:
@@ -142,8 +158,10 @@ class _Block:
 
 
 def reserve_space(descriptor: int, size: int) -> None:
-    """Make a file this long, with room for all of it: what is missing when a map is written to
-    would kill the process."""
+    """Reserve disk space for a file of this size.
+
+    Writing to a mapped page without disk space would kill the process.
+    """
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(descriptor, 0, size)
     else:
@@ -151,7 +169,7 @@ def reserve_space(descriptor: int, size: int) -> None:
 
 
 def create_shared_folder(needed: int) -> tempfile.TemporaryDirectory[str]:
-    """A folder for the files, in memory where ``needed`` bytes fit there."""
+    """Create a folder for block files, in memory if ``needed`` bytes are free there."""
     place = None
     if _IN_MEMORY.is_dir() and os.access(_IN_MEMORY, os.W_OK):
         status = os.statvfs(_IN_MEMORY)

@@ -1,9 +1,9 @@
-"""Values of our protocols as a text with numbers and a block of array bytes, and back.
+"""Encoding of values as JSON text and a block of array bytes.
 
-Not pickle: what comes from the other side can be nothing but the types below, and the versions of
-Python and numpy of both sides may differ. Known are None, bool, int, float, str, paths, lists,
-tuples, dictionaries with text keys, numpy arrays, the data types, and specifications of weights and
-calibrations.
+The encoding is not pickle: a message can only contain the types below, and both processes may have
+different versions of Python and numpy. Supported are None, bool, int, float, str, paths, lists,
+tuples, dictionaries with text keys, numpy arrays, the data types of :mod:`mpsfm_core.data`, weights
+files and calibrations.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ _TYPES: Mapping[str, type] = MappingProxyType(
 
 
 class EncodedMessage:
-    """A value ready to be sent: ``text`` and the arrays that it refers to, in their order."""
+    """Value ready to send: ``text`` and the arrays that the text refers to, in order."""
 
     def __init__(self, value: Any) -> None:
         self.arrays: list[NDArray[Any]] = []
         self.size = 0
-        """Of the block that :meth:`write` fills, in bytes."""
+        """Size in bytes of the block that :meth:`write` fills."""
         self.text = json.dumps(self._plain(value)).encode()
 
     def write(self, block: memoryview) -> None:
-        """Copy the arrays to their places in a block of ``size`` bytes."""
+        """Copy the arrays to their offsets in a block of ``size`` bytes."""
         start = 0
         for array in self.arrays:
             place = np.frombuffer(block, array.dtype, array.size, start).reshape(array.shape)
@@ -71,7 +71,7 @@ class EncodedMessage:
         if isinstance(value, Path):
             return {"path": str(value)}
         if isinstance(value, np.ndarray):
-            return {"array": self._place(value)}
+            return {"array": self._allocate(value)}
         if isinstance(value, np.generic):
             return value.item()
         if isinstance(value, (list, tuple)):
@@ -83,7 +83,7 @@ class EncodedMessage:
             return {"type": name, "fields": {k: self._plain(v) for k, v in _fields(value)}}
         raise DataError("value", f"a {name} cannot be handed to another process")
 
-    def _place(self, array: NDArray[Any]) -> list[Any]:
+    def _allocate(self, array: NDArray[Any]) -> list[Any]:
         if array.dtype.hasobject:
             raise DataError("value", "an array of objects cannot be handed to another process")
         start, self.size = self.size, self.size + _aligned(array.nbytes)
@@ -92,21 +92,30 @@ class EncodedMessage:
 
 
 def decode_message(text: bytes, block: UInt8, copy: bool) -> Any:
-    """The value again. Its arrays are read-only views of the block, or copies if so asked.
+    """Decode a value.
 
-    Data types are put together without the checks of their values: the other side's constructors
-    made them, and :mod:`mpsfm_core.providers.validation` checks every answer of a provider,
-    wherever it lives. Raises :class:`~mpsfm_core.data.errors.DataError` for what is no value of a
-    type above."""
+    Data types are restored without validation. The constructors of the other side validated them,
+    and :mod:`mpsfm_core.providers.validation` validates every answer of a provider.
 
+    Args:
+        text: JSON text of the message.
+        block: Bytes of the arrays.
+        copy: True returns copies of the arrays, else read-only views of the block.
+
+    Returns:
+        The value.
+
+    Raises:
+        DataError: The message does not follow the protocol.
+    """
     try:
-        return _Unpacking(block, copy).build(json.loads(text))
+        return _Decoder(block, copy).build(json.loads(text))
     except (ValueError, KeyError, TypeError, AttributeError, MemoryError, RecursionError) as error:
         raise DataError("value", f"does not follow the protocol: {error}") from error
 
 
-class _Unpacking:
-    """Of one message. It is gone with it, and arrays alone keep the block."""
+class _Decoder:
+    """Decoder of one message. Only the arrays outlive it and keep the block alive."""
 
     def __init__(self, block: UInt8, copy: bool) -> None:
         self._block, self._copy = block, copy
@@ -116,18 +125,18 @@ class _Unpacking:
             return plain
         if "type" in plain:
             values = {key: self.build(entry) for key, entry in plain["fields"].items()}
-            return _put_together(_TYPES[plain["type"]], values)
-        ((kind_of, content),) = plain.items()
-        if kind_of == "array":
+            return _restore(_TYPES[plain["type"]], values)
+        ((tag, content),) = plain.items()
+        if tag == "array":
             return self._array(content)
-        if kind_of == "path":
+        if tag == "path":
             return Path(content)
-        if kind_of == "dict":
+        if tag == "dict":
             return {key: self.build(entry) for key, entry in content.items()}
-        if kind_of in ("list", "tuple"):
+        if tag in ("list", "tuple"):
             entries = [self.build(entry) for entry in content]
-            return tuple(entries) if kind_of == "tuple" else entries
-        raise DataError("value", f"unknown content {kind_of!r}")
+            return tuple(entries) if tag == "tuple" else entries
+        raise DataError("value", f"unknown content {tag!r}")
 
     def _array(self, description: list[Any]) -> NDArray[Any]:
         dtype, shape, start = np.dtype(description[0]), tuple(description[1]), description[2]
@@ -142,7 +151,8 @@ class _Unpacking:
         return view
 
 
-def _put_together(kind: type, values: dict[str, Any]) -> Any:
+def _restore(kind: type, values: dict[str, Any]) -> Any:
+    """Create an instance of a data type without validation."""
     if issubclass(kind, BaseModel):
         return kind(**values)
     assert is_dataclass(kind)

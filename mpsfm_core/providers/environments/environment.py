@@ -1,4 +1,4 @@
-"""Environments by name: where they are, how one is made, what it brings."""
+"""Python environments with providers: creation, lookup, description and removal."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import platformdirs
-
 from mpsfm_core.data.errors import InputError, ProviderError, did_you_mean
 from mpsfm_core.providers.environments.worker_process import Worker
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.format_versions import VERSION, check_version
+from mpsfm_core.support.user_folders import user_data_folder
 
 _log = logging.getLogger(__name__)
 
 FORMAT = 1
-"""Of the description of an environment."""
+"""Version of the description of an environment."""
 FOLDER_VARIABLE = "MPSFM_ENVIRONMENTS"
 """Environment variable that names the folder with all environments."""
 
@@ -34,12 +33,12 @@ _NAME = re.compile(r"[a-z0-9]+([._-][a-z0-9]+)*")
 _CORE = "mpsfm-core"
 _DESCRIPTION = "providers.json"
 _UNFINISHED = ".unfinished-"
-_ASKING_S = 120.0
-"""For a question that no network is needed for."""
+_REQUEST_TIMEOUT_S = 120.0
+"""Time limit in seconds for a request that runs no network."""
 
 
 class Environment:
-    """A Python environment with providers, in a folder of its own."""
+    """Python environment with providers in its own folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -51,44 +50,44 @@ class Environment:
 
     @property
     def name(self) -> str:
-        """As configurations call it."""
+        """Name in configurations."""
         return self.folder.name
 
     @property
     def label(self) -> str:
-        """As messages call it."""
+        """Name in messages."""
         return f"environment {self.name!r}"
 
     @property
     def python(self) -> Path:
-        """Its interpreter."""
+        """Path of the interpreter."""
         inside = ("Scripts", "python.exe") if os.name == "nt" else ("bin", "python")
         return self.folder.joinpath("venv", *inside)
 
     def start(self) -> Worker:
-        """A worker process in it."""
+        """Start a worker process."""
         return Worker(self.python, self.label)
 
     def ask(self, **request: Any) -> Any:
-        """The answer to a question about its providers, of a worker that stays for the next one."""
+        """Send a request about the providers to a worker that stays alive for the next request."""
         with self._lock:
             if self._worker is None or not self._worker.alive:
                 self._worker = self.start()
             worker = self._worker
-        return worker.ask(request, _ASKING_S)
+        return worker.ask(request, _REQUEST_TIMEOUT_S)
 
     def close(self) -> None:
-        """End the worker that answers questions."""
+        """End the worker that answers requests."""
         if self._worker is not None:
             self._worker.close()
             self._worker = None
 
     def describe(self) -> list[dict[str, Any]]:
-        """What its providers are, without starting it: as of when it was made."""
+        """Return the stored description of the providers. Starts no process."""
         path = self.folder / _DESCRIPTION
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            if isinstance(content, list):  # as it was before it had a version
+            if isinstance(content, list):  # written before the description had a version
                 content = {"providers": content}
             check_version(content, FORMAT, path)
             found: list[dict[str, Any]] = content["providers"]
@@ -100,7 +99,7 @@ class Environment:
         return found
 
     def refresh(self) -> list[dict[str, Any]]:
-        """Ask it what it brings, and keep the answer."""
+        """Request the description of the providers and store it."""
         found: list[dict[str, Any]] = self.ask(do="describe")
         content = {VERSION: FORMAT, "providers": found}
         text = json.dumps(content, indent=1, sort_keys=True)
@@ -109,13 +108,13 @@ class Environment:
 
 
 def environments_folder() -> Path:
-    """``$MPSFM_ENVIRONMENTS``, or ``environments`` in the user's data folder."""
-    said = os.environ.get(FOLDER_VARIABLE)
-    return Path(said) if said else Path(platformdirs.user_data_dir("mpsfm")) / "environments"
+    """Return ``$MPSFM_ENVIRONMENTS``, or ``environments`` in the user data folder."""
+    folder = os.environ.get(FOLDER_VARIABLE)
+    return Path(folder) if folder else user_data_folder() / "environments"
 
 
 def all_environments() -> list[Environment]:
-    """Those that are there, by name."""
+    """List the existing environments by name."""
     root = environments_folder()
     if not root.is_dir():
         return []
@@ -125,8 +124,11 @@ def all_environments() -> list[Environment]:
 
 
 def find_environment(name: str) -> Environment:
-    """The environment of a name; raises :class:`~mpsfm_core.data.errors.InputError` if there is
-    none."""
+    """Return the environment with a name.
+
+    Raises:
+        InputError: There is none.
+    """
     known = {environment.name: environment for environment in all_environments()}
     if name not in known:
         hint = did_you_mean(name, known)
@@ -139,14 +141,19 @@ def find_environment(name: str) -> Environment:
 def create_environment(
     name: str, packages: Sequence[str], python: str | None = None
 ) -> tuple[Environment, list[dict[str, Any]]]:
-    """Make an environment with the core and these packages, and see what it brings.
+    """Create an environment with the core and other packages, by uv or by venv and pip.
 
-    ``packages``: requirements or folders, as for pip. ``python``: interpreter or version, by
-    default this one's. It is made by uv where that is installed, else by venv and pip.
+    Args:
+        name: Name of the environment.
+        packages: Requirements or folders, as for pip.
+        python: Interpreter or version, by default this one.
+
+    Returns:
+        The environment and the description of its providers.
 
     Raises:
-        InputError: the name is taken or not one. ProviderError: it cannot be made; nothing of it
-            stays behind.
+        InputError: The name is invalid or taken.
+        ProviderError: The environment cannot be created; nothing of it remains.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"{name!r} is not made of lower-case letters, digits and - . _")
@@ -154,26 +161,27 @@ def create_environment(
     if environment.folder.exists():
         raise InputError(f"{environment.label} exists; 'mpsfm env remove {name}' removes it")
     environments_folder().mkdir(parents=True, exist_ok=True)
-    # made beside its place, so that one that was killed half-way is not there at all
+    # created next to its final folder, so that an interrupted creation leaves no environment
     with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=environments_folder()) as scratch:
         made = Environment(Path(scratch) / name)
-        for command in _commands(made, [*_core(), *packages], python):
+        for command in _commands(made, [*_core_requirement(), *packages], python):
             _run(command, environment.label)
         made.refresh()
         made.close()
-        _name_place(made.python.parent, made.folder, environment.folder)
+        _relocate_scripts(made.python.parent, made.folder, environment.folder)
         made.folder.rename(environment.folder)
     return environment, environment.describe()
 
 
 def remove_environment(name: str) -> None:
-    """Remove it with all that is in it."""
+    """Remove an environment and its folder."""
     shutil.rmtree(find_environment(name).folder)
 
 
 def _commands(
     environment: Environment, packages: Sequence[str], python: str | None
 ) -> list[list[str]]:
+    """Return the commands that create an environment and install packages."""
     venv, inside = str(environment.folder / "venv"), str(environment.python)
     uv = shutil.which("uv")
     if uv:
@@ -187,18 +195,18 @@ def _commands(
     ]
 
 
-def _name_place(scripts: Path, before: Path, after: Path) -> None:
-    """Scripts of an environment name its interpreter: at the place where it is going to be."""
+def _relocate_scripts(scripts: Path, before: Path, after: Path) -> None:
+    """Replace the path of the interpreter in the scripts of an environment."""
     old, new = os.fsencode(before), os.fsencode(after)
     for path in scripts.iterdir():
         if path.is_file() and not path.is_symlink():
             content = path.read_bytes()
-            if old in content and b"\0" not in content:  # launchers on Windows are programs
+            if old in content and b"\0" not in content:  # launchers on Windows are binaries
                 path.write_bytes(content.replace(old, new))
 
 
-def _core() -> list[str]:
-    """This core for pip: the same folder where it was installed from one, else its version."""
+def _core_requirement() -> list[str]:
+    """Return the pip requirement of this core: its source folder or its version."""
     distribution = metadata.distribution(_CORE)
     origin = json.loads(distribution.read_text("direct_url.json") or "{}")
     url = str(origin.get("url", ""))
@@ -209,6 +217,7 @@ def _core() -> list[str]:
 
 
 def _run(command: list[str], label: str) -> None:
+    """Run a command; a failure becomes a ProviderError with the reason."""
     try:
         done = subprocess.run(command, capture_output=True, text=True)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Providers of an environment as specifications of the registry, and as objects that are asked."""
+"""Providers of another environment as specifications for the registry and as callable objects."""
 
 from __future__ import annotations
 
@@ -26,103 +26,104 @@ from mpsfm_core.providers.environments.environment import Environment
 from mpsfm_core.providers.environments.worker_process import Worker, WorkerLost
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
-_CREATING_S = 1800.0
-"""Large weights from a slow disk, to a GPU; downloads are waited for without limit."""
-_ANSWERING_S = 600.0
-"""For one view or pair: minutes on a CPU are possible, hours mean that it hangs."""
+_CONSTRUCTION_TIMEOUT_S = 1800.0
+"""Time limit in seconds: large weights from a slow disk to a GPU. Downloads have no limit."""
+_CALL_TIMEOUT_S = 600.0
+"""Time limit in seconds for one view or pair: minutes on a CPU are normal."""
 
 
 @dataclass(frozen=True)
 class ProviderLocation:
-    """Where a provider lives: environment, kind and name there."""
+    """Location of a provider: environment, kind, and name there."""
 
     environment: Environment
     kind: Kind
     name: str
 
     def ask(self, do: str, **request: Any) -> Any:
-        """The answer to a question about the provider."""
+        """Send a request about the provider and return the answer."""
         return self.environment.ask(do=do, kind=self.kind, name=self.name, **request)
 
 
 class RemoteOptions(Options):
-    """Options whose class is in the other environment, which checks them there."""
+    """Options whose class is in the other environment, which validates them."""
 
     model_config = ConfigDict(
         frozen=True, extra="allow", protected_namespaces=(), ser_json_inf_nan="constants"
     )
-    home: ClassVar[ProviderLocation]
+    location: ClassVar[ProviderLocation]
     defaults: ClassVar[Mapping[str, Any]]
 
     @classmethod
     def model_validate(cls, values: Any, **_: Any) -> Any:  # type: ignore[override]
-        """As pydantic's; raises :class:`~mpsfm_core.data.options.SettingsError`."""
-        return cls._holding(cls.home.ask("options", values=dict(values)))
+        """Validate as pydantic does, in the other environment; raises SettingsError."""
+        return cls._from_values(cls.location.ask("options", values=dict(values)))
 
     @classmethod
     def model_construct(  # type: ignore[override]
         cls, _fields_set: Any = None, **values: Any
     ) -> Any:
-        """As pydantic's."""
-        return cls._holding({**cls.defaults, **values})
+        """Construct without validation, as pydantic does."""
+        return cls._from_values({**cls.defaults, **values})
 
     @classmethod
-    def _holding(cls, values: Mapping[str, Any]) -> Any:
+    def _from_values(cls, values: Mapping[str, Any]) -> Any:
+        """Create an instance with validated values."""
         return super().model_construct(**values)
 
     def __reduce__(self) -> Any:
-        return _options, (self.home, dict(self.defaults), self.model_dump())
+        return _options, (self.location, dict(self.defaults), self.model_dump())
 
 
-def _options_class(home: ProviderLocation, defaults: Mapping[str, Any]) -> type[RemoteOptions]:
-    return type("RemoteOptions", (RemoteOptions,), {"home": home, "defaults": defaults})
+def _options_class(location: ProviderLocation, defaults: Mapping[str, Any]) -> type[RemoteOptions]:
+    return type("RemoteOptions", (RemoteOptions,), {"location": location, "defaults": defaults})
 
 
 def _options(
-    home: ProviderLocation, defaults: Mapping[str, Any], values: Mapping[str, Any]
+    location: ProviderLocation, defaults: Mapping[str, Any], values: Mapping[str, Any]
 ) -> RemoteOptions:
-    holding: RemoteOptions = _options_class(home, defaults)._holding(values)
-    return holding
+    instance: RemoteOptions = _options_class(location, defaults)._from_values(values)
+    return instance
 
 
 class RemoteProvider:
-    """A provider in a worker process. It has the methods of all kinds; which of them can be asked
-    is said by its specification.
+    """Provider in a worker process.
 
-    A worker that crashed, hung or ran out of memory fails the call; the next one starts another.
+    It has the methods of all kinds; the specification declares which of them work. If the worker
+    crashes, hangs or runs out of memory, the call fails and the next call starts another worker.
     """
 
     def __init__(
-        self, home: ProviderLocation, options: Mapping[str, Any], context: ProviderContext
+        self, location: ProviderLocation, options: Mapping[str, Any], context: ProviderContext
     ) -> None:
-        self._home = home
+        self._location = location
         self._options = dict(options)
         self._context = context
         self._worker: Worker | None = None
         self._running()
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
-        """Depth, or normals."""
-        given = (view,) if self._home.kind == "depth" else (view, depth)
+        """Predict depth or normals."""
+        given = (view,) if self._location.kind == "depth" else (view, depth)
         return self._call("predict", *given)
 
     def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
-        """Depth and normals of one pass."""
+        """Predict depth and normals in one pass."""
         depth, normals = self._call("predict_joint", view)
         return depth, normals
 
     def estimate_focal(self, view: View) -> float | None:
-        """In pixels of the view."""
+        """Estimate the focal length in pixels of the view."""
         focal: float | None = self._call("estimate_focal", view)
         return focal
 
     def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
-        """Depth of a group of views."""
+        """Predict the depth of a group of views."""
         group: MultiViewPrior = self._call("predict_group", tuple(views))
         return group
 
     def extract(self, view: View) -> Features:
-        """Features."""
+        """Extract features."""
         features: Features = self._call("extract", view)
         return features
 
@@ -133,41 +134,41 @@ class RemoteProvider:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Matches."""
+        """Match two views."""
         matches: PairMatches = self._call("match", view_a, view_b, features_a, features_b)
         return matches
 
     def describe(self, view: View) -> Float32:
-        """Global descriptor."""
+        """Compute a global descriptor."""
         descriptor: Float32 = self._call("describe", view)
         return descriptor
 
     def mask(self, view: View) -> Bool:
-        """Pixels that may be used."""
+        """Segment usable pixels."""
         mask: Bool = self._call("mask", view)
         return mask
 
     def _call(self, method: str, *arguments: Any) -> Any:
         request = {"do": "call", "method": method, "arguments": list(arguments)}
-        return self._running().ask(request, _ANSWERING_S)
+        return self._running().ask(request, _CALL_TIMEOUT_S)
 
     def _running(self) -> Worker:
-        """The worker with the provider, made if there is none (any more)."""
+        """Return a worker with the constructed provider, starting one if necessary."""
         if self._worker is None or not self._worker.alive:
-            worker, context = self._home.environment.start(), self._context
+            worker, context = self._location.environment.start(), self._context
             request = {
                 "do": "create",
-                "kind": self._home.kind,
-                "name": self._home.name,
+                "kind": self._location.kind,
+                "name": self._location.name,
                 "options": self._options,
                 "device": context.device,
                 "threads": context.threads,
                 "seed": context.seed,
             }
             try:
-                worker.ask(request, _CREATING_S, context.resolve_weights)
+                worker.ask(request, _CONSTRUCTION_TIMEOUT_S, context.resolve_weights)
             except WorkerLost as error:
-                raise ProviderError(f"{self._home.name}: {error}") from error
+                raise ProviderError(f"{self._location.name}: {error}") from error
             except BaseException:
                 worker.close()
                 raise
@@ -177,27 +178,31 @@ class RemoteProvider:
 
 @dataclass(frozen=True)
 class _Factory:
-    home: ProviderLocation
+    """Factory of a remote provider that can be pickled."""
+
+    location: ProviderLocation
 
     def __call__(self, options: Options | None, context: ProviderContext) -> RemoteProvider:
         values = {} if options is None else options.model_dump()
-        return RemoteProvider(self.home, values, context)
+        return RemoteProvider(self.location, values, context)
 
 
 @dataclass(frozen=True)
 class _Weights:
-    home: ProviderLocation
+    """Function from options to weights files that can be pickled."""
+
+    location: ProviderLocation
 
     def __call__(self, options: Options | None) -> tuple[WeightsFile, ...]:
         values = {} if options is None else options.model_dump()
-        return tuple(self.home.ask("weights", values=values))
+        return tuple(self.location.ask("weights", values=values))
 
 
 @dataclass(frozen=True)
 class RemoteSpec:
-    """A provider of an environment for the registry."""
+    """Specification of a provider of an environment, for the registry."""
 
-    home: ProviderLocation
+    location: ProviderLocation
     spec: ProviderSpec
     distribution: str
     version: str
@@ -206,62 +211,70 @@ class RemoteSpec:
 
 
 def remote_providers(environment: Environment) -> list[RemoteSpec]:
-    """What an environment brings, as it was described when it was made; starts nothing.
+    """List the providers of an environment from its stored description.
 
-    Their names are ``NAME@ENVIRONMENT``.
+    Starts no process. The names are ``NAME@ENVIRONMENT``.
+
+    Args:
+        environment: The environment.
+
+    Returns:
+        Specifications with their origin and fault.
     """
-    found = []
+    specs: list[RemoteSpec] = []
     for entry in environment.describe():
-        home = ProviderLocation(environment, entry["kind"], entry["name"])
+        location = ProviderLocation(environment, entry["kind"], entry["name"])
         defaults = entry["defaults"]
         spec = ProviderSpec(
-            kind=home.kind,
-            name=f"{home.name}@{environment.name}",
-            factory=_Factory(home),
-            options=None if defaults is None else _options_class(home, defaults),
+            kind=location.kind,
+            name=f"{location.name}@{environment.name}",
+            factory=_Factory(location),
+            options=None if defaults is None else _options_class(location, defaults),
             capabilities=frozenset(entry["capabilities"]),
             summary=entry["summary"],
             code_license=entry["code_license"],
             weights_license=entry["weights_license"],
-            weights=_Weights(home) if entry["has_weights"] else (),
+            weights=_Weights(location) if entry["has_weights"] else (),
             accuracy=entry["accuracy"],
             tags=tuple(entry["tags"]),
-            contract=_Contract(home),
+            contract=_Contract(location),
         )
         origin = f"{entry['distribution']} in {environment.label}"
-        found.append(
-            RemoteSpec(home, spec, origin, entry["version"], entry["fault"], entry["hint"])
+        specs.append(
+            RemoteSpec(location, spec, origin, entry["version"], entry["fault"], entry["hint"])
         )
-    return found
+    return specs
 
 
 @dataclass(frozen=True)
 class _Contract:
-    """For the contract kit: the fields of the setup that the plugin gives there."""
+    """Contract function that requests the setup from the environment."""
 
-    home: ProviderLocation
+    location: ProviderLocation
 
     def __call__(self, folder: Path) -> Mapping[str, Any]:
-        setup: Mapping[str, Any] = self.home.ask("setup", folder=folder)
+        setup: Mapping[str, Any] = self.location.ask("setup", folder=folder)
         return setup
 
 
 class EnvironmentHooks:
-    """The hooks of a registry that answer for providers of environments."""
+    """Hooks of the registry that answer for providers of environments."""
 
     def __init__(self, remotes: Sequence[RemoteSpec]) -> None:
-        self._homes: dict[tuple[str, str], ProviderLocation] = {
-            (r.spec.kind, r.spec.name): r.home for r in remotes
+        self._locations: dict[tuple[str, str], ProviderLocation] = {
+            (r.spec.kind, r.spec.name): r.location for r in remotes
         }
 
     @hookimpl
     def mpsfm_calibration(
         self, kind: str, provider: str, options: BaseModel | None
     ) -> DepthCalibration | NormalCalibration | None:
-        """What the plugin declares there, for these options."""
-        home = self._homes.get((kind, provider))
-        if home is None:
+        """Return the calibration that the plugin declares in its environment."""
+        location = self._locations.get((kind, provider))
+        if location is None:
             return None
         values = {} if options is None else options.model_dump()
-        found: DepthCalibration | NormalCalibration | None = home.ask("calibration", values=values)
+        found: DepthCalibration | NormalCalibration | None = location.ask(
+            "calibration", values=values
+        )
         return found

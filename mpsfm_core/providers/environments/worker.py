@@ -1,6 +1,7 @@
-"""The other side of :mod:`mpsfm_core.providers.environments`: serves the providers of this
-environment to a main process, one question after the other. ``python -m
-mpsfm_core.providers.environments.worker FOLDER``."""
+"""Worker process: serves the providers of its environment to a client, one request at a time.
+
+Started as ``python -m mpsfm_core.providers.environments.worker FOLDER``.
+"""
 
 from __future__ import annotations
 
@@ -22,17 +23,17 @@ from mpsfm_core.support.threads import limit_threads
 
 
 class ProviderServer:
-    """Answers the questions of a main process."""
+    """Server of the providers of this environment for one client process."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
         self._registry: Registry | None = None
         self._provider: Any = None
         self._threads: int | None = None
-        self._limit, self._limited_with = ExitStack(), 0
+        self._limit, self._num_limited_modules = ExitStack(), 0
 
     def serve(self) -> None:
-        """Greet, and answer until the main process is gone."""
+        """Send the greeting and answer requests until the client has ended."""
         self._channel.send(
             {
                 "protocol": PROTOCOL,
@@ -53,16 +54,17 @@ class ProviderServer:
                 self._channel.send({"error": encode_error(error)})
 
     def _answer(self, request: Mapping[str, Any]) -> Any:
-        what = request["do"]
-        if what == "call":
+        """Execute one request."""
+        action = request["do"]
+        if action == "call":
             self._limit_threads()
             return getattr(self._provider, request["method"])(*request["arguments"])
         registry = self._registry or Registry.discover(environments=False)
         self._registry = registry
-        if what == "describe":
+        if action == "describe":
             return _description(registry)
         kind, name = request["kind"], request["name"]
-        if what == "create":
+        if action == "create":
             context = ProviderContext(
                 resolve_weights=self._resolve,
                 device=request["device"],
@@ -72,27 +74,27 @@ class ProviderServer:
             self._threads = context.threads
             self._provider = registry.create(kind, name, request["options"] or None, context)
             return None
-        if what == "setup":
+        if action == "setup":
             return _setup(registry, kind, name, request["folder"])
         values = request["values"]
-        if what == "options":
+        if action == "options":
             options = registry.validate_options(kind, name, values, ())
             return {} if options is None else options.model_dump()
-        if what == "weights":
+        if action == "weights":
             return registry.weights(kind, name, values)
-        if what == "calibration":
+        if action == "calibration":
             return registry.calibration(kind, ProviderConfig(use=name, options=values))
-        raise ProviderError(f"nobody here can {what!r}")
+        raise ProviderError(f"unknown request {action!r}")
 
     def _limit_threads(self) -> None:
-        """To be done again, which takes a millisecond, when libraries may have come since."""
-        if self._limited_with != len(sys.modules):
+        """Apply the thread limit again if modules, and maybe thread pools, were loaded since."""
+        if self._num_limited_modules != len(sys.modules):
             self._limit.close()
             self._limit.enter_context(limit_threads(self._threads))
-            self._limited_with = len(sys.modules)
+            self._num_limited_modules = len(sys.modules)
 
     def _resolve(self, uri: str, sha256: str | None) -> Path:
-        """The main process finds and fetches weights for all."""
+        """Let the client find or download a weights file."""
         self._channel.send({"resolve": [uri, sha256]})
         answer = self._channel.receive()
         if "error" in answer:
@@ -102,9 +104,12 @@ class ProviderServer:
 
 
 def _description(registry: Registry) -> list[dict[str, Any]]:
-    """The providers of installed plugins; those of the core are wherever it is, and a wrapper
-    belongs to the process of what it wraps."""
-    found = []
+    """Describe the providers of the installed plugins.
+
+    Built-in providers exist in every environment. A wrapper has to run in the process of its inner
+    provider. Both are excluded.
+    """
+    entries = []
     for line in registry.status():
         if line.kind in ("plugin", "wrapper") or line.distribution == CORE:
             continue
@@ -130,19 +135,19 @@ def _description(registry: Registry) -> list[dict[str, Any]]:
             entry["has_weights"] = bool(spec.weights)
             if spec.options is not None:
                 entry["defaults"] = registry.default_options(line.kind, line.name)
-        found.append(entry)
-    return found
+        entries.append(entry)
+    return entries
 
 
 def _setup(registry: Registry, kind: Any, name: str, folder: Path) -> dict[str, Any]:
-    """What the contract kit needs to know, without what would have to be told here."""
+    """Return the fields of the contract setup that can be sent to the client."""
     from mpsfm_core.testing.contract_case import load_setup
 
     setup = load_setup(registry.spec(kind, name), folder)
     if setup.prepare is not None:
         raise ProviderError(
-            f"the stand-in of {name!r} is told about views by a function, which cannot be done "
-            f"from another environment: check it in its own"
+            f"the contract setup of {name!r} prepares examples by a function, which does not work "
+            f"across environments: run the check inside its environment"
         )
     return {
         "options": dict(setup.options),
@@ -152,7 +157,7 @@ def _setup(registry: Registry, kind: Any, name: str, folder: Path) -> dict[str, 
 
 
 def main() -> None:
-    """Serve over stdin and stdout; what providers print goes to stderr."""
+    """Serve over stdin and stdout; the standard output of providers goes to stderr."""
     reader = os.fdopen(os.dup(0), "rb")
     writer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)

@@ -1,4 +1,4 @@
-"""A worker process of another environment, and what is said when it is lost."""
+"""Client of a worker process in another environment: start, requests, errors, time limits."""
 
 from __future__ import annotations
 
@@ -20,18 +20,17 @@ from mpsfm_core.providers import API_VERSION
 from mpsfm_core.providers.environments.channel import Channel, ChannelClosed, create_shared_folder
 
 PROTOCOL = 3
-"""Of the messages; both sides must have the same."""
+"""Version of the messages; client and worker must have the same."""
 
 _MODULE = "mpsfm_core.providers.environments.worker"
-_START_S = 120.0
-"""For the process to begin and import the core, on a cold network disk."""
+_START_TIMEOUT_S = 120.0
+"""Time limit in seconds for starting and importing the core, from a slow network disk."""
 _NEEDED_BYTES = 256 << 20
-"""Room in memory for the messages of a worker; else they go through the temporary folder."""
-_LENT = 2
-"""Answers that are looked into at once: one more is asked for while one is put away. They hold
-their memory as long as the worker lives."""
-_ENDING_S = 5.0
-_OURS: Mapping[str, type[MpsfmError]] = MappingProxyType(
+"""Free memory that the messages of a worker need; with less they use the temporary folder."""
+_NUM_LENT_BLOCKS = 2
+"""Number of answers whose arrays may be alive at once: one is requested while one is stored."""
+_EXIT_TIMEOUT_S = 5.0
+_MPSFM_ERRORS: Mapping[str, type[MpsfmError]] = MappingProxyType(
     {
         name: getattr(errors, name)
         for name in ("InputError", "ConfigError", "ProviderError", "WeightsError", "OutputError")
@@ -40,17 +39,22 @@ _OURS: Mapping[str, type[MpsfmError]] = MappingProxyType(
 
 
 class WorkerLost(RuntimeError):
-    """The worker crashed or did not answer; the next call starts another one."""
+    """The worker crashed or did not answer; the next call starts another worker."""
 
 
 class Worker:
-    """A running worker process.
-
-    ``python``: the interpreter. ``label``: of the environment, for messages. Raises
-    :class:`~mpsfm_core.data.errors.ProviderError` when it does not start, or has another version of
-    the protocols."""
+    """Client of a running worker process."""
 
     def __init__(self, python: Path, label: str) -> None:
+        """Start a worker.
+
+        Args:
+            python: Interpreter of the environment.
+            label: Name of the environment for messages.
+
+        Raises:
+            ProviderError: The worker does not start, or has another version of the protocols.
+        """
         self._label = label
         self._folder = create_shared_folder(_NEEDED_BYTES)
         folder = Path(self._folder.name)
@@ -66,14 +70,21 @@ class Worker:
             )
         assert self._process.stdin is not None and self._process.stdout is not None
         self._channel = Channel(
-            self._process.stdout, self._process.stdin, folder, "main", "worker", lent=_LENT
+            self._process.stdout,
+            self._process.stdin,
+            folder,
+            "main",
+            "worker",
+            lent=_NUM_LENT_BLOCKS,
         )
         self._lock = threading.Lock()
         self._end = weakref.finalize(self, _end, self._process, self._folder)
         try:
-            greeting = self._receive(_START_S, "did not start")
+            greeting = self._receive(_START_TIMEOUT_S, "did not start")
         except WorkerLost as error:
-            raise ProviderError(f"{error}; 'mpsfm env create' makes it anew") from error
+            raise ProviderError(
+                f"{error}; 'mpsfm env remove' and 'mpsfm env create' make it again"
+            ) from error
         versions = greeting["protocol"], greeting["api"]
         if versions != (PROTOCOL, API_VERSION):
             self.close()
@@ -85,7 +96,7 @@ class Worker:
 
     @property
     def alive(self) -> bool:
-        """Whether it can still be asked."""
+        """Whether the process is running."""
         return self._process.poll() is None
 
     def ask(
@@ -94,11 +105,20 @@ class Worker:
         timeout_s: float,
         resolve_weights: Callable[[str, str | None], Path] | None = None,
     ) -> Any:
-        """The answer to a request.
+        """Send a request and wait for the answer.
 
-        ``resolve_weights``: asked for the files that the worker wants meanwhile. Raises what the
-        provider raises where that is an error of ours, RuntimeError with its type and text where
-        not, and :class:`WorkerLost` when there is no answer.
+        Args:
+            request: The request.
+            timeout_s: Time limit.
+            resolve_weights: Function for weights files that the worker needs meanwhile.
+
+        Returns:
+            The answer.
+
+        Raises:
+            MpsfmError: An error of MP-SfM in the worker.
+            RuntimeError: Any other exception of the provider, with its type and text.
+            WorkerLost: There is no answer.
         """
         with self._lock:
             self._send(dict(request))
@@ -123,11 +143,11 @@ class Worker:
             raise self._lost("") from error
 
     def _receive(self, timeout_s: float, late: str) -> Any:
-        """The next message; a worker that takes too long is killed, which ends the wait."""
-        overdue: list[bool] = []
+        """Receive the next message; a worker that takes too long is killed, which ends the wait."""
+        timed_out: list[bool] = []
 
         def kill() -> None:
-            overdue.append(True)
+            timed_out.append(True)
             _kill(self._process)
 
         timer = threading.Timer(timeout_s, kill)
@@ -136,24 +156,26 @@ class Worker:
         try:
             return self._channel.receive()
         except ChannelClosed as error:
-            raise self._lost(late if overdue else "") from error
+            raise self._lost(late if timed_out else "") from error
         finally:
             timer.cancel()
 
     def _lost(self, late: str) -> WorkerLost:
+        """Describe how the worker ended and clean up."""
         try:
-            code = self._process.wait(_ENDING_S)
+            code = self._process.wait(_EXIT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             _kill(self._process)
             code = self._process.wait()
         reason = late or _ended(code)
         lines = self._log.read_text(errors="replace").strip().splitlines()
-        last = f"; its last words: {lines[-1].strip()}" if lines else ""
+        last = f"; its last line: {lines[-1].strip()}" if lines else ""
         self.close()
         return WorkerLost(f"{self._label} {reason}{last}")
 
 
 def _ended(code: int) -> str:
+    """Describe an exit code."""
     if code == -getattr(signal, "SIGKILL", 9):
         return "was killed from outside, most likely because memory ran out"
     if code < 0:
@@ -164,17 +186,18 @@ def _ended(code: int) -> str:
 def _resolved(
     resolve: Callable[[str, str | None], Path] | None, uri: str, sha256: str | None
 ) -> dict[str, Any]:
+    """Resolve a weights file for the worker; an error becomes a message."""
     try:
         if resolve is None:
-            raise ProviderError(f"nobody here can fetch {uri}")
+            raise ProviderError(f"weights {uri} cannot be fetched without a weight store")
         return {"value": resolve(uri, sha256)}
     except MpsfmError as error:
         return {"error": encode_error(error)}
 
 
 def encode_error(error: BaseException) -> dict[str, Any]:
-    """An error as a message of the protocol; :func:`decode_error` makes one of it again."""
-    kind = next((k.__name__ for k in type(error).__mro__ if k.__name__ in _OURS), "")
+    """Encode an error as a message of the protocol; :func:`decode_error` is the inverse."""
+    kind = next((k.__name__ for k in type(error).__mro__ if k.__name__ in _MPSFM_ERRORS), "")
     if isinstance(error, SettingsError):
         problems = [[list(p.path), p.text, p.missing] for p in error.problems]
         return {"settings": problems, "text": str(error)}
@@ -185,7 +208,7 @@ def encode_error(error: BaseException) -> dict[str, Any]:
 
 
 def decode_error(message: Mapping[str, Any]) -> Exception:
-    """The error that a message describes."""
+    """Decode the error of a message."""
     if "settings" in message:
         problems = (
             SettingProblem(tuple(p), text, missing) for p, text, missing in message["settings"]
@@ -193,16 +216,16 @@ def decode_error(message: Mapping[str, Any]) -> Exception:
         return SettingsError(tuple(problems))
     if "field" in message:
         return DataError(message["field"], message["rule"])
-    return _OURS.get(message["kind"], RuntimeError)(message["text"])
+    return _MPSFM_ERRORS.get(message["kind"], RuntimeError)(message["text"])
 
 
 def _environment() -> dict[str, str]:
-    """The worker finds its own packages: what this process adds to its search path stays here."""
+    """Return environment variables without the search path of this process."""
     return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """The process, and what it may have started."""
+    """Kill the process and its children."""
     if process.poll() is None:
         if os.name == "posix":
             os.killpg(process.pid, signal.SIGKILL)
@@ -211,12 +234,13 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]) -> None:
+    """Kill the process, close its pipes and remove its folder."""
     _kill(process)
     process.wait()
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
             try:
                 pipe.close()
-            except OSError:  # what could not be written any more
+            except OSError:  # buffered data could not be written
                 continue
     folder.cleanup()

@@ -1,5 +1,6 @@
-"""Networks that nobody publishes as a file, made from their authors' code and weights.
+"""Export of networks that are not published as ONNX files, from their authors' code and weights.
 
-The code runs in a process of its own (:mod:`authors` is what a plugin's script uses there); nothing
-of it enters this one, which checks the file against what the network said (:mod:`run`).
+The authors' code runs in its own process, with the script of a plugin that uses
+:mod:`author_script`. This process (:mod:`export`) only compares the file with the output of the
+original network.
 """

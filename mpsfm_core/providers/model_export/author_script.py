@@ -1,6 +1,6 @@
-"""For the scripts of plugins that export a network, in the process of the authors' code.
+"""Helpers for plugin scripts that export a network in the process of its authors' code.
 
-A script is run as a program with the checkouts on its search path::
+A script runs as a program with the authors' checkouts on its search path::
 
     from mpsfm_core.providers.model_export.author_script import ExportJob
 
@@ -11,7 +11,7 @@ A script is run as a program with the checkouts on its search path::
             job.load(model, job.checkpoint()["model"])
         job.export(model, [{"image": torch.rand(1, 3, 96, 128)}], ["normal"])
 
-Imports torch: for such scripts only.
+Imports torch, therefore only for such scripts.
 """
 
 from __future__ import annotations
@@ -31,32 +31,35 @@ from torch.overrides import TorchFunctionMode
 
 OPSET = 17
 
-Given: TypeAlias = Mapping[str, torch.Tensor]
-"""Inputs of a network by name, in its order."""
+Inputs: TypeAlias = Mapping[str, torch.Tensor]
+"""Inputs of a network by name, in the order of its arguments."""
 
 
 @dataclass(frozen=True)
 class ExportJob:
-    """What a script is asked for. ``weights``: the checkpoint, None for seeded random weights.
-    ``output``: where the file goes. ``size``: of the network, where it comes in several."""
+    """Export request for the script of a plugin."""
 
     weights: Path | None
+    """Checkpoint; None for seeded random weights."""
     output: Path
+    """Path of the ONNX file."""
     size: str = ""
+    """Size of the network if there are several."""
 
     @classmethod
     def from_arguments(cls) -> ExportJob:
-        """From the program's argument; random weights are seeded from here on."""
+        """Read the job from the program argument; seeds torch for random weights."""
         warnings.simplefilter("ignore")
         torch.manual_seed(0)
-        said = json.loads(sys.argv[1])
-        weights = said["weights"]
-        return cls(Path(weights) if weights else None, Path(said["output"]), said["size"])
+        job = json.loads(sys.argv[1])
+        weights = job["weights"]
+        return cls(Path(weights) if weights else None, Path(job["output"]), job["size"])
 
     def checkpoint(self, *allowed: type) -> Any:
-        """The content of the checkpoint, on the CPU: tensors and plain values, no code.
+        """Load the checkpoint to the CPU: tensors and plain values, no code.
 
-        ``allowed``: classes without code of their own that it may hold too.
+        Args:
+            allowed: Further classes without code of their own that the file may contain.
         """
         assert self.weights is not None
         if self.weights.suffix == ".safetensors":
@@ -67,7 +70,7 @@ class ExportJob:
             return torch.load(self.weights, map_location="cpu", weights_only=True)
 
     def load(self, model: torch.nn.Module, state: Mapping[str, torch.Tensor]) -> None:
-        """Weights into the network, which has to find all of its own among them."""
+        """Load weights into the network; every parameter of the network has to be present."""
         missing = model.load_state_dict(state, strict=False).missing_keys
         if missing:
             raise SystemExit(f"the checkpoint lacks {missing[0]} and {len(missing) - 1} more")
@@ -75,71 +78,77 @@ class ExportJob:
     def export(
         self,
         model: torch.nn.Module,
-        given: Sequence[Given],
+        inputs: Sequence[Inputs],
         outputs: Sequence[str],
         dynamic: Mapping[str, Mapping[int, str]] | None = None,
-        said: Sequence[Sequence[torch.Tensor]] = (),
+        expected: Sequence[Sequence[torch.Tensor]] = (),
     ) -> None:
-        """Write the network, traced on the first of the ``given`` inputs, and its run_network to all.
+        """Write the network, traced on the first input, and its outputs for all inputs.
 
-        ``dynamic``: of each tensor the axes that may have other lengths, with a name; then the
-        given ones should have such. ``said``: the run_network of the authors' own network, where
-        ``model`` is another form of it.
+        Args:
+            model: Network to export.
+            inputs: Inputs by name, in the order of the arguments.
+            outputs: Names of the outputs.
+            dynamic: Name of each axis of variable length by tensor; the inputs should differ there.
+            expected: Outputs of the original network if ``model`` is a modified form of it.
         """
-        said = said or run_network(model, given)
+        expected = expected or run_network(model, inputs)
         register_custom_op_symbolic("aten::expm1", _expm1, OPSET)
         before = set(self.output.parent.iterdir())
         with MaskedWriteRewriter():
             torch.onnx.export(
                 model,
-                tuple(tensor.clone() for tensor in given[0].values()),
+                tuple(tensor.clone() for tensor in inputs[0].values()),
                 str(self.output),
-                input_names=list(given[0]),
+                input_names=list(inputs[0]),
                 output_names=list(outputs),
                 dynamic_axes=dynamic,
                 opset_version=OPSET,
                 dynamo=False,
             )
-        if beside := set(self.output.parent.iterdir()) - before - {self.output}:
-            gather_weights(self.output, beside)
+        if tensor_files := set(self.output.parent.iterdir()) - before - {self.output}:
+            gather_weights(self.output, tensor_files)
         arrays: dict[str, Any] = {}
-        for number, (tensors, found) in enumerate(zip(given, said, strict=True)):
+        for number, (tensors, result) in enumerate(zip(inputs, expected, strict=True)):
             arrays |= {f"{number}/in/{name}": tensor.numpy() for name, tensor in tensors.items()}
-            named = zip(outputs, found, strict=True)
+            named = zip(outputs, result, strict=True)
             arrays |= {f"{number}/out/{name}": tensor.numpy() for name, tensor in named}
         np.savez(self.output.with_suffix(".npz"), **arrays)
 
 
-def gather_weights(output: Path, beside: Collection[Path]) -> None:
-    """Of a network beyond 2 GB, whose weights the exporter lays ``beside`` it one by one: into one
-    file of the network's name with ``.data``."""
+def gather_weights(output: Path, tensor_files: Collection[Path]) -> None:
+    """Merge the external weights of a network larger than 2 GB into one file.
+
+    Args:
+        output: The ONNX file; the weights go to a file with its name and ``.data``.
+        tensor_files: Files with one tensor each that the exporter wrote.
+    """
     import onnx
 
     onnx.save(onnx.load(output), output, save_as_external_data=True, location=f"{output.name}.data")
-    for path in beside:
+    for path in tensor_files:
         path.unlink()
 
 
-def run_network(model: torch.nn.Module, given: Sequence[Given]) -> list[tuple[torch.Tensor, ...]]:
-    """What a network says of several inputs."""
+def run_network(model: torch.nn.Module, inputs: Sequence[Inputs]) -> list[tuple[torch.Tensor, ...]]:
+    """Run a network on several inputs."""
     model = model.eval()
     with torch.inference_mode():
-        return [_answer(model, tensors) for tensors in given]
+        return [_answer(model, tensors) for tensors in inputs]
 
 
 class MaskedWriteRewriter(TorchFunctionMode):
-    """Writes ``tensor[index][mask] = x`` as ``tensor[index] = where(mask, x, ...)``, which
-    is the same.
+    """Torch mode that replaces ``tensor[index][mask] = x`` by an equivalent ``where``.
 
-    The exporter of torch 2.13 (``dynamo=False``) loses what was written to a tensor before a masked
-    write to a view of it: ``axes[:, 0] = x; axes[:, 0][invalid] = 0.0`` is 0 everywhere in the
-    file. That made the normals of DSINE wrong by 100 degrees.
+    The exporter of torch 2.13 (``dynamo=False``) drops earlier writes to a tensor before a masked
+    write to a view of it: after ``axes[:, 0] = x; axes[:, 0][invalid] = 0.0`` the file has 0
+    everywhere.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self._last: tuple[torch.Tensor, torch.Tensor, Any] | None = None
-        """The last view that was taken, its tensor and the index."""
+        """Last view, its tensor and the index."""
 
     def __torch_function__(
         self,
@@ -148,7 +157,7 @@ class MaskedWriteRewriter(TorchFunctionMode):
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
-        """As of torch; see the class."""
+        """Execute a torch function, see the class."""
         if func is torch.Tensor.__getitem__:
             view = func(*args)
             self._last = view, args[0], args[1]
@@ -163,13 +172,13 @@ class MaskedWriteRewriter(TorchFunctionMode):
 
 
 def _expm1(graph: Any, x: Any) -> Any:
-    """``exp(x) - 1``, which ONNX lacks, as ``2 sinh(x / 2) exp(x / 2)``: as exact near 0."""
+    """Export ``exp(x) - 1``, which ONNX lacks, as ``2 sinh(x / 2) exp(x / 2)``, accurate near 0."""
     half = graph.op("Mul", x, graph.op("Constant", value_t=torch.tensor(0.5)))
     return graph.op("Add", *2 * (graph.op("Mul", graph.op("Sinh", half), graph.op("Exp", half)),))
 
 
-def _answer(model: torch.nn.Module, given: Given) -> tuple[torch.Tensor, ...]:
-    found = model(*(tensor.clone() for tensor in given.values()))
-    if isinstance(found, Mapping):  # the exporter takes the values, in their order
-        found = tuple(found.values())
-    return tuple(found) if isinstance(found, (list, tuple)) else (found,)
+def _answer(model: torch.nn.Module, inputs: Inputs) -> tuple[torch.Tensor, ...]:
+    result = model(*(tensor.clone() for tensor in inputs.values()))
+    if isinstance(result, Mapping):  # the exporter takes the values, in their order
+        result = tuple(result.values())
+    return tuple(result) if isinstance(result, (list, tuple)) else (result,)

@@ -1,4 +1,4 @@
-"""This side of an export: the process is started, its file checked, and a manifest written."""
+"""Export of a network: run the authors' code, verify the file, write a manifest."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from mpsfm_core.providers.weights import WeightStore, exports_folder, file_sha25
 from mpsfm_core.support.files import write_file
 
 RANDOM = "random"
-"""As the checkpoint: seeded random weights, to try an export; nothing takes that file by name."""
+"""Checkpoint name for seeded random weights, which test an export. The file is not registered."""
 
 TOLERANCE = 1e-3
-"""Relative, of 99.9 % of the values: both sides compute in float32 by other kernels, and a network
-that refines step by step lets single values go another way."""
+"""Largest relative difference of 99.9 % of the values. Kernels differ in float32, and iterative
+networks amplify differences of single values."""
 _QUANTILE = 0.999
 
 
@@ -43,16 +43,28 @@ def export_model(
     python: Path | None = None,
     store: WeightStore | None = None,
 ) -> dict[str, Any]:
-    """Make a network's ONNX file from its authors' code and weights; its manifest.
+    """Export a network from its authors' code and weights to an ONNX file.
 
-    ``code``: checkouts, the network's own first, then libraries that it needs. ``checkpoint``: path
-    or URI, or ``random``. ``output``: by default in the folder of exports. ``python``: the
-    interpreter for the authors' code, by default this one. The manifest lies beside the folder's
-    other ones, and ``export:NAME`` means the file from then on.
+    A manifest is stored with the file, and ``export:NAME`` refers to the file from then on.
+
+    Args:
+        name: Name of the export.
+        recipe: Recipe of the plugin.
+        code: Checkouts, first the network's own, then required libraries.
+        checkpoint: Path or URI of the weights, or ``random``.
+        output: Path of the file, by default in the folder of exports.
+        sha256: Expected hash of the checkpoint.
+        size: Size of the network if there are several.
+        python: Interpreter for the authors' code, by default this one.
+        store: Store for the checkpoint.
+
+    Returns:
+        The manifest.
 
     Raises:
-        InputError: a checkout is not there. WeightsError: the checkpoint is not.
-        ProviderError: the authors' code fails, or the file says something else than it.
+        InputError: A checkout does not exist.
+        WeightsError: The checkpoint is not available.
+        ProviderError: The authors' code fails, or the file computes other outputs.
     """
     for folder in code:
         if not folder.is_dir():
@@ -65,7 +77,9 @@ def export_model(
     target = (output or exports_folder() / f"{name}.onnx").expanduser().resolve()
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".export-", dir=target.parent) as scratch:
-        made = Path(scratch) / target.name  # a file of large weights is known by its name in it
+        made = (
+            Path(scratch) / target.name
+        )  # the network refers to the file of large weights by its name
         script = importlib.util.find_spec(recipe.script)
         if script is None or script.origin is None:
             raise ProviderError(f"the plugin of {name} has no script {recipe.script!r}")
@@ -79,10 +93,10 @@ def export_model(
         differences = compare_with_original(made)
         worst = max(differences.values())
         if worst > TOLERANCE:
-            told = ", ".join(f"{key} {value:.1e}" for key, value in differences.items())
+            listed = ", ".join(f"{key} {value:.1e}" for key, value in differences.items())
             raise ProviderError(
-                f"the exported {name} says something else than its authors' network (relative "
-                f"differences: {told}): nothing was written"
+                f"the exported {name} computes other outputs than its authors' network (relative "
+                f"differences: {listed}): nothing was written"
             )
         manifest = {
             "name": name,
@@ -97,7 +111,9 @@ def export_model(
             "largest_differences": differences,
             "made": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         }
-        for part in sorted(Path(scratch).glob(f"{target.name}*")):  # large weights lie beside
+        for part in sorted(
+            Path(scratch).glob(f"{target.name}*")
+        ):  # including the file of large weights
             shutil.move(part, target.with_name(part.name))
     text = json.dumps(manifest, indent=1) + "\n"
     write_file(target.with_suffix(".json"), text)
@@ -108,34 +124,49 @@ def export_model(
 
 
 def compare_with_original(made: Path) -> dict[str, float]:
-    """Of each output the relative difference that 99.9 % of its values stay below, in the worst of
-    the inputs that the script left beside the file."""
+    """Compare an exported file with the outputs of the original network.
+
+    Args:
+        made: ONNX file, with the inputs and outputs of the script in an NPZ file next to it.
+
+    Returns:
+        For each output the largest relative difference over the inputs, see
+        :func:`measure_relative_difference`.
+    """
     runtime = importlib.import_module("onnxruntime")
     session = runtime.InferenceSession(str(made), providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
-    wanted = {tensor.name for tensor in session.get_inputs()}
+    inputs = {tensor.name for tensor in session.get_inputs()}
     worst = dict.fromkeys(names, 0.0)
     with np.load(made.with_suffix(".npz")) as stored:
         arrays = dict(stored)
     for number in sorted({name.split("/")[0] for name in arrays}):
-        given = {n: arrays[f"{number}/in/{n}"] for n in wanted}
+        given = {n: arrays[f"{number}/in/{n}"] for n in inputs}
         for name, found in zip(names, session.run(names, given), strict=True):
             difference = measure_relative_difference(found, arrays[f"{number}/out/{name}"])
             worst[name] = max(worst[name], difference)
     return worst
 
 
-def measure_relative_difference(found: Any, expected: Any) -> float:
-    """What 99.9 % of the values of an array are off by from another of its shape, in terms of their
-    size, or of the typical one where they are smaller; infinite where the shapes differ or a value
-    is no number."""
-    if found.shape != expected.shape or not np.isfinite([found, expected]).all():
+def measure_relative_difference(actual: Any, expected: Any) -> float:
+    """Return the relative difference that 99.9 % of the values stay below.
+
+    Differences are relative to the expected value, or to the median of the values if larger.
+
+    Args:
+        actual: Array of the exported network.
+        expected: Array of the original network.
+
+    Returns:
+        The difference; infinite if the shapes differ or a value is not finite.
+    """
+    if actual.shape != expected.shape or not np.isfinite([actual, expected]).all():
         return float("inf")
-    if not found.size:
+    if not actual.size:
         return 0.0
     size = np.abs(expected.astype(np.float64))
     size = np.maximum(size, max(float(np.median(size)), 1e-12))
-    return float(np.quantile(np.abs(found.astype(np.float64) - expected) / size, _QUANTILE))
+    return float(np.quantile(np.abs(actual.astype(np.float64) - expected) / size, _QUANTILE))
 
 
 def run_script(
@@ -147,16 +178,25 @@ def run_script(
     size: str = "",
     python: Path | None = None,
 ) -> None:
-    """Run a script that makes ``output`` with the checkouts on its search path, see
-    :class:`mpsfm_core.providers.model_export.author_script.ExportJob`.
+    """Run an export script with the authors' checkouts on its search path.
+
+    Args:
+        script: The script, see :class:`~mpsfm_core.providers.model_export.author_script.ExportJob`.
+        code: Checkouts.
+        output: File that the script writes.
+        weights: Checkpoint, None for random weights.
+        size: Size of the network if there are several.
+        python: Interpreter, by default this one.
 
     Raises:
-        ProviderError: it fails; the message is its last line.
+        ProviderError: The script fails; the message is the last line of its output.
     """
     job = {"weights": weights and str(weights.resolve()), "output": str(output), "size": size}
     environment = {
         **os.environ,
-        "PYTHONPATH": os.pathsep.join([*(str(folder.resolve()) for folder in code), *_ours()]),
+        "PYTHONPATH": os.pathsep.join(
+            [*(str(folder.resolve()) for folder in code), *_core_folder()]
+        ),
         "PYTHONDONTWRITEBYTECODE": "1",
         "XFORMERS_DISABLED": "1",
     }
@@ -168,13 +208,13 @@ def run_script(
         raise ProviderError((done.stderr.strip().splitlines() or ["no message"])[-1])
 
 
-def _ours() -> list[str]:
-    """Where this core is, for an interpreter that may not have it installed."""
+def _core_folder() -> list[str]:
+    """Return the parent folder of this core for an interpreter without it."""
     return [str(Path(__file__).parents[3])]
 
 
 def _commit(folder: Path) -> Mapping[str, Any]:
-    """Commit of a checkout, and whether it was changed since; None where it is none."""
+    """Return commit and state of a checkout; the commit is None outside of git."""
 
     def ask(*arguments: str) -> str | None:
         try:

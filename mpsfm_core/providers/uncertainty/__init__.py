@@ -1,1 +1,1 @@
-"""What the std of a prior means: the model of its uncertainty, and the files that hold one."""
+"""Uncertainty of priors: the model of the standard deviation and its files."""

@@ -1,8 +1,8 @@
-"""Calibrations as files: the values, and where they come from.
+"""Calibration files: values of an uncertainty model and their provenance.
 
-A file is YAML or JSON, either the bare values of a calibration or a :class:`CalibrationFile` as
-``mpsfm calibrate`` writes it. A configuration names it (``depth.calibration: FILE``); a plugin
-ships it and announces ``ProviderSpec(calibration=load_calibration(path))``.
+A file is YAML or JSON. It contains either the bare values or a :class:`CalibrationFile`, as
+``mpsfm calibrate`` writes it. A configuration refers to it by ``depth.calibration: FILE``. A plugin
+declares it by ``ProviderSpec(calibration=load_calibration(path))``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.yaml_text import parse_yaml, write_yaml
 
 FORMAT = 1
-"""Of calibration files."""
+"""Version of calibration files."""
 
 CalibratedKind = Literal["depth", "normals"]
 CALIBRATIONS: Mapping[str, type[DepthCalibration] | type[NormalCalibration]] = {
@@ -36,35 +36,37 @@ CALIBRATIONS: Mapping[str, type[DepthCalibration] | type[NormalCalibration]] = {
 
 
 class Provenance(Options):
-    """Where a calibration comes from."""
+    """Origin of a calibration: provider, data and quality of the fit."""
 
     provider: str
     distribution: str
-    """Package and version that the provider comes from."""
+    """Package and version of the provider."""
     wrappers: tuple[str, ...] = ()
     options: dict[str, Any] = Field(default_factory=dict)
-    """Of the provider; of files only the names."""
+    """Options of the provider; files by name only."""
     weights: dict[str, str] = Field(default_factory=dict)
     """SHA-256 of each file that the provider loaded, by name or URI."""
     truth: str
-    """What the prior was compared with."""
+    """Source of the true values."""
     data: str
-    """Which images."""
+    """Images of the fit."""
     date: str
-    """Of the fit, ISO 8601."""
+    """Date of the fit, ISO 8601."""
     core: str
     """Version of mpsfm-core."""
     images: int
-    """Images that the values were fitted to."""
+    """Number of images of the fit."""
     pixels: int
+    """Number of pixels of the fit."""
     intervals_95: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    """Confidence interval of each value, 95 %."""
     metrics: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """``before`` and ``after``: coverage, z_mad, nll and ause on images that were held out."""
+    """coverage, z_mad, nll and ause on held-out images, ``before`` and ``after`` the fit."""
     warnings: tuple[str, ...] = ()
 
 
 class CalibrationFile(Options):
-    """A calibration with its provenance."""
+    """Calibration with its provenance."""
 
     kind: CalibratedKind
     calibration: DepthCalibration | NormalCalibration
@@ -73,7 +75,7 @@ class CalibrationFile(Options):
     @model_validator(mode="before")
     @classmethod
     def _by_kind(cls, values: Any) -> Any:
-        """The kind says which class the values have; both share names."""
+        """Select the calibration class by kind, because both classes share field names."""
         if isinstance(values, Mapping) and isinstance(values.get("calibration"), Mapping):
             model = CALIBRATIONS.get(values.get("kind", ""))
             if model is not None:
@@ -81,7 +83,7 @@ class CalibrationFile(Options):
         return values
 
     def write(self, path: Path) -> None:
-        """Write the file: JSON if it is named so, else YAML."""
+        """Write the file as JSON if its name ends with ``.json``, else as YAML."""
         content = {VERSION: FORMAT, **self.model_dump(mode="json")}
         is_json = path.suffix == ".json"
         text = json.dumps(content, indent=2) + "\n" if is_json else write_yaml(content)
@@ -89,11 +91,19 @@ class CalibrationFile(Options):
 
 
 def read_values(path: Path, kind: str) -> Mapping[str, Any]:
-    """The unchecked values in a calibration file for a kind of provider.
+    """Read the values of a calibration file without validation.
+
+    Args:
+        path: The file.
+        kind: Kind of the provider.
+
+    Returns:
+        Values by name.
 
     Raises:
-        ConfigError: the file cannot be read, holds no mapping, is of a newer version, or is for
-            another kind.
+        ConfigError: The file cannot be read, is not a mapping, has a newer version, or is for
+            another
+            kind.
     """
     try:
         content = parse_yaml(path.read_text(encoding="utf-8"), str(path))
@@ -113,10 +123,17 @@ def read_values(path: Path, kind: str) -> Mapping[str, Any]:
 
 
 def load_calibration(path: Path, kind: CalibratedKind = "depth") -> Calibration:
-    """The calibration in a file.
+    """Load the calibration of a file.
+
+    Args:
+        path: The file.
+        kind: Kind of the provider.
+
+    Returns:
+        The calibration.
 
     Raises:
-        ConfigError: as :func:`read_values`, or a value is wrong.
+        ConfigError: See :func:`read_values`, or a value is wrong.
     """
     try:
         return parse_settings(CALIBRATIONS[kind], read_values(path, kind))

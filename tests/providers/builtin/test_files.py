@@ -168,7 +168,7 @@ def test_any_grid_that_covers_the_view(folder: Path, context: ProviderContext) -
     ("content", "hint"),
     [
         (DEPTH[..., None].repeat(4, axis=2), "expected a map of one channel"),
-        (NORMALS, "is a colour image"),
+        (NORMALS, "is a color image"),
         (DEPTH[0], "expected a map of one channel"),
     ],
 )

@@ -112,7 +112,7 @@ def test_weights_are_found_by_this_process(registry, tmp_path):
     [
         ("crash", "crashed \\(SIGSEGV\\)"),
         ("memory", "was killed from outside, most likely because memory ran out"),
-        ("exit", "ended by itself \\(exit code 3\\); its last words: goodbye"),
+        ("exit", "ended by itself \\(exit code 3\\); its last line: goodbye"),
         ("error", "IndexError: tensor of 3 dimensions"),
         ("ours", "far.pt is damaged"),
     ],
@@ -129,7 +129,7 @@ def test_a_worker_that_hangs(registry, context, named, monkeypatch):
     provider = registry.create("depth", "far@far", None, context)
     provider.predict(named("first.png"))
     with monkeypatch.context() as hurry:
-        hurry.setattr(remote_provider, "_ANSWERING_S", 1.0)
+        hurry.setattr(remote_provider, "_CALL_TIMEOUT_S", 1.0)
         with pytest.raises(WorkerLost, match="did not answer within 1 s"):
             provider.predict(named("hang"))
     assert provider.predict(named("next.png")).valid.any()
