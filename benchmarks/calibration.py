@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks._scenes import RESULTS, print_progress, shared_folder
-from mpsfm_core.calibration.calibrate import Photos, calibrate, compare
-from mpsfm_core.calibration.study import judge
+from mpsfm_core.calibration.calibrate import CalibrationImages, calibrate, compare_prior
+from mpsfm_core.calibration.cross_validation import evaluate_calibrations
 from mpsfm_core.config import load_config
 from mpsfm_core.evaluation.benchmark import BenchmarkPlan, run_benchmark
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS
@@ -101,7 +101,7 @@ def _calibrated(prior: Prior, scene: SceneFolder, images: Path, output: Path) ->
     file = output / f"{_slug(prior.name)}.calibration.yaml"
     if not file.is_file():
         config = _config(prior, DepthCalibration(), True, output / "fit.yaml")
-        photos = Photos(scene.images, scene.intrinsics, images)
+        photos = CalibrationImages(scene.images, scene.intrinsics, images)
         result = calibrate(photos, load_config(config), ground_truth=_truth(scene))
         result.file.write(file)
     calibration = load_calibration(file)
@@ -113,10 +113,14 @@ def _coverage(
     prior: Prior, scene: SceneFolder, images: Path, declared: Mapping[str, DepthCalibration]
 ) -> dict[str, dict[str, Any]]:
     """Compute the metrics of each declaration on listed images."""
-    config = _config(prior, DepthCalibration(), True, images.with_name("judge.yaml"))
-    photos = Photos(scene.images, scene.intrinsics, images)
-    data = compare(photos, load_config(config), _truth(scene))
-    return {name: judge([data], [calibration]) for name, calibration in declared.items()}
+    config = _config(
+        prior, DepthCalibration(), True, images.with_name("evaluate_calibrations.yaml")
+    )
+    photos = CalibrationImages(scene.images, scene.intrinsics, images)
+    data = compare_prior(photos, load_config(config), _truth(scene))
+    return {
+        name: evaluate_calibrations([data], [calibration]) for name, calibration in declared.items()
+    }
 
 
 def _poses(
@@ -147,8 +151,8 @@ def _poses(
     records = run_benchmark(plan, output, Registry.discover(), print_progress)
     rows = {}
     for key, path in configs.items():
-        own = [replace(r, bucket="all") for r in records if r.config == Path(path).stem]
-        rows[key] = build_rows(own)[0]
+        own_records = [replace(r, bucket="all") for r in records if r.config == Path(path).stem]
+        rows[key] = build_rows(own_records)[0]
     return rows
 
 

@@ -26,11 +26,11 @@ import pycolmap
 
 from benchmarks._scenes import RESULTS, shared_folder
 from benchmarks._sift import extract, match
-from mpsfm_core.calibration.calibrate import Photos, compare
-from mpsfm_core.calibration.fitting import DepthData, std_of
+from mpsfm_core.calibration.calibrate import CalibrationImages, compare_prior
+from mpsfm_core.calibration.cross_validation import evaluate_calibrations
 from mpsfm_core.calibration.metrics import sensitivity_curve
+from mpsfm_core.calibration.model_selection import DepthData, std_of
 from mpsfm_core.calibration.samples import Residuals
-from mpsfm_core.calibration.study import judge
 from mpsfm_core.config import load_config
 from mpsfm_core.data import Float64
 from mpsfm_core.evaluation.scene_folder import read_scene
@@ -98,8 +98,10 @@ def main() -> None:
     depth: list[DepthRow] = []
     normals: list[NormalsRow] = []
     for name, block in priors.items():
-        own = name == "compact"
-        config = _config(block, block if own else {"use": "from-depth"}, arguments.work / name)
+        has_normals = name == "compact"
+        config = _config(
+            block, block if has_normals else {"use": "from-depth"}, arguments.work / name
+        )
         for scene in arguments.scenes:
             folder = shared / "data" / scene
             depth.append(_depth_row(name, folder, config, registry, arguments.work))
@@ -119,14 +121,14 @@ def main() -> None:
 
 def _depth_row(name: str, folder: Path, config: str, registry: Registry, work: Path) -> DepthRow:
     scene = read_scene(folder)
-    photos = Photos(scene.images, scene.intrinsics)
+    photos = CalibrationImages(scene.images, scene.intrinsics)
     loaded = load_config(config, registry=registry)
     if scene.depth is not None:
         truth: dict[str, Any] = {"directory": str(scene.depth), "suffix": ".png", **_MILLIMETRE}
-        data = compare(photos, loaded, truth, registry=registry)
+        data = compare_prior(photos, loaded, truth, registry=registry)
     else:
         model = _triangulated(folder, work / folder.name)
-        data = compare(photos, loaded, model=model, registry=registry)
+        data = compare_prior(photos, loaded, model=model, registry=registry)
     declared = registry.calibration("depth", loaded.depth)
     residuals = data.residuals(declared)
     assert isinstance(data, DepthData)
@@ -139,7 +141,7 @@ def _depth_row(name: str, folder: Path, config: str, registry: Registry, work: P
         float(np.mean([np.abs(r - 1).mean() for r in ratios])),
         float(np.mean([(np.maximum(r, 1 / r) < 1.25).mean() for r in ratios])),
         float(np.exp(np.median(residuals.scales))) if scene.depth is not None else None,
-        judge([data], [declared])["coverage"][0],
+        evaluate_calibrations([data], [declared])["coverage"][0],
         _ause(errors, std_of(declared, residuals)),
         _ause(errors, np.ones_like(errors)),
     )
@@ -154,8 +156,8 @@ def _normals_row(name: str, folder: Path, config: str, registry: Registry) -> No
     scene = read_scene(folder)
     loaded = load_config(config, registry=registry)
     truth = {"directory": str(folder / "gt_normals"), "suffix": ".png"}
-    photos = Photos(scene.images, scene.intrinsics)
-    data = compare(photos, loaded, truth, "normals", registry=registry)
+    photos = CalibrationImages(scene.images, scene.intrinsics)
+    data = compare_prior(photos, loaded, truth, "normals", registry=registry)
     declared = registry.calibration("normals", loaded.normals)
     residuals: Residuals = data.residuals(declared)
     angle = np.degrees(residuals.magnitude)
@@ -165,7 +167,7 @@ def _normals_row(name: str, folder: Path, config: str, registry: Registry) -> No
         residuals.images,
         float(np.median(angle)),
         float(np.mean(angle < 30)),
-        judge([data], [declared])["coverage"][0],
+        evaluate_calibrations([data], [declared])["coverage"][0],
     )
 
 
@@ -194,10 +196,10 @@ def _as_in_database(truth: pycolmap.Reconstruction, path: Path) -> pycolmap.Reco
         for camera in database.read_all_cameras():
             known.add_camera_with_trivial_rig(camera)
         for image in database.read_all_images():
-            own = pycolmap.Image(
+            renumbered = pycolmap.Image(
                 name=image.name, camera_id=image.camera_id, image_id=image.image_id
             )
-            known.add_image_with_trivial_frame(own, poses[image.name])
+            known.add_image_with_trivial_frame(renumbered, poses[image.name])
     return known
 
 

@@ -16,11 +16,16 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from mpsfm_core.calibration.comparison import Comparison
-from mpsfm_core.calibration.fitting import Alignment, rounded, std_of
-from mpsfm_core.calibration.model_truth import model_truth
+from mpsfm_core.calibration.cross_validation import (
+    CalibrationData,
+    CalibrationStudy,
+    StudyOptions,
+    run_study,
+)
+from mpsfm_core.calibration.model_selection import Alignment, round_significant, std_of
+from mpsfm_core.calibration.model_truth import depth_truth_from_model
+from mpsfm_core.calibration.prior_comparison import PriorComparison
 from mpsfm_core.calibration.samples import DepthTruth
-from mpsfm_core.calibration.study import Data, Study, StudyOptions, study
 from mpsfm_core.config import Config
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.extraction.active_provider import ActiveProvider, thread_count
@@ -49,7 +54,7 @@ _KEPT_METRICS = ("coverage", "coverage_without_scaling", "z_mad", "nll", "nll_he
 
 
 @dataclass(frozen=True)
-class Photos:
+class CalibrationImages:
     """The images to calibrate on, as :func:`mpsfm_core.reconstruct` takes them."""
 
     folder: Path
@@ -58,7 +63,7 @@ class Photos:
 
 
 @dataclass(frozen=True, eq=False)
-class Calibrated:
+class CalibrationResult:
     """``file``: the calibration with its provenance. ``report``: all numbers, plain data."""
 
     file: CalibrationFile
@@ -66,7 +71,7 @@ class Calibrated:
 
 
 def calibrate(
-    photos: Photos,
+    photos: CalibrationImages,
     config: Config,
     kind: CalibratedKind = "depth",
     *,
@@ -75,7 +80,7 @@ def calibrate(
     alignments: Sequence[Alignment] | None = None,
     options: StudyOptions | None = None,
     registry: Registry | None = None,
-) -> Calibrated:
+) -> CalibrationResult:
     """Calibrate the depth or normals provider of a configuration.
 
     Args:
@@ -104,8 +109,8 @@ def calibrate(
         return run.alone() if model is None else run.with_model(model)
 
 
-def compare(
-    photos: Photos,
+def compare_prior(
+    photos: CalibrationImages,
     config: Config,
     ground_truth: Mapping[str, Any] | None = None,
     kind: CalibratedKind = "depth",
@@ -113,8 +118,8 @@ def compare(
     model: Path | None = None,
     options: StudyOptions | None = None,
     registry: Registry | None = None,
-) -> Data:
-    """A prior beside true maps or a model's points, for :func:`mpsfm_core.calibration.study.judge`.
+) -> CalibrationData:
+    """A prior beside true maps or a model's points, for :func:`mpsfm_core.calibration.cross_validation.evaluate_calibrations`.
 
     Arguments and errors as of :func:`calibrate`; one of ``ground_truth`` and ``model``.
     """
@@ -135,7 +140,7 @@ class _Run:
 
     def __init__(
         self,
-        photos: Photos,
+        photos: CalibrationImages,
         config: Config,
         kind: CalibratedKind,
         registry: Registry,
@@ -150,47 +155,47 @@ class _Run:
         self._backend: ProviderConfig = getattr(config, kind)
         self._declared: Calibration = registry.calibration(kind, self._backend)
         images = load_images(photos.folder, photos.intrinsics, photos.image_list, config.inputs)
-        self._bench = ExtractionContext(images, config, registry, stages)
-        self._comparison = Comparison(self._bench, kind, alignments, options)
+        self._context = ExtractionContext(images, config, registry, stages)
+        self._comparison = PriorComparison(self._context, kind, alignments, options)
 
     def prepare(self) -> None:
         """Run the mask providers: what they mask is not compared."""
-        self._bench.run_masks()
+        self._context.run_masks()
 
-    def with_files(self, options: Mapping[str, Any]) -> Calibrated:
+    def with_files(self, options: Mapping[str, Any]) -> CalibrationResult:
         """Calibrate with true maps."""
         data = self.data_of_files(options)
         return self._finish(data, f"{self._kind} maps in {PurePath(options['directory']).name}")
 
-    def with_model(self, folder: Path) -> Calibrated:
+    def with_model(self, folder: Path) -> CalibrationResult:
         """Calibrate with the points of a COLMAP model."""
         return self._finish(self.data_of_model(folder), f"points of a model: {folder.name}")
 
-    def data_of_files(self, options: Mapping[str, Any]) -> Data:
+    def data_of_files(self, options: Mapping[str, Any]) -> CalibrationData:
         """The prior beside true maps."""
         return self._comparison.with_files(options)
 
-    def data_of_model(self, folder: Path) -> Data:
+    def data_of_model(self, folder: Path) -> CalibrationData:
         """The prior beside the points of a COLMAP model."""
-        truth = model_truth(read_model(folder), self._bench.images)
+        truth = depth_truth_from_model(read_model(folder), self._context.images)
         if not truth:
             raise InputError(f"{folder}: the model has no points in any of the images")
         return self._comparison.with_points(truth)
 
-    def alone(self) -> Calibrated:
+    def alone(self) -> CalibrationResult:
         """Reconstruct, compare with what the rays of its points say, and again."""
         current, rounds = self._declared, []
         quick = self._options.model_copy(update={"bootstraps": 0})
         for _ in range(MAX_ROUNDS):
             data = self._comparison.with_points(self._reconstruct(current))
-            fitted = study(data, self._declared, quick).calibration
+            fitted = run_study(data, self._declared, quick).calibration
             change = _median_change(data, current, fitted)
             rounds.append({"calibration": fitted.model_dump(mode="json"), "change": change})
             current = fitted
             if change < SETTLED:
                 break
         result = self._finish(data, f"own reconstruction, {len(rounds)} rounds")
-        return Calibrated(result.file, {**result.report, "rounds": rounds})
+        return CalibrationResult(result.file, {**result.report, "rounds": rounds})
 
     def _reconstruct(self, calibration: Calibration) -> dict[str, DepthTruth]:
         """True depth by the rays of all models that can be made with a calibration."""
@@ -206,11 +211,11 @@ class _Run:
         )
         truth: dict[str, DepthTruth] = {}
         for model in (result.model, *result.further_models):
-            truth |= model_truth(model, self._bench.images)
+            truth |= depth_truth_from_model(model, self._context.images)
         return truth
 
-    def _finish(self, data: Data, truth: str) -> Calibrated:
-        found = study(data, self._declared, self._options)
+    def _finish(self, data: CalibrationData, truth: str) -> CalibrationResult:
+        found = run_study(data, self._declared, self._options)
         for warning in found.warnings:
             _log.warning("calibration of %s: %s", self._backend.use, warning)
         file = CalibrationFile(
@@ -219,9 +224,9 @@ class _Run:
             provenance=self._provenance(found, truth),
         )
         head = {"kind": self._kind, "provenance": file.provenance.model_dump(mode="json")}
-        return Calibrated(file, {**head, **found.report})
+        return CalibrationResult(file, {**head, **found.report})
 
-    def _provenance(self, found: Study, truth: str) -> Provenance:
+    def _provenance(self, found: CalibrationStudy, truth: str) -> Provenance:
         report, provider = found.report, self._comparison.provider
         chosen, *_ = provider.identity["providers"]
         return Provenance(
@@ -231,7 +236,7 @@ class _Run:
             options=_without_folders(chosen["options"]),
             weights=_weights(provider),
             truth=truth,
-            data=f"{len(self._bench.images)} images of {_last_folders(self._photos.folder)}",
+            data=f"{len(self._context.images)} images of {_last_folders(self._photos.folder)}",
             date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
             core=core_version(),
             images=len(report["images"]),
@@ -245,7 +250,7 @@ class _Run:
         )
 
 
-def _median_change(data: Data, before: Calibration, after: Calibration) -> float:
+def _median_change(data: CalibrationData, before: Calibration, after: Calibration) -> float:
     """Median over the samples of how much the std changed, as a share."""
     stds = [std_of(c, data.residuals(c)) for c in (before, after)]
     return float(np.expm1(np.median(np.abs(np.log(stds[1] / stds[0])))))
@@ -264,7 +269,7 @@ def _short(value: Any) -> Any:
         return {key: _short(content) for key, content in value.items()}
     if isinstance(value, list):
         return [_short(content) for content in value]
-    return rounded(value) if isinstance(value, float) else value
+    return round_significant(value) if isinstance(value, float) else value
 
 
 def _last_folders(folder: Path) -> str:

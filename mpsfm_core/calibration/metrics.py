@@ -8,8 +8,8 @@ import numpy as np
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
-from mpsfm_core.calibration.fit import FREEDOM, ONE_SIGMA, STD_OF_T
 from mpsfm_core.calibration.samples import Residuals
+from mpsfm_core.calibration.std_likelihood import FREEDOM, ONE_SIGMA, STD_OF_T
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.geometry.statistics import MAD_TO_STD, weighted_quantile
 
@@ -20,7 +20,7 @@ NORMAL_COVERAGE = (ONE_SIGMA, 0.9545, 0.9973)
 """Of normal errors, within 1, 2 and 3 standard deviations."""
 
 
-def measure(residuals: Residuals, std: Float64) -> dict[str, Any]:
+def compute_metrics(residuals: Residuals, std: Float64) -> dict[str, Any]:
     """All metrics of a std (n,), as plain data. Every image counts the same but in the curves.
 
     ``coverage``: share of errors within 1, 2, 3 std. ``z_mad``: 1.4826 times the median of
@@ -48,7 +48,7 @@ def measure(residuals: Residuals, std: Float64) -> dict[str, Any]:
     }
 
 
-def coverage(error: Float64, std: Float64, weights: Float64) -> list[float]:
+def compute_coverage(error: Float64, std: Float64, weights: Float64) -> list[float]:
     """Share of errors (n,) within 1, 2 and 3 standard deviations (n,)."""
     z = np.abs(error) / std
     return [float(np.average(z <= limit, weights=weights)) for limit in (1, 2, 3)]
@@ -108,7 +108,7 @@ def _by_range(residuals: Residuals, total: Float64) -> list[dict[str, Any]]:
 
 def _summary(error: Float64, total: Float64, weights: Float64) -> dict[str, Any]:
     z_mad = MAD_TO_STD * weighted_quantile(np.abs(error) / total, weights, 0.5)
-    return {"coverage": coverage(error, total, weights), "z_mad": z_mad}
+    return {"coverage": compute_coverage(error, total, weights), "z_mad": z_mad}
 
 
 def _quantile_bins(values: Float64, count: int) -> list[Bool]:

@@ -22,7 +22,7 @@ from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.geometry.statistics import MAD_TO_STD
 from mpsfm_core.inputs.images import ImageSet
-from mpsfm_core.mapping.scene.kernels import max_triangulation_angles
+from mpsfm_core.mapping.scene.kernels import compute_max_triangulation_angles
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
 from mpsfm_core.optimize.covariance import compute_point_covariances, propagate_depth_variance
 from mpsfm_core.optimize.options import SOFT_L1_OPTIONS
@@ -40,7 +40,9 @@ REACH = 0.08
 to 0.15 gave stds within 12 % in the HoloLens room)."""
 
 
-def model_truth(model: pycolmap.Reconstruction, images: ImageSet) -> dict[str, DepthTruth]:
+def depth_truth_from_model(
+    model: pycolmap.Reconstruction, images: ImageSet
+) -> dict[str, DepthTruth]:
     """True depth at the observed points of each image that both the model and the set have."""
     seen = _observe(model, images)
     if not len(seen.points):
@@ -60,7 +62,7 @@ def model_truth(model: pycolmap.Reconstruction, images: ImageSet) -> dict[str, D
     return truth
 
 
-def drawn_evenly(
+def sample_evenly(
     truth: DepthTruth, size: tuple[int, int], count: int, rng: np.random.Generator
 ) -> DepthTruth:
     """The points nearest to ``count`` pixels drawn evenly from a view of ``size`` (width, height).
@@ -75,7 +77,7 @@ def drawn_evenly(
     return DepthTruth(truth.xy[rows], truth.depth[rows], truth.std[rows])
 
 
-class _Seen(NamedTuple):
+class _ModelObservations(NamedTuple):
     """Observations of a model, sorted by point.
 
     ``names``: of the images, ``rotations`` (n, 3, 3), ``translations`` (n, 3), ``focals`` (n,).
@@ -94,7 +96,7 @@ class _Seen(NamedTuple):
     view_xy: Float64
 
 
-def _observe(model: pycolmap.Reconstruction, images: ImageSet) -> _Seen:
+def _observe(model: pycolmap.Reconstruction, images: ImageSet) -> _ModelObservations:
     sources = {image.name: image for image in images}
     posed = [i for i in model.images.values() if i.has_pose and i.name in sources]
     posed.sort(key=lambda image: str(image.name))
@@ -114,7 +116,7 @@ def _observe(model: pycolmap.Reconstruction, images: ImageSet) -> _Seen:
     order = np.argsort(point, kind="stable")
     rows = np.concatenate([np.zeros((0, 5)), *columns])[order]
     matrices = np.array(poses).reshape(-1, 3, 4)
-    return _Seen(
+    return _ModelObservations(
         [str(image.name) for image in posed],
         matrices[:, :, :3],
         matrices[:, :, 3],
@@ -127,7 +129,7 @@ def _observe(model: pycolmap.Reconstruction, images: ImageSet) -> _Seen:
     )
 
 
-def _triangulate(seen: _Seen) -> BundleProblem:
+def _triangulate(seen: _ModelObservations) -> BundleProblem:
     """Points where their rays want them for the given poses; the noise of keypoints measured."""
     zeros = np.zeros(len(seen.focals))
     problem = BundleProblem(
@@ -160,7 +162,7 @@ def _noise_px(problem: BundleProblem) -> float:
 def _well_placed(problem: BundleProblem) -> Bool:
     """(p,) points that are seen under a large angle and agree with all their observations."""
     centers = camera_center(problem.rotations, problem.translations)[problem.obs_image]
-    angles = max_triangulation_angles(
+    angles = compute_max_triangulation_angles(
         problem.points, np.asarray(problem.obs_point, dtype=np.int64), centers
     )
     worst = np.zeros(len(problem.points))

@@ -17,7 +17,7 @@ BEFORE, AFTER, IDEAL = "#b3561d", "#1f6f8b", "#888888"
 Metrics = Mapping[str, Any]
 
 
-def draw(metrics: Mapping[str, Metrics], place: str, error: str) -> tuple[str, bytes]:
+def draw_plots(metrics: Mapping[str, Metrics], place: str, error: str) -> tuple[str, bytes]:
     """Four plots of the metrics ``before`` and ``after``: an SVG element, and a PNG file.
 
     ``place``: what errors are broken down by, ``error``: what they are, both with units.

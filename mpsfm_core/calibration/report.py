@@ -152,10 +152,10 @@ def _rounds(report: Mapping[str, Any]) -> Iterable[str]:
 def _plots(report: Mapping[str, Any]) -> tuple[str, bytes | None]:
     """For the page, and as a PNG file."""
     try:
-        from mpsfm_core.calibration.plots import draw
+        from mpsfm_core.calibration.plots import draw_plots
     except ImportError:
         return "<p>The plots need matplotlib: pip install 'mpsfm-core[report]'</p>", None
-    return draw(report["metrics"], report["place"], _ERRORS[report["kind"]])
+    return draw_plots(report["metrics"], report["place"], _ERRORS[report["kind"]])
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

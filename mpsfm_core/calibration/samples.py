@@ -112,7 +112,7 @@ class Residuals:
         return 1.0 / np.bincount(self.image, minlength=self.images)[self.image]
 
 
-def join(parts: Sequence[Residuals]) -> Residuals:
+def concatenate_residuals(parts: Sequence[Residuals]) -> Residuals:
     """Residuals of different images as one."""
     names = ("error", "noise", "terms", "step", "magnitude", "unit", "place", "scales")
     arrays: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}

@@ -10,8 +10,8 @@ import typer
 from mpsfm_core.cli.arguments import Quiet
 
 if TYPE_CHECKING:
-    from mpsfm_core.calibration.calibrate import Calibrated
-    from mpsfm_core.calibration.fitting import Alignment
+    from mpsfm_core.calibration.calibrate import CalibrationResult
+    from mpsfm_core.calibration.model_selection import Alignment
     from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 
 _PROVIDER_KEYS = ("options.", "wrap.", "calibration")
@@ -87,9 +87,9 @@ def calibrate(
     photos and compares with the points. Writes FILE for `depth.calibration: FILE`, and a report
     next to FILE.
     """
-    from mpsfm_core.calibration.calibrate import Photos, calibrate
+    from mpsfm_core.calibration.calibrate import CalibrationImages, calibrate
+    from mpsfm_core.calibration.cross_validation import StudyOptions
     from mpsfm_core.calibration.report import write_report
-    from mpsfm_core.calibration.study import StudyOptions
     from mpsfm_core.cli.progress import show_progress
     from mpsfm_core.config import load_config
     from mpsfm_core.data.errors import InputError
@@ -113,7 +113,7 @@ def calibrate(
         intrinsics = find_model_folder(model)
     with show_progress(registry, quiet):
         result = calibrate(
-            Photos(images, intrinsics, image_list),
+            CalibrationImages(images, intrinsics, image_list),
             loaded,
             calibrated_kind,
             ground_truth=None
@@ -139,7 +139,7 @@ def _check_names(
     Raises:
         InputError: A name is unknown.
     """
-    from mpsfm_core.calibration.fitting import Alignment
+    from mpsfm_core.calibration.model_selection import Alignment
     from mpsfm_core.data.errors import InputError, did_you_mean
     from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 
@@ -167,7 +167,7 @@ def _split_overrides(kind: str, overrides: list[str]) -> tuple[list[str], dict[s
     return config_settings, truth_settings
 
 
-def _print_outcome(result: Calibrated) -> None:
+def _print_outcome(result: CalibrationResult) -> None:
     """Print the fitted values and the cross-validated coverage."""
     report = result.report
     for name, (low, high) in report["intervals_95"].items():

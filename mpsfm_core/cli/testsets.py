@@ -34,7 +34,7 @@ def build(
 
     In leq5, the three-view overlap of any three photos of a set is at most 5 %.
     """
-    from mpsfm_core.evaluation.build_test_sets import build_test_sets
+    from mpsfm_core.evaluation.build_sets import build_test_sets
     from mpsfm_core.evaluation.sampling import SamplingOptions
 
     options = SamplingOptions(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.calibration.metrics import NORMAL_COVERAGE, measure, sensitivity_curve
+from mpsfm_core.calibration.metrics import NORMAL_COVERAGE, compute_metrics, sensitivity_curve
 from mpsfm_core.calibration.samples import Residuals
 from mpsfm_core.data import Float64
 
@@ -33,7 +33,7 @@ def residuals_of(error: Float64, images: int = 1) -> Residuals:
 def test_normal_errors_of_the_declared_size() -> None:
     rng = np.random.default_rng(0)
     std = np.exp(rng.normal(-2, 0.5, 100_000))
-    metrics = measure(residuals_of(std * rng.normal(size=len(std))), std)
+    metrics = compute_metrics(residuals_of(std * rng.normal(size=len(std))), std)
     assert metrics["coverage"] == pytest.approx(NORMAL_COVERAGE, abs=0.004)
     assert metrics["z_mad"] == pytest.approx(1, abs=0.01)
     entropy = (0.5 * np.log(2 * np.pi * np.e * std**2)).mean()
@@ -46,7 +46,7 @@ def test_normal_errors_of_the_declared_size() -> None:
 def test_five_times_too_small_a_std_shows_everywhere() -> None:
     rng = np.random.default_rng(0)
     error = rng.normal(size=20_000)
-    right, wrong = (measure(residuals_of(error), np.full(20_000, s)) for s in (1.0, 0.2))
+    right, wrong = (compute_metrics(residuals_of(error), np.full(20_000, s)) for s in (1.0, 0.2))
     assert wrong["coverage"][0] == pytest.approx(0.1585, abs=0.01)
     assert wrong["z_mad"] == pytest.approx(5, rel=0.03)
     assert wrong["nll"] > right["nll"]
@@ -57,15 +57,15 @@ def test_noise_of_the_truth_is_part_of_what_is_expected() -> None:
     rng = np.random.default_rng(0)
     error = 0.5 * rng.normal(size=50_000)
     noisy = replace(residuals_of(error), noise=np.full(50_000, 0.4))
-    assert measure(noisy, np.full(50_000, 0.3))["z_mad"] == pytest.approx(1, abs=0.02)
+    assert compute_metrics(noisy, np.full(50_000, 0.3))["z_mad"] == pytest.approx(1, abs=0.02)
 
 
 def test_ause_is_0_for_the_true_order_and_large_for_the_opposite() -> None:
     error = np.random.default_rng(0).normal(size=5_000)
     residuals = residuals_of(error)
-    perfect = measure(residuals, np.abs(error) + 1e-9)["ause"]
-    ignorant = measure(residuals, np.ones(5_000))["ause"]
-    opposite = measure(residuals, 1 / (np.abs(error) + 1e-3))["ause"]
+    perfect = compute_metrics(residuals, np.abs(error) + 1e-9)["ause"]
+    ignorant = compute_metrics(residuals, np.ones(5_000))["ause"]
+    opposite = compute_metrics(residuals, 1 / (np.abs(error) + 1e-3))["ause"]
     assert perfect == pytest.approx(0, abs=1e-9)
     assert 0.2 < ignorant < opposite
 
@@ -91,4 +91,4 @@ def test_every_image_has_the_same_weight() -> None:
     residuals = replace(
         residuals_of(np.concatenate([good, bad]), images=2), image=np.repeat([0, 1], [900, 100])
     )
-    assert measure(residuals, np.ones(1000))["coverage"][0] == pytest.approx(0.5)
+    assert compute_metrics(residuals, np.ones(1000))["coverage"][0] == pytest.approx(0.5)

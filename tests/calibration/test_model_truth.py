@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mpsfm_core.calibration.model_truth import model_truth
+from mpsfm_core.calibration.model_truth import depth_truth_from_model
 from mpsfm_core.calibration.samples import DepthTruth
 from mpsfm_core.data import Float64
 from mpsfm_core.geometry import project
@@ -78,7 +78,7 @@ def errors(truth: dict[str, DepthTruth], points: Float64, images: ImageSet) -> F
 
 
 def test_depth_has_errors_of_the_declared_size(points: Float64, images: ImageSet) -> None:
-    z = np.abs(errors(model_truth(make_model(points, points), images), points, images))
+    z = np.abs(errors(depth_truth_from_model(make_model(points, points), images), points, images))
     assert len(z) > POINTS
     # Noisy keypoints are sometimes nearest to another point, so the middle is looked at.
     assert 1.4826 * np.median(z) == pytest.approx(1, abs=0.2)
@@ -88,8 +88,8 @@ def test_where_the_model_puts_the_points_does_not_matter(points: Float64, images
     """A prior that pulled points along their rays must not be compared with itself."""
     center = -arc_poses(5, 8.0)[2][:, :3].T @ arc_poses(5, 8.0)[2][:, 3]
     pulled = center + 1.15 * (points - center)
-    right = model_truth(make_model(points, points), images)
-    again = model_truth(make_model(points, pulled), images)
+    right = depth_truth_from_model(make_model(points, points), images)
+    again = depth_truth_from_model(make_model(points, pulled), images)
     assert len(again["3.png"].depth) == pytest.approx(len(right["3.png"].depth), rel=0.02)
     assert np.abs(np.median(errors(again, points, images))) < 0.2
 
@@ -99,7 +99,7 @@ def test_points_of_small_angle_and_wrong_matches_are_no_truth(
 ) -> None:
     near = points.copy()
     near[:100] = points[:100] * 0.1 + [0, 60.0, 0]  # so far away that the rays are parallel
-    truth = model_truth(make_model(near, near), images)
+    truth = depth_truth_from_model(make_model(near, near), images)
     assert all(one.depth.max() < 20 for one in truth.values())
     model = make_model(points, points)
     image = model.images[1]
@@ -107,16 +107,16 @@ def test_points_of_small_angle_and_wrong_matches_are_no_truth(
     for row, point in enumerate(image.points2D):
         if point.has_point3D() and point.point3D_id in wrong:
             image.points2D[row].xy = point.xy + np.array([25.0, -25.0])
-    kept = model_truth(model, images)
+    kept = depth_truth_from_model(model, images)
     assert len(kept["2.png"].depth) < len(
-        model_truth(make_model(points, points), images)["2.png"].depth
+        depth_truth_from_model(make_model(points, points), images)["2.png"].depth
     )
 
 
 def test_images_that_only_the_model_has_are_left_out(points: Float64, images: ImageSet) -> None:
     some = ImageSet(images.images[:2], images._options)
-    assert set(model_truth(make_model(points, points), some)) == {"1.png", "2.png"}
+    assert set(depth_truth_from_model(make_model(points, points), some)) == {"1.png", "2.png"}
 
 
 def test_a_model_without_points_has_no_truth(images: ImageSet) -> None:
-    assert model_truth(make_model(np.zeros((0, 3)), np.zeros((0, 3))), images) == {}
+    assert depth_truth_from_model(make_model(np.zeros((0, 3)), np.zeros((0, 3))), images) == {}

@@ -9,8 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mpsfm_core.calibration.calibrate import Calibrated, Photos, calibrate, compare
-from mpsfm_core.calibration.fitting import std_of
+from mpsfm_core.calibration.calibrate import (
+    CalibrationImages,
+    CalibrationResult,
+    calibrate,
+    compare_prior,
+)
+from mpsfm_core.calibration.model_selection import std_of
 from mpsfm_core.config import Config, load_config
 from mpsfm_core.evaluation.peers import PEERS, write_database
 from mpsfm_core.extraction.runner import extract
@@ -33,8 +38,8 @@ FRAMES = 30
 class Room:
     """All photos and some successive ones, what reconstructs them, options of the sensor depth."""
 
-    photos: Photos
-    frames: Photos
+    photos: CalibrationImages
+    frames: CalibrationImages
     config: Config
     truth: dict[str, Any]
 
@@ -50,7 +55,7 @@ def room(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Room:
     settings += ["pairs.mode=sequential", "pairs.overlap=4", "runtime.workers=2"]
     names = sorted(path.name for path in (folder / "images").iterdir())
     (work / "frames.txt").write_text("\n".join(names[:FRAMES]))
-    photos = Photos(folder / "images", folder / "intrinsics.yaml")
+    photos = CalibrationImages(folder / "images", folder / "intrinsics.yaml")
     return Room(
         photos,
         replace(photos, image_list=work / "frames.txt"),
@@ -60,11 +65,13 @@ def room(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Room:
 
 
 @pytest.fixture(scope="module")
-def by_sensor(room: Room) -> Calibrated:
+def by_sensor(room: Room) -> CalibrationResult:
     return calibrate(room.photos, room.config, ground_truth=room.truth)
 
 
-def assert_near(found: Calibrated, by_sensor: Calibrated, room: Room, values: float) -> None:
+def assert_near(
+    found: CalibrationResult, by_sensor: CalibrationResult, room: Room, values: float
+) -> None:
     """The std of the pixels of all photos differs by at most 25 %, its parts by so many ``values``
     (of a few frames they are less certain than what they make together)."""
     own, true = found.file.calibration, by_sensor.file.calibration
@@ -72,7 +79,7 @@ def assert_near(found: Calibrated, by_sensor: Calibrated, room: Room, values: fl
     assert not (own.use_network_variance or true.use_network_variance)
     assert own.relative_std == pytest.approx(true.relative_std, rel=values)
     assert own.std_floor == pytest.approx(true.std_floor, rel=values)
-    data = compare(room.photos, room.config, room.truth)
+    data = compare_prior(room.photos, room.config, room.truth)
     stds = [std_of(calibration, data.residuals(calibration)) for calibration in (own, true)]
     assert 0.75 < np.median(stds[0] / stds[1]) < 1.25
     # So different a std shows: the defaults, which are another network's, are not near.
@@ -80,7 +87,7 @@ def assert_near(found: Calibrated, by_sensor: Calibrated, room: Room, values: fl
     assert np.median(std_of(other, data.residuals(other)) / stds[1]) < 0.3
 
 
-def test_one_std_covers_held_out_images(by_sensor: Calibrated) -> None:
+def test_one_std_covers_held_out_images(by_sensor: CalibrationResult) -> None:
     before, after = (by_sensor.report["metrics"][when] for when in ("before", "after"))
     assert len(by_sensor.report["images"]) == 123
     assert 0.60 < after["coverage"][0] < 0.76
@@ -88,14 +95,16 @@ def test_one_std_covers_held_out_images(by_sensor: Calibrated) -> None:
     assert after["nll_heavy"] < before["nll_heavy"]
 
 
-def test_nothing_but_photos_leads_to_nearly_the_same(room: Room, by_sensor: Calibrated) -> None:
+def test_nothing_but_photos_leads_to_nearly_the_same(
+    room: Room, by_sensor: CalibrationResult
+) -> None:
     own = calibrate(room.frames, room.config)
     assert len(own.report["rounds"]) > 1
     assert_near(own, by_sensor, room, 0.25)
 
 
 def test_so_do_the_points_of_a_model_by_colmap(
-    room: Room, by_sensor: Calibrated, tmp_path: Path
+    room: Room, by_sensor: CalibrationResult, tmp_path: Path
 ) -> None:
     photos, registry = room.frames, Registry.discover()
     config = resolve_providers(room.config, registry).config

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from mpsfm_core.calibration.fitting import DepthData
-from mpsfm_core.calibration.study import Study, StudyOptions, study
+from mpsfm_core.calibration.cross_validation import CalibrationStudy, StudyOptions, run_study
+from mpsfm_core.calibration.model_selection import DepthData
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 from tests.calibration.simulation import Simulated, simulate
 
@@ -16,17 +16,17 @@ PRIOR = Simulated(network=False, relative_std=0.1, std_floor=0.0, gross=0.02)
 DECLARED = DepthCalibration(relative_std=0.02, std_floor=0)
 
 
-def run(images: int, parameters: Simulated = PRIOR, **options: int) -> Study:
+def run(images: int, parameters: Simulated = PRIOR, **options: int) -> CalibrationStudy:
     data = DepthData(simulate(parameters, images, pixels=300))
-    return study(data, DECLARED, StudyOptions(bootstraps=20).model_copy(update=options))
+    return run_study(data, DECLARED, StudyOptions(bootstraps=20).model_copy(update=options))
 
 
 @pytest.fixture(scope="module")
-def twenty() -> Study:
+def twenty() -> CalibrationStudy:
     return run(20)
 
 
-def test_coverage_on_held_out_images_before_and_after(twenty: Study) -> None:
+def test_coverage_on_held_out_images_before_and_after(twenty: CalibrationStudy) -> None:
     before, after = (twenty.report["metrics"][when] for when in ("before", "after"))
     assert before["coverage"][0] < 0.2
     assert after["coverage"][0] == pytest.approx(0.683 * 0.98, abs=0.03)
@@ -40,14 +40,14 @@ def test_scenes_are_held_out_as_a_whole() -> None:
     hard = simulate(replace(PRIOR, relative_std=0.2), 8, seed=1, pixels=300)
     named = [replace(image, name=f"{'ab'[n // 8]}/{image.name}") for n, image in enumerate(easy)]
     named += [replace(image, name=f"c/{image.name}") for image in hard]
-    found = study(DepthData(tuple(named)), DECLARED, StudyOptions(bootstraps=0))
+    found = run_study(DepthData(tuple(named)), DECLARED, StudyOptions(bootstraps=0))
     assert found.report["folds"] == 3
     *others, last = found.report["metrics"]["after"]["coverage_of_folds"]
     assert last == pytest.approx(0.38, abs=0.05)
     assert min(others) > 0.7
 
 
-def test_the_scale_of_each_image_is_told_and_not_part_of_the_std(twenty: Study) -> None:
+def test_the_scale_of_each_image_is_told_and_not_part_of_the_std(twenty: CalibrationStudy) -> None:
     # Simulated images have scales with a log spread of 0.2, twice the std.
     assert twenty.report["scale"]["log_spread"] == pytest.approx(0.2, rel=0.5)
     after = twenty.report["metrics"]["after"]
@@ -55,20 +55,20 @@ def test_the_scale_of_each_image_is_told_and_not_part_of_the_std(twenty: Study) 
 
 
 def test_truth_in_no_unit_says_nothing_about_the_scale() -> None:
-    data = DepthData(simulate(PRIOR, 8, pixels=200), in_metres=False)
-    report = study(data, DECLARED, StudyOptions(bootstraps=0)).report
+    data = DepthData(simulate(PRIOR, 8, pixels=200), in_meters=False)
+    report = run_study(data, DECLARED, StudyOptions(bootstraps=0)).report
     assert "coverage_without_scaling" not in report["metrics"]["after"]
 
 
-def test_the_report_is_plain_data(twenty: Study) -> None:
+def test_the_report_is_plain_data(twenty: CalibrationStudy) -> None:
     assert json.loads(json.dumps(twenty.report)) == twenty.report
 
 
-def test_the_same_input_gives_the_same_study(twenty: Study) -> None:
+def test_the_same_input_gives_the_same_study(twenty: CalibrationStudy) -> None:
     assert run(20).report == twenty.report
 
 
-def test_enough_images_give_no_warning(twenty: Study) -> None:
+def test_enough_images_give_no_warning(twenty: CalibrationStudy) -> None:
     assert twenty.warnings == ()
 
 
@@ -82,7 +82,7 @@ def test_few_images_are_warned_of() -> None:
 def test_a_wide_interval_is_warned_of() -> None:
     quiet, loud = (replace(PRIOR, relative_std=std) for std in (0.03, 0.3))
     mixed = simulate(quiet, 6, pixels=100) + simulate(loud, 6, pixels=100)
-    warnings = study(DepthData(mixed), DECLARED, StudyOptions(bootstraps=40)).warnings
+    warnings = run_study(DepthData(mixed), DECLARED, StudyOptions(bootstraps=40)).warnings
     assert any("relative_std is somewhere between" in warning for warning in warnings)
 
 
@@ -93,6 +93,6 @@ def test_wrong_truth_is_suspected() -> None:
 
 def test_a_prior_that_is_the_truth_is_declared_nearly_exact() -> None:
     exact = tuple(replace(s, truth=s.prior * 1.3) for s in simulate(PRIOR, 4, pixels=100))
-    calibration = study(DepthData(exact), DECLARED, StudyOptions(bootstraps=5)).calibration
+    calibration = run_study(DepthData(exact), DECLARED, StudyOptions(bootstraps=5)).calibration
     assert isinstance(calibration, DepthCalibration)
     assert calibration.relative_std < 1e-6

@@ -7,8 +7,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mpsfm_core.calibration.fitting import Alignment, DepthData, NormalData
-from mpsfm_core.calibration.model_truth import drawn_evenly
+from mpsfm_core.calibration.cross_validation import CalibrationData, StudyOptions
+from mpsfm_core.calibration.file_truth import FileTruth
+from mpsfm_core.calibration.model_selection import Alignment, DepthData, NormalData
+from mpsfm_core.calibration.model_truth import sample_evenly
 from mpsfm_core.calibration.samples import (
     MIN_SAMPLES,
     DepthSamples,
@@ -17,22 +19,20 @@ from mpsfm_core.calibration.samples import (
     compare_depth,
     compare_normals,
 )
-from mpsfm_core.calibration.study import Data, StudyOptions
-from mpsfm_core.calibration.truth import FileTruth
 from mpsfm_core.data import NormalPrior
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.priors.raw_priors import RawPriors
-from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
+from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 
 Samples = TypeVar("Samples", DepthSamples, NormalSamples)
 
 ALL_ALIGNMENTS: tuple[Alignment, ...] = ("scale", "scale-shift", "disparity")
 
 
-class Comparison:
+class PriorComparison:
     """Samples of one kind of prior beside the truth.
 
     ``alignments``: what may be tried for depth, None for what suits the provider.
@@ -40,23 +40,23 @@ class Comparison:
 
     def __init__(
         self,
-        bench: ExtractionContext,
+        context: ExtractionContext,
         kind: CalibratedKind,
         alignments: Sequence[Alignment] | None,
         options: StudyOptions,
     ) -> None:
-        self._bench = bench
+        self._context = context
         self._kind = kind
         self._alignments = alignments
         self._options = options
-        self._raw = RawPriors(bench)
+        self._raw = RawPriors(context)
 
     @property
     def provider(self) -> ActiveProvider:
         """The provider that is calibrated."""
         return (self._kind == "normals" and self._raw.normals) or self._raw.depth
 
-    def with_files(self, options: Mapping[str, Any]) -> Data:
+    def with_files(self, options: Mapping[str, Any]) -> CalibrationData:
         """Compare with true maps in files; images without a file are left out.
 
         Raises:
@@ -64,41 +64,41 @@ class Comparison:
         """
         sampling = self._options
         truth = FileTruth(
-            self._bench, self._kind, options, sampling.samples_per_image, sampling.seed
+            self._context, self._kind, options, sampling.samples_per_image, sampling.seed
         )
-        known = [i for i in range(len(self._bench.images)) if truth.has(self._bench.view(i))]
+        known = [i for i in range(len(self._context.images)) if truth.has(self._context.view(i))]
         if not known:
             raise InputError(f"{options['directory']} has no file for any of the images")
         if self._kind == "normals":
             return NormalData(self._compare(known, lambda i: self._normals(i, truth)))
 
         def depth(index: int) -> DepthSamples | None:
-            return self._depth(index, truth.depth(self._bench.view(index), index))
+            return self._depth(index, truth.depth(self._context.view(index), index))
 
-        return self._depth_data(self._compare(known, depth), in_metres=True)
+        return self._depth_data(self._compare(known, depth), in_meters=True)
 
-    def with_points(self, truth: Mapping[str, DepthTruth]) -> Data:
+    def with_points(self, truth: Mapping[str, DepthTruth]) -> CalibrationData:
         """Compare with depth at points of any unit, by image name; each counts by its area.
 
         Raises:
             InputError: no image has enough of them.
         """
-        names, sampling = self._bench.images.names, self._options
+        names, sampling = self._context.images.names, self._options
         points = {i: truth[name] for i, name in enumerate(names) if name in truth}
         known = [i for i, found in points.items() if len(found.xy) >= MIN_SAMPLES]
 
         def depth(index: int) -> DepthSamples | None:
-            size = self._bench.images[index].pinhole.size
+            size = self._context.images[index].pinhole.size
             rng = np.random.default_rng([sampling.seed, index])
-            even = drawn_evenly(points[index], size, sampling.samples_per_image, rng)
+            even = sample_evenly(points[index], size, sampling.samples_per_image, rng)
             return self._depth(index, even)
 
-        return self._depth_data(self._compare(known, depth), in_metres=False)
+        return self._depth_data(self._compare(known, depth), in_meters=False)
 
     def _compare(
         self, images: Sequence[int], compare: Callable[[int], Samples | None]
     ) -> tuple[Samples, ...]:
-        compared = self._bench.each("comparison", images, compare, self.provider)
+        compared = self._context.each("comparison", images, compare, self.provider)
         samples = tuple(image for image in compared if image is not None)
         if not samples:
             raise InputError(
@@ -107,17 +107,17 @@ class Comparison:
             )
         return samples
 
-    def _depth_data(self, samples: tuple[DepthSamples, ...], *, in_metres: bool) -> DepthData:
+    def _depth_data(self, samples: tuple[DepthSamples, ...], *, in_meters: bool) -> DepthData:
         usual = ("scale",) if samples[0].metric else ALL_ALIGNMENTS
-        return DepthData(samples, tuple(self._alignments or usual), in_metres)
+        return DepthData(samples, tuple(self._alignments or usual), in_meters)
 
     def _depth(self, index: int, truth: DepthTruth) -> DepthSamples | None:
-        image = self._bench.images[index]
+        image = self._context.images[index]
         return compare_depth(image.name, self._raw.predict(index)[0], image.pinhole.size, truth)
 
     def _normals(self, index: int, truth: FileTruth) -> NormalSamples | None:
-        image = self._bench.images[index]
-        known = truth.normals(self._bench.view(index), index)
+        image = self._context.images[index]
+        known = truth.normals(self._context.view(index), index)
         return compare_normals(
             image.name, self._predicted_normals(index), image.pinhole.size, known
         )
@@ -129,6 +129,6 @@ class Comparison:
         depth, normals = self._raw.predict(index)
         if normals is not None:
             return normals
-        calibration = self._bench.registry.calibration("depth", self._bench.config.depth)
+        calibration = self._context.registry.calibration("depth", self._context.config.depth)
         assert isinstance(calibration, DepthCalibration)
         return self._raw.predict_normals(index, calibration.apply(depth))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpsfm_core.calibration.fitting import DepthData, winner
-from mpsfm_core.calibration.model_truth import REACH, drawn_evenly
+from mpsfm_core.calibration.model_selection import DepthData, select_candidate
+from mpsfm_core.calibration.model_truth import REACH, sample_evenly
 from mpsfm_core.calibration.samples import DepthSamples, DepthTruth, compare_depth
 from mpsfm_core.data import DepthPrior, Float64
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
@@ -22,7 +22,7 @@ def truth_at(xy: Float64, depth: Float64 | None = None) -> DepthTruth:
 def test_a_crowd_counts_no_more_than_a_point_alone() -> None:
     rng = np.random.default_rng(0)
     crowd = rng.normal((50, 75), 0.1, (99, 2))
-    even = drawn_evenly(truth_at(np.vstack([crowd, [[150.0, 75.0]]])), SIZE, 40_000, rng)
+    even = sample_evenly(truth_at(np.vstack([crowd, [[150.0, 75.0]]])), SIZE, 40_000, rng)
     alone = even.depth == 100
     assert alone.mean() == pytest.approx(0.5, abs=0.03)
     np.testing.assert_array_equal(even.xy[alone], np.tile([150.0, 75.0], (alone.sum(), 1)))
@@ -31,7 +31,7 @@ def test_a_crowd_counts_no_more_than_a_point_alone() -> None:
 
 def test_pixels_far_from_all_points_are_left_out() -> None:
     rng = np.random.default_rng(0)
-    even = drawn_evenly(truth_at(np.array([[100.0, 75.0]])), SIZE, 20_000, rng)
+    even = sample_evenly(truth_at(np.array([[100.0, 75.0]])), SIZE, 20_000, rng)
     disc = np.pi * (REACH * WIDTH) ** 2 / (WIDTH * HEIGHT)
     assert len(even.xy) / 20_000 == pytest.approx(disc, rel=0.1)
 
@@ -49,19 +49,19 @@ def photos(*, texture_only: bool) -> DepthData:
         depth = 2.0 * np.exp(np.where(textured, 0.05, 0.15) * rng.normal(size=len(points)))
         truth = truth_at(points, depth)
         if not texture_only:
-            truth = drawn_evenly(truth, SIZE, 500, rng)
+            truth = sample_evenly(truth, SIZE, 500, rng)
         prior = DepthPrior.from_arrays(np.full((HEIGHT, WIDTH), 2.0), None, metric=False)
         compared = compare_depth(f"{number}.png", prior, SIZE, truth)
         assert compared is not None
         samples.append(compared)
-    return DepthData(tuple(samples), in_metres=False)
+    return DepthData(tuple(samples), in_meters=False)
 
 
 def test_the_std_is_that_of_the_picture_and_not_of_its_texture() -> None:
     """Half of the pixels err with a std of 5 %, half with 15 %: 68.27 % are within 8.8 %."""
     stds = []
     for texture_only in (True, False):
-        calibration = winner(photos(texture_only=texture_only).fit()).calibration
+        calibration = select_candidate(photos(texture_only=texture_only).fit()).calibration
         assert isinstance(calibration, DepthCalibration)
         stds.append(calibration.relative_std)
     assert stds[0] < 0.06

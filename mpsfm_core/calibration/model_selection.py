@@ -13,7 +13,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from mpsfm_core.calibration.fit import DOMINANT_SHARE, Fit, fit_std
 from mpsfm_core.calibration.samples import (
     GROSS_DEPTH,
     DepthSamples,
@@ -22,8 +21,13 @@ from mpsfm_core.calibration.samples import (
     depth_residuals,
     normal_residuals,
 )
+from mpsfm_core.calibration.std_likelihood import DOMINANT_SHARE, StdFit, fit_std
 from mpsfm_core.data import Float64, Int64
-from mpsfm_core.providers.uncertainty.calibration import Calibration, DepthCalibration, NormalCalibration
+from mpsfm_core.providers.uncertainty.calibration import (
+    Calibration,
+    DepthCalibration,
+    NormalCalibration,
+)
 
 Alignment = Literal["scale", "scale-shift", "disparity"]
 """What an image's depth is unknown up to: a factor; and a shift of depth, or of inverse depth."""
@@ -53,7 +57,7 @@ class Candidate:
     with its standard error over images; both 0 for the first."""
 
     name: str
-    fit: Fit
+    fit: StdFit
     calibration: Calibration
     gain: float
     standard_error: float
@@ -89,12 +93,12 @@ def std_of(calibration: Calibration, residuals: Residuals) -> Float64:
 class DepthData:
     """Samples of depth priors, one entry an image.
 
-    ``alignments``: what may be tried, the simplest first. ``in_metres``: whether the truth is.
+    ``alignments``: what may be tried, the simplest first. ``in_meters``: whether the truth is.
     """
 
     samples: tuple[DepthSamples, ...]
     alignments: tuple[Alignment, ...] = ("scale",)
-    in_metres: bool = True
+    in_meters: bool = True
 
     def of(self, images: Int64) -> DepthData:
         """The data of some images."""
@@ -106,13 +110,13 @@ class DepthData:
         return depth_residuals(self.samples, calibration, scaled=scaled)
 
     def fit(self) -> list[Candidate]:
-        """Fit alignment, terms and edges in this order; :func:`winner` is the result."""
+        """StdFit alignment, terms and edges in this order; :func:`select_candidate` is the result."""
         floor = ("std_floor",) * self.samples[0].metric
-        search = _Search()
+        search = _ModelSearch()
         for alignment in self.alignments:
             model = _shift(self.samples, alignment)
             names = ("relative_std", *floor)
-            attempt = _Attempt(model, self.residuals(model), names)
+            attempt = _CandidateModel(model, self.residuals(model), names)
             search.offer(f"{' + '.join(names)}, aligned by {alignment}", [attempt])
         if "std_scale" in search.best.residuals.names:
             for names in (("std_scale", *floor), ("std_scale", "relative_std", *floor)):
@@ -137,30 +141,30 @@ class NormalData:
         return normal_residuals(self.samples)
 
     def fit(self) -> list[Candidate]:
-        """Fit a constant std, and a scale of the network's own with a floor if it has one."""
+        """StdFit a constant std, and a scale of the network's own with a floor if it has one."""
         base = NormalCalibration()
         residuals = self.residuals(base)
-        search = _Search()
-        constant = _Attempt(base, residuals, ("std_floor_deg",))
+        search = _ModelSearch()
+        constant = _CandidateModel(base, residuals, ("std_floor_deg",))
         search.offer("constant", [constant])
         if "std_scale" in residuals.names:
             search.offer("std_scale + std_floor_deg", [constant._replace(names=residuals.names)])
         return search.candidates
 
 
-def winner(candidates: Sequence[Candidate]) -> Candidate:
+def select_candidate(candidates: Sequence[Candidate]) -> Candidate:
     """The chosen model: the last that was better than all before it."""
     return next(c for c in reversed(candidates) if c.chosen)
 
 
-def describe(base: Calibration, fit: Fit) -> Calibration:
-    """A fit as a calibration, with the shift of ``base``, rounded to four digits.
+def calibration_from_fit(base: Calibration, fit: StdFit) -> Calibration:
+    """A fit as a calibration, with the shift of ``base``, round_significant to four digits.
 
     What the data do not determine, as it is the largest nearly nowhere, is left out; a floor is
     then the usual one.
     """
     found = {
-        name: rounded(value)
+        name: round_significant(value)
         for name, value, share in zip(fit.names, fit.values, fit.shares, strict=True)
         if share >= DOMINANT_SHARE
     }
@@ -169,7 +173,7 @@ def describe(base: Calibration, fit: Fit) -> Calibration:
         "use_network_variance": "std_scale" in found,
     }
     if isinstance(base, NormalCalibration):
-        floor = rounded(np.degrees(found.get("std_floor_deg", 0.0)))
+        floor = round_significant(np.degrees(found.get("std_floor_deg", 0.0)))
         if "std_scale" in found:
             return NormalCalibration(**network, std_floor_deg=floor)
         usual = min(NormalCalibration().std_floor_deg, floor)
@@ -179,15 +183,15 @@ def describe(base: Calibration, fit: Fit) -> Calibration:
     return DepthCalibration(
         **network,
         relative_std=found.get("relative_std", 0.0),
-        std_floor=found.get("std_floor", rounded(usual)),
-        shift=rounded(base.shift),
+        std_floor=found.get("std_floor", round_significant(usual)),
+        shift=round_significant(base.shift),
         shift_space=base.shift_space,
         edge_ratio=fit.edge_ratio,
-        edge_std_scale=rounded(fit.edge_scale),
+        edge_std_scale=round_significant(fit.edge_scale),
     )
 
 
-class _Attempt(NamedTuple):
+class _CandidateModel(NamedTuple):
     """A model to fit: ``base`` has its shift."""
 
     base: Calibration
@@ -196,16 +200,16 @@ class _Attempt(NamedTuple):
     edge_ratio: float | None = None
 
 
-class _Search:
+class _ModelSearch:
     """Tries models of growing richness and remembers the best."""
 
     def __init__(self) -> None:
         self.candidates: list[Candidate] = []
-        self.best: _Attempt
+        self.best: _CandidateModel
         self._density: Float64 | None = None
 
-    def offer(self, name: str, attempts: Sequence[_Attempt]) -> None:
-        """Fit variants of one model; take the likeliest if it is better than the best so far."""
+    def offer(self, name: str, attempts: Sequence[_CandidateModel]) -> None:
+        """StdFit variants of one model; take the likeliest if it is better than the best so far."""
         fits = [fit_std(a.residuals, a.names, a.edge_ratio) for a in attempts]
         place = int(np.argmax([fit.log_density.mean() for fit in fits]))
         attempt, fit = attempts[place], fits[place]
@@ -214,7 +218,7 @@ class _Search:
             differences = fit.log_density - self._density
             gain, error = float(differences.mean()), _standard_error(differences)
         chosen = self._density is None or gain > max(CLEARLY * error, MIN_GAIN)
-        calibration = describe(attempt.base, fit)
+        calibration = calibration_from_fit(attempt.base, fit)
         self.candidates.append(Candidate(name, fit, calibration, gain, error, chosen))
         if chosen:
             self.best, self._density = attempt, fit.log_density
@@ -249,6 +253,6 @@ def _shift_loss(samples: Sequence[DepthSamples], model: DepthCalibration) -> flo
     return float((np.abs(residuals.error).sum() + lost * GROSS_DEPTH) / (len(residuals) + lost))
 
 
-def rounded(value: float) -> float:
+def round_significant(value: float) -> float:
     """A value to four significant digits: more would pretend."""
     return float(f"{value:.{_DIGITS}g}")

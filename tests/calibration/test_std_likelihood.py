@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.calibration.fit import bootstrap, fit_std
-from mpsfm_core.calibration.fitting import DepthData, NormalData, std_of, winner
+from mpsfm_core.calibration.model_selection import DepthData, NormalData, select_candidate, std_of
 from mpsfm_core.calibration.samples import (
     DepthSamples,
     NormalSamples,
@@ -16,6 +15,7 @@ from mpsfm_core.calibration.samples import (
     normal_residuals,
     tangent_errors,
 )
+from mpsfm_core.calibration.std_likelihood import bootstrap_fit, fit_std
 from mpsfm_core.data import Float64
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from tests.calibration.simulation import Simulated, simulate
@@ -24,7 +24,7 @@ PLAIN = Simulated()
 
 
 def fitted(samples: tuple[DepthSamples, ...], *alignments: str) -> DepthCalibration:
-    calibration = winner(DepthData(samples, alignments or ("scale",)).fit()).calibration
+    calibration = select_candidate(DepthData(samples, alignments or ("scale",)).fit()).calibration
     assert isinstance(calibration, DepthCalibration)
     return calibration
 
@@ -116,7 +116,7 @@ def test_intervals_hold_the_truth_and_narrow_with_more_images() -> None:
     for images in (5, 30):
         residuals = depth_residuals(simulate(PLAIN, images, seed=7, pixels=300), DepthCalibration())
         fit = fit_std(residuals)
-        drawn = bootstrap(residuals, fit, 40, np.random.default_rng(0))
+        drawn = bootstrap_fit(residuals, fit, 40, np.random.default_rng(0))
         low, high = np.percentile(drawn[:, 1], [2.5, 97.5])
         assert low < PLAIN.relative_std * 1.02
         assert high > PLAIN.relative_std * 0.98
@@ -137,7 +137,7 @@ def test_every_image_counts_the_same() -> None:
 def test_normals_within_5_percent_from_20_images(network: bool) -> None:
     rng = np.random.default_rng(0)
     samples = tuple(_normal_samples(rng, 2.0, np.radians(4.0), network) for _ in range(20))
-    found = winner(NormalData(samples).fit()).calibration
+    found = select_candidate(NormalData(samples).fit()).calibration
     assert isinstance(found, NormalCalibration)
     assert found.use_network_variance == network
     if network:

@@ -29,7 +29,12 @@ class FileTruth:
     """
 
     def __init__(
-        self, bench: ExtractionContext, kind: str, options: Mapping[str, Any], count: int, seed: int
+        self,
+        context: ExtractionContext,
+        kind: str,
+        options: Mapping[str, Any],
+        count: int,
+        seed: int,
     ) -> None:
         depth = kind == "depth"
         values = {"relative_std": EXACT, **options} if depth else dict(options)
@@ -38,7 +43,7 @@ class FileTruth:
         if not self._options.directory.is_dir():
             raise InputError(f"ground truth folder {self._options.directory} does not exist")
         backend = ProviderConfig(use="files", options=self._options.model_dump(mode="json"))
-        self._provider = bench.provider("depth" if depth else "normals", backend)
+        self._provider = context.provider("depth" if depth else "normals", backend)
         self._count, self._seed = count, seed
 
     def has(self, view: View) -> bool:

@@ -43,7 +43,7 @@ _RANGE = 1e4
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class StdFit:
     """A fitted std.
 
     ``names``: of the terms used, ``values``: (m,) their factors. ``edge_ratio``: pixels beside a
@@ -65,14 +65,16 @@ class Fit:
 
 def fit_std(
     residuals: Residuals, names: Sequence[str] | None = None, edge_ratio: float | None = None
-) -> Fit:
-    """Fit the factors of some terms (all by default) and, if asked, of edges."""
+) -> StdFit:
+    """StdFit the factors of some terms (all by default) and, if asked, of edges."""
     problem = _Problem(residuals, tuple(names or residuals.names), edge_ratio)
     best = min((problem.solve(start) for start in problem.starts()), key=lambda found: found[1])
     return problem.finish(best[0])
 
 
-def bootstrap(residuals: Residuals, fit: Fit, count: int, rng: np.random.Generator) -> Float64:
+def bootstrap_fit(
+    residuals: Residuals, fit: StdFit, count: int, rng: np.random.Generator
+) -> Float64:
     """The fit repeated on images drawn with replacement: (count, m + 1), factors and edge scale."""
     problem = _Problem(residuals, fit.names, fit.edge_ratio)
     start = problem.vector(fit)
@@ -134,7 +136,7 @@ class _Problem:
             mixes += [np.where(np.eye(count, dtype=np.bool_)[j], 0.0, -0.7) for j in range(count)]
         return [np.concatenate([self._alone + mix, rest]) for mix in mixes]
 
-    def vector(self, fit: Fit) -> Float64:
+    def vector(self, fit: StdFit) -> Float64:
         """The parameters of a fit."""
         edges = [np.log(fit.edge_scale)] * (self._edge_ratio is not None)
         share = np.clip(fit.gross / MAX_GROSS, 1e-4, 1 - 1e-4)
@@ -154,7 +156,7 @@ class _Problem:
                 break
         return np.asarray(best.x), float(best.fun)
 
-    def finish(self, vector: Float64) -> Fit:
+    def finish(self, vector: Float64) -> StdFit:
         """Set the common factor by coverage and describe the result."""
         state = self._evaluate(vector)
         count = len(self._names)
@@ -168,7 +170,7 @@ class _Problem:
         density = state.log_density * self._residuals.weights()
         per_image = np.zeros(self._residuals.images)
         np.add.at(per_image, self._residuals.image, density)
-        return Fit(
+        return StdFit(
             self._names,
             np.exp(vector[:count]),
             self._edge_ratio,

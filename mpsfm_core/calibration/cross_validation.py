@@ -11,10 +11,16 @@ from typing import Any, TypeAlias
 import numpy as np
 from pydantic import Field
 
-from mpsfm_core.calibration.fit import DOMINANT_SHARE, Fit, bootstrap
-from mpsfm_core.calibration.fitting import Candidate, DepthData, NormalData, std_of, winner
-from mpsfm_core.calibration.metrics import coverage, measure
-from mpsfm_core.calibration.samples import Residuals, join
+from mpsfm_core.calibration.metrics import compute_coverage, compute_metrics
+from mpsfm_core.calibration.model_selection import (
+    Candidate,
+    DepthData,
+    NormalData,
+    select_candidate,
+    std_of,
+)
+from mpsfm_core.calibration.samples import Residuals, concatenate_residuals
+from mpsfm_core.calibration.std_likelihood import DOMINANT_SHARE, StdFit, bootstrap_fit
 from mpsfm_core.data import Float64, Int64
 from mpsfm_core.data.options import Options
 from mpsfm_core.geometry.statistics import MAD_TO_STD
@@ -28,14 +34,14 @@ MANY_GROSS = 0.2
 """Share of gross errors above which the truth itself is in doubt (ours)."""
 _INTERVAL = (2.5, 97.5)
 
-Data: TypeAlias = DepthData | NormalData
+CalibrationData: TypeAlias = DepthData | NormalData
 
 
 class StudyOptions(Options):
     """How a calibration is fitted."""
 
     seed: int = Field(0, ge=0)
-    """Of the choice of pixels and of the bootstrap."""
+    """Of the choice of pixels and of the bootstrap_fit."""
     folds: int = Field(4, ge=2)
     """Each of so many groups of successive images is held out once: the model is chosen and fitted
     on the others and judged on it. Successive, as neighbours in a video are nearly the same image;
@@ -48,7 +54,7 @@ class StudyOptions(Options):
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
+class CalibrationStudy:
     """A calibration and how it was found.
 
     ``report``: everything the report shows, plain data. ``warnings``: what makes it doubtful.
@@ -59,18 +65,20 @@ class Study:
     warnings: tuple[str, ...]
 
 
-def study(data: Data, declared: Calibration, options: StudyOptions) -> Study:
-    """Fit a calibration and compare it with the declared one on images it has not seen.
+def run_study(
+    data: CalibrationData, declared: Calibration, options: StudyOptions
+) -> CalibrationStudy:
+    """StdFit a calibration and compare it with the declared one on images it has not seen.
 
     ``data``: one image at least.
     """
     candidates = data.fit()
-    best = winner(candidates)
+    best = select_candidate(candidates)
     residuals = data.residuals(best.calibration)
     rng = np.random.default_rng(options.seed)
     intervals = _intervals(residuals, best.fit, options.bootstraps, rng)
     folds = _folds([image.name for image in data.samples], options.folds)
-    fitted = [winner(data.of(kept).fit()).calibration for kept, _ in folds]
+    fitted = [select_candidate(data.of(kept).fit()).calibration for kept, _ in folds]
     held_out = [data.of(left) for _, left in folds] or [data]
     report = {
         "images": [image.name for image in data.samples],
@@ -85,18 +93,18 @@ def study(data: Data, declared: Calibration, options: StudyOptions) -> Study:
         "gross_errors": best.fit.gross,
         "candidates": [_describe(candidate) for candidate in candidates],
         "metrics": {
-            "before": judge(held_out, [declared] * len(held_out)),
-            "after": judge(held_out, fitted or [best.calibration]),
+            "before": evaluate_calibrations(held_out, [declared] * len(held_out)),
+            "after": evaluate_calibrations(held_out, fitted or [best.calibration]),
         },
         "scale": _scale(data, best.calibration),
         "place": _place(data),
     }
     warnings = tuple(_warnings(len(data.samples), intervals, best.fit))
-    return Study(best.calibration, {**report, "warnings": list(warnings)}, warnings)
+    return CalibrationStudy(best.calibration, {**report, "warnings": list(warnings)}, warnings)
 
 
 def _folds(names: Sequence[str], wanted: int) -> list[tuple[Int64, Int64]]:
-    """Images to fit on and images to judge on, for each fold; none for a single image."""
+    """Images to fit on and images to evaluate_calibrations on, for each fold; none for a single image."""
     if len(names) < 2:
         return []
     folders, scene = np.unique([str(PurePosixPath(n).parent) for n in names], return_inverse=True)
@@ -107,21 +115,25 @@ def _folds(names: Sequence[str], wanted: int) -> list[tuple[Int64, Int64]]:
     return [(np.flatnonzero(~left), np.flatnonzero(left)) for left in held_out]
 
 
-def judge(held_out: Sequence[Data], calibrations: Sequence[Calibration]) -> dict[str, Any]:
+def evaluate_calibrations(
+    held_out: Sequence[CalibrationData], calibrations: Sequence[Calibration]
+) -> dict[str, Any]:
     """How good each calibration is on its images: metrics over all of them after each image's own
     scale, coverage of each part, and coverage of a metric prior without scaling."""
     scaled, std = _apply(held_out, calibrations, scaled=True)
-    metrics = measure(join(scaled), np.concatenate(std))
+    metrics = compute_metrics(concatenate_residuals(scaled), np.concatenate(std))
     metrics["coverage_of_folds"] = [_coverage(r, s)[0] for r, s in zip(scaled, std, strict=True)]
     first = held_out[0]
-    if isinstance(first, DepthData) and first.samples[0].metric and first.in_metres:
+    if isinstance(first, DepthData) and first.samples[0].metric and first.in_meters:
         raw, std = _apply(held_out, calibrations, scaled=False)
-        metrics["coverage_without_scaling"] = _coverage(join(raw), np.concatenate(std))
+        metrics["coverage_without_scaling"] = _coverage(
+            concatenate_residuals(raw), np.concatenate(std)
+        )
     return metrics
 
 
 def _apply(
-    held_out: Sequence[Data], calibrations: Sequence[Calibration], *, scaled: bool
+    held_out: Sequence[CalibrationData], calibrations: Sequence[Calibration], *, scaled: bool
 ) -> tuple[list[Residuals], list[Float64]]:
     """Errors of each fold and the std that its calibration declares for them."""
     parts = [d.residuals(c, scaled=scaled) for d, c in zip(held_out, calibrations, strict=True)]
@@ -129,17 +141,17 @@ def _apply(
 
 
 def _coverage(residuals: Residuals, std: Float64) -> list[float]:
-    return coverage(residuals.error, np.hypot(std, residuals.noise), residuals.weights())
+    return compute_coverage(residuals.error, np.hypot(std, residuals.noise), residuals.weights())
 
 
-def _place(data: Data) -> str:
+def _place(data: CalibrationData) -> str:
     """What errors are broken down by, with its unit."""
     if isinstance(data, NormalData):
         return "slant (degrees)"
-    return "depth (m)" if data.in_metres else "depth (unit of the model)"
+    return "depth (m)" if data.in_meters else "depth (unit of the model)"
 
 
-def _scale(data: Data, calibration: Calibration) -> dict[str, float] | None:
+def _scale(data: CalibrationData, calibration: Calibration) -> dict[str, float] | None:
     """True depth over prior depth: median over images, and the spread of its log."""
     if isinstance(data, NormalData):
         return None
@@ -150,12 +162,12 @@ def _scale(data: Data, calibration: Calibration) -> dict[str, float] | None:
 
 
 def _intervals(
-    residuals: Residuals, fit: Fit, count: int, rng: np.random.Generator
+    residuals: Residuals, fit: StdFit, count: int, rng: np.random.Generator
 ) -> dict[str, list[float]]:
     """95 % intervals of what the fit determines; angles in degrees."""
     if count == 0 or residuals.images < 2:
         return {}
-    low, high = np.percentile(bootstrap(residuals, fit, count, rng), _INTERVAL, axis=0)
+    low, high = np.percentile(bootstrap_fit(residuals, fit, count, rng), _INTERVAL, axis=0)
     intervals = {
         name: [float(low[j]), float(high[j])]
         for j, name in enumerate(fit.names)
@@ -180,7 +192,7 @@ def _describe(candidate: Candidate) -> dict[str, Any]:
     }
 
 
-def _warnings(images: int, intervals: dict[str, list[float]], fit: Fit) -> Iterator[str]:
+def _warnings(images: int, intervals: dict[str, list[float]], fit: StdFit) -> Iterator[str]:
     if images < FEW_IMAGES:
         yield f"fitted to only {images} images: too few to know how images differ"
     if images < 2:
