@@ -49,7 +49,7 @@ def main() -> None:
     for name in arguments.scenes:
         scene = read_scene(shared_folder() / "data" / name)
         for bucket, chosen in groupby(scene.select_sets(arguments.buckets), attrgetter("bucket")):
-            sets = [one.images for one in chosen]
+            sets = [image_set.images for image_set in chosen]
             for method in METHODS:
                 print(row(scene, bucket, sets, method, arguments.cache), flush=True)
 

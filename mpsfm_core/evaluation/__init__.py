@@ -1,4 +1,4 @@
-"""Compares reconstructions with ground truth."""
+"""Comparison of reconstructions with ground truth."""
 
 from mpsfm_core.data import Pose
 from mpsfm_core.evaluation.alignment import TrajectoryErrors, trajectory_errors

@@ -1,4 +1,4 @@
-"""Trajectory errors after the best similarity transform."""
+"""Trajectory errors after alignment by a similarity transform."""
 
 from __future__ import annotations
 
@@ -13,56 +13,63 @@ from mpsfm_core.geometry import camera_center, rotation_angle_deg
 
 @dataclass(frozen=True, eq=False)
 class SimilarityTransform:
-    """``x_b = scale * rotation @ x_a + translation``; (3, 3), (3,), > 0."""
+    """Similarity transform ``x_b = scale * rotation @ x_a + translation``."""
 
     scale: float
+    """Scale > 0."""
     rotation: Float64
+    """(3, 3) rotation."""
     translation: Float64
+    """(3,) translation."""
 
     def apply(self, points: Float64) -> Float64:
-        """Points (n, 3) of frame a in frame b."""
+        """Transform points (n, 3) from frame a to frame b."""
         moved: Float64 = self.scale * points @ self.rotation.T + self.translation
         return moved
 
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryErrors:
-    """Errors of camera centres and orientations after alignment, in the truth's unit and degrees.
-
-    ``centers``: (n,), after ``truth_from_estimate``, which has the least squared error over the
-    centres. ``rotations_deg``: (n,), after the best common rotation of the orientations alone, so
-    that centres on a line do no harm. ``steps``: (n - 1,), error of the motion from each image to
-    the next, in the order of the truth, after the scale of the alignment; ``step_turns_deg``: of
-    its rotation. These two are the relative pose error.
-    """
+    """Errors of camera centers and orientations after alignment, in the unit of the truth."""
 
     truth_from_estimate: SimilarityTransform
+    """Least-squares alignment of the camera centers."""
     centers: Float64
+    """(n,) distances of aligned and true camera centers."""
     rotations_deg: Float64
+    """(n,) errors of the orientations after their best common rotation.
+
+    The rotation comes from the orientations alone, so collinear centers cause no error."""
     steps: Float64
+    """(n - 1,) translation errors of the motion to the next image, in the order of the truth."""
     step_turns_deg: Float64
+    """(n - 1,) rotation errors of the motion to the next image."""
 
     @property
     def ate_rmse(self) -> float:
-        """Absolute trajectory error: root of the mean squared centre error."""
+        """Absolute trajectory error: RMSE of the camera centers."""
         return _rms(self.centers)
 
     @property
     def rpe_rmse(self) -> float:
-        """Relative pose error: root of the mean squared error of the steps."""
+        """Relative pose error: RMSE of the translations between successive images."""
         return _rms(self.steps)
 
     @property
     def rpe_rmse_deg(self) -> float:
-        """The same of their rotations."""
+        """Relative pose error: RMSE of the rotations between successive images."""
         return _rms(self.step_turns_deg)
 
 
 def umeyama(a: Float64, b: Float64) -> SimilarityTransform:
-    """The similarity from points a (n, 3) to points b (n, 3) with the least squared error.
+    """Fit the least-squares similarity transform ``b_from_a`` (Umeyama, PAMI 1991).
 
-    Umeyama, PAMI 1991. Raises ``ValueError`` when all points of either set coincide, where the
-    scale has no meaning.
+    Args:
+        a: (n, 3) points in frame a.
+        b: (n, 3) points in frame b.
+
+    Raises:
+        ValueError: All points of a set coincide, so the scale is undefined.
     """
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
     spread_a, spread_b = a - mean_a, b - mean_b
@@ -78,9 +85,10 @@ def umeyama(a: Float64, b: Float64) -> SimilarityTransform:
 def trajectory_errors(
     estimated: Mapping[str, Pose], truth: Mapping[str, Pose]
 ) -> TrajectoryErrors | None:
-    """Errors of the images that both have, in the order of ``truth``.
+    """Compute the trajectory errors of the common images, in the order of `truth`.
 
-    None with fewer than three common images or coinciding centres: nothing can be aligned.
+    Returns:
+        The errors, or None with fewer than three common images or coinciding centers.
     """
     names = [name for name in truth if name in estimated]
     if len(names) < 3:
@@ -92,23 +100,23 @@ def trajectory_errors(
     except ValueError:
         return None
     offsets = np.linalg.norm(similarity.apply(centers) - true_centers, axis=1)
-    # R_est = R_true @ G for a common G; its chordal mean is the projection of the sum.
+    # R_est = R_true @ G for a common G; the chordal mean of G is the projection of the sum.
     turns = np.stack([truth[name][0].T @ estimated[name][0] for name in names])
     u, _, vt = np.linalg.svd(turns.sum(axis=0))
     common = (u * [1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
-    have = _steps([estimated[name] for name in names], similarity.scale)
-    want = _steps([truth[name] for name in names], 1.0)
+    steps = _steps([estimated[name] for name in names], similarity.scale)
+    true_steps = _steps([truth[name] for name in names], 1.0)
     return TrajectoryErrors(
         similarity,
         offsets,
         rotation_angle_deg(turns @ common.T),
-        np.linalg.norm(have[1] - want[1], axis=1),
-        rotation_angle_deg(have[0] @ want[0].transpose(0, 2, 1)),
+        np.linalg.norm(steps[1] - true_steps[1], axis=1),
+        rotation_angle_deg(steps[0] @ true_steps[0].transpose(0, 2, 1)),
     )
 
 
 def _steps(poses: Sequence[Pose], scale: float) -> Pose:
-    """``b_from_a`` of each image and the next: rotations (n - 1, 3, 3), translations (n - 1, 3)."""
+    """Compute ``b_from_a`` of successive images: rotations (n - 1, 3, 3), translations."""
     rotations = np.stack([rotation for rotation, _ in poses])
     translations = scale * np.stack([translation for _, translation in poses])
     relative = rotations[1:] @ rotations[:-1].transpose(0, 2, 1)

@@ -1,8 +1,8 @@
-"""Runs configurations and peers on the sets of scene folders, on the same verified matches.
+"""Benchmark of configurations and other mappers on the same verified matches.
 
-For each scene and configuration, priors, features and matches are computed once for all images of
-the sets, matches only for pairs inside a set; the cache keeps them. Each finished run is a file
-(:mod:`mpsfm_core.evaluation.records`), and a run that has its file already is not repeated.
+Priors, features and matches are computed once per scene and configuration and cached; only pairs
+inside a set are matched. Each finished run writes a file (:mod:`mpsfm_core.evaluation.records`),
+and a run with a matching file is not repeated.
 """
 
 from __future__ import annotations
@@ -42,110 +42,122 @@ from mpsfm_core.providers.registry import Registry, core_version
 from mpsfm_core.support.files import write_file
 
 RecordCallback = Callable[[BenchmarkRecord, bool], None]
-"""Is told of each record, and whether it was there already."""
+"""Called with each record, and True if the record was read from an earlier benchmark."""
 
 
 @dataclass(frozen=True)
 class BenchmarkPlan:
-    """What to run.
-
-    ``configs``: names or files. ``buckets``: None for all. ``priors``: of
-    :data:`~mpsfm_core.evaluation.prior_quality.QUALITIES` or ``degraded-N``, our mapper runs with
-    each. ``peers``: of :data:`~mpsfm_core.evaluation.methods.PEER_METHODS`. ``overrides``: settings
-    ``KEY=VALUE`` of all configurations. ``workers``: sets that are mapped at the same time.
-    ``results``: label -> folder of models that another program made
-    (:mod:`~mpsfm_core.evaluation.external_results`). ``distances``: metres, at which clouds are
-    judged where a configuration has the dense stage and a scene true depth.
-    """
+    """Scenes, configurations and methods of a benchmark."""
 
     scenes: tuple[Path, ...]
+    """Scene folders."""
     configs: tuple[str, ...] = ("benchmark",)
+    """Names or files of configurations."""
     buckets: tuple[str, ...] | None = None
+    """Buckets of test sets; None for all."""
     priors: tuple[str, ...] = ("config",)
+    """Prior qualities of :mod:`~mpsfm_core.evaluation.prior_quality`; mpsfm runs with each."""
     peers: tuple[str, ...] = PEER_METHODS
+    """Names of :data:`~mpsfm_core.evaluation.methods.PEER_METHODS`."""
     overrides: tuple[str, ...] = ()
+    """Settings ``KEY=VALUE`` of all configurations."""
     workers: int = 1
+    """Number of sets that are mapped in parallel."""
     results: Mapping[str, Path] = field(default_factory=dict)
+    """Label -> folder of models of another program
+    (:mod:`~mpsfm_core.evaluation.external_results`)."""
     distances: tuple[float, ...] = TOLERANCES
+    """Distance thresholds of the clouds in meters, for dense configurations and true depth."""
 
 
 def run_benchmark(
     plan: BenchmarkPlan,
     output: Path,
     registry: Registry | None = None,
-    done: RecordCallback | None = None,
+    on_record: RecordCallback | None = None,
 ) -> list[BenchmarkRecord]:
-    """Run a plan and return the records of all its runs, old and new.
+    """Run a plan and return the records of all runs, cached and new.
 
-    What a method raises is in its record. Raises :class:`InputError` (or another
-    :class:`~mpsfm_core.data.errors.MpsfmError` of the extraction) for what no run could do without.
+    The error of a method is part of its record.
+
+    Args:
+        plan: What to run.
+        output: Folder of the records.
+        registry: Registry of plugins.
+        on_record: Called with each record.
+
+    Raises:
+        InputError: The plan or a scene is wrong.
+        MpsfmError: The extraction fails.
     """
     registry = registry or Registry.discover()
     _check_names("prior", [p for p in plan.priors if parse_error_seed(p) is None], QUALITIES)
     _check_names("peer", plan.peers, PEER_METHODS)
     scenes = [read_scene(path) for path in plan.scenes]
     if len({scene.name for scene in scenes}) < len(scenes):
-        raise InputError("two scene folders have the same name, as their results would")
-    only = SetPairFilter()
-    registry.register(only, name="pairs of sets")
+        raise InputError("two scene folders have the same name; rename one of them")
+    pair_filter = SetPairFilter()
+    registry.register(pair_filter, name="pairs of sets")
     records = []
     for scene in scenes:
-        sets = scene.chosen(plan.buckets)
-        only.allow(sets)
+        sets = scene.select_sets(plan.buckets)
+        pair_filter.allow(sets)
         for config in plan.configs:
             runs = _SceneRuns(scene, sets, config, plan, output, registry)
-            own = []
-            for record, known in runs():
-                own.append(record)
-                if done is not None:
-                    done(record, known)
-            records += sorted(own, key=_order(sets, plan))
+            scene_records = []
+            for record, cached in runs():
+                scene_records.append(record)
+                if on_record is not None:
+                    on_record(record, cached)
+            records += sorted(scene_records, key=_sort_key(sets, plan))
             for label, folder in plan.results.items():
                 for record in read_external_records(label, folder, scene, sets, Path(config).stem):
                     write_record(output, record)
                     records.append(record)
-                    if done is not None:
-                        done(record, True)
+                    if on_record is not None:
+                        on_record(record, True)
     return records
 
 
 class SetPairFilter:
-    """Plugin that lets only pairs be matched whose images are in one set together."""
+    """Plugin that restricts matching to pairs of images in a common set."""
 
     def __init__(self) -> None:
         self._allowed: set[tuple[str, str]] = set()
 
     def allow(self, sets: Sequence[EvaluationSet]) -> None:
-        """Allow the pairs of these sets from now on."""
+        """Replace the allowed pairs by those of the given sets."""
         self._allowed = {pair for item in sets for pair in combinations(sorted(item.images), 2)}
 
     @hookimpl
     def mpsfm_filter_pairs(self, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-        """Those inside a set."""
+        """Return the pairs inside a set."""
         return [(a, b) for a, b in pairs if (min(a, b), max(a, b)) in self._allowed]
 
 
 class PreparedSets(NamedTuple):
-    """``problem``: verified matches, on keypoints as they were found, and priors of all ``images``
-    of some sets. ``config``: as it was resolved for them."""
+    """Extraction results of all images of some sets."""
 
     problem: MappingProblem
+    """Priors and verified matches, before keypoint adjustment."""
     images: ImageSet
+    """Images of all sets."""
     config: Config
+    """Configuration with resolved providers."""
     registry: Registry
+    """Registry of plugins."""
 
-    def of(self, item: EvaluationSet) -> MappingProblem:
-        """The problem of one set; its keypoints are adjusted by its own pairs alone."""
-        names, images = set(item.images), self.problem.images
+    def build_problem(self, image_set: EvaluationSet) -> MappingProblem:
+        """Build the problem of one set; only its own pairs adjust its keypoints."""
+        names, images = set(image_set.images), self.problem.images
         inside = [
             pair
             for pair in self.problem.pairs
             if {images[pair.image_a].name, images[pair.image_b].name} <= names
         ]
-        alone = replace(self.problem, pairs=tuple(inside))
-        return adjust_problem(self.images, self.config, self.registry, alone).subset(
-            list(item.images)
-        )
+        restricted = replace(self.problem, pairs=tuple(inside))
+        adjusted = adjust_problem(self.images, self.config, self.registry, restricted)
+        return adjusted.subset(list(image_set.images))
 
 
 def prepare_sets(
@@ -157,28 +169,34 @@ def prepare_sets(
     work: Path,
     registry: Registry,
 ) -> PreparedSets:
-    """Photos of the sets, verified and with priors, and the configuration.
+    """Extract priors and verified matches of all images of some sets.
 
-    ``prior``: a quality of :mod:`~mpsfm_core.evaluation.prior_quality`. ``work``: a folder for the
-    depth of that quality.
+    Args:
+        scene: Scene folder.
+        sets: Sets of images.
+        prior: Quality of :mod:`~mpsfm_core.evaluation.prior_quality`.
+        config: Name or file of the configuration.
+        overrides: Settings ``KEY=VALUE``.
+        work: Folder for degraded depth maps.
+        registry: Registry of plugins.
     """
     names = sorted({name for item in sets for name in item.images})
     settings = prior_overrides(prior, scene, names, work / f"{prior}-depth")
     stages = Stages(registry)
     loaded = load_config(config, (*settings, *overrides), registry=registry)
     loaded = resolve_providers(loaded, registry, stages).config
-    listed = work / "images.txt"
-    write_file(listed, "\n".join(names) + "\n")
-    inputs = loaded.inputs.model_copy(update={"strict": True})  # a set is compared as a whole
-    images = load_images(scene.images, scene.intrinsics, listed, inputs)
-    as_found = loaded.adjustment.model_copy(update={"enabled": False})
-    alone = loaded.model_copy(update={"adjustment": as_found})
-    extraction = extract(images, alone, registry, stages)
+    image_list = work / "images.txt"
+    write_file(image_list, "\n".join(names) + "\n")
+    inputs = loaded.inputs.model_copy(update={"strict": True})  # sets must be complete
+    images = load_images(scene.images, scene.intrinsics, image_list, inputs)
+    no_adjustment = loaded.adjustment.model_copy(update={"enabled": False})
+    unadjusted = loaded.model_copy(update={"adjustment": no_adjustment})
+    extraction = extract(images, unadjusted, registry, stages)
     return PreparedSets(extraction.problem, images, loaded, registry)
 
 
 class _SceneRuns:
-    """All runs of one scene with one configuration."""
+    """Runs of one scene with one configuration."""
 
     def __init__(
         self,
@@ -198,7 +216,7 @@ class _SceneRuns:
         self._registry = registry
 
     def __call__(self) -> Iterator[tuple[BenchmarkRecord, bool]]:
-        """Records and whether they were there already."""
+        """Yield records, and True for records of an earlier benchmark."""
         for number, prior in enumerate(self._plan.priors):
             prepared = prepare_sets(
                 self._scene,
@@ -214,95 +232,102 @@ class _SceneRuns:
                 for method in (OURS, *self._plan.peers)
                 if method in PRIOR_METHODS or number == 0
             }
-            options, dense = prepared.config.mapper_options(), self._dense(prepared)
-            places: dict[MethodRun, tuple[EvaluationSet, str]] = {}
-            for item in self._sets:
-                subset = prepared.of(item)
+            options = prepared.config.mapper_options()
+            dense = self._dense_evaluation(prepared)
+            pending: dict[MethodRun, tuple[EvaluationSet, str]] = {}
+            for image_set in self._sets:
+                problem = prepared.build_problem(image_set)
                 for label, method in methods.items():
-                    task = MethodRun(
-                        label, method, subset, options, dense if method == OURS else None
+                    run = MethodRun(
+                        label, method, problem, options, dense if method == OURS else None
                     )
-                    key = _key(task)
-                    known = self._known(item, label, key)
-                    if known is not None:
-                        yield known, True
+                    key = _content_key(run)
+                    record = self._read_cached(image_set, label, key)
+                    if record is not None:
+                        yield record, True
                     else:
-                        places[task] = item, key
-            for task, outcome in run_methods(list(places), self._plan.workers):
-                record = self._record(*places[task], task, outcome)
+                        pending[run] = image_set, key
+            for run, result in run_methods(list(pending), self._plan.workers):
+                record = self._build_record(*pending[run], run, result)
                 write_record(self._output, record)
                 yield record, False
 
-    def _dense(self, prepared: PreparedSets) -> DenseEvaluation | None:
+    def _dense_evaluation(self, prepared: PreparedSets) -> DenseEvaluation | None:
+        """Return the dense evaluation if the configuration is dense and has true depth."""
         config = prepared.config
         if not config.dense.enabled or self._scene.depth is None:
             return None
         settings = config.dense, config.results, self._scene, self._plan.distances
         return DenseEvaluation(prepared.images, *settings)
 
-    def _known(self, item: EvaluationSet, label: str, key: str) -> BenchmarkRecord | None:
-        path = self._output / record_file(self._scene.name, self._config_name, item.name, label)
+    def _read_cached(
+        self, image_set: EvaluationSet, label: str, key: str
+    ) -> BenchmarkRecord | None:
+        """Read a successful record with the same key; None without one."""
+        file = record_file(self._scene.name, self._config_name, image_set.name, label)
+        path = self._output / file
         try:
             record = read_record(path) if path.is_file() else None
         except InputError:
             return None
         if record is None or record.key != key or record.error:
-            return None  # what failed may have lacked memory, and is tried again
+            return None  # failures may be due to missing memory, so they are repeated
         return record
 
-    def _record(
-        self, item: EvaluationSet, key: str, task: MethodRun, outcome: MethodResult
+    def _build_record(
+        self, image_set: EvaluationSet, key: str, run: MethodRun, result: MethodResult
     ) -> BenchmarkRecord:
         return BenchmarkRecord(
             self._scene.name,
             self._config_name,
-            item.bucket,
-            item.name,
-            task.label,
+            image_set.bucket,
+            image_set.name,
+            run.label,
             key,
-            outcome.models[0] if outcome.models else {},
-            {name: self._scene.truth[name] for name in item.images},
-            len(task.problem.pairs),
-            outcome.seconds,
-            outcome.cpu_seconds,
-            outcome.error,
-            outcome.models[1:],
-            outcome.dense,
+            result.models[0] if result.models else {},
+            {name: self._scene.truth[name] for name in image_set.images},
+            len(run.problem.pairs),
+            result.seconds,
+            result.cpu_seconds,
+            result.error,
+            result.models[1:],
+            result.dense,
         )
 
 
-def _order(
+def _sort_key(
     sets: Sequence[EvaluationSet], plan: BenchmarkPlan
 ) -> Callable[[BenchmarkRecord], tuple[int, int]]:
-    """Sorts records by set, then ours before the peers: runs end in no particular order."""
-    places = {item.name: number for number, item in enumerate(sets)}
+    """Return a sort key by set, then method; parallel runs finish in any order."""
+    positions = {image_set.name: number for number, image_set in enumerate(sets)}
     labels = [_label(m, prior) for m in (OURS, *plan.peers) for prior in plan.priors]
-    return lambda record: (places[record.set_name], labels.index(record.label))
+    return lambda record: (positions[record.set_name], labels.index(record.label))
 
 
 def _label(method: str, prior: str) -> str:
     return f"{method}-{prior}" if method in PRIOR_METHODS else method
 
 
-def _key(task: MethodRun) -> str:
-    """Names all that the outcome of a task depends on."""
-    parts: list[object] = [task.method, core_version(), pycolmap.__version__]
-    if task.method == OURS:
-        parts.append(task.options.model_dump(mode="json"))
-    if task.dense is not None:
-        settings = (task.dense.dense, task.dense.results)
-        parts += [[each.model_dump(mode="json") for each in settings], task.dense.distances]
-    if task.method in PRIOR_METHODS:
-        parts += [digest(image) for image in task.problem.images]
+def _content_key(run: MethodRun) -> str:
+    """Hash everything that the result of a run depends on."""
+    parts: list[object] = [run.method, core_version(), pycolmap.__version__]
+    if run.method == OURS:
+        parts.append(run.options.model_dump(mode="json"))
+    if run.dense is not None:
+        options = (run.dense.dense, run.dense.results)
+        parts += [[each.model_dump(mode="json") for each in options], run.dense.distances]
+    if run.method in PRIOR_METHODS:
+        parts += [digest(image) for image in run.problem.images]
     else:
         parts += [
             [image.name, image.camera.params.tolist(), digest(image.keypoints)]
-            for image in task.problem.images
+            for image in run.problem.images
         ]
-    return content_key(parts, [digest(pair) for pair in task.problem.pairs])
+    return content_key(parts, [digest(pair) for pair in run.problem.pairs])
 
 
-def _check_names(what: str, names: Iterable[str], known: Collection[str]) -> None:
+def _check_names(kind: str, names: Iterable[str], known: Collection[str]) -> None:
+    """Raise :class:`InputError` for an unknown name."""
     for name in names:
         if name not in known:
-            raise InputError(f"no {what} {name!r}{did_you_mean(name, known)}")
+            raise InputError(f"no {kind} {name!r}{did_you_mean(name, known)}")

@@ -1,4 +1,4 @@
-"""Builds the test sets of a scene folder from its true depth or its COLMAP model."""
+"""Building of test sets from the true depth or the COLMAP model of a scene folder."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from mpsfm_core.inputs.models import read_model
 from mpsfm_core.inputs.options import InputOptions
 
 SOURCES = ("auto", "depth", "model")
+"""Sources of overlap."""
 
 
 def build_test_sets(
@@ -23,17 +24,26 @@ def build_test_sets(
     *,
     replace: bool = False,
 ) -> dict[str, int]:
-    """Write ``testsets.yaml`` of a scene folder; returns the number of sets by bucket.
+    """Write ``testsets.yaml`` of a scene folder.
 
-    ``source``: of overlap, ``depth`` (``gt_depth/``), ``model`` (points of ``gt/``) or ``auto``,
-    depth where there is any. Raises :class:`InputError` when the file is there and shall not be
-    replaced, or when the source is missing.
+    Args:
+        folder: Scene folder.
+        source: Source of overlap: ``depth`` (``gt_depth/``), ``model`` (points of ``gt/``) or
+            ``auto`` (depth if available).
+        options: Options of the sampling.
+        replace: Replace an existing file.
+
+    Returns:
+        Number of sets by bucket.
+
+    Raises:
+        InputError: The file exists and `replace` is False, or the source is missing.
     """
     if source not in SOURCES:
         raise InputError(f"no source {source!r} of overlap; there are {', '.join(SOURCES)}")
     file = folder / TESTSETS
     if file.exists() and not replace:
-        raise InputError(f"{file} exists already; --replace builds it anew")
+        raise InputError(f"{file} exists already; --replace builds the file again")
     scene = read_scene(folder, with_sets=False)
     options = options or SamplingOptions()
     if source == "auto":
@@ -50,7 +60,7 @@ def build_test_sets(
 
 
 def _from_depth(scene: SceneFolder) -> Overlap:
-    """Views without a depth map are left out."""
+    """Compute overlap from true depth; images without a depth map are left out."""
     if scene.depth is None:
         raise InputError(f"{scene.path}: there is no gt_depth/ to measure overlap with")
     folder = scene.depth
@@ -62,6 +72,7 @@ def _from_depth(scene: SceneFolder) -> Overlap:
 
 
 def _from_model(scene: SceneFolder) -> Overlap:
+    """Compute overlap from the points of the true model."""
     model = read_model(scene.path / "gt")
     if not model.num_points3D():
         raise InputError(f"{scene.path / 'gt'}: the model has no points to measure overlap with")

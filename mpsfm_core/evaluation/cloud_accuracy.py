@@ -1,4 +1,4 @@
-"""How far a point cloud is from a scan: accuracy and completeness, as ETH3D defines them."""
+"""Accuracy and completeness of a point cloud compared with a scan, as in ETH3D."""
 
 from __future__ import annotations
 
@@ -12,26 +12,34 @@ from mpsfm_core.data import Float64, Int64
 from mpsfm_core.data.errors import InputError
 
 TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
-"""In the scan's unit (ETH3D, metres)."""
-
-_SAMPLE = 1000
-"""Points whose distances tell a median that is beyond all tolerances."""
+"""Distance thresholds in the unit of the scan [ETH3D, meters]."""
+_MEDIAN_SAMPLES = 1000
+"""Samples that estimate a median beyond all tolerances."""
 
 
 def cloud_accuracy(
     points: Float64, scan: Float64, tolerances: Sequence[float] = TOLERANCES
 ) -> dict[str, Any]:
-    """Compare points (n, 3) with a scan (m, 3) in the same frame; plain data, ready for JSON.
+    """Compare a point cloud with a scan in the same frame.
 
-    ``accuracy``: tolerance -> share of the points that have the scan within it; ``completeness``:
-    of the scan that has a point within it; ``f1``: their harmonic mean. Both clouds are thin_points to
-    one point a cube of half the smallest tolerance, so that no place counts twice. Points where
-    the scanner saw nothing count as wrong: crop the cloud first if the scan is partial.
+    Both clouds are reduced to one point per cube of half the smallest tolerance, so that dense
+    regions do not dominate. Points outside the scanned region count as wrong; crop the cloud first
+    if the scan is partial.
 
-    Raises :class:`InputError` when a cloud is empty.
+    Args:
+        points: (n, 3) points.
+        scan: (m, 3) points of the scan.
+        tolerances: Distance thresholds.
+
+    Returns:
+        Plain data for JSON. ``accuracy`` maps a tolerance to the ratio of points near the scan,
+        ``completeness`` to the ratio of the scan near points, ``f1`` to their harmonic mean.
+
+    Raises:
+        InputError: A cloud is empty.
     """
     if not len(points) or not len(scan):
-        raise InputError("a point cloud is empty, there is nothing to compare")
+        raise InputError("cannot compare point clouds: one of them is empty")
     points, scan = (thin_points(cloud, min(tolerances) / 2) for cloud in (points, scan))
     to_scan, median_to_scan = _distances(points, scan, max(tolerances))
     to_points, median_to_points = _distances(scan, points, max(tolerances))
@@ -49,23 +57,23 @@ def cloud_accuracy(
 
 
 def _distances(points: Float64, others: Float64, limit: float) -> tuple[Float64, float]:
-    """To the nearest of others (n,), infinite beyond the limit, and the median.
+    """Compute nearest-neighbor distances (n,), infinite beyond the limit, and their median.
 
-    If the median is beyond the limit it is that of a sample: in the middle of a room all of it is
-    about equally far, so that finding the very nearest takes a walk through all points.
+    A median beyond the limit is estimated from a sample, because unbounded queries are slow for
+    points far from all others.
     """
     tree = cKDTree(others)
-    found: Float64 = tree.query(points, distance_upper_bound=np.nextafter(limit, np.inf))[0]
-    sample = found
-    if np.isinf(np.median(found)):
-        count = min(len(points), _SAMPLE)
-        chosen = np.random.default_rng(0).choice(len(points), count, replace=False)
-        sample = tree.query(points[chosen])[0]
-    return found, float(np.median(sample))
+    distances: Float64 = tree.query(points, distance_upper_bound=np.nextafter(limit, np.inf))[0]
+    sample = distances
+    if np.isinf(np.median(distances)):
+        count = min(len(points), _MEDIAN_SAMPLES)
+        sampled = np.random.default_rng(0).choice(len(points), count, replace=False)
+        sample = tree.query(points[sampled])[0]
+    return distances, float(np.median(sample))
 
 
 def thin_points(points: Float64, size: float) -> Float64:
-    """The first point of each cube of a grid of this size."""
+    """Keep the first point of each cube of a grid."""
     cells: Int64 = np.floor(points / size).astype(np.int64)
     order = np.lexsort(cells.T)
     ordered = cells[order]

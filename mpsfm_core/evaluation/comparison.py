@@ -1,11 +1,9 @@
-"""Is one benchmark better than another? Differences of AUC and whether they are chance.
+"""Statistical comparison of two benchmarks by differences of pose AUC.
 
-Both sides are compared on the sets they share. Intervals are those of a paired bootstrap, which
-draws sets with replacement. P-values are those of a randomisation test: if the sides were equal,
-each set's results could as well be swapped. (With few sets it is exact, while a bootstrap of eight
-rejects 13 % of equal sides at 5 %, as we measured.) Where a bucket has too few sets, image pairs
-are drawn and swapped instead, those of the two orders together. Pairs of a set share images, so
-that this promises more than new sets would hold; the table says what was drawn.
+Both sides are compared on their common sets. Confidence intervals come from a paired bootstrap over
+sets. P-values come from a randomization test that swaps the sides of each set, which is exact even
+for few sets. If a bucket has too few sets, image pairs are resampled instead (both orders together).
+Pairs of a set share images, so these intervals are too narrow; the table names the resampled unit.
 """
 
 from __future__ import annotations
@@ -28,35 +26,48 @@ from mpsfm_core.evaluation.pose_auc import (
 from mpsfm_core.evaluation.records import BenchmarkRecord, read_records
 
 MIN_SETS = 6
-"""Fewer sets have too few different resamples to tell a 95 % interval (ours)."""
+"""Minimum number of sets for a bootstrap over sets; fewer have too few distinct resamples
+[ours]."""
 RESAMPLES = 2000
+"""Resamples of the bootstrap and of the randomization test."""
 _CONFIDENCE = 0.95
 _ROUNDING = 1e-9
+"""Tolerance for rounding in comparisons of AUC differences."""
 
 
 @dataclass(frozen=True)
 class AucDifference:
-    """Second side minus first, in percent points of AUC.
-
-    ``auc``: threshold -> (first, second). ``interval``: threshold -> 95 % interval of the
-    difference. ``p_value``: threshold -> two-sided, share of random swaps that make a difference
-    as large.
-    ``unit``: what was drawn, ``sets`` or ``pairs``.
-    """
+    """Difference of pose AUC, second side minus first, in percentage points."""
 
     scene: str
+    """Name of the scene."""
     config: str
+    """Name of the configuration."""
     bucket: str
+    """Bucket of test sets."""
     method: str
+    """Label of the method."""
     sets: int
+    """Number of common sets."""
     unit: str
+    """Resampled unit: ``sets`` or ``pairs``."""
     auc: Mapping[int, tuple[float, float]]
+    """Threshold in degrees -> AUC in percent of the first and the second side."""
     interval: Mapping[int, tuple[float, float]]
+    """Threshold in degrees -> 95 % confidence interval of the difference."""
     p_value: Mapping[int, float]
+    """Threshold in degrees -> two-sided p-value."""
 
 
 def read_benchmark(place: str) -> dict[str, list[BenchmarkRecord]]:
-    """Records of a benchmark by method; ``DIR``, or ``DIR:METHOD`` for one method, called ``*``."""
+    """Read the records of a benchmark by method.
+
+    Args:
+        place: ``DIR``, or ``DIR:METHOD`` for one method, whose key in the result is ``*``.
+
+    Raises:
+        InputError: There are no records, or the method does not exist.
+    """
     folder, colon, method = place.rpartition(":")
     if not colon or Path(place).is_dir():
         folder, method = place, ""
@@ -78,20 +89,28 @@ def compare_benchmarks(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> list[AucDifference]:
-    """Differences for each scene, configuration, bucket and method that both sides have.
+    """Compute the differences of each common scene, configuration, bucket and method.
 
-    Raises :class:`InputError` when they share nothing.
+    Args:
+        first: Records of the first side by method.
+        second: Records of the second side by method.
+        convention: Convention of the pose AUC.
+        resamples: Number of resamples.
+        seed: Seed of the resampling.
+
+    Raises:
+        InputError: The benchmarks have no set and method in common.
     """
     rng = np.random.default_rng(seed)
     differences = []
     for method in first:
         if method not in second:
             continue
-        matched = _matched(first[method], second[method])
+        matched = _match_records(first[method], second[method])
         for (scene, config, bucket), pairs in matched.items():
-            errors = [tuple(_unordered(r, convention) for r in pair) for pair in pairs]
-            place = (scene, config, bucket, _name(method, pairs[0]))
-            differences.append(_difference(place, errors, convention, resamples, rng))
+            errors = [tuple(_unordered_errors(r, convention) for r in pair) for pair in pairs]
+            group = (scene, config, bucket, _method_name(method, pairs[0]))
+            differences.append(_compute_difference(group, errors, convention, resamples, rng))
     if not differences:
         raise InputError("the two benchmarks have no set and method in common")
     return differences
@@ -100,7 +119,7 @@ def compare_benchmarks(
 def format_differences(
     differences: Sequence[AucDifference], convention: PoseConvention = CONVENTIONS["paper"]
 ) -> str:
-    """A Markdown table, the convention in words above it."""
+    """Format a Markdown table of differences, with the convention above."""
     head = ["scene", "bucket", "method", "sets", "drawn"]
     head += [f"AUC@{t}°" for t in THRESHOLDS_DEG]
     lines = [head, ["---"] * len(head)]
@@ -118,31 +137,32 @@ def format_differences(
     )
 
 
-_Place = tuple[str, str, str, str]
+_Group = tuple[str, str, str, str]
+"""Scene, configuration, bucket and method."""
 _SetErrors = tuple[Float64, ...]
 """Errors (pairs, orders) of both sides on one set."""
 
 
-def _matched(
+def _match_records(
     first: Iterable[BenchmarkRecord], second: Iterable[BenchmarkRecord]
 ) -> dict[tuple[str, str, str], list[tuple[BenchmarkRecord, BenchmarkRecord]]]:
-    """Records of the same set of images, by scene, configuration and bucket."""
+    """Match records of equal image sets, by scene, configuration and bucket."""
     others = {record.name[:3]: record for record in second}
     matched: dict[tuple[str, str, str], list[tuple[BenchmarkRecord, BenchmarkRecord]]] = {}
     for record in first:
         other = others.get(record.name[:3])
         if other is not None and set(other.truth) == set(record.truth):
-            place = record.scene, record.config, record.bucket
-            matched.setdefault(place, []).append((record, other))
+            group = record.scene, record.config, record.bucket
+            matched.setdefault(group, []).append((record, other))
     return matched
 
 
-def _name(method: str, pair: tuple[BenchmarkRecord, BenchmarkRecord]) -> str:
+def _method_name(method: str, pair: tuple[BenchmarkRecord, BenchmarkRecord]) -> str:
     return f"{pair[0].label} → {pair[1].label}" if method == "*" else method
 
 
-def _unordered(record: BenchmarkRecord, convention: PoseConvention) -> Float64:
-    """Errors (pairs, orders): those of both orders of a pair in one row."""
+def _unordered_errors(record: BenchmarkRecord, convention: PoseConvention) -> Float64:
+    """Return errors (pairs, orders), with both orders of a pair in one row."""
     errors = record.errors_deg(convention)
     count = len(record.truth)
     if not convention.ordered:
@@ -152,23 +172,24 @@ def _unordered(record: BenchmarkRecord, convention: PoseConvention) -> Float64:
     return np.asarray(errors[np.array(rows)])
 
 
-def _difference(
-    place: _Place,
+def _compute_difference(
+    group: _Group,
     errors: Sequence[_SetErrors],
     convention: PoseConvention,
     resamples: int,
     rng: np.random.Generator,
 ) -> AucDifference:
-    units = list(errors) if len(errors) >= MIN_SETS else _pairs(errors)
-    drawn = _gains((_drawn(units, rng) for _ in range(resamples)), convention)
-    swapped = _gains((_swapped(units, rng) for _ in range(resamples)), convention)
-    low, high = np.quantile(drawn, [(1 - _CONFIDENCE) / 2, (1 + _CONFIDENCE) / 2], axis=0)
-    both = [_areas([side[k] for side in errors], convention) for k in (0, 1)]
+    """Compute difference, bootstrap interval and p-value of a group."""
+    units = list(errors) if len(errors) >= MIN_SETS else _split_pairs(errors)
+    resampled = _auc_differences((_resample(units, rng) for _ in range(resamples)), convention)
+    swapped = _auc_differences((_swap_sides(units, rng) for _ in range(resamples)), convention)
+    low, high = np.quantile(resampled, [(1 - _CONFIDENCE) / 2, (1 + _CONFIDENCE) / 2], axis=0)
+    both = [_compute_aucs([side[k] for side in errors], convention) for k in (0, 1)]
     extreme = np.abs(swapped) >= np.abs(both[1] - both[0]) - _ROUNDING
     p_value = (1 + extreme.sum(axis=0)) / (1 + resamples)
     columns = list(enumerate(THRESHOLDS_DEG))
     return AucDifference(
-        *place,
+        *group,
         sets=len(errors),
         unit="sets" if len(errors) >= MIN_SETS else "pairs",
         auc={t: (float(both[0][k]), float(both[1][k])) for k, t in columns},
@@ -177,35 +198,38 @@ def _difference(
     )
 
 
-def _pairs(errors: Sequence[_SetErrors]) -> list[_SetErrors]:
-    """The rows of all sets as units of their own."""
+def _split_pairs(errors: Sequence[_SetErrors]) -> list[_SetErrors]:
+    """Split all sets into single pairs."""
     return [
         (a[None], b[None]) for first, second in errors for a, b in zip(first, second, strict=True)
     ]
 
 
-def _drawn(units: Sequence[_SetErrors], rng: np.random.Generator) -> list[_SetErrors]:
-    """As many units, drawn with replacement."""
+def _resample(units: Sequence[_SetErrors], rng: np.random.Generator) -> list[_SetErrors]:
+    """Draw the same number of units with replacement."""
     return [units[k] for k in rng.integers(len(units), size=len(units))]
 
 
-def _swapped(units: Sequence[_SetErrors], rng: np.random.Generator) -> list[_SetErrors]:
-    """The units, the sides of each swapped with probability one half."""
+def _swap_sides(units: Sequence[_SetErrors], rng: np.random.Generator) -> list[_SetErrors]:
+    """Swap the sides of each unit with probability 1/2."""
     flips = rng.integers(2, size=len(units))
     return [unit[::-1] if flip else unit for unit, flip in zip(units, flips, strict=True)]
 
 
-def _gains(samples: Iterable[Sequence[_SetErrors]], convention: PoseConvention) -> Float64:
-    """Second side minus first, (samples, thresholds), in percent points."""
+def _auc_differences(
+    samples: Iterable[Sequence[_SetErrors]], convention: PoseConvention
+) -> Float64:
+    """Compute second side minus first, (samples, thresholds), in percentage points."""
     both = [
-        [_areas([unit[k] for unit in sample], convention) for k in (0, 1)] for sample in samples
+        [_compute_aucs([unit[k] for unit in sample], convention) for k in (0, 1)]
+        for sample in samples
     ]
     values = np.array(both)
     difference: Float64 = values[:, 1] - values[:, 0]
     return difference
 
 
-def _areas(errors: Sequence[Float64], convention: PoseConvention) -> Float64:
-    """AUC in percent at all thresholds of errors that are pooled."""
+def _compute_aucs(errors: Sequence[Float64], convention: PoseConvention) -> Float64:
+    """Compute the AUC in percent of pooled errors at all thresholds."""
     pooled = np.concatenate([values.ravel() for values in errors])
     return 100 * np.array(list(pose_auc(pooled, convention).values()))

@@ -1,4 +1,4 @@
-"""How far depth maps are from the truth."""
+"""Accuracy of depth maps compared with true depth."""
 
 from __future__ import annotations
 
@@ -11,35 +11,44 @@ from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.geometry import pixel_centers, sample_bilinear, scale_pixels
 
 _DELTA = 1.25
+"""Base of the ratio thresholds delta1, delta2 and delta3."""
 
 
 @dataclass(frozen=True)
 class DepthAccuracy:
-    """Errors over the pixels where prediction and truth are known.
-
-    ``abs_rel``: mean of ``|d - t| / t``. ``rmse_log``: root mean square of ``log d - log t``.
-    ``delta1``, ``delta2``, ``delta3``: share of pixels with ``max(d / t, t / d)`` below 1.25,
-    1.25^2, 1.25^3. ``pixels``: how many; ``coverage``: share of those with known truth.
-    ``scale``: factor that the prediction was multiplied with.
-    """
+    """Errors over the pixels where prediction d and truth t are known."""
 
     abs_rel: float
+    """Mean of ``|d - t| / t``."""
     rmse_log: float
+    """RMSE of ``log d - log t``."""
     delta1: float
+    """Ratio of pixels with ``max(d / t, t / d) < 1.25``."""
     delta2: float
+    """Ratio of pixels with ``max(d / t, t / d) < 1.25^2``."""
     delta3: float
+    """Ratio of pixels with ``max(d / t, t / d) < 1.25^3``."""
     pixels: int
+    """Number of compared pixels."""
     coverage: float
+    """Ratio of the pixels with known truth that were compared."""
     scale: float
+    """Factor of the prediction."""
 
 
 def depth_accuracy(
     depth: Float32, valid: Bool, truth: Float32, *, scale: float | None
 ) -> DepthAccuracy | None:
-    """Compare a map (h, w) with the truth (H, W), 0 where unknown, on the truth's pixels.
+    """Compare a depth map with true depth at the pixels of the truth.
 
-    ``scale``: the map is multiplied with it; None for the one that makes the median of
-    ``truth / depth`` one. Returns None when no pixel can be compared.
+    Args:
+        depth: (h, w) predicted depth.
+        valid: (h, w) mask of the prediction.
+        truth: (H, W) true depth, 0 where unknown.
+        scale: Factor of the prediction; None for the median of ``truth / depth``.
+
+    Returns:
+        The accuracy, or None if no pixel can be compared.
     """
     _, predicted, true = sample_depth_at_truth(depth, valid, truth)
     if not len(true):
@@ -63,20 +72,26 @@ def depth_accuracy(
 def sample_depth_at_truth(
     depth: Float32, valid: Bool, truth: Float32
 ) -> tuple[Float64, Float64, Float64]:
-    """A map (h, w) at the pixels of the truth (H, W), 0 where unknown.
+    """Sample a depth map at the pixels with true depth.
 
-    Of those where both are known: the pixel of the map (n, 2), its depth (n,) and the true one.
+    Args:
+        depth: (h, w) depth.
+        valid: (h, w) mask.
+        truth: (H, W) true depth, 0 where unknown.
+
+    Returns:
+        Pixels of the map (n, 2), sampled depth (n,) and true depth (n,) where both are known.
     """
     known = truth > 0
     height, width = truth.shape
     xy = scale_pixels(pixel_centers(width, height)[known], (width, height), depth.shape[::-1])
-    found, ok = sample_bilinear(depth, valid, xy)
-    ok &= found > 0
-    return xy[ok], found[ok], truth[known][ok].astype(np.float64)
+    sampled, ok = sample_bilinear(depth, valid, xy)
+    ok &= sampled > 0
+    return xy[ok], sampled[ok], truth[known][ok].astype(np.float64)
 
 
 def mean_accuracy(images: Sequence[DepthAccuracy]) -> dict[str, float]:
-    """Mean of each number over images (``pixels``: the sum), plain data ready for JSON."""
+    """Average each value over images (``pixels``: the sum), as plain data for JSON."""
     rows = [asdict(image) for image in images]
     means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     return {**means, "pixels": sum(row["pixels"] for row in rows), "images": len(rows)}

@@ -1,7 +1,7 @@
-"""Models that another program made of the sets of a scene, as records of a benchmark.
+"""Models of other programs as benchmark records.
 
-What can be read: COLMAP models (also as MASt3R-SfM, VGGSfM, VGGT and GLOMAP write them) and
-``transforms.json`` of nerfstudio and its kin.
+Supported are COLMAP models (also written by MASt3R-SfM, VGGSfM, VGGT and GLOMAP) and
+``transforms.json`` of nerfstudio and others.
 """
 
 from __future__ import annotations
@@ -21,40 +21,49 @@ TRANSFORMS = "transforms.json"
 def read_external_records(
     label: str, folder: Path, scene: SceneFolder, sets: Sequence[EvaluationSet], config: str
 ) -> list[BenchmarkRecord]:
-    """A record for each set. Where there is no model of a set, all its images are unregistered.
+    """Read a record for each set; without a model, all images of a set are unregistered.
 
-    ``folder``: holds ``SCENE/SET/``, ``SET/`` or, of a single set, ``SCENE/`` or the model itself.
-    Times are not known, and 0.
+    Times are unknown and recorded as 0.
+
+    Args:
+        label: Label of the records.
+        folder: Folder with ``SCENE/SET/`` or ``SET/``; for a single set also ``SCENE/`` or the
+            model itself.
+        scene: Scene folder.
+        sets: Sets of images.
+        config: Name of the configuration for the records.
 
     Raises:
-        InputError: there is a model of no set, or one cannot be read.
+        InputError: No set has a model, or a model cannot be read.
     """
-    found = {item.name: _place(folder, scene.name, item.name, len(sets) == 1) for item in sets}
-    if not any(found.values()):
+    folders = {
+        item.name: _find_folder(folder, scene.name, item.name, len(sets) == 1) for item in sets
+    }
+    if not any(folders.values()):
         raise InputError(
             f"{folder}: no model of a set of {scene.name}; expected as "
             f"{folder / scene.name / sets[0].name} (a COLMAP model or {TRANSFORMS})"
         )
-    return [_record(label, scene, item, found[item.name], config) for item in sets]
+    return [_build_record(label, scene, item, folders[item.name], config) for item in sets]
 
 
-def _record(
-    label: str, scene: SceneFolder, item: EvaluationSet, place: Path | None, config: str
+def _build_record(
+    label: str, scene: SceneFolder, item: EvaluationSet, folder: Path | None, config: str
 ) -> BenchmarkRecord:
     truth = {name: scene.truth[name] for name in item.images}
     models: list[dict[str, Pose]] = []
-    for path in _models(place) if place is not None else ():
+    for path in _find_models(folder) if folder is not None else ():
         poses = read_poses(path)
-        models.append({name: poses[own] for name, own in match_names(truth, poses).items()})
+        models.append({name: poses[other] for name, other in match_names(truth, poses).items()})
     models.sort(key=lambda model: -len(model))
-    error = "" if place is not None else "no model of this set"
+    error = "" if folder is not None else "no model of this set"
     return BenchmarkRecord(
         scene.name,
         config,
         item.bucket,
         item.name,
         label,
-        str(place),
+        str(folder),
         models[0] if models else {},
         truth,
         0,
@@ -65,20 +74,20 @@ def _record(
     )
 
 
-def _place(folder: Path, scene: str, name: str, alone: bool) -> Path | None:
-    """The first folder that holds models."""
-    places = [folder / scene / name, folder / name]
-    if alone:
-        places += [folder / scene, folder]
-    return next((place for place in places if any(_models(place))), None)
+def _find_folder(root: Path, scene: str, name: str, single_set: bool) -> Path | None:
+    """Find the first folder with models of a set."""
+    folders = [root / scene / name, root / name]
+    if single_set:
+        folders += [root / scene, root]
+    return next((folder for folder in folders if any(_find_models(folder))), None)
 
 
-def _models(place: Path) -> Iterator[Path]:
-    """A model, or the numbered ones of a mapper that made several."""
-    if (place / TRANSFORMS).is_file():
-        yield place / TRANSFORMS
+def _find_models(root: Path) -> Iterator[Path]:
+    """Yield a single model, or the numbered models of a mapper."""
+    if (root / TRANSFORMS).is_file():
+        yield root / TRANSFORMS
         return
-    for folder in (place, place / "sparse"):
+    for folder in (root, root / "sparse"):
         if _is_model(folder):
             yield folder
             return

@@ -1,6 +1,6 @@
-"""What is compared: our mapper and its peers, each run in a process of its own.
+"""Methods of the benchmark: mpsfm and other mappers, each run in a subprocess.
 
-A mapper that crashes takes its process with it, not the benchmark.
+A crash of a mapper ends its subprocess, not the benchmark.
 """
 
 from __future__ import annotations
@@ -30,125 +30,127 @@ from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 OURS = "ours"
 CHAINED_PNP = "chained-pnp"
-"""A reference point without a mapper (:mod:`~mpsfm_core.evaluation.chained_pnp`)."""
+"""Baseline without a mapper (:mod:`~mpsfm_core.evaluation.chained_pnp`)."""
 PRIOR_METHODS = (OURS, CHAINED_PNP)
-"""Methods that run once with each prior."""
+"""Methods that run with each prior quality."""
 PEER_METHODS = (CHAINED_PNP, *PEERS)
-"""All that ours is compared with."""
+"""Methods to compare mpsfm with."""
 
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """What a method made of a set.
-
-    ``models``: poses by image name, of the largest model first. ``seconds``: wall clock;
-    ``cpu_seconds``: of the process, which other jobs on the machine do not stretch.
-    ``peak_mib``: most memory that the process held, its problem and earlier tasks included; 0
-    where the system does not tell. ``error``: why it failed, empty if it did not. ``dense``: what
-    :meth:`DenseEvaluation.measure` says of the largest model; its time is not in the seconds.
-    """
+    """Result of a method on a set of images."""
 
     models: Sequence[dict[str, Pose]] = ()
+    """``cam_from_world`` by image name of each model, the largest first."""
     seconds: float = 0.0
+    """Wall time without dense evaluation."""
     cpu_seconds: float = 0.0
+    """CPU time of the process without dense evaluation; independent of other jobs."""
     peak_mib: float = 0.0
+    """Peak memory of the process, including earlier runs; 0 if unknown."""
     error: str = ""
+    """Reason of a failure; empty on success."""
     dense: dict[str, Any] | None = None
+    """:meth:`DenseEvaluation.evaluate` of the largest model."""
 
 
 @dataclass(frozen=True, eq=False)
 class MethodRun:
-    """One run: ``method`` is :data:`OURS`, :data:`CHAINED_PNP` or the name of a peer. ``dense``: how the
-    depth of ours is measured and compared, None where it is not. ``threads``: at most, one unless
-    wall time with more is what is compared; results of a peer may depend on them."""
+    """Run of a method on a set of images."""
 
     label: str
+    """Label of the record."""
     method: str
+    """:data:`OURS` or one of :data:`PEER_METHODS`."""
     problem: MappingProblem
+    """Problem of the set."""
     options: MapperOptions
+    """Options of mpsfm."""
     dense: DenseEvaluation | None = None
+    """Dense evaluation of mpsfm; None for none."""
     threads: int = 1
+    """Maximum number of threads. With several, results of COLMAP depend on the schedule."""
 
 
 def run_methods(
-    tasks: Sequence[MethodRun], workers: int
+    runs: Sequence[MethodRun], workers: int
 ) -> Iterator[tuple[MethodRun, MethodResult]]:
-    """Run tasks in ``workers`` processes; yields them as they are done."""
-    lanes = _WorkerProcesses()
+    """Run methods in `workers` subprocesses and yield each result when done."""
+    processes = _WorkerProcesses()
     pool = ThreadPoolExecutor(max(1, workers), thread_name_prefix="mpsfm-benchmark")
     try:
         futures: dict[Future[MethodResult], MethodRun] = {
-            pool.submit(lanes.run, t): t for t in tasks
+            pool.submit(processes.run, t): t for t in runs
         }
         for future in as_completed(futures):
             yield futures[future], future.result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-        lanes.close()
+        processes.close()
 
 
-def run_method(task: MethodRun) -> MethodResult:
-    """Run a task here and now; what it raises becomes the outcome's error."""
+def run_method(run: MethodRun) -> MethodResult:
+    """Run a method in this process; an exception becomes the error of the result."""
     started, cpu_started = time.perf_counter(), time.process_time()
     models: list[dict[str, Pose]] = []
-    found: Sequence[Reconstruction] = ()
+    reconstructions: Sequence[Reconstruction] = ()
     dense, error = None, ""
     try:
-        with limit_threads(task.threads):
-            if task.method == CHAINED_PNP:
-                models = estimate_chained_poses(task.problem, task.options.seed)
-            elif task.method != OURS:
-                models = run_peer(task.method, task.problem)
+        with limit_threads(run.threads):
+            if run.method == CHAINED_PNP:
+                models = estimate_chained_poses(run.problem, run.options.seed)
+            elif run.method != OURS:
+                models = run_peer(run.method, run.problem)
             else:
-                found = mapper.reconstruct(task.problem, task.options).reconstructions
-                models = [model.poses for model in found]
-    except Exception as raised:  # whatever a mapper raises is its result
+                reconstructions = mapper.reconstruct(run.problem, run.options).reconstructions
+                models = [model.poses for model in reconstructions]
+    except Exception as raised:  # failures are results
         error = f"{type(raised).__name__}: {raised}"
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
-    if task.dense is not None and found:
+    if run.dense is not None and reconstructions:
         try:
-            with limit_threads(task.threads):
-                dense = task.dense.measure(found[0], task.problem)
-        except Exception as raised:  # the poses stand
+            with limit_threads(run.threads):
+                dense = run.dense.evaluate(reconstructions[0], run.problem)
+        except Exception as raised:  # the poses stay valid
             error = f"dense: {type(raised).__name__}: {raised}"
     return MethodResult(models, seconds, cpu_seconds, peak_memory_mb() or 0.0, error, dense)
 
 
 class _WorkerProcesses:
-    """A process for each thread that asks for one, and a new one when it died."""
+    """Pool with one subprocess per calling thread, restarted after a crash."""
 
     def __init__(self) -> None:
         self._local = threading.local()
         self._lock = threading.Lock()
         self._processes: list[ProcessPoolExecutor] = []
 
-    def run(self, task: MethodRun) -> MethodResult:
-        """Run a task in the process of the calling thread."""
-        process = getattr(self._local, "process", None) or self._start()
+    def run(self, run: MethodRun) -> MethodResult:
+        """Run a method in the subprocess of the calling thread."""
+        process = getattr(self._local, "process", None) or self._start_process()
         try:
-            return process.submit(run_method, task).result()
+            return process.submit(run_method, run).result()
         except BrokenProcessPool:
-            self._start()
+            self._start_process()
             return MethodResult(error="its process died")
 
     def close(self) -> None:
-        """End all processes."""
+        """Shut down all subprocesses."""
         for process in self._processes:
             process.shutdown(wait=True, cancel_futures=True)
 
-    def _start(self) -> ProcessPoolExecutor:
-        # Forked processes would inherit locks of threads that do not exist in them.
+    def _start_process(self) -> ProcessPoolExecutor:
+        # Forked processes would inherit locks of threads that they do not have.
         context = multiprocessing.get_context("spawn")
-        process = ProcessPoolExecutor(1, mp_context=context, initializer=_prepare)
+        process = ProcessPoolExecutor(1, mp_context=context, initializer=_initialize_process)
         self._local.process = process
         with self._lock:
             self._processes.append(process)
         return process
 
 
-def _prepare() -> None:
-    """Silence COLMAP, whose failures are results here, and load the compiled loops, which would
-    otherwise count for the first set."""
+def _initialize_process() -> None:
+    """Silence COLMAP and load compiled kernels, which would add to the time of the first set."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     camera = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
     problem = make_mapping_problem(room_scene(), camera, arc_poses(3, 8.0))

@@ -1,10 +1,10 @@
-"""How much views see of each other, from true depth or from a COLMAP model.
+"""Two-view and three-view overlap from true depth or from a COLMAP model [paper, appendix].
 
-Two-view overlap: share of what one view sees that the other sees too, the minimum of both
-directions. Three-view overlap of a triplet: share of what one of its views sees that both others
-see, the largest over its views. What a view sees is counted in pixels with known depth, where
-there is depth (seen in another view: projects into it, and the depth there agrees within 5 %), else
-in the points of the model that it observes (paper, low-overlap evaluation).
+* Two-view overlap: ratio of one view's units that the other view sees, minimum of both directions.
+* Three-view overlap: ratio of one view's units that both other views see, maximum over the views.
+
+A unit is a pixel with true depth, or an observed point of the COLMAP model. Another view sees a
+pixel if the pixel projects into it with a consistent depth.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from mpsfm_core.geometry import (
 )
 
 DEPTH_TOLERANCE = 0.05
-"""Relative difference of depth up to which two views see the same surface."""
-_GRID = 96
+"""Maximum relative difference of consistent depths."""
+_GRID_COLUMNS = 96
 """Columns of the grid on which pixels are compared."""
 _ONES: UInt8 = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(
     axis=1, dtype=np.uint8
@@ -37,27 +37,26 @@ _ONES: UInt8 = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).su
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """What views see of each other.
-
-    ``seen``: for each view i (n, bytes) uint8, row j: which of the units that i sees (pixels or
-    points) view j sees as well, as bits. ``counts``: (n,) how many units each view sees.
-    ``two_view``: (n, n) float64 in [0, 1], symmetric, 1 on the diagonal.
-    """
+    """Overlap of n views."""
 
     names: tuple[str, ...]
+    """Names of the views."""
     seen: tuple[UInt8, ...]
+    """Per view i, (n, bytes) uint8: row j has the packed bits of i's units that view j sees."""
     counts: Float64
+    """(n,) number of units of each view."""
     two_view: Float64
+    """(n, n) two-view overlap in [0, 1], symmetric, 1 on the diagonal."""
 
     def __len__(self) -> int:
         return len(self.names)
 
     def three_view(self, a: int, b: int, c: int) -> float:
-        """Three-view overlap of a triplet, in [0, 1]."""
-        return max(self._share(a, b, c), self._share(b, a, c), self._share(c, a, b))
+        """Return the three-view overlap of a triplet in [0, 1]."""
+        return max(self._ratio(a, b, c), self._ratio(b, a, c), self._ratio(c, a, b))
 
-    def _share(self, view: int, first: int, second: int) -> float:
-        """Share of what a view sees that both others see."""
+    def _ratio(self, view: int, first: int, second: int) -> float:
+        """Return the ratio of a view's units that both other views see."""
         both = self.seen[view][first] & self.seen[view][second]
         return float(_ONES[both].sum(dtype=np.int64)) / max(float(self.counts[view]), 1.0)
 
@@ -68,8 +67,15 @@ def overlap_from_depth(
     cameras: Mapping[str, PinholeCamera],
     depth_of: Callable[[str], Float32],
 ) -> Overlap:
-    """Overlap of views with true depth (h, w) in the unit of the poses, 0 where unknown."""
-    views = [_reduced(cameras[name], depth_of(name)) for name in names]
+    """Compute the overlap of views with true depth.
+
+    Args:
+        names: Names of the views.
+        poses: ``cam_from_world`` by name.
+        cameras: Intrinsics by name.
+        depth_of: Returns the depth (h, w) of a name in the unit of the poses, 0 where unknown.
+    """
+    views = [_downsample(cameras[name], depth_of(name)) for name in names]
     seen, counts = [], np.array([float((depth > 0).sum()) for _, depth in views])
     for i, name in enumerate(names):
         camera, depth = views[i]
@@ -79,11 +85,11 @@ def overlap_from_depth(
         world = (points - translation) @ rotation
         rows = [_sees(*views[j], poses[other], world) for j, other in enumerate(names)]
         seen.append(np.packbits(np.stack(rows), axis=1))
-    return _overlap(names, seen, counts)
+    return _build_overlap(names, seen, counts)
 
 
 def overlap_from_model(model: pycolmap.Reconstruction, names: Sequence[str]) -> Overlap:
-    """Overlap of images of a COLMAP model by the points they observe."""
+    """Compute the overlap of images of a COLMAP model from their observed points."""
     by_name = {str(image.name): image for image in model.images.values()}
     observed = [
         np.unique([p.point3D_id for p in by_name[n].get_observation_points2D()]).astype(np.uint64)
@@ -93,10 +99,11 @@ def overlap_from_model(model: pycolmap.Reconstruction, names: Sequence[str]) -> 
     for points in observed:
         rows = [np.isin(points, others, assume_unique=True) for others in observed]
         seen.append(np.packbits(np.stack(rows), axis=1))
-    return _overlap(names, seen, np.array([float(len(points)) for points in observed]))
+    return _build_overlap(names, seen, np.array([float(len(points)) for points in observed]))
 
 
-def _overlap(names: Sequence[str], seen: Sequence[UInt8], counts: Float64) -> Overlap:
+def _build_overlap(names: Sequence[str], seen: Sequence[UInt8], counts: Float64) -> Overlap:
+    """Compute two-view overlap from packed visibility."""
     shared = np.stack([_ONES[bits].sum(axis=1, dtype=np.int64) for bits in seen])
     one_way = shared / np.maximum(counts, 1.0)[:, None]
     two_view = np.minimum(one_way, one_way.T)
@@ -104,17 +111,17 @@ def _overlap(names: Sequence[str], seen: Sequence[UInt8], counts: Float64) -> Ov
     return Overlap(tuple(names), tuple(seen), counts, two_view)
 
 
-def _reduced(camera: PinholeCamera, depth: Float32) -> tuple[PinholeCamera, Float32]:
-    """Camera and depth on the grid of comparison; no depth is made up between two surfaces."""
-    rows = max(1, round(_GRID * camera.height / camera.width))
-    return camera.resized(_GRID, rows), resize_map(depth, _GRID, rows, linear=False)
+def _downsample(camera: PinholeCamera, depth: Float32) -> tuple[PinholeCamera, Float32]:
+    """Resize camera and depth to the grid, without interpolation across depth edges."""
+    rows = max(1, round(_GRID_COLUMNS * camera.height / camera.width))
+    return camera.resized(_GRID_COLUMNS, rows), resize_map(depth, _GRID_COLUMNS, rows, linear=False)
 
 
 def _sees(camera: PinholeCamera, depth: Float32, pose: Pose, world: Float64) -> Bool:
-    """Which world points (n, 3) a view sees."""
+    """Return the mask (n,) of world points (n, 3) that a view sees."""
     local = transform(*pose, world)
     xy = project(camera, local)
     within = inside(xy, camera.size)
-    there = sample_nearest(depth, np.where(within[:, None], xy, 0.0))
-    agrees = np.abs(there - local[:, 2]) <= DEPTH_TOLERANCE * local[:, 2]
-    return np.asarray(within & (there > 0) & agrees)
+    view_depth = sample_nearest(depth, np.where(within[:, None], xy, 0.0))
+    consistent = np.abs(view_depth - local[:, 2]) <= DEPTH_TOLERANCE * local[:, 2]
+    return np.asarray(within & (view_depth > 0) & consistent)

@@ -1,9 +1,8 @@
-"""COLMAP's own mappers on our verified matches: the peers that a benchmark compares with.
+"""COLMAP mappers on the same verified matches, the peers of the benchmark.
 
-All see the same keypoints and verified matches, with intrinsics that are known and kept. All keep
-models of two images, as ours does (COLMAP's default drops models of fewer than 80 % of a small
-set), use as many threads as allowed (one in tables of accuracy: with more their models depend on
-the schedule) and a fixed seed.
+All use the same keypoints, verified matches and fixed intrinsics, and a fixed seed. Models of two
+images are kept, as in mpsfm. With several threads the models of COLMAP depend on the schedule, so
+accuracy tables use one thread.
 """
 
 from __future__ import annotations
@@ -24,12 +23,16 @@ from mpsfm_core.support.threads import thread_limit
 Models = Mapping[int, pycolmap.Reconstruction]
 
 _TUNED_ANGLE_DEG = 0.001
-"""Paper, baselines: all minimum triangulation angles for low parallax."""
+"""Minimum triangulation angle of the tuned baselines, for low parallax [paper, baselines]."""
 
 
 def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path], Models]:
-    """``tuned``: paper, baselines. ``structure_less``: COLMAP's fallback to 2D-2D registration,
-    which pycolmap 4.2 has on by default."""
+    """Configure COLMAP's incremental mapper.
+
+    Args:
+        tuned: Use the angles of the paper's tuned baselines.
+        structure_less: Allow the fallback to 2D-2D registration, the default of pycolmap 4.2.
+    """
 
     def run(database: Path, output: Path) -> Models:
         options = pycolmap.IncrementalPipelineOptions()
@@ -55,6 +58,7 @@ def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path],
 
 
 def _global(database: Path, output: Path) -> Models:
+    """Run COLMAP's global mapper (GLOMAP)."""
     options = pycolmap.GlobalPipelineOptions()
     options.min_model_size = 2
     options.num_threads = thread_limit()
@@ -78,7 +82,7 @@ PEERS: Mapping[str, Callable[[Path, Path], Models]] = MappingProxyType(
 
 
 def run_peer(name: str, problem: MappingProblem) -> list[dict[str, Pose]]:
-    """Poses by image name of the models that a peer makes of a problem, the largest first."""
+    """Run a peer on a problem; returns ``cam_from_world`` by name per model, largest first."""
     with tempfile.TemporaryDirectory(prefix="mpsfm-peer-") as folder:
         output = Path(folder)
         database = output / "database.db"
@@ -90,7 +94,7 @@ def run_peer(name: str, problem: MappingProblem) -> list[dict[str, Pose]]:
 def write_database(problem: MappingProblem, path: Path) -> None:
     """Write keypoints, verified matches and two-view geometries as a COLMAP database.
 
-    Image ids are positions in the problem plus one; each image has a camera of its own.
+    Image ids are indices in the problem plus one. Each image has its own camera.
     """
     with pycolmap.Database.open(path) as database:
         for number, image in enumerate(problem.images, start=1):
@@ -114,7 +118,7 @@ def write_database(problem: MappingProblem, path: Path) -> None:
 
 
 def _geometry(problem: MappingProblem, pair: VerifiedPair) -> pycolmap.TwoViewGeometry:
-    """The pair as COLMAP stores it: an essential matrix, or without a baseline a homography."""
+    """Build COLMAP's two-view geometry: essential matrix, or homography without a baseline."""
     geometry = pycolmap.TwoViewGeometry()
     geometry.inlier_matches = pair.matches.astype(np.uint32)
     pose = np.column_stack([pair.rotation, pair.translation])
@@ -131,5 +135,5 @@ def _geometry(problem: MappingProblem, pair: VerifiedPair) -> pycolmap.TwoViewGe
 
 
 def _cross(t: Float64) -> Float64:
-    """The matrix of the cross product with a vector."""
+    """Return the cross product matrix of a vector."""
     return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])

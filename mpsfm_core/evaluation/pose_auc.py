@@ -1,8 +1,8 @@
-"""Pose AUC: how many relative poses are right, and how right, in one number a threshold.
+"""Pose AUC: area under the recall curve of relative pose errors.
 
-Papers differ in three choices that move the number by several points: which pairs count, whether
-the sign of the translation counts, and how the area under the recall curve is taken. A
-:class:`PoseConvention` names one set of choices; :data:`CONVENTIONS` holds those in use.
+Papers differ in three choices that change the result by several points: the pairs, the sign of the
+translation, and the integration of the recall curve. A :class:`PoseConvention` is a set of choices;
+:data:`CONVENTIONS` lists the common ones.
 """
 
 from __future__ import annotations
@@ -17,40 +17,38 @@ from mpsfm_core.data import Float64, Pose
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
 
 THRESHOLDS_DEG = (1, 5, 20)
-"""The thresholds of the paper's tables."""
-
+"""Thresholds in degrees [paper, tables]."""
 UNREGISTERED_DEG = 180.0
-"""Error of a pair of which an image has no pose."""
+"""Error of a pair with an unregistered image."""
 
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """One way to turn poses into a number.
-
-    ``ordered``: (a, b) and (b, a) both count, their translation errors differ. ``folded``: the
-    translation's sign is free, its error is at most 90 deg. ``area(errors, threshold)``: area
-    under the recall curve from 0 to the threshold, divided by the threshold, in [0, 1].
-    ``every_model``: a pair counts as registered if both images are in one model, whichever; else
-    only those of the largest model count.
-    """
+    """Convention of the pose AUC."""
 
     name: str
+    """Name for the command line."""
     description: str
+    """Description for reports."""
     ordered: bool
+    """Count (a, b) and (b, a); their translation errors differ."""
     folded: bool
+    """Ignore the sign of the translation, so that its error is at most 90 degrees."""
     area: Callable[[Float64, int], float]
+    """``area(errors, threshold)``: normalized area under the recall curve, in [0, 1]."""
     every_model: bool = False
+    """Count pairs within any model; else only pairs within the largest model."""
 
 
 def exact_area(errors: Float64, threshold: int) -> float:
-    """Area under the empirical recall curve, a step function: mean of ``max(0, 1 - e / t)``."""
+    """Integrate the empirical recall curve (a step function): mean of ``max(0, 1 - e / t)``."""
     return float(np.maximum(0.0, 1.0 - errors / threshold).mean())
 
 
 def interpolated_area(errors: Float64, threshold: int) -> float:
-    """Area under straight lines between (0, 0) and the steps' upper corners.
+    """Integrate the linearly interpolated recall curve, as SuperGlue and COLMAP's benchmark do.
 
-    What SuperGlue's and COLMAP's benchmarks take; never below :func:`exact_area`.
+    The result is never below :func:`exact_area`.
     """
     ordered = np.sort(errors)
     below = ordered[ordered <= threshold]
@@ -61,10 +59,9 @@ def interpolated_area(errors: Float64, threshold: int) -> float:
 
 
 def histogram_area(errors: Float64, threshold: int) -> float:
-    """Mean of the recalls at 1, 2, ... ``threshold`` degrees (a whole number).
+    """Average the recalls at 1, 2, ... `threshold` degrees, as PoseDiffusion and VGGT do.
 
-    What PoseDiffusion and VGGT take; errors equal to a bin's end count for the next bin, in the
-    last one for itself.
+    An error at a bin edge counts for the next bin, except in the last bin.
     """
     counts, _ = np.histogram(errors, bins=np.arange(threshold + 1))
     return float(np.cumsum(counts).mean() / len(errors))
@@ -114,15 +111,17 @@ CONVENTIONS: Mapping[str, PoseConvention] = MappingProxyType(
 def pose_errors_deg(
     estimated: Mapping[str, Pose], truth: Mapping[str, Pose], convention: PoseConvention
 ) -> Float64:
-    """Errors of the relative poses of all pairs of the images in ``truth``.
+    """Compute the errors of the relative poses of all pairs of images.
+
+    The translation error of a pair with coinciding true centers is 0.
 
     Args:
-        estimated: poses by image name; images of ``truth`` that are not here are unregistered.
-        truth: poses by image name, two at least. convention: see :data:`CONVENTIONS`.
+        estimated: ``cam_from_world`` by image name; missing images are unregistered.
+        truth: True ``cam_from_world`` by image name, at least two.
+        convention: Convention, see :data:`CONVENTIONS`.
 
     Returns:
-        (pairs,) float64, degrees in [0, 180]; in the order of ``truth``, first image slowest.
-        Where two true centres coincide the translation has no direction and counts as right.
+        (pairs,) float64 errors in [0, 180] degrees, in the order of `truth`, first image slowest.
     """
     names = list(truth)
     count = len(names)
@@ -134,10 +133,12 @@ def pose_errors_deg(
     errors = np.full(len(first), UNREGISTERED_DEG)
     if known.any():
         poses = [estimated.get(name, truth[name]) for name in names]
-        have = _relative(poses, first[known], second[known])
-        want = _relative([truth[name] for name in names], first[known], second[known])
-        rotation = rotation_angle_deg(have[0] @ want[0].transpose(0, 2, 1))
-        translation = angle_between_deg(have[1], want[1])
+        relative = _relative_poses(poses, first[known], second[known])
+        true_relative = _relative_poses(
+            [truth[name] for name in names], first[known], second[known]
+        )
+        rotation = rotation_angle_deg(relative[0] @ true_relative[0].transpose(0, 2, 1))
+        translation = angle_between_deg(relative[1], true_relative[1])
         if convention.folded:
             translation = np.minimum(translation, 180.0 - translation)
         errors[known] = np.maximum(rotation, translation)
@@ -149,17 +150,26 @@ def pose_auc(
     convention: PoseConvention,
     thresholds: Sequence[int] = THRESHOLDS_DEG,
 ) -> dict[int, float]:
-    """Threshold in degrees -> area under the recall curve up to it, in [0, 1].
+    """Compute the pose AUC at each threshold.
 
-    Errors of several scenes are pooled by concatenating them. Raises ``ValueError`` without any.
+    Args:
+        errors_deg: (pairs,) errors; concatenate the errors of several scenes to pool them.
+        convention: Convention of the integration.
+        thresholds: Thresholds in degrees.
+
+    Returns:
+        Threshold -> area in [0, 1].
+
+    Raises:
+        ValueError: There are no errors.
     """
     if len(errors_deg) == 0:
         raise ValueError("no pairs to evaluate")
     return {threshold: convention.area(errors_deg, threshold) for threshold in thresholds}
 
 
-def _relative(poses: Sequence[Pose], first: Float64, second: Float64) -> Pose:
-    """``second_from_first`` of pairs: rotations (n, 3, 3) and translations (n, 3)."""
+def _relative_poses(poses: Sequence[Pose], first: Float64, second: Float64) -> Pose:
+    """Compute ``second_from_first`` of pairs: rotations (n, 3, 3) and translations (n, 3)."""
     rotations = np.stack([rotation for rotation, _ in poses])
     translations = np.stack([translation for _, translation in poses])
     relative = rotations[second] @ rotations[first].transpose(0, 2, 1)

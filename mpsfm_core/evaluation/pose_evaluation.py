@@ -1,4 +1,4 @@
-"""Compares the poses of two models by image name."""
+"""Evaluation of estimated poses: pose AUC and trajectory errors in one report."""
 
 from __future__ import annotations
 
@@ -25,16 +25,21 @@ def evaluate(
     images: Sequence[str] | None = None,
     convention: PoseConvention = CONVENTIONS["paper"],
 ) -> dict[str, Any]:
-    """Compare poses with the truth; plain data, ready for JSON.
+    """Compare estimated poses with true poses.
 
     Args:
-        estimated: poses by image name. truth: poses by image name. images: the names to evaluate
-            (extension optional), all of ``truth`` by default. convention: of the pose AUC.
+        estimated: ``cam_from_world`` by image name.
+        truth: True ``cam_from_world`` by image name.
+        images: Names to evaluate, extension optional; all of `truth` by default.
+        convention: Convention of the pose AUC.
+
+    Returns:
+        Report as plain data for JSON.
 
     Raises:
-        InputError: an image is not in the truth, or fewer than two images are left.
+        InputError: An image is not in the truth, or fewer than two images remain.
     """
-    names = list(truth) if images is None else _choose(images, truth)
+    names = list(truth) if images is None else _match_images(images, truth)
     if len(names) < 2:
         raise InputError(f"ground truth: at least two images are needed, got {len(names)}")
     reference = {name: truth[name] for name in names}
@@ -51,12 +56,12 @@ def evaluate(
         "pairs": len(errors),
         "auc_unit": "percent",
         "auc": {str(threshold): 100 * area for threshold, area in areas.items()},
-        "trajectory": _describe(trajectory_errors(poses, reference)),
+        "trajectory": _summarize_trajectory(trajectory_errors(poses, reference)),
     }
 
 
-def _choose(images: Sequence[str], truth: Mapping[str, Pose]) -> list[str]:
-    """The names in ``truth`` that ``images`` means, each once."""
+def _match_images(images: Sequence[str], truth: Mapping[str, Pose]) -> list[str]:
+    """Return the unique names in `truth` that match the given names."""
     matched = match_names(images, truth)
     missing = [name for name in images if name not in matched]
     if missing:
@@ -64,7 +69,8 @@ def _choose(images: Sequence[str], truth: Mapping[str, Pose]) -> list[str]:
     return list(dict.fromkeys(matched.values()))
 
 
-def _describe(errors: TrajectoryErrors | None) -> dict[str, float] | None:
+def _summarize_trajectory(errors: TrajectoryErrors | None) -> dict[str, float] | None:
+    """Return the statistics of trajectory errors for the report."""
     if errors is None:
         return None
     return {

@@ -1,10 +1,12 @@
-"""Depth of a stated quality for a scene whose true depth is known.
+"""Depth priors of known quality, made from the true depth of a scene.
 
-``sensor``: the true depth, declared good to 1 %: an upper bound. ``degraded``: the true depth with
-the errors of :mod:`mpsfm_core.testing.synthetic.degraded_depth`, declared honestly, which means as
-large as they are after the best scale of each image: stands for a good monocular network;
-``degraded-N`` is the same with the errors of seed N, which is 0 otherwise. ``config``: what the
-configuration's own provider predicts."""
+* ``sensor``: true depth with a declared relative std of 1 %, an upper bound.
+* ``degraded``: true depth with the errors of :mod:`mpsfm_core.testing.synthetic.degraded_depth`,
+which
+  represents a good monocular network. The declared std is the std of the errors after the best
+  scale per image. ``degraded-N`` uses seed N instead of 0.
+* ``config``: the provider of the configuration.
+"""
 
 from __future__ import annotations
 
@@ -25,24 +27,32 @@ from mpsfm_core.support.files import write_file
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors, degrade_depth
 
 QUALITIES = ("sensor", "degraded", "config")
+"""Names of the prior qualities."""
 SENSOR_STD = 0.01
 """Declared relative std of the true depth."""
-_MILLIMETRE = 0.001
+_MILLIMETER = 0.001
+"""One millimeter in meters, the unit of depth files."""
 
 
 def parse_error_seed(quality: str) -> int | None:
-    """Seed of the errors of degraded depth; None for other qualities."""
-    found = re.fullmatch(r"degraded(?:-(\d+))?", quality)
-    return int(found[1] or 0) if found else None
+    """Parse the seed of a degraded quality; None for other qualities."""
+    match = re.fullmatch(r"degraded(?:-(\d+))?", quality)
+    return int(match[1] or 0) if match else None
 
 
 def prior_overrides(
     quality: str, scene: SceneFolder, images: Iterable[str], work: Path
 ) -> tuple[str, ...]:
-    """Settings ``KEY=VALUE`` that make a configuration use depth of a quality.
+    """Return the overrides ``KEY=VALUE`` for a configuration with depth of a quality.
 
-    ``work``: folder where degraded maps of the images are written. Raises :class:`InputError`
-    when the scene has no true depth to make it of.
+    Args:
+        quality: Prior quality.
+        scene: Scene folder.
+        images: Names of the images.
+        work: Folder for degraded depth maps.
+
+    Raises:
+        InputError: The scene has no true depth.
     """
     if quality == "config":
         return ()
@@ -50,7 +60,7 @@ def prior_overrides(
     if scene.depth is None:
         raise InputError(f"{scene.path}: prior {quality!r} needs true depth in gt_depth/")
     if quality == "sensor":
-        return _from_files(scene.depth, SENSOR_STD)
+        return _depth_file_settings(scene.depth, SENSOR_STD)
     errors = DepthErrors()
     for image in images:
         stem = PurePosixPath(image).with_suffix("")
@@ -58,37 +68,45 @@ def prior_overrides(
         if not target.is_file():
             depth = read_depth(scene.depth / f"{stem}.png")
             write_depth(target, degrade_depth(depth, str(stem), errors, seed or 0))
-    return _from_files(work, round(errors.std, 3))
+    return _depth_file_settings(work, round(errors.std, 3))
 
 
 def read_depth(path: Path) -> Float32:
-    """True depth (h, w) in metres, 0 where unknown; raises :class:`InputError`."""
+    """Read a 16-bit depth image.
+
+    Returns:
+        (h, w) float32 depth in meters, 0 where unknown.
+
+    Raises:
+        InputError: The file is missing or no 16-bit image.
+    """
     stored = None
     if path.is_file():
         check_size(read_bytes(path), path, InputOptions().max_pixels)
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.ndim != 2 or stored.dtype != np.uint16:
-        raise InputError(f"{path}: no 16-bit depth image")
-    return np.asarray(stored * np.float32(_MILLIMETRE))
+        raise InputError(f"{path}: no 16-bit depth image; expected PNG in millimeters")
+    return np.asarray(stored * np.float32(_MILLIMETER))
 
 
 def write_depth(path: Path, depth: Float32) -> None:
-    """Write depth in metres as 16-bit PNG in millimetres; what does not fit becomes 0."""
-    stored = np.rint(np.nan_to_num(depth, nan=0.0, posinf=0.0) / _MILLIMETRE)
+    """Write depth in meters as 16-bit PNG in millimeters; values out of range become 0."""
+    stored = np.rint(np.nan_to_num(depth, nan=0.0, posinf=0.0) / _MILLIMETER)
     stored = np.where((stored > 0) & (stored <= np.iinfo(np.uint16).max), stored, 0)
     ok, data = cv2.imencode(".png", stored.astype(np.uint16))
     assert ok
     write_file(path, data.tobytes())
 
 
-def _from_files(folder: Path, std: float) -> tuple[str, ...]:
+def _depth_file_settings(folder: Path, std: float) -> tuple[str, ...]:
+    """Return overrides that read depth from files with a relative std."""
     return (
         "depth.use=files",
         f"depth.options.directory={json.dumps(str(folder.resolve()))}",
         "depth.options.suffix=.png",
-        f"depth.options.scale={_MILLIMETRE}",
+        f"depth.options.scale={_MILLIMETER}",
         f"depth.options.relative_std={std}",
-        # The declared std is the total one already.
+        # The declared std is already the total std.
         "depth.calibration={std_scale: 1, relative_std: 0, std_floor: 0}",
         "normals.use=from-depth",
     )

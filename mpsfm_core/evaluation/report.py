@@ -1,4 +1,4 @@
-"""One table of a benchmark: Markdown for people, JSON for programs, HTML with recall curves."""
+"""Report of a benchmark as Markdown, JSON, and HTML with recall curves."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ from mpsfm_core.support.files import write_file
 from mpsfm_core.support.format_versions import VERSION
 
 FORMAT = 1
-"""Of ``report.json``."""
+"""Format version of ``report.json``."""
 ALL_SCENES = "all scenes"
+"""Scene name of the results pooled over all scenes."""
 CLOUD_METRICS = ("accuracy", "completeness", "f1")
-"""What a dense column says of a cloud at a distance."""
+"""Metrics of a cloud at a distance, in the order of the table."""
 _COLORS = ("#1b6ca8", "#d1495b", "#2e8b57", "#e08e0b", "#7b4fa3", "#5c5c5c", "#17a2b8", "#a0522d")
 _PLOT = (440, 260)
 _RANGE_DEG = 20
@@ -44,42 +45,50 @@ GroupKey = tuple[str, str, str, str]
 
 @dataclass(frozen=True)
 class BenchmarkRow:
-    """A method on a bucket.
-
-    ``auc``: threshold in degrees -> percent, errors of all sets pooled. ``registered``: share of
-    the images. ``cpu_seconds``, ``seconds``: mean of a set. ``failed``: sets on which it raised.
-    ``dense``: None where no set was measured and compared with true depth, else means over
-    ``sets`` of them: ``abs_rel`` of the depth maps, and of the cloud ``accuracy``,
-    ``completeness`` and ``f1``, each distance in metres -> share.
-    """
+    """Results of a method on a bucket."""
 
     scene: str
+    """Name of the scene, or :data:`ALL_SCENES`."""
     config: str
+    """Name of the configuration."""
     bucket: str
+    """Bucket of test sets."""
     method: str
+    """Label of the method."""
     sets: int
+    """Number of sets."""
     pairs: int
+    """Number of verified pairs."""
     auc: Mapping[int, float]
+    """Threshold in degrees -> pose AUC in percent, errors of all sets pooled."""
     registered: float
+    """Ratio of registered images."""
     seconds: float
+    """Mean wall time per set."""
     cpu_seconds: float
+    """Mean CPU time per set."""
     failed: int
+    """Number of failed sets."""
     dense: Mapping[str, Any] | None = None
+    """Means over the ``sets`` with dense evaluation: ``abs_rel``, and distance in meters -> ratio
+    for each of :data:`CLOUD_METRICS`; None without."""
 
     @property
-    def place(self) -> GroupKey:
-        """Which group of records the row is about."""
+    def group(self) -> GroupKey:
+        """Key of the group of records."""
         return self.scene, self.config, self.bucket, self.method
 
 
 def pool_errors(records: Iterable[BenchmarkRecord], convention: PoseConvention) -> Float64:
-    """Errors in degrees of all image pairs of some records, one after the other."""
+    """Concatenate the errors in degrees of all image pairs of some records."""
     return np.concatenate([record.errors_deg(convention) for record in records])
 
 
 def group_records(records: Iterable[BenchmarkRecord]) -> dict[GroupKey, list[BenchmarkRecord]]:
-    """Records by scene, configuration, bucket and method; if there are several scenes, also
-    pooled over them as the scene :data:`ALL_SCENES`."""
+    """Group records by scene, configuration, bucket and method.
+
+    Several scenes are also pooled as the scene :data:`ALL_SCENES`.
+    """
     records = list(records)
     groups: dict[GroupKey, list[BenchmarkRecord]] = {}
     several = len({record.scene for record in records}) > 1
@@ -92,7 +101,7 @@ def group_records(records: Iterable[BenchmarkRecord]) -> dict[GroupKey, list[Ben
 def build_rows(
     records: Iterable[BenchmarkRecord], convention: PoseConvention = CONVENTIONS["paper"]
 ) -> list[BenchmarkRow]:
-    """The table's rows, in the order of the records."""
+    """Compute the rows of the table in the order of the records."""
     rows = []
     for key, group in group_records(records).items():
         areas = pose_auc(pool_errors(group, convention), convention)
@@ -127,7 +136,7 @@ def _mean_dense(sets: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
 def format_markdown(
     rows: Sequence[BenchmarkRow], convention: PoseConvention = CONVENTIONS["paper"]
 ) -> str:
-    """A table for each scene and configuration, the convention in words above it."""
+    """Format one Markdown table per scene and configuration, with the convention above."""
     parts = [f"Pose AUC in percent, convention `{convention.name}`: {convention.description}."]
     if any(row.dense for row in rows):
         parts.append(_DENSE_NOTE)
@@ -140,12 +149,12 @@ def format_markdown(
 
 
 def list_failures(records: Iterable[BenchmarkRecord]) -> list[str]:
-    """A line for each run that raised, with its reason."""
+    """Return a line for each failed run with its reason."""
     return [f"{' / '.join(record.name)}: {record.error}" for record in records if record.error]
 
 
 def write_report(output: Path, records: Sequence[BenchmarkRecord]) -> None:
-    """Write ``report.md``, ``report.json`` and ``report.html``; the JSON has all conventions."""
+    """Write ``report.md``, ``report.json`` (all conventions) and ``report.html``."""
     convention = CONVENTIONS["paper"]
     rows, failed = build_rows(records), list_failures(records)
     text = format_markdown(rows, convention)
@@ -167,7 +176,7 @@ def write_report(output: Path, records: Sequence[BenchmarkRecord]) -> None:
 
 
 def _lines(rows: Sequence[BenchmarkRow]) -> list[list[str]]:
-    """Head and cells of a table; dense columns where a row has them, one a distance."""
+    """Return header and cells of a table, with a dense column per distance if evaluated."""
     head = ["bucket", "sets", "method", *(f"AUC@{t}°" for t in THRESHOLDS_DEG)]
     head += ["registered", "CPU s / set", "failed"]
     dense = [row.dense for row in rows if row.dense]
@@ -197,7 +206,7 @@ def _dense_cells(row: BenchmarkRow, distances: Sequence[str]) -> list[str]:
 def _page(
     rows: Sequence[BenchmarkRow], records: Sequence[BenchmarkRecord], convention: PoseConvention
 ) -> str:
-    """One self-contained page: a table and recall curves for each bucket."""
+    """Return a self-contained page with a table and recall curves per bucket."""
     parts = [
         "<!doctype html><meta charset='utf-8'><title>Benchmark</title>",
         "<style>body{font:14px sans-serif;margin:2em}td,th{padding:2px 10px;text-align:right}"
@@ -214,7 +223,7 @@ def _page(
         parts.append(_table(here))
         curves = {}
         for row in here:
-            curves[row.method] = pool_errors(groups[row.place], convention)
+            curves[row.method] = pool_errors(groups[row.group], convention)
         parts.append(_curves(curves))
     if failed := list_failures(records):
         lines = "".join(f"<li>{html.escape(line)}</li>" for line in failed)
@@ -230,7 +239,7 @@ def _table(rows: Sequence[BenchmarkRow]) -> str:
 
 
 def _curves(errors: Mapping[str, Float64]) -> str:
-    """Recall over the error's threshold, a drawing in SVG."""
+    """Draw recall curves as SVG."""
     width, height = _PLOT
     shapes = _axes()
     for number, (method, values) in enumerate(errors.items()):
@@ -252,7 +261,7 @@ def _curves(errors: Mapping[str, Float64]) -> str:
 
 
 def _axes() -> list[str]:
-    """Frame, grid and labels of a plot of recall."""
+    """Draw frame, grid and labels of a recall plot as SVG elements."""
     width, height = _PLOT
     shapes = [f"<rect width='{width}' height='{height}' fill='none' stroke='#999'/>"]
     for degrees in range(0, _RANGE_DEG + 1, 5):
@@ -264,7 +273,7 @@ def _axes() -> list[str]:
         shapes.append(f"<path d='M0 {y:g}H{width}' stroke='#ddd'/>")
         shapes.append(f"<text x='-6' y='{y + 4:g}' text-anchor='end'>{percent}%</text>")
     middle = f"x='{width / 2:g}' y='{height + 36}' text-anchor='middle'"
-    beside = f"transform='translate(-46 {height / 2:g}) rotate(-90)' text-anchor='middle'"
+    rotated = f"transform='translate(-46 {height / 2:g}) rotate(-90)' text-anchor='middle'"
     shapes.append(f"<text {middle}>error of a pair up to</text>")
-    shapes.append(f"<text {beside}>share of pairs</text>")
+    shapes.append(f"<text {rotated}>ratio of pairs</text>")
     return shapes

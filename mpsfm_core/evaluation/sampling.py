@@ -1,12 +1,12 @@
-"""Sets of images with little overlap, sampled as in the paper (appendix, low-overlap evaluation).
+"""Sampling of image sets with little overlap, after the paper's low-overlap evaluation.
 
-A set starts with a random image. An image is added when it has enough two-view overlap with some
-member and no triplet that it completes has more three-view overlap than the bucket allows; the set
-is finished when no image can be added. Sets of a bucket differ by two images or more. The same
-overlap and seed give the same sets.
+A set starts with a random image. An image is added if it has enough two-view overlap with a member
+and if no triplet with it exceeds the three-view overlap of the bucket. The set is complete when no
+image can be added. Sets of a bucket differ by at least two images. The same overlap and seed give
+the same sets.
 
-The paper lets a minimal set also take images of more overlap when those lead to new ones of none,
-to span a whole scene. Ours do not: a minimal set is minimal throughout.
+In the paper, a minimal set may include images of more overlap that lead to images without overlap,
+to span a whole scene. Minimal sets here satisfy the limit throughout.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mpsfm_core.evaluation.overlap import Overlap
 LIMITS: Mapping[str, float] = MappingProxyType(
     {"minimal": 0.01, "leq5": 0.05, "leq10": 0.10, "leq30": 0.30}
 )
-"""Bucket -> largest three-view overlap (paper; minimal means none, up to rounding)."""
+"""Bucket -> maximum three-view overlap [paper, appendix]; minimal is 0 up to rounding."""
 TRIPLETS: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
         "0": (0.0, 0.0),
@@ -35,36 +35,37 @@ TRIPLETS: Mapping[str, tuple[float, float]] = MappingProxyType(
         "40+": (0.40, 1.0),
     }
 )
-"""Group of triplets -> three-view overlap, above the first and up to the second (paper)."""
+"""Group of triplets -> range of the three-view overlap, upper bound included [paper, appendix]."""
 
 
 @dataclass(frozen=True)
 class SamplingOptions:
-    """How sets are sampled.
-
-    ``min_two_view``: overlap an image needs with some member. ``sets``: of each bucket, twice as
-    many minimal ones (paper: 5 and 10). ``min_images``: of a set (paper: 5). ``max_images``: None
-    for no limit. ``attempts``: starts for each wanted set.
-    """
+    """Options of the sampling of image sets."""
 
     min_two_view: float = 0.25
+    """Minimum two-view overlap of an image with a member of the set."""
     sets: int = 5
+    """Number of sets per bucket; minimal has twice as many [paper: 5 and 10]."""
     min_images: int = 5
+    """Minimum number of images of a set [paper]."""
     max_images: int | None = None
+    """Maximum number of images of a set; None for no limit."""
     attempts: int = 20
+    """Random starts per requested set."""
     seed: int = 0
+    """Seed of the random generator."""
 
 
 def sample_buckets(overlap: Overlap, options: SamplingOptions | None = None) -> dict[str, Any]:
-    """All buckets in the form of ``testsets.yaml``; those without a set are left out."""
+    """Sample the buckets of ``testsets.yaml``; buckets without a set are left out."""
     options = options or SamplingOptions()
     buckets: dict[str, Any] = {}
     for number, (bucket, limit) in enumerate(LIMITS.items()):
         rng = np.random.default_rng([options.seed, number])
-        wanted = options.sets * (2 if bucket == "minimal" else 1)
-        sets = _distinct(_grow_many(overlap, limit, options, rng, wanted), wanted)
+        count = options.sets * (2 if bucket == "minimal" else 1)
+        sets = _select_distinct(_grow_sets(overlap, limit, options, rng, count), count)
         if sets:
-            buckets[bucket] = [_described(overlap, members) for members in sets]
+            buckets[bucket] = [_describe_set(overlap, members) for members in sets]
     triplets = sample_triplets(overlap, options)
     if triplets:
         buckets["triplets"] = triplets
@@ -73,60 +74,60 @@ def sample_buckets(overlap: Overlap, options: SamplingOptions | None = None) -> 
 
 
 def sample_triplets(overlap: Overlap, options: SamplingOptions) -> dict[str, list[list[str]]]:
-    """Group -> triplets of which one view overlaps enough with both others."""
+    """Sample triplets in which one image overlaps enough with both others, by group."""
     rng = np.random.default_rng([options.seed, len(LIMITS)])
     linked = overlap.two_view >= options.min_two_view
     np.fill_diagonal(linked, False)
-    found: dict[str, dict[frozenset[int], None]] = {name: {} for name in TRIPLETS}
+    groups: dict[str, dict[frozenset[int], None]] = {name: {} for name in TRIPLETS}
     centers = np.flatnonzero(linked.sum(axis=1) >= 2)
-    tries = options.attempts * options.sets * len(TRIPLETS) * 10 if len(centers) else 0
-    for _ in range(tries):
+    attempts = options.attempts * options.sets * len(TRIPLETS) * 10 if len(centers) else 0
+    for _ in range(attempts):
         center = int(rng.choice(centers))
         a, b = map(int, rng.choice(np.flatnonzero(linked[center]), 2, replace=False))
-        group = _group(overlap.three_view(center, a, b))
-        if len(found[group]) < options.sets:
-            found[group][frozenset((center, a, b))] = None
-        if all(len(triplets) == options.sets for triplets in found.values()):
+        group = _triplet_group(overlap.three_view(center, a, b))
+        if len(groups[group]) < options.sets:
+            groups[group][frozenset((center, a, b))] = None
+        if all(len(triplets) == options.sets for triplets in groups.values()):
             break
     return {
         group: [[overlap.names[i] for i in sorted(triplet)] for triplet in triplets]
-        for group, triplets in found.items()
+        for group, triplets in groups.items()
         if triplets
     }
 
 
-def _group(three_view: float) -> str:
+def _triplet_group(three_view: float) -> str:
     return next(name for name, (_, high) in TRIPLETS.items() if three_view <= high)
 
 
-def _grow_many(
-    overlap: Overlap, limit: float, options: SamplingOptions, rng: np.random.Generator, wanted: int
+def _grow_sets(
+    overlap: Overlap, limit: float, options: SamplingOptions, rng: np.random.Generator, count: int
 ) -> Iterator[frozenset[int]]:
-    """Sets that are large enough, as many starts as allowed."""
-    for _ in range(options.attempts * wanted):
-        members = _grow(overlap, limit, options, rng)
+    """Yield sets with enough images, from a limited number of random starts."""
+    for _ in range(options.attempts * count):
+        members = _grow_set(overlap, limit, options, rng)
         if len(members) >= options.min_images:
             yield frozenset(members)
 
 
-def _grow(
+def _grow_set(
     overlap: Overlap, limit: float, options: SamplingOptions, rng: np.random.Generator
 ) -> list[int]:
-    """One set: candidates in random order, again and again until none can be added.
+    """Grow a set from random candidates until none can be added.
 
-    An image that exceeds the limit once does so for good, as members only become more.
+    A rejected candidate stays rejected, because members are never removed.
     """
     order = [int(i) for i in rng.permutation(len(overlap))]
-    members, waiting = order[:1], order[1:]
+    members, candidates = order[:1], order[1:]
     added = True
     while added:
         added = False
-        for candidate in list(waiting):
+        for candidate in list(candidates):
             if len(members) == options.max_images:
                 return members
             if overlap.two_view[candidate, members].max() < options.min_two_view:
                 continue
-            waiting.remove(candidate)
+            candidates.remove(candidate)
             if all(
                 overlap.three_view(candidate, a, b) <= limit for a, b in combinations(members, 2)
             ):
@@ -135,18 +136,19 @@ def _grow(
     return members
 
 
-def _distinct(sets: Iterator[frozenset[int]], wanted: int) -> list[frozenset[int]]:
-    """The first sets that differ from each other by two images or more."""
-    chosen: list[frozenset[int]] = []
+def _select_distinct(sets: Iterator[frozenset[int]], count: int) -> list[frozenset[int]]:
+    """Select the first sets that differ from each other by at least two images."""
+    selected: list[frozenset[int]] = []
     for members in sets:
-        if all(max(len(members - other), len(other - members)) >= 2 for other in chosen):
-            chosen.append(members)
-        if len(chosen) == wanted:
+        if all(max(len(members - other), len(other - members)) >= 2 for other in selected):
+            selected.append(members)
+        if len(selected) == count:
             break
-    return chosen
+    return selected
 
 
-def _described(overlap: Overlap, members: frozenset[int]) -> dict[str, Any]:
+def _describe_set(overlap: Overlap, members: frozenset[int]) -> dict[str, Any]:
+    """Return names and overlap of a set for ``testsets.yaml``."""
     ordered = sorted(members)
     three = max(overlap.three_view(*triplet) for triplet in combinations(ordered, 3))
     two = max(float(overlap.two_view[a, b]) for a, b in combinations(ordered, 2))

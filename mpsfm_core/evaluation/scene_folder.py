@@ -1,4 +1,4 @@
-"""A scene to evaluate on: photos, intrinsics, true poses and depth, and sets of images.
+"""Scene folder of the benchmark: images, intrinsics, true poses and depth, and test sets.
 
 The layout::
 
@@ -6,12 +6,12 @@ The layout::
     intrinsics.yaml   optional: see mpsfm_core.inputs.intrinsics; else the cameras of gt/
     gt/               COLMAP model with true poses
     gt_depth/         optional: 16-bit PNG, millimetres along z, 0 where unknown
-    testsets.yaml     optional: bucket -> sets of images; else one set of all images; beside the
-                      buckets maybe ``format_version``
+    testsets.yaml     optional: bucket -> sets of images, and ``format_version``; else one set of
+                      all images
 
-A bucket is a list of sets, or a mapping of names to lists of sets (then its buckets are called
-``triplets/0-5`` and so on). A set is a list of image names, extensions optional, or a mapping with
-the list under ``images``.
+A bucket is a list of sets, or a mapping of group names to lists of sets (for example
+``triplets/0-5``). A set is a list of image names, extensions optional, or a mapping with the list
+under ``images``.
 """
 
 from __future__ import annotations
@@ -33,39 +33,45 @@ from mpsfm_core.support.yaml_text import write_yaml
 
 TESTSETS = "testsets.yaml"
 FORMAT = 1
-"""Of ``testsets.yaml``."""
+"""Format version of ``testsets.yaml``."""
 
 
 @dataclass(frozen=True)
 class EvaluationSet:
-    """Images that are reconstructed together; ``index`` counts the sets of a bucket."""
+    """Set of images that are reconstructed together."""
 
     bucket: str
+    """Bucket of the set."""
     index: int
+    """Index of the set in its bucket."""
     images: tuple[str, ...]
+    """Names of the images."""
 
     @property
     def name(self) -> str:
-        """Unique in its scene and fit for a folder's name."""
+        """Name that is unique in the scene and valid as a folder name."""
         return f"{self.bucket.replace('/', '_')}-{self.index:02d}"
 
 
 @dataclass(frozen=True, eq=False)
 class SceneFolder:
-    """A scene of the layout above; ``truth``: ``cam_from_world`` by image name."""
+    """Scene folder with true poses and test sets."""
 
     path: Path
+    """Folder of the scene."""
     truth: Mapping[str, Pose]
+    """True ``cam_from_world`` by image name."""
     sets: tuple[EvaluationSet, ...]
+    """Test sets of all buckets."""
 
     @property
     def name(self) -> str:
-        """The folder's name."""
+        """Name of the folder."""
         return self.path.resolve().name
 
     @property
     def images(self) -> Path:
-        """Folder of the photos."""
+        """Folder of the images."""
         return self.path / "images"
 
     @property
@@ -80,27 +86,35 @@ class SceneFolder:
         folder = self.path / "gt_depth"
         return folder if folder.is_dir() else None
 
-    def chosen(self, buckets: Sequence[str] | None) -> list[EvaluationSet]:
-        """The sets of some buckets, all by default; ``triplets`` means all ``triplets/...``.
+    def select_sets(self, buckets: Sequence[str] | None) -> list[EvaluationSet]:
+        """Return the sets of some buckets, all by default.
 
-        Raises :class:`InputError` when a bucket does not exist.
+        Args:
+            buckets: Names of buckets; ``triplets`` selects all ``triplets/...``.
+
+        Raises:
+            InputError: A bucket does not exist.
         """
         known = dict.fromkeys(item.bucket for item in self.sets)
-        wanted = list(known) if buckets is None else list(buckets)
-        for bucket in wanted:
-            if not any(_answers(name, bucket) for name in known):
+        selected = list(known) if buckets is None else list(buckets)
+        for bucket in selected:
+            if not any(_is_in_bucket(name, bucket) for name in known):
                 raise InputError(f"{self.path}: no bucket {bucket!r}; it has {', '.join(known)}")
-        return [item for item in self.sets if any(_answers(item.bucket, b) for b in wanted)]
+        return [item for item in self.sets if any(_is_in_bucket(item.bucket, b) for b in selected)]
 
 
 def read_scene(path: Path, *, with_sets: bool = True) -> SceneFolder:
-    """Read a scene folder; without its sets, there is one set of all images.
+    """Read a scene folder.
 
-    Raises :class:`InputError` when images or true poses are missing, or a set names an image
-    that is not there or has no true pose.
+    Args:
+        path: Scene folder.
+        with_sets: Read ``testsets.yaml``; else return one set of all images.
+
+    Raises:
+        InputError: Images or true poses are missing, or a set has an image without true pose.
     """
     if not (path / "images").is_dir():
-        raise InputError(f"{path}: a scene folder has its photos in images/")
+        raise InputError(f"{path}: no scene folder; photos must be in images/")
     names = find_images(path / "images")
     poses = read_poses(path / "gt")
     truth = {name: poses[found] for name, found in match_names(names, poses).items()}
@@ -120,18 +134,19 @@ def read_scene(path: Path, *, with_sets: bool = True) -> SceneFolder:
 
 
 def write_sets(path: Path, buckets: Mapping[str, Sequence[Mapping[str, Any]]], note: str) -> None:
-    """Write ``testsets.yaml`` of a scene folder; ``note`` becomes its first line, a comment."""
+    """Write ``testsets.yaml`` of a scene folder, with a note as comment in the first line."""
     write_file(path / TESTSETS, f"# {note}\n{write_yaml({VERSION: FORMAT, **buckets})}")
 
 
-def _answers(bucket: str, wanted: str) -> bool:
-    return bucket == wanted or bucket.startswith(wanted + "/")
+def _is_in_bucket(name: str, bucket: str) -> bool:
+    """Return True if a name is the bucket or one of its groups."""
+    return name == bucket or name.startswith(bucket + "/")
 
 
 def _read_sets(file: Path) -> Iterator[tuple[str, int, list[str]]]:
-    """Bucket, number of the set in it, and its image names."""
+    """Yield bucket, index of the set in the bucket, and image names."""
     try:
-        # The base loader leaves all scalars texts: a stem such as 0008 is no number.
+        # The base loader keeps all scalars as text, so that a stem such as 0008 is no number.
         content = yaml.load(file.read_text(encoding="utf-8"), Loader=yaml.BaseLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{file} cannot be read: {error}") from error

@@ -1,4 +1,4 @@
-"""The true surface, as far as the photos of a reconstruction show it: true depth as a scan."""
+"""True surface of a scene, sampled from the true depth maps of some images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mpsfm_core.geometry import camera_center, pixel_centers, unproject
 
 
 def true_depth_file(folder: Path, image: str) -> Path:
-    """Where the true depth of an image is: named as the photo, with ``.png``."""
+    """Return the file of an image's true depth: the image name with suffix ``.png``."""
     return folder / PurePosixPath(image).with_suffix(".png")
 
 
@@ -26,11 +26,20 @@ def build_true_surface(
     poses: Mapping[str, Pose],
     spacing: float,
 ) -> Float64:
-    """World points (n, 3) of the true maps in ``folder`` (16-bit PNG, millimetres) of some images.
+    """Build a point cloud from the true depth maps of images with depth, camera and pose.
 
-    ``cameras``: undistorted, any size, and ``poses``: true ones, by name. ``spacing``: metres, of
-    the cubes of each map that keep one point. Images without map, camera or pose add nothing;
-    raises :class:`InputError` when none has them all.
+    Args:
+        folder: Folder of 16-bit PNG files in millimeters.
+        images: Names of the images.
+        cameras: Undistorted cameras of any size by image name.
+        poses: True ``cam_from_world`` by image name.
+        spacing: Side in meters of the cubes that keep one point per map.
+
+    Returns:
+        World points (n, 3).
+
+    Raises:
+        InputError: No image has depth, camera and pose.
     """
     parts = []
     for name in images:
@@ -45,5 +54,5 @@ def build_true_surface(
         rotation, translation = poses[name]
         parts.append(thin_points(local @ rotation + camera_center(rotation, translation), spacing))
     if not sum(map(len, parts)):
-        raise InputError(f"{folder}: has no true depth of an image with a true pose")
+        raise InputError(f"{folder}: no image with a true pose has true depth here")
     return np.concatenate(parts)

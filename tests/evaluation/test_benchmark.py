@@ -155,11 +155,11 @@ def test_what_changed_or_broke_is_computed_again(output, scene_folder: Path, con
         ("colmap",),
         ("mapping.max_components=9",),
     )
-    run_benchmark(plan, folder, done=lambda record, old: known.update({record.label: old}))
+    run_benchmark(plan, folder, on_record=lambda record, old: known.update({record.label: old}))
     assert known == {"ours-sensor": False, "colmap": False}
     assert read_record(damaged).label == "colmap"
     known.clear()
-    run_benchmark(plan, folder, done=lambda record, old: known.update({record.label: old}))
+    run_benchmark(plan, folder, on_record=lambda record, old: known.update({record.label: old}))
     assert known == {"ours-sensor": True, "colmap": True}
 
 

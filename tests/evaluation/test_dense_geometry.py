@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mpsfm_core.evaluation.read_true_surface import build_true_surface
 
 from mpsfm_core.data import DepthPrior, Float64
 from mpsfm_core.evaluation.dense_geometry import evaluate_dense_geometry
@@ -15,6 +14,7 @@ from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.records import BenchmarkRecord
 from mpsfm_core.evaluation.report import build_rows
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
+from mpsfm_core.evaluation.true_surface import build_true_surface
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from tests.evaluation.conftest import CAMERA, NAMES
 

@@ -92,7 +92,7 @@ def test_overlaps_declared_by_a_shared_scene(shared_data: Path) -> None:
     scene = read_scene(shared_data / "data" / "rendered_kitchen")
     declared = yaml.safe_load((scene.path / "testsets.yaml").read_text())
     cameras = {i.name: i.pinhole for i in load_images(scene.images, scene.intrinsics)}
-    for item in scene.chosen(["minimal", "leq10", "leq30"]):
+    for item in scene.select_sets(["minimal", "leq10", "leq30"]):
         overlap = overlap_from_depth(
             item.images,
             scene.truth,

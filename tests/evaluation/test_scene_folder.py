@@ -30,11 +30,11 @@ def test_sets_poses_and_files(scene_folder: Path) -> None:
 
 def test_buckets_are_chosen_by_name_and_by_group(scene_folder: Path) -> None:
     scene = read_scene(scene_folder)
-    assert len(scene.chosen(None)) == 3
-    assert [item.bucket for item in scene.chosen(["triplets"])] == ["triplets/20-40"] * 2
-    assert [item.bucket for item in scene.chosen(["all"])] == ["all"]
+    assert len(scene.select_sets(None)) == 3
+    assert [item.bucket for item in scene.select_sets(["triplets"])] == ["triplets/20-40"] * 2
+    assert [item.bucket for item in scene.select_sets(["all"])] == ["all"]
     with pytest.raises(InputError, match="no bucket 'minimal'; it has all, triplets/20-40"):
-        scene.chosen(["minimal"])
+        scene.select_sets(["minimal"])
 
 
 @pytest.fixture

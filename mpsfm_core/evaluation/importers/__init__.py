@@ -1,6 +1,6 @@
-"""Turns scenes of public datasets, as they are distributed, into scene folders.
+"""Importers that convert scenes of public datasets to scene folders.
 
-One file a dataset; each says in its docstring which layout it reads.
+The docstring of each module describes the layout of its dataset.
 """
 
 from __future__ import annotations
@@ -31,24 +31,31 @@ IMPORTERS: Mapping[str, Callable[[Path], list[Frame]]] = MappingProxyType(
         "scannet": scannet.read_frames,
     }
 )
-"""Name of a dataset -> what reads the frames of one scene, in the order of their names."""
+"""Name of a dataset -> function that reads the frames of a scene, in the order of their names."""
 
 
 def import_scene(kind: str, source: Path, target: Path, every: int = 1) -> SceneFolder:
-    """Write a scene folder of one scene of a dataset, of every n-th of its images.
+    """Convert one scene of a dataset to a scene folder; images are hard-linked or copied.
 
-    Photos are hard-linked where that is possible, else copied. Raises :class:`InputError` when
-    the dataset is unknown, the source has not its layout, or the target holds something already.
+    Args:
+        kind: Name of the dataset.
+        source: Scene as distributed.
+        target: Scene folder to write.
+        every: Take every n-th image.
+
+    Raises:
+        InputError: The dataset is unknown, the source has another layout, or the target is not
+            empty.
     """
     if kind not in IMPORTERS:
         raise InputError(f"no dataset {kind!r}{did_you_mean(kind, IMPORTERS)}")
     if target.exists() and any(target.iterdir()):
-        raise InputError(f"{target} is not empty")
+        raise InputError(f"{target}: is not empty; choose a new folder")
     try:
         frames = IMPORTERS[kind](source)[::every]
     except (OSError, ValueError) as error:
         raise InputError(f"{source}: cannot be read as {kind}: {error}") from error
     if len(frames) < 2:
-        raise InputError(f"{source}: {len(frames)} usable images, two or more are needed")
+        raise InputError(f"{source}: {len(frames)} usable images; two or more are needed")
     write_frames(target, frames)
     return read_scene(target)

@@ -1,4 +1,4 @@
-"""Frames of datasets whose truth is a COLMAP model."""
+"""Frames of datasets whose ground truth is a COLMAP model."""
 
 from __future__ import annotations
 
@@ -14,10 +14,13 @@ from mpsfm_core.inputs.models import read_model
 
 
 def model_frames(folder: Path, photo_of: Callable[[str], Path]) -> list[Frame]:
-    """Frames of the registered images of a model, named as their photos.
+    """Read the registered images of a model as frames.
 
-    ``photo_of``: where the photo of an image of the model is; images without one are left out.
-    Photos of another size than the model's cameras have get cameras of their size.
+    Cameras are rescaled to the size of the image files.
+
+    Args:
+        folder: COLMAP model.
+        photo_of: Returns the file of an image name; images without a file are skipped.
     """
     model = read_model(folder)
     frames = []
@@ -38,7 +41,7 @@ def model_frames(folder: Path, photo_of: Callable[[str], Path]) -> list[Frame]:
 def _observations(
     model: pycolmap.Reconstruction, image: pycolmap.Image, scale: Float64
 ) -> FrameObservations:
-    """Each point once."""
+    """Return the observations of an image, each point once."""
     seen = {int(point.point3D_id): point.xy for point in image.get_observation_points2D()}
     ids: Int64 = np.array(list(seen), dtype=np.int64)
     return FrameObservations(

@@ -1,4 +1,4 @@
-"""What all importers share: frames, and writing them as a scene folder."""
+"""Frames of imported datasets, and their conversion to a scene folder."""
 
 from __future__ import annotations
 
@@ -19,37 +19,43 @@ from mpsfm_core.geometry.pycolmap_conversion import camera_key
 from mpsfm_core.inputs.image_header import read_header
 
 PHOTOS = (".jpg", ".jpeg", ".png")
-_DEPTH_COLUMNS = 1024
-"""Depth that is carried over from another camera is written with at most as many columns."""
+"""Suffixes of image files."""
+_MAX_DEPTH_COLUMNS = 1024
+"""Maximum columns of depth maps that are resampled to another camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameObservations:
-    """Points that a photo observes: pixels (p, 2), ids (p,) and world coordinates (p, 3)."""
+    """Points that an image observes."""
 
     xy: Float64
+    """(p, 2) pixels."""
     ids: Int64
+    """(p,) ids of the 3D points."""
     points: Float64
+    """(p, 3) 3D points, world frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One photo with its truth.
-
-    ``name``: in the scene folder. ``camera``: of the photo. ``pose``: (3, 4) ``cam_from_world``.
-    ``depth``: reads its depth map in metres, 0 where unknown, on a grid that covers the photo.
-    """
+    """Image with its true camera, pose and optional depth."""
 
     name: str
+    """Name in the scene folder."""
     photo: Path
+    """File of the image."""
     camera: pycolmap.Camera
+    """Camera of the image."""
     pose: Float64
+    """(3, 4) ``cam_from_world``."""
     depth: Callable[[], Float32] | None = None
+    """Reads the depth map in meters, 0 where unknown, on a grid over the whole image."""
     observations: FrameObservations | None = None
+    """Observed 3D points."""
 
 
 def write_frames(target: Path, frames: Sequence[Frame]) -> None:
-    """Write photos, cameras, poses, points and depth as a scene folder."""
+    """Write images, cameras, poses, points and depth as a scene folder."""
     model = pycolmap.Reconstruction()
     cameras: dict[str, int] = {}
     tracks: dict[int, list[tuple[int, int]]] = {}
@@ -63,8 +69,8 @@ def write_frames(target: Path, frames: Sequence[Frame]) -> None:
         key = camera_key(frame.camera)
         if key not in cameras:
             cameras[key] = len(cameras) + 1
-            own = pycolmap.Camera({**frame.camera.todict(), "camera_id": cameras[key]})
-            model.add_camera_with_trivial_rig(own)
+            camera = pycolmap.Camera({**frame.camera.todict(), "camera_id": cameras[key]})
+            model.add_camera_with_trivial_rig(camera)
         seen = frame.observations
         xy = np.empty((0, 2)) if seen is None else seen.xy
         image = pycolmap.Image(
@@ -83,7 +89,11 @@ def write_frames(target: Path, frames: Sequence[Frame]) -> None:
 
 
 def photo_size(path: Path) -> tuple[int, int]:
-    """(width, height) of a photo; raises :class:`InputError`."""
+    """Read (width, height) of an image file.
+
+    Raises:
+        InputError: The file cannot be read or is no image.
+    """
     try:
         size = read_header(path.read_bytes()).size
     except OSError as error:
@@ -93,8 +103,16 @@ def photo_size(path: Path) -> tuple[int, int]:
     return size
 
 
-def need(path: Path, what: str) -> Path:
-    """The path if it exists; raises :class:`InputError` that says what was looked for."""
+def require_path(path: Path, what: str) -> Path:
+    """Return an existing path.
+
+    Args:
+        path: File or folder.
+        what: Description for the message.
+
+    Raises:
+        InputError: The path does not exist.
+    """
     if not path.exists():
         raise InputError(f"{what} is missing: {path}")
     return path
@@ -103,36 +121,46 @@ def need(path: Path, what: str) -> Path:
 def pinhole_camera(
     size: tuple[int, int], fx: float, fy: float, cx: float, cy: float
 ) -> pycolmap.Camera:
-    """A camera of photos of (width, height); ``cx, cy`` in COLMAP pixels."""
+    """Build a PINHOLE camera of an image size (width, height); ``cx, cy`` in COLMAP pixels."""
     return pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=[fx, fy, cx, cy])
 
 
-def inverted(world_from_cam: Float64) -> Float64:
-    """(3, 4) ``cam_from_world`` of a (4, 4) or (3, 4) ``world_from_cam``."""
+def invert_pose(world_from_cam: Float64) -> Float64:
+    """Invert ``world_from_cam`` (4, 4) or (3, 4) to ``cam_from_world`` (3, 4)."""
     rotation = world_from_cam[:3, :3].T
     return np.column_stack([rotation, -rotation @ world_from_cam[:3, 3]])
 
 
-def carried_depth(depth: Float32, own: pycolmap.Camera, photo: pycolmap.Camera) -> Float32:
-    """Depth of one camera as another one in the same place and direction sees it.
+def resample_depth(
+    depth: Float32, depth_camera: pycolmap.Camera, camera: pycolmap.Camera
+) -> Float32:
+    """Resample a depth map to another camera with the same pose.
 
-    ``own``: the camera of the map (h, w), maybe distorted. ``photo``: the undistorted camera whose
-    view the result covers. The nearest pixel counts: depth is not mixed across edges.
+    Nearest-neighbor sampling avoids interpolation across depth edges.
+
+    Args:
+        depth: (h, w) depth.
+        depth_camera: Camera of the depth map, may have distortion.
+        camera: Undistorted camera of the result.
     """
-    width = min(photo.width, _DEPTH_COLUMNS)
-    height = max(1, round(width * photo.height / photo.width))
+    width = min(camera.width, _MAX_DEPTH_COLUMNS)
+    height = max(1, round(width * camera.height / camera.width))
     grid = pixel_centers(width, height).reshape(-1, 2)
-    xy = grid * [photo.width / width, photo.height / height]
-    rays = np.column_stack([photo.cam_from_img(xy), np.ones(len(xy))])
-    there = np.asarray(own.img_from_cam(rays))
-    there = there * [depth.shape[1] / own.width, depth.shape[0] / own.height]
-    known = inside(there, (depth.shape[1], depth.shape[0]))
-    values = sample_nearest(depth, np.where(known[:, None], there, 0.0))
-    carried: Float32 = np.where(known, values, np.float32(0)).reshape(height, width)
-    return carried
+    xy = grid * [camera.width / width, camera.height / height]
+    rays = np.column_stack([camera.cam_from_img(xy), np.ones(len(xy))])
+    depth_xy = np.asarray(depth_camera.img_from_cam(rays))
+    depth_xy = depth_xy * [
+        depth.shape[1] / depth_camera.width,
+        depth.shape[0] / depth_camera.height,
+    ]
+    known = inside(depth_xy, (depth.shape[1], depth.shape[0]))
+    values = sample_nearest(depth, np.where(known[:, None], depth_xy, 0.0))
+    resampled: Float32 = np.where(known, values, np.float32(0)).reshape(height, width)
+    return resampled
 
 
 def _link(source: Path, target: Path) -> None:
+    """Hard-link a file, or copy it if links are impossible."""
     try:
         os.link(source.resolve(), target)
     except OSError:  # another disk, or a file system without links

@@ -1,10 +1,9 @@
-"""RealEstate10K.
+"""Importer of RealEstate10K.
 
-Reads the text file of a video (``ID.txt``: its address, then for each frame the time stamp,
-``fx fy cx cy`` as shares of width and height, two zeros, and the 3 x 4 ``cam_from_world`` row by
-row) and the frames that were cut from it, ``TIMESTAMP.png`` or ``.jpg``. The source is the folder
-of the frames, with the text file in it or beside it under the folder's name. Translations have no
-metric scale.
+Reads the text file of a video (``ID.txt``: URL, then for each frame the timestamp, ``fx fy cx cy``
+relative to width and height, two zeros, and the row-major 3 x 4 ``cam_from_world``) and the
+extracted frames, ``TIMESTAMP.png`` or ``.jpg``. The source is the folder of the frames, with the
+text file in it or next to it under the folder's name. Translations have no metric scale.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.importers.frames import PHOTOS, Frame, photo_size, pinhole_camera
 
 _VALUES = 19
-"""Numbers of a frame's line."""
+"""Values per line of a frame."""
 
 
 def read_frames(source: Path) -> list[Frame]:
-    """Frames of one video that were cut out; others of the text file are left out."""
+    """Read the extracted frames of a video; frames without an image file are skipped."""
     file = next((f for f in _candidates(source) if f.is_file()), None)
     if file is None:
-        raise InputError(f"{source}: no text file with cameras in it or beside it")
+        raise InputError(f"{source}: no text file with cameras in it or next to it")
     photos = {path.stem: path for path in source.iterdir() if path.suffix.lower() in PHOTOS}
     frames = []
     for line in file.read_text(encoding="utf-8").splitlines()[1:]:
@@ -45,6 +44,7 @@ def read_frames(source: Path) -> list[Frame]:
 
 
 def _candidates(source: Path) -> list[Path]:
+    """Return possible text files of the cameras."""
     return [
         source / f"{source.name}.txt",
         source.with_suffix(".txt"),

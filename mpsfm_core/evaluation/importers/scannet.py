@@ -1,9 +1,9 @@
-"""ScanNet, as its own reader exports a ``.sens`` file.
+"""Importer of ScanNet, as its reader exports a ``.sens`` file.
 
-Reads ``color/N.jpg``, ``depth/N.png`` (millimetres, 0 unknown), ``pose/N.txt`` (4 x 4
-``world_from_cam``, metres; not finite where tracking was lost), ``intrinsic/intrinsic_color.txt``
-and ``intrinsic_depth.txt`` (4 x 4, the first pixel's centre at (0, 0)). Both cameras are taken to
-be in one place, as their published extrinsics say.
+Reads ``color/N.jpg``, ``depth/N.png`` (millimeters, 0 unknown), ``pose/N.txt`` (4 x 4
+``world_from_cam``, meters; not finite if tracking was lost), ``intrinsic/intrinsic_color.txt``
+and ``intrinsic_depth.txt`` (4 x 4, the center of the first pixel at (0, 0)). Both cameras are
+assumed to have the same pose, as in their published extrinsics.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from mpsfm_core.data import Float32
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.importers.frames import (
     Frame,
-    carried_depth,
-    inverted,
-    need,
+    invert_pose,
     photo_size,
     pinhole_camera,
+    require_path,
+    resample_depth,
 )
 from mpsfm_core.evaluation.prior_quality import read_depth
 
 
 def read_frames(source: Path) -> list[Frame]:
-    """Frames with a pose, in the order they were taken."""
-    folder = need(source / "color", "folder of photos")
-    intrinsic = need(source / "intrinsic", "folder of intrinsics")
+    """Read the frames with a pose, in temporal order."""
+    folder = require_path(source / "color", "folder of photos")
+    intrinsic = require_path(source / "intrinsic", "folder of intrinsics")
     frames = []
     for photo in sorted(folder.glob("*.jpg"), key=lambda path: (len(path.stem), path.stem)):
         pose_file = source / "pose" / f"{photo.stem}.txt"
@@ -46,22 +46,24 @@ def read_frames(source: Path) -> list[Frame]:
                 f"{photo.stem.zfill(6)}.jpg",
                 photo,
                 camera,
-                inverted(pose),
-                _reader(depth, intrinsic / "intrinsic_depth.txt", camera),
+                invert_pose(pose),
+                _depth_reader(depth, intrinsic / "intrinsic_depth.txt", camera),
             )
         )
     return frames
 
 
-def _reader(depth: Path, intrinsic: Path, photo: pycolmap.Camera) -> Callable[[], Float32] | None:
+def _depth_reader(
+    depth: Path, intrinsic: Path, photo: pycolmap.Camera
+) -> Callable[[], Float32] | None:
     if not depth.is_file():
         return None
-    own = _camera(intrinsic, photo_size(depth))
-    return lambda: carried_depth(read_depth(depth), own, photo)
+    depth_camera = _camera(intrinsic, photo_size(depth))
+    return lambda: resample_depth(read_depth(depth), depth_camera, photo)
 
 
 def _camera(path: Path, size: tuple[int, int]) -> pycolmap.Camera:
-    matrix = np.loadtxt(need(path, "intrinsics"))
+    matrix = np.loadtxt(require_path(path, "intrinsics"))
     if matrix.shape != (4, 4):
         raise InputError(f"{path}: not a 4 x 4 matrix")
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5

@@ -1,9 +1,9 @@
-"""7-Scenes.
+"""Importer of 7-Scenes.
 
 Reads a scene (``chess/`` with ``seq-01/``, ...) or one sequence: ``frame-000000.color.png``,
-``.depth.png`` (millimetres, 65535 and 0 unknown) and ``.pose.txt`` (4 x 4 ``world_from_cam``,
-metres). Its authors give one focal length of 585 pixels for both cameras and treat depth and
-colour as one camera; they differ by some pixels.
+``.depth.png`` (millimeters, 65535 and 0 unknown) and ``.pose.txt`` (4 x 4 ``world_from_cam``,
+meters). The authors give a focal length of 585 pixels for both cameras and treat depth and
+color as one camera; the actual offset is a few pixels.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ import numpy as np
 
 from mpsfm_core.data import Float32
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.evaluation.importers.frames import Frame, inverted, photo_size, pinhole_camera
+from mpsfm_core.evaluation.importers.frames import Frame, invert_pose, photo_size, pinhole_camera
 
 _FOCAL_RATIO = 585 / 640
-"""Focal length over width."""
+"""Focal length relative to the image width."""
 _UNKNOWN = 65535
+"""Value of unknown depth."""
 
 
 def read_frames(source: Path) -> list[Frame]:
-    """Frames with a pose, of all sequences below the source."""
+    """Read the frames with a pose of all sequences below the source."""
     frames = []
     for photo in sorted(source.rglob("frame-*.color.png")):
         stem = photo.name.removesuffix(".color.png")
@@ -40,7 +41,7 @@ def read_frames(source: Path) -> list[Frame]:
         camera = pinhole_camera((width, height), focal, focal, width / 2, height / 2)
         name = (photo.relative_to(source).parent / f"{stem}.png").as_posix()
         read = partial(_read, depth) if depth.is_file() else None
-        frames.append(Frame(name, photo, camera, inverted(pose), read))
+        frames.append(Frame(name, photo, camera, invert_pose(pose), read))
     return frames
 
 

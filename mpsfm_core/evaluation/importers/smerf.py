@@ -1,8 +1,8 @@
-"""Scenes of Zip-NeRF that SMERF uses (Berlin, London, New York, Alameda).
+"""Importer of the Zip-NeRF scenes of SMERF (Berlin, London, New York, Alameda).
 
-Reads a folder with a COLMAP model in ``sparse/0`` (or ``colmap/sparse/0``) and the photos in
-``images``, else in the largest of ``images_2``, ``images_4``, ``images_8`` that is there. Fisheye
-and undistorted versions both work. There is no depth: overlap comes from the model's points.
+Reads a folder with a COLMAP model in ``sparse/0`` (or ``colmap/sparse/0``) and the images in
+``images`` or the largest available of ``images_2``, ``images_4`` and ``images_8``. Fisheye and
+undistorted versions work. The scenes have no depth, so overlap comes from the points of the model.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _PHOTOS = ("images", "images_2", "images_4", "images_8")
 
 
 def read_frames(source: Path) -> list[Frame]:
-    """Frames of one scene."""
+    """Read the frames of a scene."""
     model = next((source / m for m in _MODELS if has_model(source / m)), None)
     photos = next((source / p for p in _PHOTOS if (source / p).is_dir()), None)
     if model is None or photos is None:
@@ -27,5 +27,5 @@ def read_frames(source: Path) -> list[Frame]:
 
 
 def has_model(folder: Path) -> bool:
-    """Whether a folder holds a COLMAP model."""
+    """Return True if a folder contains a COLMAP model."""
     return any((folder / f"images.{suffix}").is_file() for suffix in ("bin", "txt"))

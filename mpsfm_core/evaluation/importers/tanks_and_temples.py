@@ -1,10 +1,10 @@
-"""Tanks and Temples.
+"""Importer of Tanks and Temples.
 
-Reads a folder with the photos (in it or in ``images/``) and either a COLMAP model of them in
-``sparse/0``, whose points give the overlap as in the paper, or the poses as the benchmark has them,
-``NAME_COLMAP_SfM.log``: for each photo in the order of names a line of three numbers and the
-4 x 4 matrix ``world_from_cam``. The logs come without intrinsics; the focal length then is the one
-that the videos' cameras have in reconstructions, so a model is the better truth.
+Reads a folder with the images (in it or in ``images/``) and either a COLMAP model in
+``sparse/0``, whose points give the overlap as in the paper, or the poses of the benchmark in
+``NAME_COLMAP_SfM.log``. The log has, for each image in the order of names, a line of three numbers
+and the 4 x 4 matrix ``world_from_cam``. The log has no intrinsics, so the focal length is a typical
+value of the cameras; a model is more accurate.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from mpsfm_core.evaluation.importers.colmap_model import model_frames
 from mpsfm_core.evaluation.importers.frames import (
     PHOTOS,
     Frame,
-    inverted,
+    invert_pose,
     photo_size,
     pinhole_camera,
 )
 from mpsfm_core.evaluation.importers.smerf import has_model
 
 _FOCAL_RATIO = 1165.72 / 1920
-"""Focal length over width."""
+"""Focal length relative to the image width."""
 _LINES = 5
 """Lines of a pose in the log."""
 
 
 def read_frames(source: Path) -> list[Frame]:
-    """Frames of one scene."""
+    """Read the frames of a scene."""
     folder = source / "images" if (source / "images").is_dir() else source
     if has_model(source / "sparse" / "0"):
         return model_frames(source / "sparse" / "0", lambda name: folder / name)
@@ -48,12 +48,12 @@ def read_frames(source: Path) -> list[Frame]:
         width, height = photo_size(photo)
         focal = _FOCAL_RATIO * width
         camera = pinhole_camera((width, height), focal, focal, width / 2, height / 2)
-        frames.append(Frame(photo.name, photo, camera, inverted(pose)))
+        frames.append(Frame(photo.name, photo, camera, invert_pose(pose)))
     return frames
 
 
 def _read_log(path: Path) -> list[Float64]:
-    """``world_from_cam`` (4, 4) of each photo."""
+    """Read ``world_from_cam`` (4, 4) of each image."""
     lines = path.read_text(encoding="utf-8").split("\n")
     lines = [line for line in lines if line.strip()]
     try:
