@@ -110,7 +110,7 @@ class Example:
     @cached_property
     def partner(self) -> Example:
         """Example of the same surfaces from 0.3 m to the side, with the same camera."""
-        return replace(self, name=f"partner/{self.name}", pose=_step_aside(self.pose))
+        return replace(self, name=f"beside/{self.name}", pose=_step_aside(self.pose))
 
     def mirror(self) -> Example:
         """Return the example with left and right swapped."""

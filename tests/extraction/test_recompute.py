@@ -179,7 +179,7 @@ from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.extraction.runner import extract
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.providers.provider_config import ProviderConfig
-from mpsfm_core.registry import Registry
+from mpsfm_core.providers.registry import Registry
 
 root = Path(sys.argv[1])
 depth = {"directory": str(root / "depth"), "relative_std": 0.02}

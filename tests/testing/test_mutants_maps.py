@@ -190,7 +190,7 @@ class FocalRatio(PaintedDepth):
         (CentreCrop, "depth-pixel-convention", "at the border", ()),
         (Transposed, "depth-orientation", "x and y are swapped", ()),
         (UpsideDown, "depth-orientation", "upside down", ()),
-        (FarSky, "depth-validity", "100% of the pixels without any surface are called valid", ()),
+        (FarSky, "depth-validity", "100% of the pixels without any surface are valid", ()),
         (NothingIsSure, "depth-validity", "50% of the pixels with a surface are not valid", ()),
         (Tilted, "depth-flip", "differs by .*% on the mirrored view", ()),
         (OldIntrinsics, "depth-same-in-larger-view", "grows 2 times", ("intrinsics-aware",)),
@@ -388,7 +388,7 @@ class DoublesIntrinsics(Wrapper):
         (KeepsDepth, "wrapper-hands-on-depth", "does not hand on the depth", "normals"),
         (MirrorNotUndone, "depth-scale", "not proportional to z", "depth"),
         (MirroredNormals, "normals-frame", "x is negated", "normals"),
-        (FillsHoles, "normals-validity", "without any surface are called valid", "normals"),
+        (FillsHoles, "normals-validity", "without any surface are valid", "normals"),
         (DoublesIntrinsics, "depth-same-in-larger-view", "grows 2 times", "depth"),
     ],
 )

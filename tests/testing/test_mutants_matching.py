@@ -219,7 +219,7 @@ class DepthOfRays(ToldMatcher):
         (SidesSwapped, "matcher-sides", "the two sides are exchanged"),
         (DenseIntegerCentres, "matcher-pixel-convention", r"shifted by \(\+0.50, \+0.50\) px"),
         (DepthSwapped, "matcher-pair-depth", "the two sides are exchanged"),
-        (DepthOfRays, "matcher-pair-depth", r"depth goes as z \* \(ray length / z\)"),
+        (DepthOfRays, "matcher-pair-depth", r"depth is proportional to z \* \(ray length / z\)"),
     ],
 )
 def test_dense_matchers(

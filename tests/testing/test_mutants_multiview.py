@@ -204,8 +204,8 @@ class Chains(Changed):
         (AlongTheFirst, "multiview-own-axis", "it is z of the first view"),
         (GroupFromCamera, "multiview-poses", "they are group_from_cam"),
         (OpenGL, "multiview-poses", "off by .* degrees"),
-        (CentersForTranslations, "multiview-poses", "goes another way"),
-        (UnitSteps, "multiview-pose-unit", "are 5 times as long as depth says"),
+        (CentersForTranslations, "multiview-poses", "has another direction"),
+        (UnitSteps, "multiview-pose-unit", "are 5 times as long as the unit of depth"),
         (OwnGrid, "multiview-intrinsics", "fx is .* off"),
         (RowsFirst, "multiview-intrinsics", "cx is 33% off"),
         (NeedsTwo, "multiview-alone", "index 1 is out of bounds"),
@@ -216,7 +216,7 @@ class Chains(Changed):
         (Sheared, "output-rules", "must be rotations and translations"),
         (Mirrored, "output-rules", "must not mirror"),
         (SomeInMetres, "output-rules", "metric in all views of a group or in none"),
-        (Chains, "no-state", "asked after other views"),
+        (Chains, "no-state", "after other views"),
     ],
 )
 def test_multiview(caught: Callable[..., None], factory: type, check: str, message: str) -> None:

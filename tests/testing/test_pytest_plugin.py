@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 SOURCE = """
     from mpsfm_core import Options, ProviderSpec, hookimpl
-    from mpsfm_core.testing.reference import PaintedDepth
+    from tests.support.reference_providers import PaintedDepth
 
     class HereOptions(Options):
         factor: float = 1.0
@@ -30,8 +30,8 @@ SOURCE = """
             return type(prior)(scaled.astype("float32"), prior.variance, prior.valid)
 
     def contract(folder):
-        from mpsfm_core.testing import Setup
-        return Setup(truth_source="painted", expected_failures={"flat": "is too honest to pass"})
+        from mpsfm_core.testing import ContractSetup
+        return ContractSetup(truth_source="painted", expected_failures={"flat": "is too honest to pass"})
 
     @hookimpl
     def mpsfm_providers():
@@ -76,7 +76,7 @@ def test_by_option_with_options(site: Path, tmp_path: Path) -> None:
     code, output = run_pytest(tmp_path, *arguments)
     assert code == 0
     assert "1 passed, 1 skipped" in output
-    assert "no known answer" in output
+    assert "correct answer is unknown" in output
 
 
 def test_by_option_without_such_a_plugin(site: Path, tmp_path: Path) -> None:
@@ -87,8 +87,8 @@ def test_by_option_without_such_a_plugin(site: Path, tmp_path: Path) -> None:
 
 def test_in_a_file_of_ones_own(site: Path, tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(
-        "from mpsfm_core.testing import Setup, contract_tests\n"
-        "test_mine = contract_tests('depth', 'here', Setup({'factor': 3}, 'painted'))\n"
+        "from mpsfm_core.testing import ContractSetup, contract_tests\n"
+        "test_mine = contract_tests('depth', 'here', ContractSetup({'factor': 3}, 'painted'))\n"
     )
     code, output = run_pytest(tmp_path, "-q", "-k", "is-z or depth-scale")
     assert code == 1
