@@ -291,8 +291,8 @@ def load_images(
             continue
         focal: FocalSource = "intrinsics"
         if given is not None:
-            camera = given.camera(name, file.size)
-        elif (shared := partial and partial.usual_camera(name, file.size)) is not None:
+            camera = given.camera(name, file.size, file.header.orientation)
+        elif (shared := partial and partial.usual_camera(name, *file.oriented_size)) is not None:
             camera = shared
         else:
             camera, focal = guesses.camera(file)
@@ -324,6 +324,11 @@ class _ProbedImage:
     digest: str
     fault: str = ""
     gps: GpsPosition | None = None
+
+    @property
+    def oriented_size(self) -> tuple[tuple[int, int], int]:
+        """Upright size and EXIF orientation."""
+        return self.size, self.header.orientation
 
 
 class _CameraGuesses:

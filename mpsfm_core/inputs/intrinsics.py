@@ -22,10 +22,13 @@ import yaml
 
 from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.inputs.colmap_database import read_database
+from mpsfm_core.inputs.model_orientation import orient_camera, stored_size
 from mpsfm_core.inputs.models import match_names, read_image_lines, read_model
 from mpsfm_core.inputs.text_files import read_text_file
 
 _DEFAULT_MODELS = {3: "SIMPLE_PINHOLE", 4: "PINHOLE"}
+_NUM_ORIENTATIONS = 8
+"""Number of EXIF orientations, 1 to 8."""
 _KEYS = ("model", "params", "width", "height", "images")
 _MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = 0.1, 10.0
 """Bounds of focal length over longer side [COLMAP min/max_focal_length_ratio]."""
@@ -49,6 +52,8 @@ class CameraEntry:
     """(width, height), None if the file does not have it."""
     images: frozenset[str] | None
     """Names of its images, None for all images that no other camera lists."""
+    is_stored: bool = False
+    """True if the camera is of stored pixels where the size does not decide [COLMAP]."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +84,16 @@ class Intrinsics:
 
     @property
     def max_id(self) -> int:
-        """Return the largest camera number."""
+        """Return the largest camera number, including those of turned cameras."""
+        return self._max_file_id + _NUM_ORIENTATIONS * len(self.entries)
+
+    @property
+    def _max_file_id(self) -> int:
         return max((entry.camera_id for entry in self.entries), default=0)
 
-    def usual_camera(self, name: str, size: tuple[int, int]) -> pycolmap.Camera | None:
+    def usual_camera(
+        self, name: str, size: tuple[int, int], orientation: int = 1
+    ) -> pycolmap.Camera | None:
         """Return the camera that lists the image, else the only camera of its size.
 
         Returns:
@@ -92,19 +103,27 @@ class Intrinsics:
             InputError: as :meth:`camera`.
         """
         if any(name in (entry.images or ()) for entry in self.entries):
-            return self.camera(name, size)
-        same = [entry for entry in self.entries if entry.size == size]
-        return self._checked(same[0], name, size) if len(same) == 1 else None
+            return self.camera(name, size, orientation)
+        sizes = (size, stored_size(size, orientation))
+        same = [entry for entry in self.entries if entry.size in sizes]
+        return self._checked(same[0], name, size, orientation) if len(same) == 1 else None
 
-    def camera(self, name: str, size: tuple[int, int]) -> pycolmap.Camera:
-        """Return the camera of an image of (width, height) pixels.
+    def camera(self, name: str, size: tuple[int, int], orientation: int = 1) -> pycolmap.Camera:
+        """Return the camera of an upright image.
+
+        Args:
+            name: name of the image.
+            size: upright (width, height).
+            orientation: EXIF orientation; a camera of the stored pixels is turned upright.
 
         Raises:
             InputError: the file has no camera for the image, or one for images of another size.
         """
-        return self._checked(self._entry(name), name, size)
+        return self._checked(self._entry(name), name, size, orientation)
 
-    def _checked(self, entry: CameraEntry, name: str, size: tuple[int, int]) -> pycolmap.Camera:
+    def _checked(
+        self, entry: CameraEntry, name: str, size: tuple[int, int], orientation: int
+    ) -> pycolmap.Camera:
         """Return the camera of an entry; raise :class:`InputError` if it does not fit the image."""
         width, height = entry.size or size
         camera = pycolmap.Camera(
@@ -114,6 +133,12 @@ class Intrinsics:
             params=list(entry.params),
             camera_id=entry.camera_id,
         )
+        fits_stored = entry.size == stored_size(size, orientation)
+        if orientation != 1 and fits_stored and (entry.is_stored or entry.size != size):
+            camera = orient_camera(camera, orientation)
+            row = self.entries.index(entry)
+            camera.camera_id = self._max_file_id + _NUM_ORIENTATIONS * row + orientation
+            entry = replace(entry, size=size)
         fault = _fault(camera, entry, size)
         if fault:
             raise InputError(
@@ -149,8 +174,10 @@ def read_intrinsics(path: Path, images_folder: Path | None = None) -> Intrinsics
     """
     try:
         if path.is_dir():
+            has_images = any((path / name).is_file() for name in ("images.txt", "images.bin"))
             text = path / "cameras.txt"
-            entries = _from_text(text) if text.is_file() else _from_model(path, images_folder)
+            is_list = text.is_file() and not has_images
+            entries = _from_text(text) if is_list else _from_model(path, images_folder)
         elif path.suffix == ".json":
             entries = _from_model(path, images_folder)
         elif path.suffix == ".db":
@@ -220,7 +247,8 @@ def _from_text(path: Path) -> tuple[CameraEntry, ...]:
         except (ValueError, IndexError) as error:
             raise InputError(f"{where}: expected ID MODEL WIDTH HEIGHT PARAMS") from error
         images = names.get(number, []) if names or len(cameras) > 1 else None
-        entries.append(_entry(where, number, fields[1], params, size, images))
+        entry = _entry(where, number, fields[1], params, size, images)
+        entries.append(replace(entry, is_stored=True))
     return tuple(entries)
 
 
@@ -229,7 +257,8 @@ def _from_database(path: Path) -> tuple[CameraEntry, ...]:
     names: dict[int, list[str]] = {}
     for name, number in database.images.items():
         names.setdefault(database.camera_of[number], []).append(name)
-    return _from_cameras(path, database.cameras, names)
+    entries = _from_cameras(path, database.cameras, names)
+    return tuple(replace(entry, is_stored=True) for entry in entries)
 
 
 def _from_model(path: Path, images_folder: Path | None) -> tuple[CameraEntry, ...]:

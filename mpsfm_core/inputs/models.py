@@ -12,7 +12,16 @@ import pycolmap
 
 from mpsfm_core.data import Pose
 from mpsfm_core.data.errors import InputError
+from mpsfm_core.data.result_layout import (
+    COMPONENTS,
+    SPARSE,
+    SPARSE_TEXT,
+    SUMMARY,
+    TRANSFORMS,
+    UNDISTORTED,
+)
 from mpsfm_core.inputs.colmap_files import check_binary_model
+from mpsfm_core.inputs.model_orientation import orient_model
 from mpsfm_core.inputs.nerfstudio import read_transforms
 from mpsfm_core.inputs.text_files import read_text_file
 
@@ -39,11 +48,31 @@ def read_model(path: Path, images_folder: Path | None = None) -> pycolmap.Recons
 
     Args:
         path: folder of the model, or the file.
-        images_folder: folder of the images, for a ``transforms.json`` without image sizes.
+        images_folder: folder of the images. With it, the model is turned to the upright images if
+            it belongs to stored pixels (see :func:`orient_model`). A ``transforms.json`` without
+            image sizes needs it.
 
     Raises:
         InputError: the model does not exist or cannot be read.
     """
+    model = _read_stored_model(path, images_folder)
+    if images_folder is None or not images_folder.is_dir() or _is_result(path):
+        return model
+    return orient_model(model, images_folder, match_names)
+
+
+def _is_result(path: Path) -> bool:
+    """Return whether a model is in one of our result folders, and so of upright images."""
+    path = path.resolve()
+    if (path / SUMMARY).is_file():
+        return True
+    if path.parent.name in (COMPONENTS, UNDISTORTED):
+        return (path.parent.parent / SUMMARY).is_file()
+    return path.name in (SPARSE, SPARSE_TEXT, TRANSFORMS) and (path.parent / SUMMARY).is_file()
+
+
+def _read_stored_model(path: Path, images_folder: Path | None) -> pycolmap.Reconstruction:
+    """Read a model as it is in its files."""
     if path.suffix == ".json":
         return read_transforms(path, images_folder)
     folder = find_model_folder(path)

@@ -74,7 +74,12 @@ class ExportSource:
             InputError: there is no model, or it is damaged.
         """
         summary = _read_summary(folder / SUMMARY)
-        model = read_model(folder)
+        if photos is None:
+            recorded = summary.get("photos")
+            sibling = find_model_folder(folder).parent / "images"
+            candidates = [Path(recorded)] if recorded else [folder / "images", sibling]
+            photos = next((path for path in candidates if path.is_dir()), None)
+        model = read_model(folder, photos)
         guesses = tuple(summary.get("images", {}).get("unconfirmed", ()))
         for image in list(model.images.values()):
             if image.name in guesses:
@@ -87,11 +92,6 @@ class ExportSource:
                 )
         if not model.num_reg_images():
             raise InputError(f"{folder}: the model has no image with a pose")
-        if photos is None:
-            recorded = summary.get("photos")
-            sibling = find_model_folder(folder).parent / "images"
-            candidates = [Path(recorded)] if recorded else [folder / "images", sibling]
-            photos = next((path for path in candidates if path.is_dir()), None)
         return cls(folder, model, photos, summary, guesses)
 
     @property
