@@ -8,7 +8,7 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.mapping.events import MappingEvents
 from mpsfm_core.mapping.model_selection import MapperRun
-from mpsfm_core.mapping.state import CheckpointArrays, freeze, thaw
+from mpsfm_core.mapping.serialization import CheckpointArrays, deserialize, serialize
 
 
 class CheckpointStore(Protocol):
@@ -58,7 +58,7 @@ class Checkpointer:
         if self._store is None or (arrays := self._store.load()) is None:
             return MapperProgress([], None)
         try:
-            runs, mapper = thaw(arrays, self._shared)
+            runs, mapper = deserialize(arrays, self._shared)
         except (DataError, TypeError, ValueError) as error:
             self._store.unreadable(str(error))
             return MapperProgress([], None)
@@ -76,4 +76,4 @@ class Checkpointer:
 
     def _save(self, progress: MapperProgress, num_registered: int) -> None:
         assert self._store is not None
-        self._store.save(freeze(tuple(progress), self._shared), num_registered)
+        self._store.save(serialize(tuple(progress), self._shared), num_registered)

@@ -48,7 +48,7 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.registration.tentative_registration import register_tentatively
 from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
-from mpsfm_core.mapping.state import canonical
+from mpsfm_core.mapping.serialization import canonicalize
 
 MIN_ABSORBING_RATIO = 0.25
 """Size relative to the largest component from which a component may absorb images of it. [ours]"""
@@ -76,7 +76,7 @@ def reconstruct(
         Connected components, the largest first, and the report.
     """
     options, events = options or MapperOptions(), events or NullMappingEvents()
-    problem = canonical(problem)
+    problem = canonicalize(problem)
     checkpointer = Checkpointer(checkpoints, problem, events)
     runs, interrupted = checkpointer.load()
     is_complete = bool(runs) and interrupted is None

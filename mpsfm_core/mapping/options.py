@@ -96,7 +96,7 @@ class TriangulationOptions(Options):
 
 
 class RefinementOptions(Options):
-    """Bundle adjustment and depth integration. [paper 3.3]"""
+    """Bundle adjustment and depth integration (paper 3.3)."""
 
     integrate: bool = Field(True)
     """Refine depth maps; False keeps the scaled priors, which is faster."""
@@ -141,7 +141,7 @@ class RefinementOptions(Options):
 
 
 class ConsistencyOptions(Options):
-    """Dense depth consistency check. [paper 3.4]"""
+    """Dense depth consistency check (paper 3.4)."""
 
     enabled: bool = True
     """Reject images whose depth contradicts the model; False registers more wrong images."""

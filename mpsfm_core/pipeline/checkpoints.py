@@ -1,8 +1,8 @@
-"""What mapping and the dense stage have found, on disk, so that a run that was killed goes on.
+"""Checkpoints of mapping and of the dense stage in the cache folder.
 
-Of the mapper its state, one file a problem; of the dense stage a file an image; both in the cache.
-They count for the same problem and options and the same code and numerical libraries; anything else
-is a new start, as results are to be those of a run that was never disturbed.
+Mapping stores its state in one file per problem, the dense stage one file per image. A checkpoint
+is valid for the same problem, options, code and numerical libraries, so a resumed run gives the
+same result as an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mpsfm_core.dense.stereo import StereoDepth
 from mpsfm_core.extraction.cache import Cache, cache_folder, content_key
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
-from mpsfm_core.mapping.state import CheckpointArrays, fingerprint
+from mpsfm_core.mapping.serialization import CheckpointArrays, fingerprint
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import core_version
 from mpsfm_core.support.files import remove_temporary_files, write_file
@@ -38,14 +38,14 @@ from mpsfm_core.support.npz import read_npz
 _log = logging.getLogger(__name__)
 
 FORMAT = 1
-"""Raised when the meaning of the files changes."""
+"""Format version of checkpoints; raising it invalidates all files."""
 
 _HEADER = "header"
-_SHARE = 0.02
-"""Of the time of a run that saving may take (ours)."""
-_KEPT_S = 30 * 24 * 3600.0
-"""Checkpoints that nobody came back to are taken away then (ours)."""
-_GIVEN_UP = "no checkpoints from now on: %s"
+_MAX_SAVING_RATIO = 0.02
+"""Share of the run time that saving may take."""
+_MAX_AGE_S = 30 * 24 * 3600.0
+"""Age at which unused checkpoints are deleted."""
+_DISK_ERROR = "no checkpoints from now on: %s"
 _LIBRARIES = ("numpy", "scipy", "numba", "pycolmap", "cv2")
 _NUMERICS = (
     "data",
@@ -58,9 +58,16 @@ _NUMERICS = (
 
 
 class MappingCheckpoints:
-    """The checkpoints of one problem.
+    """Checkpoints of the mapper for one problem.
 
-    ``every_s``: seconds between two of them at least; more where writing takes long.
+    Implements :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`.
+
+    Args:
+        cache_dir: Cache folder; None uses the cache folder of the platform.
+        problem: The mapping problem.
+        options: Options of the mapper.
+        stages: Receives notices.
+        every_s: Minimum seconds between checkpoints; more if writing is slow.
     """
 
     def __init__(
@@ -80,12 +87,12 @@ class MappingCheckpoints:
         self._failed = False
 
     def forget(self) -> None:
-        """Start anew next time: the run is finished, or that is wanted."""
+        """Delete the checkpoint."""
         with suppress(OSError):
             self._path.unlink()
 
     def load(self) -> CheckpointArrays | None:
-        """As :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`."""
+        """Load the checkpoint; None if it is missing or invalid."""
         self._clear_up()
         if not self._path.is_file():
             return None
@@ -95,27 +102,28 @@ class MappingCheckpoints:
             self.unreadable(str(error))
             return None
         if header.get("code") != code_key():
-            self.unreadable(f"it is of other code ({header.get('version')}, format or libraries)")
+            self.unreadable(
+                f"it was written by other code ({header.get('version')}, format or libraries)"
+            )
             return None
-        placed = f"{header['registered']} of {self._total} images placed in the last group"
+        placed = f"{header['registered']} of {self._total} images registered in the last component"
         self._stages.notice(
-            f"mapping goes on from a checkpoint of {header['time']}: {placed} (--fresh starts anew)"
+            f"mapping continues from a checkpoint of {header['time']}: {placed} (--fresh starts again)"
         )
         return arrays
 
     def unreadable(self, reason: str) -> None:
-        """As :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`."""
-        self._stages.notice(f"the checkpoint of this mapping is not used: {reason}; starting anew")
+        """Tell the user why the checkpoint is not used."""
+        self._stages.notice(
+            f"the checkpoint of this mapping is not used: {reason}; mapping starts again"
+        )
 
     def due(self) -> bool:
-        """As :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`."""
+        """Check whether it is time for the next checkpoint."""
         return not self._failed and time.monotonic() - self._last >= self._wait_s
 
     def save(self, state: CheckpointArrays, registered: int) -> None:
-        """As :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`.
-
-        A disk that is full ends no run: it goes on without checkpoints, and says so.
-        """
+        """Write a checkpoint; after a disk error, warn once and write no more."""
         if self._failed:
             return
         started = time.monotonic()
@@ -130,10 +138,10 @@ class MappingCheckpoints:
         try:
             write_file(self._path, lambda file: np.savez(file, **arrays), self._unfinished)
         except OSError as error:
-            _log.warning(_GIVEN_UP, error)
+            _log.warning(_DISK_ERROR, error)
             self._failed = True
         self._last = time.monotonic()
-        self._wait_s = max(self._every_s, (self._last - started) / _SHARE)
+        self._wait_s = max(self._every_s, (self._last - started) / _MAX_SAVING_RATIO)
 
     @property
     def _unfinished(self) -> Path:
@@ -143,32 +151,41 @@ class MappingCheckpoints:
         remove_temporary_files(self._unfinished)
         for path in self._folder.glob("*.npz"):
             with suppress(OSError):
-                if time.time() - path.stat().st_mtime > _KEPT_S:
+                if time.time() - path.stat().st_mtime > _MAX_AGE_S:
                     path.unlink()
 
 
 class DenseCheckpoints:
-    """What the dense stage has found for the images of a reconstruction.
+    """Checkpoints of the dense stage for the images of one reconstruction.
 
-    ``photos``: names the content of the photos of all images.
+    Implements :class:`mpsfm_core.dense.densify.StereoCheckpoints`.
+
+    Args:
+        cache_dir: Cache folder; None uses the cache folder of the platform.
+        reconstruction: The reconstruction.
+        image_keys: Content keys of all images.
+        options: Options of the dense stage.
     """
 
     def __init__(
         self,
         cache_dir: Path | None,
         reconstruction: Reconstruction,
-        photos: Sequence[str],
+        image_keys: Sequence[str],
         options: DenseOptions,
     ) -> None:
         self._cache = Cache(cache_dir)
-        self._all = content_key(
-            code_key(), fingerprint(reconstruction), list(photos), options.model_dump(mode="json")
+        self._reconstruction_key = content_key(
+            code_key(),
+            fingerprint(reconstruction),
+            list(image_keys),
+            options.model_dump(mode="json"),
         )
         self._names = [image.name for image in reconstruction.images]
-        self._failed, self._telling = False, Lock()
+        self._failed, self._warning_lock = False, Lock()
 
     def load(self, name: str) -> StereoDepth | None:
-        """As :class:`mpsfm_core.dense.densify.StereoCheckpoints`."""
+        """Load the depth of an image; None if it is missing."""
         return self._cache.load("dense", self._key(name), StereoDepth)
 
     def save(self, name: str, depth: StereoDepth) -> None:
@@ -178,22 +195,26 @@ class DenseCheckpoints:
         try:
             self._cache.store("dense", self._key(name), depth)
         except OutputError as error:
-            with self._telling:  # images are saved by several threads
+            with self._warning_lock:  # several threads save images
                 if not self._failed:
-                    _log.warning(_GIVEN_UP, error)
+                    _log.warning(_DISK_ERROR, error)
                 self._failed = True
 
     def forget(self) -> None:
-        """The run is finished."""
+        """Delete the checkpoints of all images."""
         for name in self._names:
             self._cache.forget("dense", self._key(name))
 
     def _key(self, name: str) -> str:
-        return content_key(self._all, name)
+        return content_key(self._reconstruction_key, name)
 
 
 def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], CheckpointArrays]:
-    """Header and state of a file; raises :class:`DataError` when it is damaged."""
+    """Read header and state of a checkpoint.
+
+    Raises:
+        DataError: the file is damaged.
+    """
     try:
         arrays = read_npz(path)
         header = json.loads(arrays.pop(_HEADER).tobytes())
@@ -207,12 +228,12 @@ def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], CheckpointArrays]:
 
 @functools.cache
 def code_key() -> str:
-    """Names the code that decides what mapper and dense stage find to the last bit."""
+    """Return a hash of all code and libraries that determine the result bit for bit."""
     package = Path(__file__).parents[1]
-    found = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for name in _NUMERICS:
         path = package / name
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
-            found.update(f"{file.relative_to(package)}\n".encode() + file.read_bytes())
+            sha256.update(f"{file.relative_to(package)}\n".encode() + file.read_bytes())
     versions = [importlib.import_module(name).__version__ for name in _LIBRARIES]
-    return content_key(FORMAT, found.hexdigest(), versions, platform.machine())
+    return content_key(FORMAT, sha256.hexdigest(), versions, platform.machine())

@@ -32,7 +32,7 @@ from mpsfm_core.inputs.image_search import read_image_list
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.models import read_model, read_poses
-from mpsfm_core.mapping.state import freeze, thaw
+from mpsfm_core.mapping.serialization import deserialize, serialize
 from mpsfm_core.pipeline import checkpoints
 from mpsfm_core.providers.builtin.map_files import read_arrays
 from mpsfm_core.providers.registry import Registry
@@ -95,7 +95,7 @@ def as_cache_entry(path: Path) -> None:
 
 def as_state(path: Path) -> None:
     """As a checkpoint that has been found to be of this problem."""
-    thaw(checkpoints.read_checkpoint(path)[1])
+    deserialize(checkpoints.read_checkpoint(path)[1])
 
 
 def as_hashes(path: Path) -> None:
@@ -137,7 +137,7 @@ _RECORD = json.dumps({
 def readers(registry: Registry) -> dict[str, tuple[bytes, Callable[[Path], object]]]:
     """File name -> a well-formed one, and what reads it."""
     depth = np.ones((4, 5), np.float32)
-    state = freeze(
+    state = serialize(
         {"a": np.arange(20.0), "b": [1, (2, "x")], "f": Features(np.ones((4, 2)), depth)}
     )
     header = np.frombuffer(b'{"code": "", "version": "", "registered": 1, "time": ""}', np.uint8)

@@ -39,7 +39,7 @@ from mpsfm_core.extraction.empty_results import JointPrior
 from mpsfm_core.extraction.matching.verification import TwoViewGeometry
 from mpsfm_core.inputs import video
 from mpsfm_core.inputs.options import VideoOptions
-from mpsfm_core.mapping.state import freeze
+from mpsfm_core.mapping.serialization import serialize
 from mpsfm_core.pipeline import checkpoints
 from mpsfm_core.providers.environments.environment import Environment
 from mpsfm_core.providers.environments.worker import _description
@@ -128,7 +128,7 @@ def write_cache(output: Path) -> None:
     text = json.dumps({**header, "time": "2026-01-01 00:00:00"}).encode()
     (output / "cache" / "mapping").mkdir()
     with (output / "cache" / "mapping" / "checkpoint.npz").open("wb") as file:
-        state: Any = freeze(STATE)
+        state: Any = serialize(STATE)
         np.savez(file, header=np.frombuffer(text, np.uint8), **state)
     with serving() as server:
         server.files["/v1/model.onnx"] = b"weights"

@@ -14,7 +14,13 @@ from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper, reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult
-from mpsfm_core.mapping.state import CheckpointArrays, canonical, fingerprint, freeze, thaw
+from mpsfm_core.mapping.serialization import (
+    CheckpointArrays,
+    canonicalize,
+    deserialize,
+    fingerprint,
+    serialize,
+)
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -56,12 +62,12 @@ def same(a: CheckpointArrays, b: CheckpointArrays) -> bool:
 def content(result: MappingResult, problem: MappingProblem) -> CheckpointArrays:
     """All of a result but the seconds that it took."""
     report = replace(result.report, seconds={})
-    return freeze(replace(result, report=report), problem)
+    return serialize(replace(result, report=report), problem)
 
 
 def thawed_poses(state: CheckpointArrays, problem: MappingProblem) -> CheckpointArrays:
-    _, mapper = thaw(state, (problem, NullMappingEvents()))
-    return freeze(mapper.component.scene.snapshot())
+    _, mapper = deserialize(state, (problem, NullMappingEvents()))
+    return serialize(mapper.component.scene.snapshot())
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +78,7 @@ def problem() -> MappingProblem:
         room_scene(), CAMERA, arc_poses(6, 14.0), noise=noise, points_per_view=80, map_width=48
     )
     apart = tuple(p for p in whole.pairs if (p.image_a < 3) == (p.image_b < 3))
-    return canonical(MappingProblem(whole.images, apart))
+    return canonicalize(MappingProblem(whole.images, apart))
 
 
 OPTIONS = MapperOptions(max_runs=2, enough_explained=1.0)
@@ -88,7 +94,7 @@ def test_every_attribute_comes_back(problem: MappingProblem, undisturbed) -> Non
     _, states = undisturbed
     shared = (problem, NullMappingEvents())
     for state in states:
-        assert same(freeze(thaw(state, shared), shared), state)
+        assert same(serialize(deserialize(state, shared), shared), state)
 
 
 def test_a_resumed_run_ends_the_same_bit_for_bit(problem: MappingProblem, undisturbed) -> None:
@@ -131,7 +137,7 @@ def test_a_damaged_state_is_a_new_start(problem: MappingProblem, undisturbed) ->
     broken.append({**states[0], "tree": np.frombuffer(b'{"format":1,"state":1}', np.uint8)})
     for state in broken[:-1]:
         with pytest.raises(DataError, match="state: is damaged"):
-            thaw(state, (problem, NullMappingEvents()))
+            deserialize(state, (problem, NullMappingEvents()))
     memory = Memory([broken[-1]], 2)
     with pytest.raises(Killed):
         reconstruct(problem, OPTIONS, checkpoints=memory)
@@ -144,15 +150,15 @@ def test_a_damaged_state_is_a_new_start(problem: MappingProblem, undisturbed) ->
 )
 def test_no_other_classes_come_out_of_a_state(path: str) -> None:
     text = f'{{"format":1,"state":{{"id":0,"object":"{path}","attributes":{{}}}}}}'
-    with pytest.raises(DataError, match="no class of the numerics"):
-        thaw({"tree": np.frombuffer(text.encode(), np.uint8)})
+    with pytest.raises(DataError, match="no class of a numerical package"):
+        deserialize({"tree": np.frombuffer(text.encode(), np.uint8)})
 
 
 def test_what_cannot_be_kept_is_named_with_its_place(problem: MappingProblem) -> None:
     mapper = Mapper(problem, OPTIONS, NullMappingEvents())
     mapper.event_log._seconds["lock"] = threading.Lock()
     with pytest.raises(TypeError, match=r"state\.event_log\._seconds\['lock'\]: a _thread\.lock"):
-        freeze(mapper, (problem, mapper.event_log._events))
+        serialize(mapper, (problem, mapper.event_log._events))
 
 
 def moved(array: np.ndarray) -> np.ndarray:
@@ -174,10 +180,10 @@ def test_how_a_problem_lies_in_memory_does_not_count(problem: MappingProblem, un
         for image in problem.images
     )
     other = MappingProblem(images, problem.pairs)
-    assert not same(freeze(other), freeze(problem))
-    assert fingerprint(other) == fingerprint(problem) == fingerprint(canonical(other))
-    assert same(freeze(canonical(other)), freeze(canonical(problem)))
-    assert canonical(canonical(other).images[0]) is not images[0]
+    assert not same(serialize(other), serialize(problem))
+    assert fingerprint(other) == fingerprint(problem) == fingerprint(canonicalize(other))
+    assert same(serialize(canonicalize(other)), serialize(canonicalize(problem)))
+    assert canonicalize(canonicalize(other).images[0]) is not images[0]
     memory = Memory(states[: len(states) // 2], -1)
     again = reconstruct(other, OPTIONS, checkpoints=memory)
     assert same(content(again, other), content(result, problem))
@@ -187,8 +193,8 @@ def test_how_a_problem_lies_in_memory_does_not_count(problem: MappingProblem, un
 
 def test_options_come_back(problem: MappingProblem) -> None:
     options = MapperOptions(seed=3, refinement={"global_growth": 0.5})
-    assert thaw(freeze(options)) == options != MapperOptions()
-    assert not same(freeze(options), freeze(MapperOptions()))
+    assert deserialize(serialize(options)) == options != MapperOptions()
+    assert not same(serialize(options), serialize(MapperOptions()))
 
 
 def test_arrays_keep_layout_sharing_and_protection() -> None:
@@ -208,7 +214,7 @@ def test_arrays_keep_layout_sharing_and_protection() -> None:
         "odd": [float("inf"), 1e-310, 2**70, "ä", {3, 4}, (1, (2,))],
         7: owner,
     }
-    came = thaw(freeze(state))
+    came = deserialize(serialize(state))
     assert came[7] is came["owner"] and came["owner"].flags.f_contiguous
     for name in ("owner", "view", "permuted", "fixed", "empty", "zero"):
         assert np.array_equal(came[name], state[name]) and came[name].strides == state[name].strides

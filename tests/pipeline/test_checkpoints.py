@@ -10,7 +10,7 @@ import pytest
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.state import freeze, thaw
+from mpsfm_core.mapping.serialization import deserialize, serialize
 from mpsfm_core.pipeline import checkpoints as module
 from mpsfm_core.pipeline.checkpoints import MappingCheckpoints
 from mpsfm_core.pipeline.stages import Stages
@@ -49,10 +49,10 @@ def opened(folder: Path, problem: MappingProblem, every_s: float = 0.0, **option
 def test_what_is_saved_is_loaded_by_the_same_run_only(tmp_path: Path, problem) -> None:
     checkpoints, _ = opened(tmp_path, problem)
     assert checkpoints.load() is None
-    checkpoints.save(freeze(STATE), 1)
+    checkpoints.save(serialize(STATE), 1)
     again, told = opened(tmp_path, problem)
-    assert thaw(again.load())["b"] == "text"
-    assert "goes on from a checkpoint" in told[0] and "1 of 2 images" in told[0]
+    assert deserialize(again.load())["b"] == "text"
+    assert "continues from a checkpoint" in told[0] and "1 of 2 images" in told[0]
     assert opened(tmp_path, problem, seed=1)[0].load() is None
     fewer = MappingProblem(problem.images, ())
     assert opened(tmp_path, fewer)[0].load() is None
@@ -64,16 +64,16 @@ def test_what_is_saved_is_loaded_by_the_same_run_only(tmp_path: Path, problem) -
 def test_a_checkpoint_of_other_code_is_a_new_start(
     tmp_path: Path, problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened(tmp_path, problem)[0].save(freeze(STATE), 1)
+    opened(tmp_path, problem)[0].save(serialize(STATE), 1)
     monkeypatch.setattr(module, "code_key", lambda: "another")
     checkpoints, told = opened(tmp_path, problem)
     assert checkpoints.load() is None
-    assert "other code" in told[0] and "starting anew" in told[0]
+    assert "other code" in told[0] and "mapping starts again" in told[0]
 
 
 @pytest.mark.parametrize("keep", [0, 10, 0.5, -1])
 def test_a_damaged_file_is_a_new_start(tmp_path: Path, problem, keep: float) -> None:
-    opened(tmp_path, problem)[0].save(freeze(STATE), 1)
+    opened(tmp_path, problem)[0].save(serialize(STATE), 1)
     (path,) = tmp_path.rglob("*.npz")
     data = path.read_bytes()
     path.write_bytes(data[: int(keep * len(data)) if 0 < keep < 1 else int(keep)])
@@ -91,7 +91,7 @@ def test_a_full_disk_ends_no_run(
     checkpoints, _ = opened(tmp_path, problem)
     assert checkpoints.due()
     monkeypatch.setattr(module, "write_file", full)
-    checkpoints.save(freeze(STATE), 1)
+    checkpoints.save(serialize(STATE), 1)
     assert "no checkpoints from now on" in caplog.text and "No space" in caplog.text
     assert not checkpoints.due()
 
@@ -107,7 +107,7 @@ def test_slow_disks_are_asked_less_often(
     assert not checkpoints.due()
     clock[0] = 60.0
     assert checkpoints.due()
-    checkpoints.save(freeze(STATE), 1)
+    checkpoints.save(serialize(STATE), 1)
     clock[0] = 70.0 + 499
     assert not checkpoints.due()
     clock[0] = 70.0 + 500

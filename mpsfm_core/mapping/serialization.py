@@ -1,9 +1,9 @@
-"""The state of the mapper as plain arrays and back, so that a run can go on where it was.
+"""Serialization of the state of the mapper to plain arrays, bit for bit.
 
-All of it is kept, down to which objects are one and which arrays share memory, since results are to
-be the same bit for bit: there is no list of attributes to forget one in. What cannot be kept, as a
-lock or an open file, is an error that names its place. Nothing is executed when a state is read:
-only data of the classes of the numerics comes back.
+The object graph is stored with shared objects and shared array memory, because results must not
+change by one bit. Unsupported objects, such as locks and open files, raise an error that names
+their place. Reading executes nothing: it only creates objects of the data classes of the numerical
+packages.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from pydantic import BaseModel
 from mpsfm_core.data.errors import DataError
 
 CheckpointArrays: TypeAlias = Mapping[str, NDArray[Any]]
-"""The arrays of a state by name; ``tree`` says how they belong together."""
+"""Arrays of a checkpoint by name; ``tree`` is the object graph as JSON."""
 
 T = TypeVar("T")
 
 FORMAT = 1
-"""Raised when the meaning of frozen states changes."""
+"""Format version; it increases when the meaning of stored states changes."""
 
 _TREE = "tree"
-_ROOMS = ("mapping", "scene", "optimize", "data", "geometry")
+_PACKAGES = ("mapping", "optimize", "data", "geometry")
 _PLAIN = (bool, int, float, str)
 _FACTORIES = {"int": int, "float": float, "list": list, "set": set, "dict": dict}
 _MAPS: dict[str, type[dict[Any, Any]]] = {
@@ -40,11 +40,15 @@ _MAPS: dict[str, type[dict[Any, Any]]] = {
 _GENERATORS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 
 
-def freeze(state: object, shared: object = None) -> CheckpointArrays:
-    """Take an object apart.
+def serialize(state: object, shared: object = None) -> CheckpointArrays:
+    """Serialize an object graph.
 
-    ``shared``: what the reader has as well, as the problem; objects and arrays of it are not kept
-    but found again. Raises :class:`TypeError` for what cannot be kept, with its place.
+    Args:
+        state: The object.
+        shared: Objects that the reader has too, such as the problem; they are stored by reference.
+
+    Raises:
+        TypeError: An object is not supported; the message names its place.
     """
     writer = _Writer(shared)
     tree = writer.node(state, "state")
@@ -52,10 +56,15 @@ def freeze(state: object, shared: object = None) -> CheckpointArrays:
     return {_TREE: np.frombuffer(text.encode(), dtype=np.uint8), **writer.arrays}
 
 
-def thaw(frozen: CheckpointArrays, shared: object = None) -> Any:
-    """The object that :func:`freeze` took apart, beside an equal ``shared``.
+def deserialize(frozen: CheckpointArrays, shared: object = None) -> Any:
+    """Restore an object graph from :func:`serialize`.
 
-    Raises :class:`DataError` when that is no such state or one of another format.
+    Args:
+        frozen: Arrays of the checkpoint.
+        shared: Objects equal to those that the writer had.
+
+    Raises:
+        DataError: The arrays are damaged or have another format.
     """
     try:
         stored = json.loads(frozen[_TREE].tobytes())
@@ -64,12 +73,12 @@ def thaw(frozen: CheckpointArrays, shared: object = None) -> Any:
         return _Reader(frozen, shared)(stored["state"])
     except DataError:
         raise
-    except Exception as error:  # arbitrary content: whatever it leads to, it is no state of ours
+    except Exception as error:  # arbitrary content may raise any error
         raise DataError("state", f"is damaged: {type(error).__name__}: {error}") from error
 
 
 class _Writer:
-    """Numbers the objects as it meets them; one that it met before is only named."""
+    """Writer that numbers objects and stores repeated ones by reference."""
 
     def __init__(self, shared: object) -> None:
         self.arrays: dict[str, NDArray[Any]] = {}
@@ -77,13 +86,13 @@ class _Writer:
         for number, found in enumerate(_parts(shared)):
             self._shared.setdefault(id(found), number)
         self._met: dict[int, int] = {}
-        self._alive: list[object] = [shared]  # so that no number is given to two objects
+        self._alive: list[object] = [shared]  # ids stay unique while objects live
 
     def node(self, value: Any, place: str) -> Any:
-        """The description of a value, as JSON has it."""
+        """Return the JSON node of a value."""
         if value is None or type(value) in _PLAIN:
             return value
-        if id(value) in self._shared:  # after plain values, which are one by chance
+        if id(value) in self._shared:  # after plain values, which may be interned
             return {"shared": self._shared[id(value)]}
         if id(value) in self._met:
             return {"met": self._met[id(value)]}
@@ -104,7 +113,7 @@ class _Writer:
         if cls in _MAPS.values():
             factory = getattr(value, "default_factory", None)
             if factory is not None and factory not in _FACTORIES.values():
-                raise TypeError(f"{place}: a factory of defaults {factory!r} cannot be kept")
+                raise TypeError(f"{place}: default factory {factory!r} cannot be serialized")
             keys = self._items(value, f"{place} keys")
             found = [self.node(item, f"{place}[{key!r}]") for key, item in value.items()]
             name = "" if factory is None else factory.__name__
@@ -116,7 +125,7 @@ class _Writer:
         if isinstance(value, type) and _is_ours(value):
             return {"class": _path(value)}
         if not _is_ours(cls):
-            raise TypeError(f"{place}: a {cls.__module__}.{cls.__qualname__} cannot be kept")
+            raise TypeError(f"{place}: a {cls.__module__}.{cls.__qualname__} cannot be serialized")
         if isinstance(value, Enum):
             return {"member": _path(cls), "name": value.name}
         if isinstance(value, tuple):  # of names
@@ -129,7 +138,7 @@ class _Writer:
 
     def _array(self, array: NDArray[Any], place: str) -> dict[str, Any]:
         if array.dtype.hasobject:
-            raise TypeError(f"{place}: an array of objects cannot be kept")
+            raise TypeError(f"{place}: an array of objects cannot be serialized")
         if isinstance(array.base, np.ndarray) and array.size:
             owner = array.base
             while isinstance(owner.base, np.ndarray):
@@ -160,6 +169,8 @@ class _Writer:
 
 
 class _Reader:
+    """Reader of the nodes that the writer stored."""
+
     def __init__(self, frozen: CheckpointArrays, shared: object) -> None:
         self._arrays = frozen
         self._shared = list(_parts(shared))
@@ -167,14 +178,14 @@ class _Reader:
         self._read_only: list[NDArray[Any]] = []
 
     def __call__(self, tree: Any) -> Any:
-        """The whole state."""
+        """Return the root object."""
         made = self.value(tree)
-        for array in self._read_only:  # last, as views of such an array may be written to
+        for array in self._read_only:  # last, because views of the array may be writable
             array.flags.writeable = False
         return made
 
     def value(self, node: Any) -> Any:
-        """What a node of the tree describes."""
+        """Return the object of a node."""
         if not isinstance(node, dict):
             return node
         if "shared" in node:
@@ -184,7 +195,8 @@ class _Reader:
         return self._made(node, node["id"])
 
     def _made(self, node: dict[str, Any], number: int) -> Any:
-        for kind in ("list", "set", "map", "object"):  # may hold themselves: known before filled
+        # containers may contain themselves, so that they are registered before they are filled
+        for kind in ("list", "set", "map", "object"):
             if kind in node:
                 filled: Any = getattr(self, f"_{kind}")(node, number)
                 return filled
@@ -246,7 +258,7 @@ class _Reader:
     def _array(self, node: dict[str, Any]) -> NDArray[Any]:
         if "view" in node:
             owner = self.value(node["view"])
-            # Unlike as_strided, the constructor checks that the view lies within its owner.
+            # unlike as_strided, the constructor checks the bounds of the view
             made: NDArray[Any] = np.ndarray(
                 tuple(node["shape"]),
                 node["dtype"],
@@ -263,9 +275,9 @@ class _Reader:
 
 
 def fingerprint(value: object) -> str:
-    """SHA-256 of the values in a tree of data classes, options, sequences and arrays.
+    """Compute the SHA-256 of a tree of data classes, options, sequences and arrays.
 
-    How arrays lie in memory, and which are one, does not count.
+    Memory layout and sharing of arrays have no effect.
     """
     found = hashlib.sha256()
     for part in _parts(value):
@@ -279,12 +291,12 @@ def fingerprint(value: object) -> str:
     return found.hexdigest()
 
 
-def canonical(value: T) -> T:
-    """The same data with every array in C order and in memory of its own.
+def canonicalize(value: T) -> T:
+    """Return the same data with every array in C order and in its own memory.
 
-    Results of sums and products depend, in the last bit, on how their arrays lie in memory, and a
-    problem whose parts come from the cache may differ there from one that was just computed. A view
-    of a whole array gives that array, as maps are most of what there is; it is not to be changed.
+    Sums and products depend on the memory layout in the last bit. Data from the cache may differ
+    in layout from data that was just computed. A view of a whole array is replaced by that array
+    without a copy; do not modify the result.
     """
     made: Any = value
     if isinstance(value, np.ndarray):
@@ -293,11 +305,11 @@ def canonical(value: T) -> T:
         elif value.base is not None or not value.flags.c_contiguous:
             made = np.array(value, order="C")
     elif isinstance(value, tuple):
-        items = [canonical(item) for item in value]
+        items = [canonicalize(item) for item in value]
         if any(new is not old for new, old in zip(items, value, strict=True)):
             made = type(value)._make(items) if hasattr(value, "_make") else tuple(items)
     elif _is_ours(type(value)) and not isinstance(value, (BaseModel, Enum)):
-        attributes = {name: canonical(item) for name, item in _attributes(value)}
+        attributes = {name: canonicalize(item) for name, item in _attributes(value)}
         if any(item is not getattr(value, name) for name, item in attributes.items()):
             made = object.__new__(type(value))
             for name, item in attributes.items():
@@ -306,7 +318,7 @@ def canonical(value: T) -> T:
 
 
 def _is_whole(array: NDArray[Any]) -> bool:
-    """Whether an array is a view of all of another one, which lies in order."""
+    """Return whether an array is a view of a whole array in C order."""
     owner = array.base
     return (
         type(owner) is np.ndarray
@@ -318,7 +330,7 @@ def _is_whole(array: NDArray[Any]) -> bool:
 
 
 def _parts(value: object) -> Iterator[object]:
-    """All there is in a tree, in a fixed order; twice what stands in two places."""
+    """Yield all objects of a tree in a fixed order, repeated ones repeatedly."""
     yield value
     if isinstance(value, (tuple, list)):
         for item in value:
@@ -333,6 +345,7 @@ def _parts(value: object) -> Iterator[object]:
 
 
 def _attributes(value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield names and values of slots and attributes."""
     for cls in type(value).__mro__:
         for name in getattr(cls, "__slots__", ()):
             if hasattr(value, name) and not name.startswith("__"):
@@ -341,8 +354,9 @@ def _attributes(value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _is_ours(cls: type) -> bool:
+    """Return whether a class belongs to the numerical packages."""
     package, _, rest = cls.__module__.partition(".")
-    return package == __name__.partition(".")[0] and rest.partition(".")[0] in _ROOMS
+    return package == __name__.partition(".")[0] and rest.partition(".")[0] in _PACKAGES
 
 
 def _path(cls: type) -> str:
@@ -352,23 +366,23 @@ def _path(cls: type) -> str:
 def _class(path: str) -> type:
     module, _, name = path.partition(":")
     package, _, rest = module.partition(".")
-    if package != __name__.partition(".")[0] or rest.partition(".")[0] not in _ROOMS:
-        raise ValueError(f"{path!r} is no class of the numerics")
+    if package != __name__.partition(".")[0] or rest.partition(".")[0] not in _PACKAGES:
+        raise ValueError(f"{path!r} is no class of a numerical package")
     found = getattr(importlib.import_module(module), name)
     if not (isinstance(found, type) and _is_ours(found)):
-        raise ValueError(f"{path!r} is no class of the numerics")
+        raise ValueError(f"{path!r} is no class of a numerical package")
     return found
 
 
 def _order(array: NDArray[Any]) -> list[int]:
-    """The axes as they follow each other in memory."""
+    """Return the axes in their order in memory."""
     long = [axis for axis in range(array.ndim) if array.shape[axis] > 1 and array.size]
     rest = [axis for axis in range(array.ndim) if axis not in long]
     return sorted(long, key=lambda axis: -array.strides[axis]) + rest
 
 
 def _memory(array: NDArray[Any]) -> NDArray[Any] | None:
-    """The bytes of an array that has no gaps, as a view; None if it has."""
+    """Return the bytes of an array without gaps as a view; None if it has gaps."""
     ordered = array.transpose(_order(array))
     return ordered.reshape(-1).view(np.uint8) if ordered.flags.c_contiguous else None
 
