@@ -61,10 +61,10 @@ def main() -> None:
             plain = prepared.of(item)
             for start, run in (("own", plain), ("true poses", _posed(plain, truth))):
                 models = reconstruct(run, options).reconstructions
-                found = models[0].poses if models else {}
+                poses = models[0].poses if models else {}
                 key = item.bucket, start
-                errors.setdefault(key, []).append(pose_errors_deg(found, truth, CONVENTION))
-                sizes.setdefault(key, []).append(len(found) / len(truth))
+                errors.setdefault(key, []).append(pose_errors_deg(poses, truth, CONVENTION))
+                sizes.setdefault(key, []).append(len(poses) / len(truth))
     lines = [HEADER]
     for (bucket, start), each in errors.items():
         area = pose_auc(np.concatenate(each), CONVENTION)

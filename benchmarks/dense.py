@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
-from mpsfm_core.evaluation.true_surface import true_depth_file
 
 from benchmarks._scenes import shared_folder
 from benchmarks.accuracy import FASTDEPTH, PRIORS
@@ -42,6 +41,7 @@ from mpsfm_core.evaluation.depth_accuracy import sample_depth_at_truth
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.report import CLOUD_METRICS
 from mpsfm_core.evaluation.scene_folder import EvaluationSet, SceneFolder, read_scene
+from mpsfm_core.evaluation.true_surface import true_depth_file
 from mpsfm_core.geometry import (
     camera_center,
     project,
@@ -123,9 +123,9 @@ def main() -> None:
 
 def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Reconstruction]:
     """Map the sets of a case, or read the stored result; ``true_poses``: keep the true poses."""
-    kept = output / f"{name}{'-true-poses' if true_poses else ''}.pickle"
-    if kept.is_file():
-        return list(pickle.loads(kept.read_bytes()))
+    stored = output / f"{name}{'-true-poses' if true_poses else ''}.pickle"
+    if stored.is_file():
+        return list(pickle.loads(stored.read_bytes()))
     prepared, sets = problem_of_case(name, output)
     options, truth = prepared.config.mapper_options(), {}
     if true_poses:
@@ -135,7 +135,7 @@ def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Recon
     for item in sets:
         problem = prepared.of(item).with_poses(truth)
         mapped.append(reconstruct(problem, options).reconstructions[0])
-    kept.write_bytes(pickle.dumps(mapped))
+    stored.write_bytes(pickle.dumps(mapped))
     return mapped
 
 
@@ -171,7 +171,7 @@ def measured(
     photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
     rows = []
     for way in WAYS:
-        found = []
+        errors_by_set = []
         for item in mapped:
             model, seconds, seen = item, 0.0, {}
             if way == "without prior":
@@ -189,8 +189,8 @@ def measured(
                 seconds = (time.process_time() - started) / len(model.images)
             cloud, *_ = fuse_depth_maps(model, view_of(photos), ResultOptions())
             errors = set_errors(scene, photos, problem, model, seen, cloud)
-            found.append({**errors, "cpu_s_photo": seconds})
-        usable = [each for each in found if len(each) > 1]
+            errors_by_set.append({**errors, "cpu_s_photo": seconds})
+        usable = [each for each in errors_by_set if len(each) > 1]
         rows.append({"case": name, "maps": way, "sets": len(usable), **_means(usable)})
     return rows
 
@@ -233,16 +233,16 @@ def set_errors(
     if scene.depth is None:
         assert problem is not None
         return points_near(problem, scene.truth, maps, scale)
-    beside = [
+    common_pixels = [
         MapBesideTruth.of(depth, read_depth(true_depth_file(scene.depth, name)), seen.get(name))
         for name, depth in maps.items()
     ]
-    own = own_scale(beside)
-    found = [map_errors(each, scale, own) for each in beside]
+    own_scale_factor = own_scale(common_pixels)
+    map_metrics = [map_errors(each, scale, own_scale_factor) for each in common_pixels]
     cameras = {photo.name: photo.pinhole for photo in photos}
     accuracy = evaluate_dense_geometry(reconstruction, cloud, scene, cameras, TOLERANCES)
     assert accuracy is not None  # guaranteed by scale and true depth
-    result = {"abs_rel": accuracy["depth"]["abs_rel"], **_means(found)}
+    result = {"abs_rel": accuracy["depth"]["abs_rel"], **_means(map_metrics)}
     for tolerance in map(str, TOLERANCES):
         centimetres = round(100 * float(tolerance))
         for key in CLOUD_METRICS:
@@ -266,10 +266,12 @@ class MapBesideTruth(NamedTuple):
     def of(cls, depth: DepthPrior, truth: Float32, seen: Bool | None) -> MapBesideTruth:
         """Collect the common pixels of a map and the true map; ``seen`` (h, w): measured pixels."""
         assert depth.variance is not None  # refined maps always have a std
-        xy, found, true = sample_depth_at_truth(depth.depth, depth.valid, truth)
+        xy, depth_samples, true = sample_depth_at_truth(depth.depth, depth.valid, truth)
         variance, _ = sample_bilinear(depth.variance, depth.valid, xy)
-        own = np.zeros(depth.shape, np.bool_) if seen is None else seen
-        return cls(found, np.sqrt(np.maximum(variance, 0)), true, sample_nearest(own, xy))
+        measured_mask = np.zeros(depth.shape, np.bool_) if seen is None else seen
+        return cls(
+            depth_samples, np.sqrt(np.maximum(variance, 0)), true, sample_nearest(measured_mask, xy)
+        )
 
 
 def own_scale(maps: Sequence[MapBesideTruth]) -> float:
@@ -278,25 +280,27 @@ def own_scale(maps: Sequence[MapBesideTruth]) -> float:
     It is more accurate than the scale of a few camera centers.
     """
     ratios = [each.truth / each.depth for each in maps]
-    told = [ratio[each.measured] for ratio, each in zip(ratios, maps, strict=True)]
-    return float(np.median(np.concatenate(told if any(map(len, told)) else ratios)))
+    measured_ratios = [ratio[each.measured] for ratio, each in zip(ratios, maps, strict=True)]
+    return float(
+        np.median(np.concatenate(measured_ratios if any(map(len, measured_ratios)) else ratios))
+    )
 
 
-def map_errors(of: MapBesideTruth, scale: float, own: float) -> dict[str, float]:
+def map_errors(pixels: MapBesideTruth, scale: float, own_scale_factor: float) -> dict[str, float]:
     """Compute the errors of one map.
 
     In the ``scale`` of the cameras: share of accurate pixels, AbsRel, and the part of AbsRel of
     pixels that are not measured. In the ``own`` scale: AbsRel and the share within the stated std,
     for measured and other pixels.
     """
-    measured, relative = of.measured, np.abs(scale * of.depth - of.truth) / of.truth
-    error = np.abs(own * of.depth - of.truth)
-    within = error <= own * of.std
+    measured, relative = pixels.measured, np.abs(scale * pixels.depth - pixels.truth) / pixels.truth
+    error = np.abs(own_scale_factor * pixels.depth - pixels.truth)
+    within = error <= own_scale_factor * pixels.std
     return {
         "near": float((relative <= NEAR).mean()),
         "measured": float(measured.mean()),
         "abs_rel_of_rest": float(relative[~measured].sum() / len(relative)),
-        "abs_rel_own_scale": float((error / of.truth).mean()),
+        "abs_rel_own_scale": float((error / pixels.truth).mean()),
         "within_std_measured": float(within[measured].mean()) if measured.any() else np.nan,
         "within_std_rest": float(within[~measured].mean()) if not measured.all() else np.nan,
     }
@@ -307,7 +311,7 @@ def triangulated(problem: MappingProblem, truth: Mapping[str, Pose]) -> dict[str
 
     Points with a residual above a pixel or a small triangulation angle are excluded.
     """
-    found: dict[str, list[Float64]] = {}
+    points_by_image: dict[str, list[Float64]] = {}
     for pair in problem.pairs:
         images = [problem.images[pair.image_a], problem.images[pair.image_b]]
         if not all(image.name in truth for image in images):
@@ -327,8 +331,9 @@ def triangulated(problem: MappingProblem, truth: Mapping[str, Pose]) -> dict[str
             off = np.linalg.norm(project(image.camera, each) - xy, axis=1)
             good &= (each[:, 2] > 0) & (off < ERROR_PX)
         for image, xy, each in zip(images, pixels, seen, strict=True):
-            found.setdefault(image.name, []).append(np.column_stack([xy, each[:, 2]])[good])
-    return {name: np.concatenate(parts) for name, parts in found.items()}
+            samples = np.column_stack([xy, each[:, 2]])[good]
+            points_by_image.setdefault(image.name, []).append(samples)
+    return {name: np.concatenate(parts) for name, parts in points_by_image.items()}
 
 
 def points_near(
@@ -345,15 +350,15 @@ def points_near(
             continue
         depth, true = maps[name], points[:, 2]
         xy = scale_pixels(points[:, :2], cameras[name].size, depth.shape[::-1])
-        found, ok = sample_bilinear(depth.depth, depth.valid, xy)
-        right += int((ok & (np.abs(scale * found - true) <= POINT_NEAR * true)).sum())
+        depth_samples, ok = sample_bilinear(depth.depth, depth.valid, xy)
+        right += int((ok & (np.abs(scale * depth_samples - true) <= POINT_NEAR * true)).sum())
         total += len(points)
     return {"points_near": right / max(1, total), "true_points": float(total)}
 
 
-def _means(found: Sequence[Mapping[str, float]]) -> dict[str, float]:
+def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Compute the mean of each key over the entries that have it."""
-    values = {key: [each[key] for each in found if np.isfinite(each[key])] for key in found[0]}
+    values = {key: [each[key] for each in rows if np.isfinite(each[key])] for key in rows[0]}
     return {key: float(np.mean(known)) if known else np.nan for key, known in values.items()}
 
 

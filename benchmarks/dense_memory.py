@@ -18,7 +18,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from mpsfm_core.evaluation.true_surface import true_depth_file
 
 from benchmarks._scenes import shared_folder
 from benchmarks.dense import view_of
@@ -27,6 +26,7 @@ from mpsfm_core.dense.densify import densify
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.scene_folder import read_scene
+from mpsfm_core.evaluation.true_surface import true_depth_file
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.options import InputOptions

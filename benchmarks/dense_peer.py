@@ -24,7 +24,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
-from mpsfm_core.evaluation.true_surface import true_depth_file
 
 from benchmarks._scenes import shared_folder
 from benchmarks.dense import CASES, TOLERANCES, mapped_sets, table, view_of, without_prior
@@ -38,6 +37,7 @@ from mpsfm_core.evaluation.depth_accuracy import sample_depth_at_truth
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.report import CLOUD_METRICS
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
+from mpsfm_core.evaluation.true_surface import true_depth_file
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.inputs.images import load_images
@@ -80,7 +80,7 @@ def peer_result(
         span = peer._depth_range(colmap, image, pose)
         if span is None or not partners[number]:
             continue
-        sources, found = [], []
+        sources, depth_maps = [], []
         for other in partners[number]:
             theirs = peer._pose(colmap.images[other])
             their_matrix = peer._K(colmap.cameras[colmap.images[other].camera_id])
@@ -89,8 +89,10 @@ def peer_result(
             sources.append((_unit(grey[other]), _params(peer, their_matrix), turned, shift))
             pair = grey[number], grey[other], matrix, their_matrix, pose, theirs, span
             depth = peer._pair_depth(*pair)
-            found += [] if depth is None else [depth]
-        start = peer._combine(found, min(agree, 1), max(tolerance, 0.01)) if found else None
+            depth_maps += [] if depth is None else [depth]
+        start = (
+            peer._combine(depth_maps, min(agree, 1), max(tolerance, 0.01)) if depth_maps else None
+        )
         normals = None if start is None else peer._normals_from_depth(start, matrix)
         kernel = peer._native.kernel("patchmatch_depth")
         depth, normals, _ = kernel(
@@ -153,8 +155,8 @@ def depth_errors(
         total += int((truth > 0).sum())
         if name not in maps:
             continue
-        xy, found, true = sample_depth_at_truth(maps[name].depth, maps[name].valid, truth)
-        errors.append(np.abs(scale * found / true - 1)[sample_nearest(chosen[name], xy)])
+        xy, depth_samples, true = sample_depth_at_truth(maps[name].depth, maps[name].valid, truth)
+        errors.append(np.abs(scale * depth_samples / true - 1)[sample_nearest(chosen[name], xy)])
     relative = np.concatenate(errors)
     return {
         "known": len(relative) / total,
@@ -192,10 +194,10 @@ def main() -> None:
                     maps, cloud, seen = ours(model, view, way == "dense", arguments.true_poses)
                 seconds = time.process_time() - started, time.perf_counter() - clock
                 scale = errors.truth_from_estimate.scale
-                found = depth_errors(scene, maps, seen, [i.name for i in model.images], scale)
+                metrics = depth_errors(scene, maps, seen, [i.name for i in model.images], scale)
                 judged = evaluate_dense_geometry(model, cloud, scene, cameras, TOLERANCES)
                 assert judged is not None
-                row: dict[str, Any] = {"case": case, "set": number, "way": way, **found}
+                row: dict[str, Any] = {"case": case, "set": number, "way": way, **metrics}
                 for tolerance in map(str, TOLERANCES):
                     for key in CLOUD_METRICS:
                         row[f"{key} {tolerance}"] = judged["cloud"][key][tolerance]

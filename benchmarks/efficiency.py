@@ -96,12 +96,12 @@ def _measured(views: int) -> dict[str, float]:
         mapper.reconstruct(problem)
         profile.disable()
     profile.create_stats()
-    found = dict.fromkeys(STEPS, 0.0)
+    seconds_by_step = dict.fromkeys(STEPS, 0.0)
     for (file, _, function), (*_, seconds, _) in profile.stats.items():
         for name, step in STEPS.items():
             if (PurePath(file).name, function) in step.functions:
-                found[name] += seconds
-    return {**found, "peak": peak_memory_mb()}
+                seconds_by_step[name] += seconds
+    return {**seconds_by_step, "peak": peak_memory_mb()}
 
 
 if __name__ == "__main__":

@@ -65,9 +65,9 @@ def compared(scene: SceneFolder) -> list[str]:
     folder = scene.images.parent
     rows = []
     with tempfile.TemporaryDirectory() as work:
-        own = [sys.executable, "-m", "benchmarks.end_to_end", "--colmap", str(folder)]
+        colmap_command = [sys.executable, "-m", "benchmarks.end_to_end", "--colmap", str(folder)]
         target = Path(work, "colmap")
-        reference = timed([*own, str(target)], {})
+        reference = timed([*colmap_command, str(target)], {})
         rows.append(row(scene, "COLMAP", read_poses(target), reference, reference))
         for config in OURS:
             target = Path(work, config)

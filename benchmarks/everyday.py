@@ -98,10 +98,10 @@ def measured(
 def _row(hall: HallProblem, outcomes: Sequence[MethodResult]) -> dict[str, Any]:
     """Compute medians of the repeats; the accuracy is the same in all."""
     first = outcomes[0]
-    found = first.models[0] if first.models else {}
-    area = pose_auc(pose_errors_deg(found, hall.truth, CONVENTION), CONVENTION)
+    poses = first.models[0] if first.models else {}
+    area = pose_auc(pose_errors_deg(poses, hall.truth, CONVENTION), CONVENTION)
     return {
-        "registered": len(found),
+        "registered": len(poses),
         "auc": {str(threshold): value for threshold, value in area.items()},
         "auc_percent": percent(area),
         "seconds": statistics.median(o.seconds for o in outcomes),

@@ -97,24 +97,24 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     film(sorted((shared_folder() / "data" / "hololens_room" / "images").iterdir()), folder / VIDEO)
     os.environ.setdefault("MPSFM_CACHE", str(folder / "cache"))
-    most = ["--set", f"inputs.video.max_frames={options.frames}"]
+    max_frames = ["--set", f"inputs.video.max_frames={options.frames}"]
     rows: list[tuple[str, float | None, float, str]] = []
     for arguments in (
-        ["reconstruct", VIDEO, "-o", "out", *most],
+        ["reconstruct", VIDEO, "-o", "out", *max_frames],
         ["export", "out", "--to", "gsplat"],
     ):
-        used, clock, said = timed([*MPSFM, *arguments], folder)
-        rows.append((f"`mpsfm {' '.join(arguments)}`", used, clock, said.splitlines()[0]))
-    clock, said = look(folder / "out" / "report.html")
-    rows.append(("`out/report.html` in Chromium", None, clock, said))
+        used, clock, output = timed([*MPSFM, *arguments], folder)
+        rows.append((f"`mpsfm {' '.join(arguments)}`", used, clock, output.splitlines()[0]))
+    clock, output = look(folder / "out" / "report.html")
+    rows.append(("`out/report.html` in Chromium", None, clock, output))
     if options.gsplat is not None:
         loader = [sys.executable, "-c", _LOADER, str(options.gsplat.resolve()), SPLATS]
-        used, clock, said = timed(loader, folder)
-        rows.append(("gsplat's own loader", used, clock, said.splitlines()[-1]))
+        used, clock, output = timed(loader, folder)
+        rows.append(("gsplat's own loader", used, clock, output.splitlines()[-1]))
     print("| step | processor s | clock s | it says |\n| --- | ---: | ---: | --- |")
-    for step, used, clock, said in rows:
+    for step, used, clock, output in rows:
         numbers = ["" if value is None else f"{value:.0f}" for value in (used, clock)]
-        print(f"| {step} | {numbers[0]} | {numbers[1]} | {said} |")
+        print(f"| {step} | {numbers[0]} | {numbers[1]} | {output} |")
 
 
 if __name__ == "__main__":

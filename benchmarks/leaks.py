@@ -36,9 +36,9 @@ def main() -> None:
     count = parser.parse_args().count
     with tempfile.TemporaryDirectory() as folder:
         runs = measure_usage(reconstruction(Path(folder)), count)
-        held = np.fromiter(runs, np.dtype((float, len(ProcessUsage._fields))), count)
+        usage = np.fromiter(runs, np.dtype((float, len(ProcessUsage._fields))), count)
     later = np.arange(count // 2, count)
-    slopes = ProcessUsage(*np.polyfit(later, held[later], 1)[0])
+    slopes = ProcessUsage(*np.polyfit(later, usage[later], 1)[0])
     lines = [
         f"# {count} reconstructions in one process",
         "",
@@ -50,7 +50,7 @@ def main() -> None:
         "| after run | resident MB | objects | open files | threads |",
         "| --- | --- | --- | --- | --- |",
         *(
-            "| {} | {:.1f} | {:.0f} | {:.0f} | {:.0f} |".format(k + 1, *held[k])
+            "| {} | {:.1f} | {:.0f} | {:.0f} | {:.0f} |".format(k + 1, *usage[k])
             for k in (0, *range(count // 10 - 1, count, count // 10))
         ),
     ]

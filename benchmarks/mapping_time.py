@@ -55,14 +55,14 @@ def _spaced(frames: Sequence[str], count: int) -> list[str]:
 
 def _table(sizes: Sequence[int], records: Sequence[BenchmarkRecord]) -> str:
     """Format a row for each number of images, and the exponents of growth."""
-    found = {(record.bucket, record.label): record for record in records}
+    record_by_run = {(record.bucket, record.label): record for record in records}
     lines = [
         f"| images | {' | '.join(METHODS)} | ours / colmap | ours / colmap-structureless |",
         "|---" * (len(METHODS) + 3) + "|",
     ]
     seconds = np.zeros((len(sizes), len(METHODS)))
     for row, size in enumerate(sizes):
-        of_size = [found[f"{size:03d}", method] for method in METHODS]
+        of_size = [record_by_run[f"{size:03d}", method] for method in METHODS]
         seconds[row] = [record.seconds for record in of_size]
         cells = [f"{r.seconds:.2f}, {r.cpu_seconds:.2f} ({len(r.estimated)})" for r in of_size]
         ratios = [f"{seconds[row, 0] / other:.1f}x" for other in seconds[row, 1:]]

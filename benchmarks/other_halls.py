@@ -49,12 +49,12 @@ class Matches:
         """Create a hall of this kind."""
         hall = make_hall_problem(views, errors, seed=seed, **self.options)  # type: ignore[arg-type]
         rng = np.random.default_rng(seed)
-        kept = [
+        selected = [
             pair
             for pair in hall.problem.pairs
             if rng.uniform() < self.share and pair.image_b - pair.image_a <= self.reach
         ]
-        return hall._replace(problem=MappingProblem(hall.problem.images, tuple(kept)))
+        return hall._replace(problem=MappingProblem(hall.problem.images, tuple(selected)))
 
 
 MATCHES = {
@@ -105,10 +105,10 @@ def compared(halls: Sequence[HallProblem], workers: int) -> str:
         for number, hall in enumerate(halls)
         for method in (PEER, OURS)
     ]
-    found: dict[str, list[tuple[HallProblem, MethodResult]]] = {PEER: [], OURS: []}
+    results: dict[str, list[tuple[HallProblem, MethodResult]]] = {PEER: [], OURS: []}
     for task, outcome in run_methods(tasks, workers):
-        found[task.method].append((halls[int(task.label)], outcome))
-    of_peer, of_ours = _summed(found[PEER]), _summed(found[OURS])
+        results[task.method].append((halls[int(task.label)], outcome))
+    of_peer, of_ours = _summed(results[PEER]), _summed(results[OURS])
     total = sum(len(hall.truth) for hall in halls)
     cells = [f"{rows['images']} of {total}" for rows in (of_peer, of_ours)]
     cells += [percent(rows["auc"]) for rows in (of_peer, of_ours)]

@@ -35,7 +35,7 @@ from mpsfm_core.extraction.events import NullExtractionEvents
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.matching.pair_matching import PairMatcher, PairVerifier
 from mpsfm_core.extraction.options import PairOptions
-from mpsfm_core.extraction.pairs import similarity as first_look
+from mpsfm_core.extraction.pairs import similarity as pair_similarity
 from mpsfm_core.extraction.pairs.pairing import Pair, most_similar_pairs, numbered_neighbor_pairs
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.providers.registry import Registry
@@ -81,10 +81,12 @@ def main() -> None:
 def _row(name: str, case: Case) -> str:
     started = time.process_time()
     count, options = len(case.names), PairOptions()
-    found = np.zeros((count, count))
+    scores = np.zeros((count, count))
     for a, b in combinations(range(count), 2):
-        found[a, b] = found[b, a] = first_look.match_score(case.descriptors[a], case.descriptors[b])
-    alike = most_similar_pairs(first_look.diffuse_similarity(found), options.partners)
+        scores[a, b] = scores[b, a] = pair_similarity.match_score(
+            case.descriptors[a], case.descriptors[b]
+        )
+    alike = most_similar_pairs(pair_similarity.diffuse_similarity(scores), options.partners)
     chosen = {*alike, *numbered_neighbor_pairs(case.names, options)}
     seconds = time.process_time() - started
     recalls = []
@@ -134,7 +136,9 @@ def _real(name: str, output: Path) -> Case:
         cosine = (np.trace(outcome.rotation @ rotation.T) - 1) / 2
         if not outcome.reason and cosine > math.cos(math.radians(RIGHT_DEG)):
             matched.append((a, b))
-    descriptors = [first_look.strongest_descriptors(table[index]) for index in range(len(names))]
+    descriptors = [
+        pair_similarity.strongest_descriptors(table[index]) for index in range(len(names))
+    ]
     return Case(names, descriptors, overlap, matched)
 
 
@@ -153,10 +157,12 @@ def _hall(seed: int = 0) -> Case:
     vectors = _unit(rng.normal(size=(1 + max(points.max() for points in hall.points), 64)))
     descriptors = []
     for points in hall.points:
-        found = rng.permutation(points)[: min(len(points), first_look.NUM_DESCRIPTORS) // 2]
-        noise = 0.5 * _unit(rng.normal(size=(len(found), 64)))
-        own = _unit(rng.normal(size=(len(found), 64)))
-        descriptors.append(np.concatenate([_unit(vectors[found] + noise), own]).astype(np.float32))
+        repeated = rng.permutation(points)[: min(len(points), pair_similarity.NUM_DESCRIPTORS) // 2]
+        noise = 0.5 * _unit(rng.normal(size=(len(repeated), 64)))
+        outliers = _unit(rng.normal(size=(len(repeated), 64)))
+        descriptors.append(
+            np.concatenate([_unit(vectors[repeated] + noise), outliers]).astype(np.float32)
+        )
     names = [f"{number:03d}.png" for number in rng.permutation(VIEWS)]
     matched = [(pair.image_a, pair.image_b) for pair in hall.problem.pairs]
     return Case(names, descriptors, overlap.two_view, matched)

@@ -47,7 +47,7 @@ def on_terminal(*arguments: str, code: int = 0) -> str:
         [*MPSFM, *arguments], stdin=theirs, stdout=theirs, stderr=theirs, env=environment
     )
     os.close(theirs)
-    said = b""
+    output = b""
     while True:
         try:
             part = os.read(ours, 65536)
@@ -55,16 +55,16 @@ def on_terminal(*arguments: str, code: int = 0) -> str:
             break
         if not part:
             break
-        said += part
+        output += part
     if process.wait() != code:
         raise SystemExit(f"mpsfm {' '.join(arguments)} ended with {process.returncode}")
-    return said.decode("utf-8", errors="replace")
+    return output.decode("utf-8", errors="replace")
 
 
-def draw_terminal(said: str, command: str, path: Path) -> None:
+def draw_terminal(output: str, command: str, path: Path) -> None:
     """Render terminal output as SVG with rich; progress bars appear once, in their final state."""
     lines = [""]
-    for part in re.split(r"(\x1b\[1A|\x1b\[2K|\r|\n)", said):
+    for part in re.split(r"(\x1b\[1A|\x1b\[2K|\r|\n)", output):
         if part == "\x1b[1A":
             lines.pop()
         elif part == "\x1b[2K":
@@ -139,9 +139,9 @@ def _colour(browser: Any, color: str) -> None:
 def draw_maps(folder: Path, row: int = 5) -> None:
     """Draw the maps of a photo side by side, from the data of the report."""
     text = (folder / "report.html").read_text(encoding="utf-8")
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
-    assert found is not None
-    pictures = json.loads(found[1])["photos"][row]["pictures"]
+    match = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
+    assert match is not None
+    pictures = json.loads(match[1])["photos"][row]["pictures"]
     strip = []
     for name in _MAPS:
         data = base64.b64decode(pictures[name]["src"].partition(",")[2])
@@ -187,8 +187,8 @@ def main() -> None:
             shutil.copy(ROOT / "examples" / "sample_scene" / "images" / name, photos)
         shown = "mpsfm demo --output out"
         if not (out / "report.html").is_file():
-            said = on_terminal("demo", "--offline", "--output", str(out))
-            draw_terminal(said.replace(str(out), "out"), shown, PICTURES / "terminal.svg")
+            output = on_terminal("demo", "--offline", "--output", str(out))
+            draw_terminal(output.replace(str(out), "out"), shown, PICTURES / "terminal.svg")
         if not (failed / "report.html").is_file():
             ours = ("--offline", "--set", "depth.use=compact")
             on_terminal("reconstruct", str(photos), *ours, "-o", str(failed), code=3)

@@ -61,7 +61,7 @@ class Life:
     @property
     def resumed(self) -> str:
         """Return the message about the resumed mapping."""
-        return next((line for line in self.said if "goes on from a checkpoint" in line), "")
+        return next((line for line in self.said if "continues from a checkpoint" in line), "")
 
 
 def main() -> None:
@@ -155,11 +155,13 @@ def cpu_seconds(pid: int) -> float:
 
 def report(folder: Path, alone: Life, lives: list[Life], arguments: argparse.Namespace) -> str:
     """Format the table and the differences."""
-    expected, found = (content(folder / name / "out") for name in ("alone", "disturbed"))
-    names = expected.keys() | found.keys()
-    different = sorted(name for name in names if expected.get(name) != found.get(name))
-    left = [p.name for p in (folder / "disturbed" / "cache" / "mapping").rglob("*") if p.is_file()]
-    left += [p.name for p in (folder / "disturbed" / "out").glob(".mpsfm-*")]
+    expected, actual = (content(folder / name / "out") for name in ("alone", "disturbed"))
+    names = expected.keys() | actual.keys()
+    different = sorted(name for name in names if expected.get(name) != actual.get(name))
+    leftovers = [
+        p.name for p in (folder / "disturbed" / "cache" / "mapping").rglob("*") if p.is_file()
+    ]
+    leftovers += [p.name for p in (folder / "disturbed" / "out").glob(".mpsfm-*")]
     total = sum(life.seconds for life in lives)
     verdict = "all identical" if not different else f"different: {', '.join(different[:10])}"
     lines = [
@@ -172,7 +174,8 @@ def report(folder: Path, alone: Life, lives: list[Life], arguments: argparse.Nam
         "",
         f"* Without kills: {alone.seconds:.0f} s. Killed and resumed: {total:.0f} s, "
         f"**{total / alone.seconds:.2f} times** as much.",
-        f"* Result: {len(expected)} files, {verdict}. Leftover files: {', '.join(left) or 'none'}.",
+        f"* Result: {len(expected)} files, {verdict}. Leftover files: "
+        f"{', '.join(leftovers) or 'none'}.",
         "",
         "| process | CPU s | killed | mapping resumed from |",
         "| --- | --- | --- | --- |",

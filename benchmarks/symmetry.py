@@ -110,10 +110,10 @@ def mapped(case: SymmetricProblem, enabled: bool) -> tuple[np.ndarray, int, list
     start = time.perf_counter()
     best = max(mapper.reconstruct_components(), key=lambda c: len(c.images), default=None)
     seconds = time.perf_counter() - start
-    found = best.poses if best else {}
+    poses = best.poses if best else {}
     views = zip(case.problem.images, case.poses, strict=True)
     truth = {image.name: (pose[:, :3], pose[:, 3]) for image, pose in views}
-    return pose_errors_deg(found, truth, CONVENTIONS["paper"]), len(found), verdicts, seconds
+    return pose_errors_deg(poses, truth, CONVENTIONS["paper"]), len(poses), verdicts, seconds
 
 
 def shares(verdicts: list[tuple[bool, bool]]) -> str:

@@ -132,8 +132,8 @@ def _differences(network: Network, made: Path, views: Sequence[View]) -> dict[st
     for index in range(len(views)):
         shown = [views[(index + k) % len(views)] for k in range(network.views)]
         with np.load(made.with_name(f"reference_{index}.npz")) as theirs:
-            found = network.compare(network.ask(provider, *shown), dict(theirs))
-        for key, value in found.items():
+            differences = network.compare(network.ask(provider, *shown), dict(theirs))
+        for key, value in differences.items():
             largest[key] = float(np.fmax(largest.get(key, np.nan), value))
     return largest
 

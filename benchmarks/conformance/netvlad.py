@@ -34,11 +34,11 @@ def compare(environment: Environment, checkout: Path) -> dict[str, float]:
         options = {"model": str(model), "network": "netvlad"}
         context = ProviderContext(resolve_weights=lambda uri, sha256: Path(uri))
         provider = Registry.discover().create("retrieval", "global-onnx", options, context)
-        found = {"as they are": 0.0, "shrunk": 0.0}
+        distances = {"as they are": 0.0, "shrunk": 0.0}
         with np.load(model.with_suffix(".npz")) as theirs:
             for index, view in enumerate(views):
                 off = np.linalg.norm(provider.describe(view) - theirs[f"photo_{index}"])
                 key = "shrunk" if max(view.camera.size) > _LARGEST else "as they are"
-                found[key] = max(found[key], float(off))
-            found[APART] = float(np.linalg.norm(theirs["photo_0"] - theirs["photo_1"]))
-    return found
+                distances[key] = max(distances[key], float(off))
+            distances[APART] = float(np.linalg.norm(theirs["photo_0"] - theirs["photo_1"]))
+    return distances

@@ -98,7 +98,7 @@ def _dsine(answer: NormalPrior, theirs: Arrays) -> Differences:
 def _mast3r(answer: PairMatches, theirs: Arrays) -> Differences:
     """Compare depth and std inside the authors' crop, and matches in pixels of their crops."""
     assert answer.dense is not None and answer.depth is not None
-    found: Differences = {"depth": np.nan, "std": np.nan, "pixels behind": 0.0}
+    differences: Differences = {"depth": np.nan, "std": np.nan, "pixels behind": 0.0}
     cells = []
     positions = answer.dense.points_a, answer.dense.points_b
     priors = answer.depth.depth_a, answer.depth.depth_b
@@ -108,24 +108,26 @@ def _mast3r(answer: PairMatches, theirs: Arrays) -> Differences:
         crop = slice(top, top + z.shape[0]), slice(left, left + z.shape[1])
         assert ours.variance is not None
         seen = ours.valid[crop]
-        found["depth"] = np.fmax(found["depth"], relative(ours.depth[crop], z, seen))
-        found["std"] = np.fmax(found["std"], relative(np.sqrt(ours.variance[crop]), std, seen))
+        differences["depth"] = np.fmax(differences["depth"], relative(ours.depth[crop], z, seen))
+        differences["std"] = np.fmax(
+            differences["std"], relative(np.sqrt(ours.variance[crop]), std, seen)
+        )
         behind = float((seen != (z > 0)).mean())
-        found["pixels behind"] = max(found["pixels behind"], behind)
+        differences["pixels behind"] = max(differences["pixels behind"], behind)
         scale = np.array(ours.shape[::-1]) / theirs[f"size_{side}"]
         cells.append(np.rint(xy * scale - (left, top) - 0.5).astype(int))
     matches = np.concatenate([theirs["matches_a"], theirs["matches_b"]], axis=1)
     expected = set(map(tuple, matches.tolist()))
     pairs = np.concatenate(cells, axis=1)
     got = set(map(tuple, pairs.tolist()))
-    found["matches of one side only"] = len(got ^ expected) / len(expected)
+    differences["matches of one side only"] = len(got ^ expected) / len(expected)
     (xa, ya, xb, yb), scores = pairs.T, []
     for a, b in (("11", "21"), ("12", "22")):
         of_both = theirs[f"certainty_{a}"][ya, xa] * theirs[f"certainty_{b}"][yb, xb]
         scores.append(np.sqrt(of_both) / (1 + np.sqrt(of_both)))
     nearest = np.abs(np.array(scores) / answer.dense.scores - 1).min(axis=0)
-    found["scores"] = float(nearest.max())
-    return found
+    differences["scores"] = float(nearest.max())
+    return differences
 
 
 def _metric3d(answer: tuple[DepthPrior, NormalPrior], theirs: Arrays) -> Differences:

@@ -48,5 +48,5 @@ def run_authors(environment: Environment, script: str, *arguments: Path) -> None
     command = [str(part) for part in (environment.python, AUTHORS / script, *arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        told = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise ProviderError(f"the authors' code fails: {told}")
+        message = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise ProviderError(f"the authors' code fails: {message}")

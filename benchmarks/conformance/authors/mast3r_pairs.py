@@ -34,12 +34,14 @@ _SIZE = 256  # the authors' descriptor comparison takes minutes for larger image
 def answers(model: Any, first: Any, second: Any) -> dict[str, Any]:
     """Compute the depth of both views in their own frames, and matches of both passes."""
     with torch.inference_mode():
-        found = symmetric_inference(model, first, second, "cpu")  # 11, 21, 22, 12
-    features, certainties = ([view[key][0] for view in found] for key in ("desc", "desc_conf"))
+        predictions = symmetric_inference(model, first, second, "cpu")  # 11, 21, 22, 12
+    features, certainties = (
+        [view[key][0] for view in predictions] for key in ("desc", "desc_conf")
+    )
     at_a, at_b, _ = extract_correspondences(features, certainties, device="cpu")
-    own = {"a": found[0], "b": found[2]}
-    maps = {f"z_{side}": view["pts3d"][0, ..., 2] for side, view in own.items()}
-    maps |= {f"confidence_{side}": view["conf"][0] for side, view in own.items()}
+    own_frame = {"a": predictions[0], "b": predictions[2]}
+    maps = {f"z_{side}": view["pts3d"][0, ..., 2] for side, view in own_frame.items()}
+    maps |= {f"confidence_{side}": view["conf"][0] for side, view in own_frame.items()}
     passes = zip(("11", "21", "22", "12"), certainties, strict=True)
     maps |= {f"certainty_{which}": certainty for which, certainty in passes}
     return {**maps, "matches_a": at_a, "matches_b": at_b}

@@ -53,8 +53,8 @@ class Exported(torch.nn.Module):
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         """Compute the descriptor."""
-        found: torch.Tensor = model._forward({"image": image})["global_descriptor"]
-        return found
+        descriptor: torch.Tensor = model._forward({"image": image})["global_descriptor"]
+        return descriptor
 
 
 found = {}
