@@ -50,7 +50,7 @@ class RuntimeOptions(Options):
     executor: str = "threads"
     """Where providers run: ``threads`` of this process, or the workers of an executor plugin
     (``dask``, ``ray``), which share ``cache_dir`` and the images."""
-    executor_options: dict[str, Any] = Field(default_factory=dict)
+    executor_options: dict[str, Any] = expert({})
     """Options of the executor plugin, such as ``address``."""
     on_error: Literal["fail", "skip"] = "fail"
     """If a provider fails on an image or pair: ``fail`` ends the run, ``skip`` continues without
@@ -75,7 +75,7 @@ class FastPass(Options):
 
     features: ProviderConfig
     matcher: ProviderConfig
-    min_points: int = Field(100, ge=1)
+    min_points: int = expert(100, ge=1)
     """Points with at least three observations that constrain an image. Raising it matches more
     images again. [COLMAP init_min_num_inliers]"""
     partners: int = expert(15, ge=1)
@@ -156,7 +156,7 @@ class Config(Options):
 
     @property
     def has_second_pass(self) -> bool:
-        """Whether ``features`` and ``matcher`` follow the fast pass.
+        """True if ``features`` and ``matcher`` follow the fast pass.
 
         False if ``features`` is the provider of the fast pass, because a second pass would find
         the same features again.

@@ -1,1 +1,1 @@
-"""Where providers run: pairs, priors, features, verified matches; cached, resumable, parallel."""
+"""Extraction runs all providers: features, pairs, verified matches and priors."""

@@ -1,4 +1,4 @@
-"""The chosen providers while they are in use: what identifies them, and an instance a thread."""
+"""A provider in use: its identity for the cache, and one instance per thread."""
 
 from __future__ import annotations
 
@@ -22,24 +22,28 @@ from mpsfm_core.support.threads import count_cores
 T = TypeVar("T")
 
 _MAX_WORKERS = 4
-"""Automatic: every worker has its own copy of a network; more cores become its threads."""
-_LONGEST_URI = 1000
+"""Largest automatic number of workers. Each worker loads its own copy of a network, so further
+cores become threads of the workers."""
+_MAX_URI_LENGTH = 1000
 
 
 @dataclass
 class Usage:
-    """How often a provider was asked, how often the cache answered, and its time in seconds."""
+    """Usage statistics of a provider."""
 
     computed: int = 0
+    """Results that the provider computed."""
     cached: int = 0
+    """Results from the cache."""
     seconds: float = 0.0
+    """Computing time of all workers."""
 
 
 class ActiveProvider:
-    """A provider chosen in the configuration.
+    """A configured provider.
 
-    It is constructed when the first result is computed, once in each thread: a run that finds
-    everything in the cache loads no network.
+    Constructs the provider when a thread computes its first result, so a run with a complete cache
+    loads no network.
     """
 
     def __init__(
@@ -58,12 +62,12 @@ class ActiveProvider:
         self._known: set[str] = set()
 
     def can(self, capability: Capability) -> bool:
-        """Whether the provider declares a capability."""
+        """Check whether the provider declares a capability."""
         return capability in self.spec.capabilities
 
     @property
     def identity(self) -> dict[str, Any]:
-        """All that its output depends on besides its input, as plain data."""
+        """Everything except the input that the output depends on, as plain data."""
         with self._lock:
             if self._identity is None:
                 self._identity = self._identify()
@@ -71,7 +75,7 @@ class ActiveProvider:
 
     @property
     def instance(self) -> Any:
-        """The provider, this thread's own."""
+        """The provider instance of this thread."""
         if not hasattr(self._local, "provider"):
             with self._lock:  # imports and downloads once, not in every thread at the same time
                 self._local.provider = self._create()
@@ -79,14 +83,24 @@ class ActiveProvider:
 
     @property
     def workers(self) -> int:
-        """How many threads may use it: one with a GPU."""
+        """Number of threads that may use the provider; one on a GPU."""
         return 1 if _device(self._runtime, self.spec) == "cuda" else worker_count(self._runtime)
 
-    def timed(self, key: str, compute: Callable[[Any], T], timeout_s: float | None = None) -> T:
-        """Compute the result named ``key`` with this thread's instance, on the provider's clock.
+    def compute_timed(
+        self, key: str, compute: Callable[[Any], T], timeout_s: float | None = None
+    ) -> T:
+        """Compute a result with the instance of this thread, and measure its time.
 
-        Raises :class:`ProviderRunError` when it takes longer than ``timeout_s``. A thread cannot be
-        killed: it stays behind, and another instance answers from then on.
+        A thread that exceeds the timeout cannot be killed. It keeps its instance, and a new
+        instance computes further results.
+
+        Args:
+            key: Key of the result in the cache.
+            compute: Computes the result with a provider instance.
+            timeout_s: Time limit in seconds, None for no limit.
+
+        Raises:
+            ProviderRunError: the time limit is exceeded.
         """
         provider = self.instance
         started = time.perf_counter()
@@ -95,7 +109,7 @@ class ActiveProvider:
         except TimeoutError as error:
             del self._local.provider
             raise ProviderRunError(
-                f"provider {self.spec.name!r}: no answer run_with_timeout {timeout_s:g} s; raise "
+                f"provider {self.spec.name!r}: no answer within {timeout_s:g} s; raise "
                 f"runtime.timeout_s if it is that slow"
             ) from error
         seconds = time.perf_counter() - started
@@ -106,7 +120,7 @@ class ActiveProvider:
         return result
 
     def count_cached(self, key: str) -> None:
-        """Note that a result came from the cache; counts once, not when it is loaded again."""
+        """Count a result from the cache, once per key."""
         with self._lock:
             self.usage.cached += key not in self._known
             self._known.add(key)
@@ -139,21 +153,21 @@ class ActiveProvider:
         return {"api": API_VERSION, "seed": self._runtime.seed, "providers": described}
 
     def _hashes(self, kind: Kind, name: str, values: dict[str, Any]) -> dict[str, str]:
-        """SHA-256 of the files that options name, and of the weights that these mean.
+        """Return the SHA-256 of the files that options name, and of the weights.
 
-        What has to be downloaded is downloaded first, by constructing the provider.
+        Constructing the provider downloads missing weights first.
         """
         named = [uri for uri in _texts(values) if is_remote(uri) or self._store.locate(uri)]
-        meant = [file.uri for file in self._registry.weights(kind, name, values)]
-        uris = list(dict.fromkeys((*named, *meant)))
+        weights = [file.uri for file in self._registry.weights(kind, name, values)]
+        uris = list(dict.fromkeys((*named, *weights)))
         if any(is_remote(uri) and self._store.locate(uri) is None for uri in uris):
             self._local.provider = self._create()
-        found = {uri: self._store.locate(uri) for uri in uris}
-        return {uri: file_sha256(path) for uri, path in found.items() if path is not None}
+        paths = {uri: self._store.locate(uri) for uri in uris}
+        return {uri: file_sha256(path) for uri, path in paths.items() if path is not None}
 
 
 def run_with_timeout(seconds: float | None, compute: Callable[[], T]) -> T:
-    """The result of a computation; :class:`TimeoutError` when it is not there in time."""
+    """Run a computation; raises TimeoutError if it takes longer than ``seconds``."""
     if seconds is None:
         return compute()
     outcome: list[Any] = []
@@ -176,19 +190,19 @@ def run_with_timeout(seconds: float | None, compute: Callable[[], T]) -> T:
 
 
 def worker_count(runtime: RuntimeOptions) -> int:
-    """Threads that a stage runs on."""
+    """Return the number of worker threads of an extraction stage."""
     return runtime.workers or min(_MAX_WORKERS, count_cores())
 
 
 def thread_count(runtime: RuntimeOptions) -> int:
-    """Threads that one provider may use itself."""
+    """Return the number of threads that a provider may use per worker."""
     if runtime.workers is not None:
         return runtime.threads
     return max(runtime.threads, count_cores() // worker_count(runtime))
 
 
 def _device(runtime: RuntimeOptions, spec: ProviderSpec) -> str:
-    """``cuda`` where it is asked for, or automatically where the provider's library can use it."""
+    """Return the configured device, or ``cuda`` if the provider's library can use a GPU."""
     if runtime.device != "auto":
         return runtime.device
     if not _may_have_gpu():
@@ -204,16 +218,16 @@ def _device(runtime: RuntimeOptions, spec: ProviderSpec) -> str:
 
 
 def _may_have_gpu() -> bool:
-    """Without NVIDIA's driver there is none, and no library need be imported to ask for it."""
+    """Look for NVIDIA's driver, which is faster than importing a GPU library."""
     return Path("/dev/nvidiactl").exists() or shutil.which("nvidia-smi") is not None
 
 
 def _texts(values: object) -> Iterator[str]:
-    """All texts in plain data that can be a file's name or URI."""
+    """Yield all texts in plain data that can be a file name or URI."""
     if isinstance(values, dict):
         values = list(values.values())
     if isinstance(values, list):
         for value in values:
             yield from _texts(value)
-    elif isinstance(values, str) and 0 < len(values) <= _LONGEST_URI and values.isprintable():
+    elif isinstance(values, str) and 0 < len(values) <= _MAX_URI_LENGTH and values.isprintable():
         yield values

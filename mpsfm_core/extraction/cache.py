@@ -1,8 +1,8 @@
-"""Results of providers on disk, found by what they depend on.
+"""Content-addressed cache of provider results on disk.
 
-An entry's key is the hash of everything that its content depends on, so that nothing is ever out
-of date: a changed option, weights file or image has another key. Entries are written beside their
-place and moved into it when complete; one that is damaged nevertheless is computed again.
+The key of an entry is the hash of everything that its content depends on: options, weights and
+images. An entry is therefore never out of date. Entries are written to a temporary file and moved
+when complete. A damaged entry is computed again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import functools
 import hashlib
 import json
 import logging
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
@@ -20,13 +19,12 @@ from pathlib import Path
 from typing import Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
-import platformdirs
 from numpy.typing import NDArray
 
 from mpsfm_core.data.errors import OutputError
-from mpsfm_core.providers.weights import CACHE_VARIABLE
 from mpsfm_core.support.files import remove_temporary_files, write_file
 from mpsfm_core.support.npz import read_npz
+from mpsfm_core.support.user_folders import user_cache_folder
 
 _log = logging.getLogger(__name__)
 
@@ -34,7 +32,7 @@ T = TypeVar("T")
 Arrays = Mapping[str, NDArray[Any]]
 
 FORMAT = 1
-"""Raised when the meaning of entries changes, which makes all old ones unreachable."""
+"""Format version of entries; raising it invalidates all entries."""
 
 
 class Cache:
@@ -51,7 +49,7 @@ class Cache:
         remove_temporary_files(self._unfinished)
 
     def load(self, kind: str, key: str, cls: type[T]) -> T | None:
-        """The entry as an object of ``cls``, None when there is none that can be read."""
+        """Load an entry as an object of ``cls``; None if it is missing or unreadable."""
         path = self._path(kind, key)
         try:
             return unpack(cls, read_npz(path))
@@ -60,24 +58,28 @@ class Cache:
         except OSError as error:
             _log.warning("cache entry %s cannot be read (%s): computing it again", path, error)
             return None
-        except Exception as error:  # what a class says to values that it does not expect
+        except Exception as error:  # the checks of a data class raise errors of any kind
             _log.warning("cache entry %s is damaged (%s): computing it again", path, error)
             return None
 
     def store(self, kind: str, key: str, value: object) -> None:
-        """Keep an object; raises :class:`OutputError` when the disk is full or fails."""
+        """Store an object.
+
+        Raises:
+            OutputError: the disk is full or fails.
+        """
         path, arrays = self._path(kind, key), cast(Any, pack(value))
         try:
             write_file(path, lambda file: np.savez(file, **arrays), self._unfinished)
         except OSError as error:
             reason = "the disk is full" if error.errno == errno.ENOSPC else str(error)
             raise OutputError(
-                f"cannot write to the cache {self.folder}: {reason}; make room or set "
+                f"cannot write to the cache {self.folder}: {reason}; free disk space or set "
                 f"runtime.cache_dir"
             ) from error
 
     def forget(self, kind: str, key: str) -> None:
-        """Take an entry away, if it is there."""
+        """Delete an entry if it exists."""
         with suppress(OSError):
             self._path(kind, key).unlink()
 
@@ -86,28 +88,27 @@ class Cache:
 
 
 def cache_folder(folder: Path | None = None) -> Path:
-    """The given folder, else ``$MPSFM_CACHE``, else the platform's user cache."""
-    root = folder or os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("mpsfm")
-    return Path(root).expanduser()
+    """Return the given folder, or ``$MPSFM_CACHE``, or the user cache of the platform."""
+    return user_cache_folder() if folder is None else Path(folder).expanduser()
 
 
 def content_key(*parts: object) -> str:
-    """SHA-256 of plain data (numbers, texts, lists, dictionaries with text keys)."""
+    """Return the SHA-256 of plain data (numbers, texts, lists, dictionaries with text keys)."""
     text = json.dumps([FORMAT, *parts], sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def digest(value: object) -> str:
-    """SHA-256 of the content of a data object."""
-    found = hashlib.sha256()
+    """Return the SHA-256 of the arrays of a data object."""
+    sha256 = hashlib.sha256()
     for name, array in pack(value).items():
-        found.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        found.update(np.ascontiguousarray(array).data)
-    return found.hexdigest()
+        sha256.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        sha256.update(np.ascontiguousarray(array).data)
+    return sha256.hexdigest()
 
 
 def pack(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """The arrays of a data object by path, without those that are None."""
+    """Return the arrays of a data object by path, without fields that are None."""
     if isinstance(value, tuple) and value and is_dataclass(value[0]):
         return {
             name: array
@@ -125,7 +126,7 @@ def pack(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
 
 
 def unpack(cls: type[T], arrays: Arrays, prefix: str = "") -> T:
-    """The object of class ``cls`` (a data class, or an array) that :func:`pack` took apart."""
+    """Rebuild an object of ``cls`` (a data class, or an array) from the result of :func:`pack`."""
     if not is_dataclass(cls):
         return arrays[prefix or "value"]  # type: ignore[return-value]
     hints = _hints(cls)
@@ -150,10 +151,10 @@ def _unpack_tuple(cls: type[T], arrays: Arrays, path: str) -> tuple[T, ...]:
     return tuple(unpack(cls, arrays, f"{path}/{index}") for index in range(count))
 
 
-_hints = functools.cache(get_type_hints)  # takes longer than reading a small entry
+_hints = functools.cache(get_type_hints)  # slower than reading a small entry
 
 
 def _data_class(hint: object) -> type | None:
-    """The data class that a field's annotation names, alone, ``| None`` or in a tuple."""
+    """Return the data class in an annotation: alone, ``| None`` or in a tuple."""
     kinds = (hint, *get_args(hint))
     return next((k for k in kinds if isinstance(k, type) and is_dataclass(k)), None)

@@ -1,4 +1,4 @@
-"""What the steps of the extraction share: views with their masks, the cache, progress."""
+"""Shared state of the extraction stages: masked views, providers, cache, failures, progress."""
 
 from __future__ import annotations
 
@@ -25,17 +25,14 @@ from mpsfm_core.providers.registry import Registry
 _log = logging.getLogger(__name__)
 
 RUNS = "run"
-"""Kind of cache entry that the workers of one run leave for each other."""
+"""Kind of the cache entries with which the workers of one run share failures."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 class ExtractionContext:
-    """Runs providers on views and keeps what they return.
-
-    ``failures``: images that the run goes on without -> what a provider failed with.
-    """
+    """Runs providers on masked views, and caches their results."""
 
     def __init__(
         self, images: ImageSet, config: Config, registry: Registry, events: ExtractionEvents
@@ -46,16 +43,17 @@ class ExtractionContext:
         self.cache = Cache(config.runtime.cache_dir)
         self.providers: list[ActiveProvider] = []
         self.failures: dict[int, str] = {}
+        """Error message of each image that the run skips."""
         self._events = events
-        self.elsewhere: Callable[[str, Sequence[Any]], Generator[None, None, None]] | None = None
-        """Runs a stage on the workers of an executor, where there is one."""
+        self.run_remotely: Callable[[str, Sequence[Any]], Generator[None, None, None]] | None = None
+        """Runs a stage on the workers of an executor; None without an executor."""
         self.shared_run = ""
-        """Names the run to the workers of an executor: all know what a provider failed on."""
+        """Identifies the run for the workers of an executor, which share failures."""
         self._mask_providers: list[ActiveProvider] = []
         self._masks: dict[int, tuple[UInt8, str]] = {}
 
     def provider(self, kind: Kind, backend: ProviderConfig) -> ActiveProvider:
-        """Take a provider into use."""
+        """Create a provider for this run."""
         provider = ActiveProvider(kind, backend, self.registry, self.config.runtime)
         self.providers.append(provider)
         return provider
@@ -66,16 +64,24 @@ class ExtractionContext:
         items: Sequence[Item],
         work: Callable[[Item], Result],
         *providers: ActiveProvider,
-        here: bool = False,
+        local: bool = False,
     ) -> list[Result]:
-        """One stage: work on all items in parallel, in their order.
+        """Run a stage on all items in parallel; return the results in order.
 
-        ``providers``: what it asks, if anything. ``here``: not on an executor's workers, even if
-        the cache would keep what they find.
+        Args:
+            stage: Name of the stage, for progress.
+            items: Input of each step.
+            work: Computes one step.
+            providers: Providers that the stage uses; they limit the number of workers.
+            local: True runs on this machine even if there is an executor.
         """
         workers = min((p.workers for p in providers), default=worker_count(self.config.runtime))
-        kept = providers and not any(provider.can("uncached") for provider in providers)
-        ahead = self.elsewhere(stage, items) if self.elsewhere and kept and not here else None
+        is_cached = providers and not any(provider.can("uncached") for provider in providers)
+        ahead = (
+            self.run_remotely(stage, items)
+            if self.run_remotely and is_cached and not local
+            else None
+        )
         return run_stage(self._events, stage, items, work, workers, ahead)
 
     def result(
@@ -86,77 +92,87 @@ class ExtractionContext:
         compute: Callable[[Any], Result],
         images: Sequence[int] = (),
     ) -> Result:
-        """What a provider returns for inputs that plain data identifies: cached, or computed.
+        """Return the result of a provider from the cache, or compute and cache it.
 
-        ``images``: those that it is about. Where ``runtime.on_error`` says so, a provider that
-        fails on one gives nothing for it, which is not cached.
+        If ``runtime.on_error`` is ``skip``, a failure gives an empty result, which is not cached.
+
+        Args:
+            provider: The provider.
+            cls: Class of the result.
+            inputs: Plain data that identifies the input.
+            compute: Computes the result with a provider instance.
+            images: Indices of the images that the input shows.
+
+        Raises:
+            ProviderRunError: the provider failed, or too many images failed.
+            ProviderOutputError: the provider broke its contract.
         """
         key = self.key(provider, inputs)
         uncached = provider.can("uncached")
-        found = None if uncached else self.cache.load(provider.kind, key, cls)
-        if found is not None:
+        cached = None if uncached else self.cache.load(provider.kind, key, cls)
+        if cached is not None:
             provider.count_cached(key)
-            return found
+            return cached
         may_skip = self.config.runtime.on_error == "skip" and cls in EMPTY_RESULTS and bool(images)
         try:
             if may_skip:
                 self._check_known_failure(key)
-            value = provider.timed(key, compute, self.config.runtime.timeout_s)
+            value = provider.compute_timed(key, compute, self.config.runtime.timeout_s)
         except (ProviderRunError, ProviderOutputError) as error:
             if not may_skip:
                 raise
             if self.shared_run:
                 self.cache.store(RUNS, content_key(self.shared_run, key), np.array(str(error)))
-            self._note_failure(images, error)
+            self._record_failure(images, error)
             return cast(Result, EMPTY_RESULTS[cls]())
         if not uncached:
             self.cache.store(provider.kind, key, value)
         return value
 
     def _check_known_failure(self, key: str) -> None:
-        """Raise what a provider failed with on another worker of this run: once is enough."""
+        """Raise the error of another worker of this run for the same result."""
         if self.shared_run:
             known = self.cache.load(RUNS, content_key(self.shared_run, key), np.ndarray)
             if known is not None:
                 raise ProviderRunError(str(known))
 
     def failed(self, images: Sequence[int]) -> bool:
-        """Whether a provider failed on one of the images: nothing more is asked about it."""
+        """Check whether a provider failed on one of the images."""
         return any(index in self.failures for index in images)
 
-    def _note_failure(self, images: Sequence[int], error: MpsfmError) -> None:
-        """Remember it; raises the error once more than half of the images have failed."""
+    def _record_failure(self, images: Sequence[int], error: MpsfmError) -> None:
+        """Record a failure; raises ProviderRunError once more than half of the images failed."""
         names = " and ".join(self.images[index].name for index in images)
-        _log.warning("%s goes on without it: %s", names, error)
+        _log.warning("%s is skipped: %s", names, error)
         if len(images) == 1:
             self.failures[images[0]] = str(error)
         if len(self.failures) > len(self.images) / 2:
             count = f"{len(self.failures)} of {len(self.images)} photos failed"
-            raise ProviderRunError(f"{count}, the last so: {error}") from error
+            raise ProviderRunError(f"{count}, the last with: {error}") from error
 
     def key(self, provider: ActiveProvider, inputs: Sequence[object]) -> str:
-        """Names a result of a provider by all it depends on."""
+        """Return the cache key of a provider's result."""
         return content_key(provider.identity, list(inputs))
 
     def view(self, index: int) -> View:
-        """The view of an image, its mask restricted by the mask providers."""
+        """Return the view of an image with the masks of the mask providers."""
         view = self.images.view(index)
         return replace(view, mask=self.mask(index)) if self._mask_providers else view
 
     def mask(self, index: int) -> Bool | None:
-        """Which pixels of a view may be used, None for all."""
+        """Return which pixels of a view may be used; None means all."""
         mask = self.images.mask(index)
         if not self._mask_providers:
             return mask
         width, height = self.images[index].pinhole.size
-        bits = np.unpackbits(self._allowed(index)[0], count=height * width)
-        allowed = bits.reshape(height, width).astype(np.bool_)
-        return allowed if mask is None else allowed & mask
+        bits = np.unpackbits(self._combined_mask(index)[0], count=height * width)
+        is_usable = bits.reshape(height, width).astype(np.bool_)
+        return is_usable if mask is None else is_usable & mask
 
     def view_inputs(self, index: int, provider: ActiveProvider) -> list[object]:
-        """What identifies a view for a provider: pixels, masks, and intrinsics if it uses them."""
+        """Return what identifies a view for a provider: pixels, masks, used intrinsics."""
         pixels, *intrinsics = self._unmasked_inputs(index, provider)
-        masks = [self._allowed(index)[1]] if self._mask_providers else []
+        masks = [self._combined_mask(index)[1]] if self._mask_providers else []
         return [pixels, *masks, *intrinsics]
 
     def _unmasked_inputs(self, index: int, provider: ActiveProvider) -> list[object]:
@@ -165,23 +181,23 @@ class ExtractionContext:
             inputs.append(self.images[index].pinhole.params.tolist())
         return inputs
 
-    def take_masks(self) -> None:
-        """Take the mask providers into use; views have their masks from then on."""
+    def load_masks(self) -> None:
+        """Create the mask providers; views have masks from now on."""
         self._mask_providers = [self.provider("mask", backend) for backend in self.config.masks]
 
     def run_masks(self) -> None:
-        """Take the mask providers into use, and run them all."""
-        self.take_masks()
+        """Create the mask providers, and compute the masks of all images."""
+        self.load_masks()
         if self._mask_providers:
-            self.each("masks", range(len(self.images)), self._allowed, *self._mask_providers)
+            self.each("masks", range(len(self.images)), self._combined_mask, *self._mask_providers)
 
-    def _allowed(self, index: int) -> tuple[UInt8, str]:
-        """Where all mask providers allow it, packed, and its digest."""
+    def _combined_mask(self, index: int) -> tuple[UInt8, str]:
+        """Return the packed conjunction of all masks of an image, and its digest."""
         if index not in self._masks:
-            together = np.array(True)
+            combined = np.array(True)
             for provider in self._mask_providers:
-                together = together & self._mask(provider, index)
-            self._masks[index] = np.packbits(together), digest(together)
+                combined = combined & self._mask(provider, index)
+            self._masks[index] = np.packbits(combined), digest(combined)
         return self._masks[index]
 
     def _mask(self, provider: ActiveProvider, index: int) -> Bool:

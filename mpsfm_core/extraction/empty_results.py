@@ -1,4 +1,4 @@
-"""What stands for the result of a provider that failed on a photo: it says nothing anywhere."""
+"""Empty results, which replace those of a provider that failed on an image."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mpsfm_core.data import (
 
 @dataclass(frozen=True, eq=False)
 class JointPrior:
-    """Both priors of one pass of a network."""
+    """Depth and normals of one pass of a network."""
 
     depth: DepthPrior
     normals: NormalPrior
@@ -51,4 +51,4 @@ EMPTY_RESULTS: Mapping[type, Callable[[], object]] = MappingProxyType(
         PairMatches: _matches,
     }
 )
-"""By the class of the result; masks and descriptions of whole images have no such value."""
+"""Constructors of empty results by class. Masks and global descriptors have no empty value."""

@@ -1,4 +1,4 @@
-"""What the extraction tells the outside while it works."""
+"""Progress events of extraction."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class ExtractionEvents(Protocol):
-    """Receives progress, always from the thread that called :func:`extract`."""
+    """Receives progress, always in the thread that called :func:`extract`."""
 
     def stage_started(self, stage: str, total: int | None) -> None: ...
 
@@ -16,13 +16,13 @@ class ExtractionEvents(Protocol):
 
 
 class NullExtractionEvents:
-    """Nobody listens."""
+    """Ignores all events."""
 
     def stage_started(self, stage: str, total: int | None) -> None:
-        """Nothing."""
+        """Ignore the event."""
 
     def stage_progress(self, stage: str, done: int, total: int) -> None:
-        """Nothing."""
+        """Ignore the event."""
 
     def stage_finished(self, stage: str, seconds: float) -> None:
-        """Nothing."""
+        """Ignore the event."""

@@ -1,4 +1,4 @@
-"""Features of the images."""
+"""Features of the images, without those in masked areas."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.support.lru_cache import LruCache
 
 CACHED_BYTES = 512 << 20
-"""Features that are kept while pairs are matched; 8192 SIFT features have 4 MB."""
+"""Size limit of the features in memory; 8192 SIFT features have 4 MB."""
 
 
 class FeatureTable:
-    """Features of each image without those in masked areas; loaded again when needed."""
+    """Features of each image without masked areas; an LRU cache in front of the disk cache."""
 
     def __init__(self, context: ExtractionContext, backend: ProviderConfig) -> None:
         self._context = context
@@ -29,20 +29,20 @@ class FeatureTable:
         )
 
     def extract(self) -> list[Features]:
-        """Run the stage; returns features without descriptors, to keep memory small."""
+        """Compute the features of all images; return them without descriptors, to limit memory."""
         images = range(len(self._context.images))
-        return self._context.each("features", images, self._located, self._provider)
+        return self._context.each("features", images, self._without_descriptors, self._provider)
 
     def __getitem__(self, index: int) -> Features:
         return self._recent.get(index, lambda: self._load(index))
 
     def key(self, index: int) -> str:
-        """Names the features of an image."""
+        """Return the cache key of the features of an image."""
         if self._provider.can("uncached"):
             return digest(self[index])
         return self._context.key(self._provider, self._context.view_inputs(index, self._provider))
 
-    def _located(self, index: int) -> Features:
+    def _without_descriptors(self, index: int) -> Features:
         features = self[index]
         return Features(
             features.keypoints,

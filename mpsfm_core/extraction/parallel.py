@@ -1,4 +1,4 @@
-"""Steps of a stage on several threads, with progress; results do not depend on their number."""
+"""Parallel steps of a stage with progress; results do not depend on the number of threads."""
 
 from __future__ import annotations
 
@@ -20,16 +20,25 @@ def run_stage(
     items: Sequence[Item],
     work: Callable[[Item], Result],
     workers: int,
-    ahead: Generator[None, None, None] | None = None,
+    remote: Generator[None, None, None] | None = None,
 ) -> list[Result]:
-    """``[work(item) for item in items]``, in parallel.
+    """Compute ``[work(item) for item in items]`` in parallel threads.
 
-    The first exception, and Ctrl-C, stops the stage: steps that run are finished, the rest is
-    dropped. Events are sent from the calling thread. ``ahead`` yields after each item that workers
-    elsewhere have done, before work on them begins here.
+    The first exception, or Ctrl-C, stops the stage after the running steps. Threads suffice,
+    because providers compute in native code that releases the interpreter lock, and a process
+    would load its own copy of every library and network.
 
-    Threads, not processes: providers compute in native code that releases the interpreter, and a
-    process would load its own copy of every library and network.
+    Args:
+        events: Receives progress in the calling thread.
+        stage: Name of the stage.
+        items: Input of each step.
+        work: Computes one step.
+        workers: Number of threads.
+        remote: Yields after each item that remote workers computed into the cache; runs before
+            the steps on this machine.
+
+    Returns:
+        The results in the order of the items.
     """
     started = time.perf_counter()
     events.stage_started(stage, len(items))
@@ -38,17 +47,17 @@ def run_stage(
         events.stage_progress(stage, done, len(items))
 
     try:
-        if ahead is None:
-            return _on_threads(stage, items, work, workers, progress)
-        with closing(ahead):
-            for done, _ in enumerate(ahead, start=1):
+        if remote is None:
+            return _run_on_threads(stage, items, work, workers, progress)
+        with closing(remote):
+            for done, _ in enumerate(remote, start=1):
                 progress(done)
-        return _on_threads(stage, items, work, workers)
+        return _run_on_threads(stage, items, work, workers)
     finally:
         events.stage_finished(stage, time.perf_counter() - started)
 
 
-def _on_threads(
+def _run_on_threads(
     stage: str,
     items: Sequence[Item],
     work: Callable[[Item], Result],

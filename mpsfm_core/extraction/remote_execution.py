@@ -1,8 +1,8 @@
-"""Steps of the extraction on workers elsewhere: they leave what they find in the shared cache.
+"""Extraction stages on the workers of an executor, with results in the shared cache.
 
-A worker makes its own providers from the configuration and the plugins that are installed there,
-and does to an item what a thread of this process would do; this process then finds the result in
-the cache.
+A worker creates its own providers from the configuration and from the plugins on its machine. It
+processes an item as a thread of this process would. This process then loads the result from the
+cache.
 """
 
 from __future__ import annotations
@@ -39,38 +39,39 @@ THREADS = "threads"
 
 @contextmanager
 def use_executor(context: ExtractionContext) -> Iterator[None]:
-    """While this lasts, the stages that the executor's workers can do are done there first.
+    """Run the stages of extraction on the configured executor inside a ``with`` block.
 
-    Raises :class:`ConfigError` when no plugin brings the executor, or its workers cannot be had.
+    Raises:
+        ConfigError: no plugin provides the executor, or its workers are unavailable.
     """
-    executor = _executor(context)
+    executor = _create_executor(context)
     if executor is None:
         yield
         return
-    context.elsewhere = _RemoteStages(context, executor)
+    context.run_remotely = _RemoteStages(context, executor)
     try:
         yield
     finally:
         executor.close()
 
 
-def _executor(context: ExtractionContext) -> Executor | None:
+def _create_executor(context: ExtractionContext) -> Executor | None:
     runtime = context.config.runtime
     name, options = runtime.executor, runtime.executor_options
     if name == THREADS:
         return None
-    found: Executor | None = context.registry.hook.mpsfm_executor(name=name, options=options)
-    if found is None:
+    created: Executor | None = context.registry.hook.mpsfm_executor(name=name, options=options)
+    if created is None:
         known = (THREADS, *EXECUTORS)
         hint = (
             f": pip install {EXECUTORS[name]}" if name in EXECUTORS else did_you_mean(name, known)
         )
-        raise ConfigError(f"runtime.executor: no plugin brings {name!r}{hint}")
-    return found
+        raise ConfigError(f"runtime.executor: no plugin provides {name!r}{hint}")
+    return created
 
 
 class _RemoteStages:
-    """The stages of a run that its executor's workers do."""
+    """Runs the stages of one run on its executor."""
 
     def __init__(self, context: ExtractionContext, executor: Executor) -> None:
         runtime = context.config.runtime.model_copy(update={"executor": THREADS})
@@ -81,18 +82,16 @@ class _RemoteStages:
         context.cache.store(RUNS, content_key(self._step.run), np.array(True))
 
     def __call__(self, stage: str, items: Sequence[Any]) -> Generator[None, None, None]:
-        """Run a stage; yields after each item."""
+        """Run a stage; yield after each item."""
         return self._executor.run(replace(self._step, stage=stage), items)
 
 
 @dataclass(frozen=True)
 class RemoteStep:
-    """A stage, to be called with an item on any machine.
-
-    ``run``: names the run; a worker keeps its providers from step to step.
-    """
+    """One stage that can process an item on any machine."""
 
     run: str
+    """Identifies the run; a worker keeps the providers of its latest run."""
     stage: str
     images: ImageSet
     config: Config
@@ -103,18 +102,20 @@ class RemoteStep:
 
 
 class _WorkerState:
-    """What a worker has of a run: how each stage works on an item."""
+    """State of a worker: the function of each stage for one run."""
 
     def __init__(self, step: RemoteStep) -> None:
         config = step.config
-        context = ExtractionContext(step.images, config, Registry.discover(), NullExtractionEvents())
+        context = ExtractionContext(
+            step.images, config, Registry.discover(), NullExtractionEvents()
+        )
         context.shared_run = step.run
         if context.cache.load(RUNS, content_key(step.run), np.ndarray) is None:
             raise InputError(
-                f"the worker on {socket.gethostname()} does not see the cache {context.cache.folder} "
-                f"of this run: set runtime.cache_dir to a folder that all machines share"
+                f"the worker on {socket.gethostname()} does not see the cache "
+                f"{context.cache.folder} of this run: set runtime.cache_dir to a folder that all machines share"
             )
-        context.take_masks()
+        context.load_masks()
         table = None if config.features is None else FeatureTable(context, config.features)
         matcher = PairMatcher(context, table)
         priors = PriorPredictor(context, matcher, [])
@@ -136,7 +137,7 @@ _WORKER_STATES: dict[str, _WorkerState] = {}
 
 
 def _worker_state(step: RemoteStep) -> _WorkerState:
-    """This process's own, of the latest run alone."""
+    """Return the state of this process for a run; drops that of earlier runs."""
     with _LOCK:
         if step.run not in _WORKER_STATES:
             _WORKER_STATES.clear()

@@ -1,4 +1,4 @@
-"""What the extraction did, as plain data for ``summary.json``."""
+"""Report of extraction, as plain data for ``summary.json``."""
 
 from __future__ import annotations
 
@@ -21,9 +21,14 @@ def describe(
     candidates: list[CandidateMatches],
     outcomes: list[TwoViewGeometry],
 ) -> dict[str, Any]:
-    """Pairs, images and providers.
+    """Describe pairs, images and providers of an extraction.
 
-    ``proposed``: number of pairs before the filters of plugins.
+    Args:
+        context: Images, failures and providers of the run.
+        problem: The mapper's problem.
+        proposed: Number of selected pairs before the filters of plugins.
+        candidates: Candidate matches of all matched pairs.
+        outcomes: Two-view geometry of each candidate.
     """
     names = context.images.names
     pairs = [
@@ -41,36 +46,36 @@ def describe(
     }
 
 
-def describe_both(first: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
-    """Two reports in one: ``more`` is of further matches of pairs, in the end of the images too."""
+def merge_reports(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge the report of a second pass into that of the first pass."""
     pairs = {tuple(pair["images"]): pair for pair in first["pairs"]}
-    for pair in more["pairs"]:
+    for pair in second["pairs"]:
         images = tuple(pair["images"])
-        pairs[images] = _pair_of_both(pairs.get(images, pair), pair)
-    used = {(provider["kind"], provider["name"]) for provider in more["providers"]}
+        pairs[images] = _merge_pair(pairs.get(images, pair), pair)
+    used = {(provider["kind"], provider["name"]) for provider in second["providers"]}
     return {
         **first,
-        "pairs_proposed": first["pairs_proposed"] + more["pairs_proposed"],
-        "pairs_matched": first["pairs_matched"] + more["pairs_matched"],
-        "pairs_verified": more["pairs_verified"],
+        "pairs_proposed": first["pairs_proposed"] + second["pairs_proposed"],
+        "pairs_matched": first["pairs_matched"] + second["pairs_matched"],
+        "pairs_verified": second["pairs_verified"],
         "pairs": [pairs[images] for images in sorted(pairs)],
-        "failed": {**first["failed"], **more["failed"]},
-        "images": more["images"],
+        "failed": {**first["failed"], **second["failed"]},
+        "images": second["images"],
         "providers": [
             *(p for p in first["providers"] if (p["kind"], p["name"]) not in used),
-            *more["providers"],
+            *second["providers"],
         ],
     }
 
 
-def _pair_of_both(first: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]:
-    """What was kept, else what was tried last."""
-    if first is more or "dropped" in first:
-        return more
-    if "dropped" in more:
+def _merge_pair(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
+    """Merge two reports of a pair; a verified result precedes a dropped one."""
+    if first is second or "dropped" in first:
+        return second
+    if "dropped" in second:
         return first
-    best = max(first, more, key=lambda pair: pair["inliers"])
-    return {**best, **{key: first[key] + more[key] for key in ("matches", "inliers")}}
+    best = max(first, second, key=lambda pair: pair["inliers"])
+    return {**best, **{key: first[key] + second[key] for key in ("matches", "inliers")}}
 
 
 def _pair(

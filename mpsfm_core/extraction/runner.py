@@ -1,9 +1,9 @@
-"""Runs the chosen providers over the images and assembles the mapper's problem.
+"""Run the configured providers on all images, and assemble the mapper's problem.
 
-Order: masks, features, first look or retrieval, matching, verification (both again where photos
-stay apart), adjustment of keypoints, groups of photos for a multi-view network, depth, normals.
-Whatever a provider returns is validated, then cached; calibration and resizing come after the
-cache, so that a change of them predicts nothing anew.
+Order of the stages: masks, features, similarity or retrieval, matching, verification (the last two
+again for pairs between components), keypoint adjustment, groups of a multi-view network, depth,
+normals. Results are validated, then cached. Calibration and resizing follow the cache, so changing
+them computes no network again.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mpsfm_core.extraction.pairs.selection import PairSelection
 from mpsfm_core.extraction.priors.multiview import GroupPriors
 from mpsfm_core.extraction.priors.prior_predictor import PriorPredictor, check_depth_source
 from mpsfm_core.extraction.remote_execution import use_executor
-from mpsfm_core.extraction.report import describe, describe_both
+from mpsfm_core.extraction.report import describe, merge_reports
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.matches import ImportedMatches
@@ -46,14 +46,12 @@ from mpsfm_core.providers.registry import Registry
 
 @dataclass(frozen=True, eq=False)
 class Extraction:
-    """The mapper's problem, its images in the order of the image set, and a report.
-
-    ``report`` is plain data for ``summary.json``: pairs tried and dropped with reasons, and what
-    each provider did.
-    """
+    """Result of extraction."""
 
     problem: MappingProblem
+    """The mapper's problem; its images have the order of the image set."""
     report: dict[str, Any]
+    """Plain data for ``summary.json``: matched and dropped pairs, and the usage of providers."""
 
 
 def extract(
@@ -65,15 +63,24 @@ def extract(
 ) -> Extraction:
     """Run all providers of a configuration.
 
-    What the cache has is not computed again, so that an interrupted run goes on where it was.
-    ``imported``: keypoints and matches that stand instead of features, pairs and matchers; they are
-    verified as ours are.
+    Cached results are not computed again, so an interrupted run continues where it stopped.
+
+    Args:
+        images: The images.
+        config: Configuration with resolved providers.
+        registry: The installed providers.
+        events: Receives progress.
+        imported: Keypoints and matches that replace features, pairs and matchers; they are
+            verified as well.
+
+    Returns:
+        The mapper's problem and a report.
 
     Raises:
-        InputError: a provider, its weights or its files are missing, or the configuration does
-            not fit together.
-        ProviderRunError, ProviderOutputError: a provider failed or broke its contract.
-        ConfigError: the executor cannot be had, or its workers do not share the cache.
+        InputError: a provider, its weights or its files are missing, or blocks do not fit together.
+        ProviderRunError: a provider failed.
+        ProviderOutputError: a provider broke its contract.
+        ConfigError: the executor is unavailable, or its workers do not share the cache.
         OutputError: the cache cannot be written.
     """
     context = ExtractionContext(images, config, registry, events or NullExtractionEvents())
@@ -89,13 +96,20 @@ def extend_matches(
     config: Config,
     registry: Registry,
     first: Extraction,
-    loose: Collection[int],
+    unconstrained: Collection[int],
     events: ExtractionEvents | None = None,
 ) -> Extraction:
-    """A finished extraction, with further matches of the pairs that one of the ``loose`` images is
-    in, by the features and matchers of ``config``.
+    """Extend an extraction by matches of the images that the fast pass does not constrain.
 
-    Depth and normals stay. Raises as :func:`extract`.
+    Depth and normals stay. Raises the same errors as :func:`extract`.
+
+    Args:
+        images: The images.
+        config: Configuration whose ``features`` and matchers are used.
+        registry: The installed providers.
+        first: Extraction of the fast pass.
+        unconstrained: Indices of the images; each new pair contains one of them.
+        events: Receives progress.
     """
     context = ExtractionContext(images, config, registry, events or NullExtractionEvents())
     with (
@@ -103,19 +117,27 @@ def extend_matches(
         use_executor(context),
     ):
         context.run_masks()
-        found = _match(context, loose, first.problem.pairs)
-        assembled = assemble_matches(found.candidates, found.outcomes, found.located)
+        outcome = _match(context, unconstrained, first.problem.pairs)
+        assembled = assemble_matches(outcome.candidates, outcome.geometries, outcome.located)
         assembled = adjust_assembled(context, assembled)
     problem = merge_matches(first.problem, assembled)
-    more = describe(context, problem, found.proposed, found.candidates, found.outcomes)
-    return Extraction(problem, describe_both(first.report, more))
+    second = describe(context, problem, outcome.proposed, outcome.candidates, outcome.geometries)
+    return Extraction(problem, merge_reports(first.report, second))
 
 
 def adjust_problem(
     images: ImageSet, config: Config, registry: Registry, problem: MappingProblem
 ) -> MappingProblem:
-    """The problem of an extraction without adjustment, or a part of its pairs, with adjust_assembled
-    keypoints. Raises as :func:`extract`."""
+    """Adjust the keypoints of a problem that was extracted without adjustment.
+
+    Raises the same errors as :func:`extract`.
+
+    Args:
+        images: The images.
+        config: Configuration with the options of adjustment.
+        registry: The installed providers.
+        problem: The problem, or a part of its pairs.
+    """
     context = ExtractionContext(images, config, registry, NullExtractionEvents())
     with threadpool_limits(thread_count(config.runtime), user_api="blas"):
         return adjust_problem_keypoints(context, problem)
@@ -124,13 +146,13 @@ def adjust_problem(
 def _extract(context: ExtractionContext, imported: ImportedMatches | None) -> Extraction:
     check_depth_source(context.config, context.registry)
     context.run_masks()
-    found = _match(context) if imported is None else _verify(context, imported)
-    candidates, outcomes, located = found.candidates, found.outcomes, found.located
-    assembled = assemble_matches(candidates, outcomes, located)
+    outcome = _match(context) if imported is None else _verify_imported(context, imported)
+    candidates = outcome.candidates
+    assembled = assemble_matches(candidates, outcome.geometries, outcome.located)
     if imported is None:
         assembled = adjust_assembled(context, assembled)
-    groups = _see_groups(context, assembled.pairs)
-    priors = PriorPredictor(context, found.matcher, candidates, groups).run()
+    groups = _predict_groups(context, assembled.pairs)
+    priors = PriorPredictor(context, outcome.matcher, candidates, groups).run()
     problem = MappingProblem(
         tuple(
             MappingImage(
@@ -141,20 +163,22 @@ def _extract(context: ExtractionContext, imported: ImportedMatches | None) -> Ex
                 keypoint_std_px=assembled.std_px[index],
                 keypoint_std_factor=assembled.std_factor[index],
                 focal_known=image.focal_known,
-                **_place(context, groups, index),
+                **_group_fields(context, groups, index),
             )
             for index, image in enumerate(context.images)
         ),
         assembled.pairs,
     )
-    described = describe(context, problem, found.proposed, candidates, outcomes)
+    described = describe(context, problem, outcome.proposed, candidates, outcome.geometries)
     if groups is not None:
         described["groups"] = groups.described()
     return Extraction(problem, described)
 
 
-def _see_groups(context: ExtractionContext, pairs: tuple[VerifiedPair, ...]) -> GroupPriors | None:
-    """Show the multi-view network, where there is one, groups of photos that see the same."""
+def _predict_groups(
+    context: ExtractionContext, pairs: tuple[VerifiedPair, ...]
+) -> GroupPriors | None:
+    """Run the multi-view network, if configured, on groups of images that share matches."""
     if context.config.multiview is None:
         return None
     groups = GroupPriors(context)
@@ -162,8 +186,10 @@ def _see_groups(context: ExtractionContext, pairs: tuple[VerifiedPair, ...]) -> 
     return groups
 
 
-def _place(context: ExtractionContext, groups: GroupPriors | None, index: int) -> dict[str, Any]:
-    """What the mapper is told of an image's group, if its depth is the group's."""
+def _group_fields(
+    context: ExtractionContext, groups: GroupPriors | None, index: int
+) -> dict[str, Any]:
+    """Return the group and the proposed pose of an image whose depth is predicted in groups."""
     if groups is None or context.config.depth.use != FROM_MULTIVIEW:
         return {}
     group, pose = groups.place(index)
@@ -172,41 +198,48 @@ def _place(context: ExtractionContext, groups: GroupPriors | None, index: int) -
 
 @dataclass(frozen=True, eq=False)
 class MatchingOutcome:
-    """``located``: features of the images, without descriptors. ``proposed``: number of pairs
-    before the filters of plugins. ``outcomes``: of each of the ``candidates``."""
+    """Matches of all pairs with their two-view geometries."""
 
     located: list[Features]
+    """Features of the images, without descriptors."""
     proposed: int
+    """Number of selected pairs before the filters of plugins."""
     candidates: list[CandidateMatches]
-    outcomes: list[TwoViewGeometry]
+    geometries: list[TwoViewGeometry]
+    """Two-view geometry of each candidate."""
     matcher: PairMatcher | None = None
 
 
 def _match(
     context: ExtractionContext,
-    loose: Collection[int] | None = None,
+    unconstrained: Collection[int] | None = None,
     verified: Sequence[VerifiedPair] = (),
 ) -> MatchingOutcome:
-    """By the providers of the configuration; pairs of ``loose`` images, all if None, beside those
-    that are ``verified`` already."""
-    backend = context.config.features
-    table = None if backend is None else FeatureTable(context, backend)
+    """Select, match and verify pairs with the configured providers.
+
+    Args:
+        context: The run.
+        unconstrained: Images of which each pair must contain one; None allows all pairs.
+        verified: Pairs that an earlier pass verified, which connect components.
+    """
+    features = context.config.features
+    table = None if features is None else FeatureTable(context, features)
     located = [_NO_FEATURES] * len(context.images) if table is None else table.extract()
-    selection = PairSelection(context, table, loose)
+    selection = PairSelection(context, table, unconstrained)
     matcher, verifier = PairMatcher(context, table), PairVerifier(context, located)
     candidates = matcher.match(selection.choose(), located)
-    outcomes = verifier.verify(candidates)
-    kept = zip(candidates, outcomes, strict=True)
+    geometries = verifier.verify(candidates)
+    pairs_with_geometry = zip(candidates, geometries, strict=True)
     connected = [(pair.image_a, pair.image_b) for pair in verified]
-    connected += [c.pair for c, outcome in kept if not outcome.dropped]
-    if more := selection.choose_again(connected):
-        candidates += matcher.match(more, located)
-        outcomes += verifier.verify(candidates[len(outcomes) :])
-    return MatchingOutcome(located, selection.proposed, candidates, outcomes, matcher)
+    connected += [c.pair for c, geometry in pairs_with_geometry if not geometry.dropped]
+    if further_pairs := selection.choose_again(connected):
+        candidates += matcher.match(further_pairs, located)
+        geometries += verifier.verify(candidates[len(geometries) :])
+    return MatchingOutcome(located, selection.proposed, candidates, geometries, matcher)
 
 
-def _verify(context: ExtractionContext, imported: ImportedMatches) -> MatchingOutcome:
-    """As they come, without those in masked areas."""
+def _verify_imported(context: ExtractionContext, imported: ImportedMatches) -> MatchingOutcome:
+    """Verify imported matches, without those in masked areas."""
     located, allowed = [], []
     for index, (xy, std_px) in enumerate(zip(imported.keypoints, imported.std_px, strict=True)):
         mask = context.mask(index)
@@ -217,8 +250,8 @@ def _verify(context: ExtractionContext, imported: ImportedMatches) -> MatchingOu
         keep = allowed[pair[0]][matches.indices[:, 0]] & allowed[pair[1]][matches.indices[:, 1]]
         sparse = SparseMatches(matches.indices[keep], matches.scores[keep])
         candidates.append(CandidateMatches(pair, sparse, NO_POINTS, 1.0))
-    outcomes = PairVerifier(context, located).verify(candidates)
-    return MatchingOutcome(located, len(candidates), candidates, outcomes)
+    geometries = PairVerifier(context, located).verify(candidates)
+    return MatchingOutcome(located, len(candidates), candidates, geometries)
 
 
 _NO_FEATURES = Features(np.empty((0, 2)), np.empty((0, 0), dtype=np.float32))

@@ -1,4 +1,4 @@
-"""Compile the numba kernels of extraction, mapping and the dense stage before they are needed.
+"""Precompile the numba kernels of extraction, mapping and the dense stage.
 
 A run without compiled kernels starts the compilation next to its extraction, and waits for it
 before mapping. ``python -m mpsfm_core.pipeline.precompile`` compiles at installation. Two processes

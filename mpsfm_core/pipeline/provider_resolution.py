@@ -1,9 +1,8 @@
-"""What a run needs, found or fetched before it looks at the first photo.
+"""Resolution of providers, weights and files before the first image is decoded.
 
-Providers, the packages below them, their weights, and the files and folders that their options
-name. Where a block of the configuration leaves a choice (``fallback``, ``same-network``), the first
-provider is taken that can be had here and now; weights that can be fetched count, until fetching
-them fails.
+A block with ``fallback`` or ``same-network`` gets the first provider that is available on this
+machine. Available means: the plugin is installed, it accepts the options, and its weights are
+present or can be downloaded. If a download fails, the next provider is tried.
 """
 
 from __future__ import annotations
@@ -29,22 +28,20 @@ _MEGABYTE = 1_000_000
 
 @dataclass(frozen=True)
 class ProviderChoice:
-    """Which provider a block of the configuration has got, and why.
-
-    ``block``: as ``depth`` or ``masks.0``. ``provider``: its specification; ``origin``: its
-    distribution and version. ``passed_over``: what would have been preferred -> why it cannot be
-    had. ``to_fetch``: weights that are not on this machine yet (of a preview only).
-    """
+    """The provider of one block, and why it was chosen."""
 
     block: str
+    """Name of the block, such as ``depth`` or ``masks.0``."""
     provider: ProviderSpec
     origin: str
+    """Distribution and version of the provider."""
     reason: ChoiceReason
     passed_over: Mapping[str, Reason] = field(default_factory=dict)
+    """Preferred providers that are unavailable, with the reason."""
     to_fetch: tuple[WeightsFile, ...] = ()
+    """Weights that are not on this machine yet; only in a preview."""
 
     def __str__(self) -> str:
-        """In one line, for people."""
         spec = self.provider
         licenses = [spec.code_license]
         if spec.weights_license != "none":
@@ -62,10 +59,11 @@ class ProviderChoice:
 
 @dataclass(frozen=True)
 class ProviderResolution:
-    """A configuration that leaves no choice open, and how each of its providers was chosen."""
+    """A configuration with one provider per block, and the choice of each."""
 
     config: Config
     choices: tuple[ProviderChoice, ...]
+    """One choice per provider, in the order of :meth:`Config.provider_configs`."""
 
 
 def resolve_providers(
@@ -74,15 +72,23 @@ def resolve_providers(
     stages: Stages | None = None,
     blocks: Collection[str] = BLOCKS,
 ) -> ProviderResolution:
-    """Find or fetch everything that a run with this configuration needs.
+    """Choose the provider of every block, and download its weights.
 
-    ``stages`` is told of every choice and of downloads. ``blocks``: those that are wanted; others
-    stay as they are. What is missing without a remedy is found out before anything is downloaded.
+    Errors without remedy are found before anything is downloaded.
+
+    Args:
+        config: The configuration.
+        registry: The installed providers.
+        stages: Receives choices and downloads.
+        blocks: Blocks to resolve; other blocks stay unchanged.
+
+    Returns:
+        The resolved configuration and the choices.
 
     Raises:
         ConfigError: a provider, or a file or folder that its options name, is missing; or the
             providers do not fit together.
-        WeightsError: weights are missing, and no other provider may be taken instead.
+        WeightsError: weights are missing, and there is no fallback.
     """
     stages = stages or Stages(registry)
     preview_providers(config, registry, blocks)
@@ -94,122 +100,127 @@ def resolve_providers(
         with downloads.announced(file, store):
             store.resolve(file.uri, file.sha256)
 
-    provision = _ProviderSearch(registry, fetch)(config, blocks)
-    for choice in provision.choices:
+    resolution = _ProviderSearch(registry, fetch)(config, blocks)
+    for choice in resolution.choices:
         stages.notice(str(choice))
-    return provision
+    return resolution
 
 
 def preview_providers(
     config: Config, registry: Registry, blocks: Collection[str] = BLOCKS
 ) -> ProviderResolution:
-    """What :func:`resolve_providers` would give if every download succeeded; downloads nothing.
+    """Resolve providers as if every download succeeded; download nothing.
 
-    Raises as :func:`resolve_providers`.
+    Takes the arguments and raises the errors of :func:`resolve_providers`.
     """
     runtime = config.runtime
     store = WeightStore(runtime.cache_dir, True if runtime.offline else None)
     absent: list[WeightsFile] = []
 
-    def look(file: WeightsFile) -> None:
+    def require(file: WeightsFile) -> None:
         if store.locate(file.uri) is None:
             if store.offline or not is_remote(file.uri):
-                store.resolve(file.uri, file.sha256)  # says what is missing, and what to do
+                store.resolve(file.uri, file.sha256)  # raises an error with the remedy
             absent.append(file)
 
-    return _ProviderSearch(registry, look, absent)(config, blocks)
+    return _ProviderSearch(registry, require, absent)(config, blocks)
 
 
 def describe_file(file: WeightsFile) -> str:
-    """URI and size of a weights file."""
+    """Return URI and size of a weights file as text."""
     return file.uri if file.size is None else f"{file.uri} ({_megabytes(file.size)} MB)"
 
 
 class _ProviderSearch:
-    """Goes through the blocks of a configuration, and through the candidates of each.
+    """Searches the first available provider of each block.
 
-    ``have``: sees to a weights file, raises where it cannot be had, and may note in ``absent`` that
-    it is not here yet.
+    Args:
+        registry: The installed providers.
+        require_weights: Makes a weights file available, or raises WeightsError. May add a file
+            that must be downloaded to ``absent``.
+        absent: Weights of the current candidate that are not on this machine.
     """
 
     def __init__(
         self,
         registry: Registry,
-        have: Callable[[WeightsFile], None],
+        require_weights: Callable[[WeightsFile], None],
         absent: list[WeightsFile] | None = None,
     ) -> None:
         self._registry = registry
-        self._have = have
+        self._require_weights = require_weights
         self._absent = [] if absent is None else absent
 
     def __call__(self, config: Config, blocks: Collection[str]) -> ProviderResolution:
         choices = []
-        for path, kind, backend in list(config.provider_configs()):
+        for path, kind, block in list(config.provider_configs()):
             if path[0] not in blocks:
                 continue
-            found, choice = self._choose(config, path, kind, backend)
-            config = config.replaced(path, found)
+            resolved, choice = self._choose(config, path, kind, block)
+            config = config.replaced(path, resolved)
             choices.append(choice)
         return ProviderResolution(config, tuple(choices))
 
     def _choose(
-        self, config: Config, path: SettingPath, kind: Kind, backend: ProviderConfig
+        self, config: Config, path: SettingPath, kind: Kind, block: ProviderConfig
     ) -> tuple[ProviderConfig, ProviderChoice]:
-        names = (backend.use, *backend.fallback)
+        names = (block.use, *block.fallback)
         passed_over: dict[str, Reason] = {}
         for name in names:
             self._absent.clear()
             try:
-                found = self._candidate(config, path, kind, backend, name)
+                resolved = self._prepare(config, path, kind, block, name)
             except InputError as error:
                 if len(names) == 1:
                     raise
                 passed_over[name] = _reason_of(error)
                 continue
-            reason = ChoiceReason.FIRST_CHOICE if backend.is_unresolved else ChoiceReason.CONFIGURED
+            reason = ChoiceReason.FIRST_CHOICE if block.is_unresolved else ChoiceReason.CONFIGURED
             if passed_over:
                 reason = ChoiceReason.FALLBACK
-            spec = self._registry.spec(kind, found.use)
-            origin = self._registry.version(kind, found.use)
+            spec = self._registry.spec(kind, resolved.use)
+            origin = self._registry.version(kind, resolved.use)
             absent = tuple(self._absent)
-            return found, ProviderChoice(dotted(path), spec, origin, reason, passed_over, absent)
+            choice = ProviderChoice(dotted(path), spec, origin, reason, passed_over, absent)
+            return resolved, choice
         reasons = "; ".join(f"{name}: {explain(why).text}" for name, why in passed_over.items())
-        raise ConfigError(f"{dotted(path)}: no provider can be had: {reasons}")
+        raise ConfigError(f"{dotted(path)}: no provider is available: {reasons}")
 
-    def _candidate(
-        self, config: Config, path: SettingPath, kind: Kind, backend: ProviderConfig, name: str
+    def _prepare(
+        self, config: Config, path: SettingPath, kind: Kind, block: ProviderConfig, name: str
     ) -> ProviderConfig:
-        """The block with this provider alone, once all that it needs is here."""
-        candidate = backend.model_copy(update={"use": name, "fallback": ()})
+        """Return the block with one provider, after making its files and weights available."""
+        candidate = block.model_copy(update={"use": name, "fallback": ()})
         if name == SAME_NETWORK:
             candidate = self._same_network(config.depth, candidate)
         candidate = check_provider_config(path, kind, candidate, self._registry)
         if path[-1] in ("matcher", "dense_matcher"):
             self._check_fit(config.replaced(path, candidate), path)
-        self._equip(path, kind, candidate)
+        self._require_files(path, kind, candidate)
         for index, wrapper in enumerate(candidate.wrap):
-            self._equip((*path, "wrap", index), "wrapper", wrapper)
+            self._require_files((*path, "wrap", index), "wrapper", wrapper)
         return candidate
 
-    def _same_network(self, depth: ProviderConfig, backend: ProviderConfig) -> ProviderConfig:
+    def _same_network(self, depth: ProviderConfig, block: ProviderConfig) -> ProviderConfig:
+        """Return the normals block with the provider and options of the depth block."""
         if "joint-normals" not in self._registry.spec("depth", depth.use).capabilities:
             raise ConfigError(f"the depth provider {depth.use!r} gives no normals")
-        return backend.model_copy(update={"use": depth.use, "options": depth.options})
+        return block.model_copy(update={"use": depth.use, "options": depth.options})
 
     def _check_fit(self, config: Config, path: SettingPath) -> None:
-        """Whether a matcher fits the features, which were chosen before."""
+        """Raise SettingsError if a matcher does not fit the resolved features."""
         problems = [p for p in combination_problems(config, self._registry) if p.path[0] == path[0]]
         if problems:
             raise SettingsError(tuple(problems))
 
-    def _equip(self, path: SettingPath, kind: Kind, backend: ProviderConfig) -> None:
-        """See to the files that a provider reads and to its weights."""
-        options = self._registry.validate_options(kind, backend.use, backend.options)
+    def _require_files(self, path: SettingPath, kind: Kind, block: ProviderConfig) -> None:
+        """Check the files that options name, and make the weights available."""
+        options = self._registry.validate_options(kind, block.use, block.options)
         for key, file in _paths(options):
             if not file.exists():
                 raise ConfigError(f"{dotted((*path, 'options', *key))}: {file} does not exist")
-        for weights in self._registry.weights(kind, backend.use, backend.options):
-            self._have(weights)
+        for weights in self._registry.weights(kind, block.use, block.options):
+            self._require_weights(weights)
 
 
 def _reason_of(error: InputError) -> Reason:
@@ -223,7 +234,7 @@ def _reason_of(error: InputError) -> Reason:
 
 
 class _Downloads:
-    """Tells of downloads: one line with the size before each, and a stage with its megabytes."""
+    """Announces each download with its size, and reports its progress in megabytes."""
 
     def __init__(self, stages: Stages) -> None:
         self._stages = stages
@@ -231,17 +242,17 @@ class _Downloads:
 
     @contextmanager
     def announced(self, file: WeightsFile, store: WeightStore) -> Iterator[None]:
-        """Around what may download a file."""
+        """Announce a download inside a ``with`` block, if the file must be downloaded."""
         if store.offline or not is_remote(file.uri) or store.locate(file.uri) is not None:
             yield
             return
         self._stage = f"fetch {file.uri.rpartition('/')[2]}"
-        self._stages.notice(f"fetching {describe_file(file)}, licence {file.license}")
+        self._stages.notice(f"fetching {describe_file(file)}, license {file.license}")
         with self._stages.step(self._stage, None if file.size is None else _megabytes(file.size)):
             yield
 
     def progress(self, name: str, done: int, total: int | None) -> None:
-        """As :data:`mpsfm_core.providers.weights.Progress`."""
+        """Report progress; implements :data:`mpsfm_core.providers.weights.Progress`."""
         self._stages.stage_progress(self._stage, _megabytes(done), _megabytes(total or done))
 
 
@@ -250,7 +261,7 @@ def _megabytes(size: int) -> int:
 
 
 def _paths(options: Options | None, key: SettingPath = ()) -> Iterator[tuple[SettingPath, Path]]:
-    """The files and folders that options name, with their places."""
+    """Yield the files and folders that options name, with their setting paths."""
     for name, value in options or ():
         if isinstance(value, Path):
             yield (*key, name), value

@@ -1,4 +1,4 @@
-"""What a run is doing, how long it takes and how much memory: told to plugins and kept."""
+"""Stages of a run: events for plugins, time and memory for the summary."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ _PROC = Path("/proc/self")
 
 @dataclass(frozen=True)
 class StageRecord:
-    """``peak_memory_mb``: resident memory of this process, None where it cannot be told."""
+    """Time and memory of a stage."""
 
     seconds: float
     peak_memory_mb: float | None
+    """Peak resident memory of this process; None if the system does not report it."""
 
     def after(self, earlier: StageRecord | None) -> StageRecord:
-        """Of a stage that ran before too: the time of both, the larger peak."""
+        """Add an earlier run of the same stage: sum of times, maximum of peaks."""
         if earlier is None:
             return self
         peaks = [p for p in (earlier.peak_memory_mb, self.peak_memory_mb) if p is not None]
@@ -33,7 +34,7 @@ class StageRecord:
 
 
 class Stages:
-    """Receives the events of all rooms and passes them on to the hooks of all plugins."""
+    """Receives the events of all packages, and forwards them to the hooks of plugins."""
 
     def __init__(self, registry: Registry) -> None:
         self._registry = registry
@@ -44,7 +45,7 @@ class Stages:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """A stage of the pipeline."""
+        """Run a stage of the pipeline in a ``with`` block."""
         self.stage_started(name, None)
         _reset_peak_memory()
         self._running[name] = time.perf_counter()
@@ -58,7 +59,7 @@ class Stages:
 
     @contextmanager
     def step(self, name: str, total: int | None) -> Iterator[None]:
-        """A step within a stage, of ``total`` units if known."""
+        """Run a step within a stage in a ``with`` block; ``total`` is its number of units."""
         started = time.perf_counter()
         self.stage_started(name, total)
         try:
@@ -67,9 +68,9 @@ class Stages:
             self.stage_finished(name, time.perf_counter() - started)
 
     def report(self) -> dict[str, StageRecord]:
-        """The stages of the pipeline in order; one that still runs with what it took so far.
+        """Return the record of each stage in order; of a running stage its values so far.
 
-        Steps within a stage (features, depth, ...) are passed on to plugins and not kept.
+        Steps within a stage (features, depth, ...) are not recorded.
         """
         return {**self._finished, **{name: self._record(name) for name in self._running}}
 
@@ -77,7 +78,7 @@ class Stages:
         return StageRecord(time.perf_counter() - self._running[name], peak_memory_mb())
 
     def notice(self, text: str) -> None:
-        """Something that the user should know now, in one line."""
+        """Show one line to the user."""
         self._registry.call_hook("mpsfm_notice", text=text)
 
     def warn(self, text: str) -> None:
@@ -86,41 +87,41 @@ class Stages:
         self.notice(f"warning: {text}")
 
     def stage_started(self, stage: str, total: int | None) -> None:
-        """A stage begins, with this many steps if known."""
+        """Forward the start of a stage with ``total`` steps, None if unknown."""
         self._registry.call_hook("mpsfm_stage_started", stage=stage, total=total)
 
     def stage_progress(self, stage: str, done: int, total: int) -> None:
-        """Steps done so far."""
+        """Forward the number of finished steps."""
         self._registry.call_hook("mpsfm_stage_progress", stage=stage, done=done, total=total)
 
     def stage_finished(self, stage: str, seconds: float) -> None:
-        """A stage ended."""
+        """Forward the end of a stage."""
         self._registry.call_hook("mpsfm_stage_finished", stage=stage, seconds=seconds)
 
     def image_registered(self, name: str, registered: int, total: int) -> None:
-        """The mapper accepted an image."""
+        """Forward the registration of an image."""
         self._registry.call_hook(
             "mpsfm_image_registered", name=name, registered=registered, total=total
         )
 
     def scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """Images or points have moved."""
+        """Forward a change of poses or points."""
         self._registry.call_hook("mpsfm_scene_changed", scene=scene)
 
     def image_rejected(self, name: str, reason: Reason) -> None:
-        """The mapper tried an image and rejected it."""
+        """Forward the rejection of an image, with its reason as text."""
         text = explain(reason).text
         self._registry.call_hook("mpsfm_image_rejected", name=name, reason=reason, text=text)
 
 
 def _reset_peak_memory() -> None:
-    """Forget the peak so far where the system can (Linux); elsewhere peaks count from the start."""
+    """Reset the peak of this process on Linux; other systems report the peak since the start."""
     with suppress(OSError):
         (_PROC / "clear_refs").write_text("5")
 
 
 def peak_memory_mb() -> float | None:
-    """Most memory that this process held, of a stage or else so far; None where nothing tells."""
+    """Return the peak resident memory of this process in MB; None if unknown."""
     with suppress(OSError):
         for line in (_PROC / "status").read_text().splitlines():
             if line.startswith("VmHWM:"):
@@ -128,6 +129,8 @@ def peak_memory_mb() -> float | None:
     with suppress(ImportError):
         import resource
 
-        unit = 1 << 20 if sys.platform == "darwin" else 1 << 10  # bytes there, kilobytes elsewhere
+        unit = (
+            1 << 20 if sys.platform == "darwin" else 1 << 10
+        )  # macOS counts bytes, other systems kilobytes
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
     return None

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pydantic import Field
-
-from mpsfm_core.data.options import Options
+from mpsfm_core.data.options import Options, expert
 
 
 class ResultOptions(Options):
     """Options of the files that are written in addition to the COLMAP model."""
 
-    text_model: bool = False
+    text_model: bool = expert(False)
     """Also write the COLMAP model as text, into ``sparse_text/``."""
     nerfstudio: bool = False
     """Also write ``transforms.json`` for nerfstudio and tools that read its format."""
@@ -20,13 +18,13 @@ class ResultOptions(Options):
     """Write ``report.html``, and small images, priors and matches into ``views/``."""
     dense_cloud: bool = True
     """Write ``dense.ply``."""
-    dense_max_points: int = Field(2_000_000, ge=1)
+    dense_max_points: int = expert(2_000_000, ge=1)
     """Maximum number of points in ``dense.ply``, 32 bytes each; random pixels are dropped."""
-    dense_max_relative_std: float = Field(0.1, gt=0)
+    dense_max_relative_std: float = expert(0.1, gt=0)
     """Maximum relative depth std of pixels in ``dense.ply``. Larger values give more and less
     accurate points. If more than three quarters exceed it, the best quarter is used [twice the std
     of the weaker networks in paper C]."""
-    dense_consistency_sigmas: float = Field(3.0, gt=0)
+    dense_consistency_sigmas: float = expert(3.0, gt=0)
     """Depth difference in standard deviations from which another image contradicts a pixel. Pixels
     with more contradicting than confirming images are dropped from ``dense.ply``."""
     georeference: bool = True

@@ -23,7 +23,6 @@ from mpsfm_core.data import (
     SparseMatches,
 )
 from mpsfm_core.data.errors import OutputError
-from mpsfm_core.extraction import cache as module
 from mpsfm_core.extraction.cache import Cache, content_key, digest, pack
 from mpsfm_core.extraction.matching.verification import TwoViewGeometry
 from mpsfm_core.extraction.priors.raw_priors import JointPrior
@@ -51,7 +50,7 @@ def examples() -> dict[str, object]:
         "everything": PairMatches(sparse, dense, PairDepth(depth(), depth(metric=False))),
         "depth": DepthPrior.from_arrays(np.ones((3, 4))),
         "joint": JointPrior(depth(), normals),
-        "two-view": TwoViewGeometry("", "planar", np.arange(3), np.eye(3), np.zeros(3)),
+        "two-view": TwoViewGeometry("", "planar", 3, np.arange(3), np.eye(3), np.zeros(3)),
         "vector": RNG.normal(size=7).astype(np.float32),
         "mask": RNG.uniform(size=(4, 4)) > 0.5,
     }
@@ -128,7 +127,7 @@ def test_disk_full_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.Monkey
         raise OSError(errno.ENOSPC, "No space left on device")
 
     cache = Cache(tmp_path)
-    monkeypatch.setattr(module.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OutputError, match=r"disk is full.*runtime\.cache_dir"):
         cache.store("depth", KEY, depth())
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]

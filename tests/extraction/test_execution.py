@@ -15,8 +15,14 @@ import pytest
 
 from mpsfm_core import hookimpl
 from mpsfm_core.config import Config, RuntimeOptions
-from mpsfm_core.data import DataError, PinholeCamera
-from mpsfm_core.data.errors import ConfigError, InputError, ProviderOutputError, ReconstructionError
+from mpsfm_core.data import PinholeCamera
+from mpsfm_core.data.errors import (
+    ConfigError,
+    DataError,
+    InputError,
+    ProviderOutputError,
+    ReconstructionError,
+)
 from mpsfm_core.extraction.remote_execution import RemoteStep
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images

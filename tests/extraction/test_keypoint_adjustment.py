@@ -16,6 +16,7 @@ from mpsfm_core.data import (
     View,
 )
 from mpsfm_core.extraction.matching.keypoint_adjustment import (
+    MAX_SHIFT_STD,
     AlignedPair,
     PairSide,
     adjust_keypoints,
@@ -103,8 +104,8 @@ def test_both_orders_of_a_pair_say_the_same() -> None:
     found = scene.correspondences(CAMERA, poses[0], OTHER, poses[1], seeds)
     xy = seeds[found.visible], found.xy_b[found.visible]
     a, b = PairSide(CAMERA, views[0], xy[0], 1.0), PairSide(OTHER, views[1], xy[1], 1.0)
-    forth = align_pair(a, b, *relative(*poses), AdjustmentOptions())
-    back = align_pair(b, a, *relative(*poses[::-1]), AdjustmentOptions())
+    forth = align_pair(a, b, *relative(*poses))
+    back = align_pair(b, a, *relative(*poses[::-1]))
     assert len(forth.rows) > 20 and np.array_equal(forth.rows, back.rows)
     left = forth.offset + np.einsum("mij,mj->mi", forth.warp, back.offset)
     assert np.median(np.linalg.norm(left, axis=1)) < 0.02
@@ -240,7 +241,7 @@ def test_rounded_keypoints_become_exact(rounded) -> None:
         np.linalg.norm(a.keypoints - b.keypoints, axis=1).max()
         for a, b in zip(on.images, off.images, strict=True)
     ]
-    assert max(moved) <= AdjustmentOptions().max_shift
+    assert max(moved) <= MAX_SHIFT_STD
     images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml")
     later = adjust_problem(images, rounded.config(**ROUNDED), rounded.registry, off)
     for a, b in zip(later.images, on.images, strict=True):

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core import DepthPrior, MultiViewPrior, View
-from mpsfm_core.data import DataError
-from mpsfm_core.data.errors import ConfigError
+from mpsfm_core.data.errors import ConfigError, DataError
 from mpsfm_core.extraction.cache import Cache, pack, unpack
 from mpsfm_core.extraction.priors.multiview import choose_groups, consecutive_groups
 from mpsfm_core.geometry import compose, invert

@@ -1,4 +1,4 @@
-"""Which photos are likely to show the same: the match_score, and what follows from all of it."""
+"""Image similarity: match scores, excess over chance, diffusion."""
 
 from __future__ import annotations
 

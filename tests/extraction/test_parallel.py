@@ -66,7 +66,7 @@ def test_events_come_from_the_calling_thread() -> None:
 
 @pytest.mark.parametrize(("cores", "workers", "threads"), [(1, 1, 1), (2, 2, 1), (16, 4, 4)])
 def test_automatic_numbers(cores, workers, threads, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backends, "cores", lambda: cores)
+    monkeypatch.setattr(backends, "count_cores", lambda: cores)
     runtime = RuntimeOptions()
     assert (worker_count(runtime), thread_count(runtime)) == (workers, threads)
 

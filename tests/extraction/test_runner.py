@@ -14,7 +14,7 @@ from mpsfm_core.data.errors import ConfigError, ProviderOutputError, ProviderRun
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.options import AdjustmentOptions, ExtractionOptions, PairOptions
 from mpsfm_core.extraction.pairs import pairing as pairs
-from mpsfm_core.extraction.pairs import similarity as first_look
+from mpsfm_core.extraction.pairs import similarity as pair_similarity
 from mpsfm_core.extraction.priors.prior_maps import EDGE_VARIANCE
 from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_angle_deg
 from mpsfm_core.inputs.options import InputOptions
@@ -217,12 +217,12 @@ def test_auto_matches_all_pairs_of_few_photos(world) -> None:
     assert world.extract(pairs=PairOptions(mode="auto", partners=3)).report["pairs_matched"] == 6
 
 
-def test_auto_takes_a_first_look(world) -> None:
+def test_auto_mode_uses_similarity(world) -> None:
     """All views share points, the neighbours most; the second time the look is remembered."""
     options = PairOptions(mode="auto", partners=1, overlap=1)
     first = world.extract(pairs=options)
     assert pairs_of(first.problem) == {(0, 1), (1, 2), (2, 3)}
-    assert len(list((world.cache / "extraction" / "first-look").rglob("*.npz"))) == 1
+    assert len(list((world.cache / "extraction" / "pair-similarity").rglob("*.npz"))) == 1
     again = world.extract(pairs=options, runtime=RuntimeOptions(cache_dir=world.cache, workers=1))
     assert again.report["pairs"] == first.report["pairs"]
 
@@ -241,10 +241,10 @@ def test_auto_without_features_matches_all(world) -> None:
 
 
 def test_what_stays_apart_is_tried_again(world, monkeypatch) -> None:
-    """A first look that sees two halves only, and names that are not numbered."""
+    """Similarity within two halves only, and names that are not numbered."""
     likeness = np.eye(4)[[1, 0, 3, 2]] + 1e-3 * np.eye(4)[[2, 3, 0, 1]]
-    monkeypatch.setattr(first_look, "diffuse_similarity", lambda found: likeness)
-    monkeypatch.setattr(pairs, "neighbours", lambda names, options: [])
+    monkeypatch.setattr(pair_similarity, "diffuse_similarity", lambda scores: likeness)
+    monkeypatch.setattr(pairs, "numbered_neighbor_pairs", lambda names, options: [])
     extraction = world.extract(pairs=PairOptions(mode="auto", partners=1))
     assert extraction.report["pairs_matched"] == 3
     assert {(0, 1), (2, 3)} < pairs_of(extraction.problem)
@@ -369,7 +369,7 @@ def test_more_than_half_of_the_photos_failing_ends_the_run(world) -> None:
     for name in world.names[1:]:
         world.break_on["depth", name] = fail
     runtime = RuntimeOptions(cache_dir=world.cache, workers=1, on_error="skip")
-    with pytest.raises(ProviderRunError, match=r"3 of 4 photos failed, the last so: provider"):
+    with pytest.raises(ProviderRunError, match=r"3 of 4 photos failed, the last with: provider"):
         world.extract(runtime=runtime)
 
 

@@ -157,7 +157,7 @@ def test_first_and_second_use(room: Room, server: Server, configured: Configured
     assert not any(b.is_unresolved for _, _, b in first.config.provider_configs())
     assert len(server.requests) == 1
     assert listener.progress[-1][0] == "fetch strong.onnx"
-    assert listener.notices[0] == f"fetching {server.url}/strong.onnx (0 MB), licence MIT"
+    assert listener.notices[0] == f"fetching {server.url}/strong.onnx (0 MB), license MIT"
     assert listener.notices[-2].startswith("depth: strong")
     assert listener.notices[-2].endswith("to expect: published")
     again = resolve_providers(config, registry)

@@ -1,4 +1,4 @@
-"""Dense matches as keypoints: snapped to features, or sampled apart from them."""
+"""Conversion of dense matches to keypoints: snapped to features, or sampled between them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,25 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Bool, DenseMatches, Float32, Float64, Int64, SparseMatches
-from mpsfm_core.extraction.options import ExtractionOptions
+
+_MIN_SCORE = 0.1
+"""Minimum score of a sampled dense match. [reference RoMa]"""
+_MIN_KEYPOINT_DISTANCE_PX = 6.0
+"""Minimum distance of a sampled match to keypoints. [reference sparse_nms_radius]"""
+_NMS_RADIUS_PX = 8.0
+"""Radius of non-maximum suppression between sampled matches. [reference]"""
 
 
 @dataclass(frozen=True, eq=False)
 class PointMatches:
-    """Matches of a pair that bring their own keypoints: (m, 2) float64 each, scores (m,)."""
+    """Matches of a pair with keypoints of their own."""
 
     xy_a: Float64
+    """(m, 2) points of the first view, pixels."""
     xy_b: Float64
+    """(m, 2) points of the second view, pixels."""
     scores: Float32
+    """(m,) scores of the matches."""
 
 
 NO_POINTS = PointMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, dtype=np.float32))
@@ -26,9 +35,15 @@ NO_POINTS = PointMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, dtype=n
 def snap_to_keypoints(
     dense: DenseMatches, keypoints_a: Float64, keypoints_b: Float64, radius_px: float
 ) -> SparseMatches:
-    """Dense matches that lie on keypoints in both images, as matches of those.
+    """Assign dense matches to the nearest keypoints in both views.
 
-    Of several for one keypoint the most certain stays.
+    Of several dense matches for one keypoint, the one with the best score is used.
+
+    Args:
+        dense: Dense matches of the pair.
+        keypoints_a: (n, 2) keypoints of the first view, pixels.
+        keypoints_b: (k, 2) keypoints of the second view, pixels.
+        radius_px: Maximum distance between match and keypoint.
     """
     distance_a, row_a = _nearest(keypoints_a, dense.points_a)
     distance_b, row_b = _nearest(keypoints_b, dense.points_b)
@@ -38,37 +53,44 @@ def snap_to_keypoints(
 
 
 def sample_dense_matches(
-    dense: DenseMatches, keypoints_a: Float64, keypoints_b: Float64, options: ExtractionOptions
+    dense: DenseMatches, keypoints_a: Float64, keypoints_b: Float64
 ) -> PointMatches:
-    """Dense matches that are certain, apart from the keypoints of both images, and apart from
-    each other (paper appendix "two-view correspondences", reference)."""
-    away = dense.scores >= options.dense_min_score
+    """Select dense matches that are certain, apart from keypoints and apart from each other.
+
+    See the paper's appendix "two-view correspondences".
+
+    Args:
+        dense: Dense matches of the pair.
+        keypoints_a: (n, 2) keypoints of the first view, pixels.
+        keypoints_b: (k, 2) keypoints of the second view, pixels.
+    """
+    is_usable = dense.scores >= _MIN_SCORE
     for keypoints, points in ((keypoints_a, dense.points_a), (keypoints_b, dense.points_b)):
-        away &= _nearest(keypoints, points)[0] >= options.dense_sparse_px
-    rows = np.flatnonzero(away)
+        is_usable &= _nearest(keypoints, points)[0] >= _MIN_KEYPOINT_DISTANCE_PX
+    rows = np.flatnonzero(is_usable)
     rows = rows[np.argsort(-dense.scores[rows], kind="stable")]
-    rows = rows[_suppress(dense.points_a[rows], options.dense_nms_px)]
-    rows = rows[_suppress(dense.points_b[rows], options.dense_nms_px)]
+    rows = rows[_suppress_neighbors(dense.points_a[rows])]
+    rows = rows[_suppress_neighbors(dense.points_b[rows])]
     return PointMatches(dense.points_a[rows], dense.points_b[rows], dense.scores[rows])
 
 
-def _suppress(points: Float64, radius_px: float) -> Bool:
-    """Which points stay when each removes the later ones nearer than the radius, in order."""
-    stays = np.ones(len(points), dtype=np.bool_)
-    if radius_px <= 0 or not len(points):
-        return stays
-    pairs = cKDTree(points).query_pairs(np.nextafter(radius_px, 0), output_type="ndarray")
-    pairs = np.sort(pairs, axis=1)
+def _suppress_neighbors(points: Float64) -> Bool:
+    """Return which points (n, 2), best first, survive greedy non-maximum suppression."""
+    survives = np.ones(len(points), dtype=np.bool_)
+    if not len(points):
+        return survives
+    radius = np.nextafter(_NMS_RADIUS_PX, 0)
+    pairs = np.sort(cKDTree(points).query_pairs(radius, output_type="ndarray"), axis=1)
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
     bounds = np.searchsorted(pairs[:, 0], np.arange(len(points) + 1))
     for row in range(len(points)):
-        if stays[row]:
-            stays[pairs[bounds[row] : bounds[row + 1], 1]] = False
-    return stays
+        if survives[row]:
+            survives[pairs[bounds[row] : bounds[row + 1], 1]] = False
+    return survives
 
 
 def _nearest(keypoints: Float64, points: Float64) -> tuple[Float64, Int64]:
-    """Distance to the nearest keypoint (infinite if there is none), and its row."""
+    """Return distance and row of the nearest keypoint of each point; infinite without keypoints."""
     if not len(keypoints):
         return np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)
     distance, row = cKDTree(keypoints).query(points)

@@ -1,4 +1,4 @@
-"""Matches of image pairs: by features, dense, or both; verified."""
+"""Matching and verification of image pairs, and assembly of their keypoints."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ from mpsfm_core.extraction.matching.dense_matches import (
     sample_dense_matches,
     snap_to_keypoints,
 )
-from mpsfm_core.extraction.matching.keypoint_adjustment import KeypointAdjuster
+from mpsfm_core.extraction.matching.keypoint_adjustment import (
+    ADJUSTED_STD_RATIO,
+    KeypointAdjuster,
+)
 from mpsfm_core.extraction.matching.verification import CALIBRATED, TwoViewGeometry, verify_matches
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.geometry import sample_nearest
@@ -39,24 +42,24 @@ from mpsfm_core.providers import validation
 
 @dataclass(frozen=True, eq=False)
 class CandidateMatches:
-    """Matches of a pair before verification: rows of the features, then free points.
-
-    ``std_px``: localisation noise of the free points. ``precision``: mean inverse variance of the
-    pair depth of both images, 0 where there is none.
-    """
+    """Matches of a pair before verification."""
 
     pair: Pair
     sparse: SparseMatches
+    """Matches between detected features."""
     points: PointMatches
+    """Dense matches with keypoints of their own; their rows follow those of ``sparse``."""
     std_px: float
+    """Standard deviation of ``points``."""
     precision: tuple[float, float] = (0.0, 0.0)
+    """Mean inverse variance of the pair depth of both images, 0 without pair depth."""
 
     def __len__(self) -> int:
         return len(self.sparse) + len(self.points.scores)
 
 
 class PairMatcher:
-    """The chosen matchers on pairs of images."""
+    """Runs the configured matchers on pairs of images."""
 
     def __init__(self, context: ExtractionContext, table: FeatureTable | None) -> None:
         self._context = context
@@ -67,26 +70,26 @@ class PairMatcher:
         self._snaps = config.matcher is None and table is not None
 
     def match(self, pairs: list[Pair], located: list[Features]) -> list[CandidateMatches]:
-        """Run the stage. ``located``: features of all images, descriptors not needed."""
+        """Match pairs; ``located`` are the features of all images, descriptors are not needed."""
 
         def work(pair: Pair) -> CandidateMatches:
-            return self._candidates(pair, located[pair[0]], located[pair[1]])
+            return self._match_pair(pair, located[pair[0]], located[pair[1]])
 
         return self._context.each("matching", pairs, work, *self._providers)
 
     def results(self, pair: Pair) -> list[PairMatches]:
-        """What each matcher returns for a pair, cached."""
+        """Return the cached results of all matchers for a pair."""
         return [self._run(provider, pair) for provider in self._providers]
 
     def pair_depth(self, pair: Pair, side: int) -> DepthPrior:
-        """Depth of one image of a pair (0 or 1) as the matcher saw it."""
+        """Return the depth that a matcher predicts for one image (0 or 1) of a pair."""
         for provider in self._providers:
             depth = self._run(provider, pair).depth
             if depth is not None:
                 return (depth.depth_a, depth.depth_b)[side]
-        raise LookupError(f"no matcher gave depth for pair {pair}")
+        raise LookupError(f"no matcher predicts depth for pair {pair}")
 
-    def _candidates(self, pair: Pair, a: Features, b: Features) -> CandidateMatches:
+    def _match_pair(self, pair: Pair, a: Features, b: Features) -> CandidateMatches:
         options = self._context.config.extraction
         results = self.results(pair)
         no_scores = np.empty(0, dtype=np.float32)
@@ -97,10 +100,10 @@ class PairMatcher:
                 sparse = result.sparse
             if result.dense is None:
                 continue
-            dense = self._allowed(pair, result.dense)
+            dense = self._unmasked(pair, result.dense)
             if self._snaps:
                 sparse = snap_to_keypoints(dense, a.keypoints, b.keypoints, options.dense_snap_px)
-            points = sample_dense_matches(dense, a.keypoints, b.keypoints, options)
+            points = sample_dense_matches(dense, a.keypoints, b.keypoints)
             std_px = dense.std_px
         return CandidateMatches(pair, sparse, points, std_px, _precision(results))
 
@@ -119,8 +122,8 @@ class PairMatcher:
             inputs += [table.key(index) for index in pair]
         return context.result(provider, PairMatches, inputs, compute, pair)
 
-    def _allowed(self, pair: Pair, dense: DenseMatches) -> DenseMatches:
-        """The matches that no mask forbids."""
+    def _unmasked(self, pair: Pair, dense: DenseMatches) -> DenseMatches:
+        """Return the matches whose points no mask excludes."""
         keep = np.ones(len(dense), dtype=np.bool_)
         for index, points in zip(pair, (dense.points_a, dense.points_b), strict=True):
             mask = self._context.mask(index)
@@ -132,14 +135,14 @@ class PairMatcher:
 
 
 class PairVerifier:
-    """Two-view geometry of candidate matches."""
+    """Verifies candidate matches by two-view geometry; cached."""
 
     def __init__(self, context: ExtractionContext, located: list[Features]) -> None:
         self._context = context
         self._located = located
 
-    def verify_matches(self, candidates: list[CandidateMatches]) -> list[TwoViewGeometry]:
-        """Run the stage."""
+    def verify(self, candidates: list[CandidateMatches]) -> list[TwoViewGeometry]:
+        """Verify all candidates; return their two-view geometries in the same order."""
         return self._context.each("verification", candidates, self._verify)
 
     def _verify(self, matches: CandidateMatches) -> TwoViewGeometry:
@@ -170,22 +173,21 @@ class PairVerifier:
 
 @dataclass(frozen=True, eq=False)
 class AssembledMatches:
-    """Verified pairs, and the keypoints (n, 2) of each image they refer to, and their noise as they
-    were found.
-
-    ``std_factor``: (n,) for each image, what adjustment left of that noise.
-    """
+    """Verified pairs with the keypoints of all images."""
 
     pairs: tuple[VerifiedPair, ...]
     keypoints: list[Float64]
+    """(n, 2) keypoints of each image, pixels."""
     std_px: list[float]
+    """Standard deviation of the detected keypoints of each image."""
     std_factor: list[Float64]
+    """(n,) ratio of each keypoint's std after adjustment to ``std_px``."""
 
 
 def assemble_matches(
     candidates: list[CandidateMatches], outcomes: list[TwoViewGeometry], located: list[Features]
 ) -> AssembledMatches:
-    """Number the keypoints: each image's features, then the free points of its verified pairs."""
+    """Number the keypoints of each image: its features, then the points of its verified pairs."""
     keypoints = [[features.keypoints] for features in located]
     counts = [len(features) for features in located]
     noise = [[(len(features), features.std_px)] for features in located]
@@ -222,21 +224,21 @@ def assemble_matches(
 
 
 def adjust_assembled(context: ExtractionContext, assembled: AssembledMatches) -> AssembledMatches:
-    """With keypoints moved to where the patches of their matches are alike."""
+    """Return the matches with adjusted keypoints, if adjustment is enabled."""
     options = context.config.adjustment
     if not (options.enabled and assembled.pairs):
         return assembled
     adjuster = KeypointAdjuster(context, assembled.keypoints, assembled.std_px)
-    found = adjuster.run(assembled.pairs)
+    adjusted = adjuster.run(assembled.pairs)
     return replace(
         assembled,
-        keypoints=[image.keypoints for image in found],
-        std_factor=[np.where(image.measured, options.std_factor, 1.0) for image in found],
+        keypoints=[image.keypoints for image in adjusted],
+        std_factor=[np.where(image.measured, ADJUSTED_STD_RATIO, 1.0) for image in adjusted],
     )
 
 
 def adjust_problem_keypoints(context: ExtractionContext, problem: MappingProblem) -> MappingProblem:
-    """A problem that was assembled without adjustment, with keypoints that are adjust_assembled."""
+    """Return a problem without adjustment with adjusted keypoints."""
     images = problem.images
     found = adjust_assembled(
         context,
@@ -255,7 +257,7 @@ def adjust_problem_keypoints(context: ExtractionContext, problem: MappingProblem
 
 
 def merge_matches(problem: MappingProblem, more: AssembledMatches) -> MappingProblem:
-    """The problem with more matches between its images, on keypoints that come after its own."""
+    """Add matches to a problem; their keypoints are appended to those of the problem."""
     offsets = [len(image.keypoints) for image in problem.images]
     images = tuple(
         replace(
@@ -284,7 +286,7 @@ def _std_factor(image: MappingImage) -> Float64:
 
 
 def _merge_pair(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:
-    """All matches of a pair, with the geometry that more of them fit."""
+    """Concatenate the matches of a pair; keep the geometry with more inliers."""
     if a is None:
         return b
     return replace(
@@ -295,7 +297,7 @@ def _merge_pair(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:
 
 
 def _median_std(parts: list[tuple[int, float]]) -> float:
-    """Median noise of keypoints that come in groups of (number, std)."""
+    """Return the median std of keypoints, given as groups of (number, std)."""
     values = np.repeat([std for _, std in parts], [count for count, _ in parts])
     return float(np.median(values)) if len(values) else 1.0
 
@@ -308,7 +310,7 @@ def _precision(results: list[PairMatches]) -> tuple[float, float]:
 
 
 def _mean_precision(depth: DepthPrior) -> float:
-    """Mean inverse variance of the valid pixels (reference: how the best pair is chosen)."""
+    """Return the mean inverse variance of valid pixels, which ranks pairs. [reference]"""
     if depth.variance is None or not depth.valid.any():
         return 0.0
     return float((1.0 / depth.variance[depth.valid].astype(np.float64)).mean())

@@ -1,4 +1,4 @@
-"""Two-view geometry of matches: which are inliers, and how the cameras lie."""
+"""Two-view geometric verification: inliers and relative pose of an image pair."""
 
 from __future__ import annotations
 
@@ -23,6 +23,20 @@ _USABLE = {
     _Configuration.PANORAMIC: "panoramic",
     _Configuration.PLANAR_OR_PANORAMIC: "planar or panoramic",
 }
+_MIN_INLIER_RATIO = 0.1
+"""Inlier ratio that the number of RANSAC trials is computed for. [reference]"""
+_MAX_TRIALS = 20_000
+"""Maximum number of RANSAC trials. [reference]"""
+_CONFIDENCE = 0.999
+"""Probability that RANSAC draws an outlier-free sample. [COLMAP confidence]"""
+_MIN_E_F_RATIO = 0.95
+"""Inliers of the essential over those of the fundamental matrix, for a calibrated pair.
+[COLMAP min_E_F_inlier_ratio]"""
+_SAMPLE_SIZE = 5
+"""Matches that determine an essential matrix."""
+_MAX_H_RATIO = 0.8
+"""Inliers of a homography over those of the epipolar model, from which a pair is planar or
+panoramic. [COLMAP max_H_inlier_ratio]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +78,19 @@ def verify_matches(
     std_px: float = 1.0,
     seed: int = 0,
 ) -> TwoViewGeometry:
-    """Verify matches, row by row of ``xy_a``, ``xy_b`` (m, 2), by COLMAP's calibrated estimation.
+    """Estimate the two-view geometry of matches with COLMAP's calibrated LO-RANSAC.
 
-    The same input and seed give the same outcome. ``std_px``: localisation noise of the matches.
+    Args:
+        camera_a: Camera of the first view.
+        camera_b: Camera of the second view.
+        xy_a: (m, 2) matched keypoints of the first view, pixels.
+        xy_b: (m, 2) matched keypoints of the second view, row by row.
+        options: Thresholds of inliers and of accepted pairs.
+        std_px: Standard deviation of the keypoints; scales the inlier threshold.
+        seed: Seed of RANSAC. Same input and seed give the same result.
+
+    Returns:
+        The geometry, or the reason why the pair is dropped.
     """
     if len(xy_a) < options.min_inliers:
         return _dropped(PairReason.TOO_FEW_MATCHES)
@@ -86,7 +110,9 @@ def verify_matches(
     configuration = _USABLE[geometry.config]
     if len(inliers) < options.min_inliers:
         return _dropped(PairReason.TOO_FEW_INLIERS, configuration, len(inliers))
-    chance = _chance(len(inliers), len(xy_a), camera_b, options.max_error_px * max(1.0, std_px))
+    chance = _chance_of_inliers(
+        len(inliers), len(xy_a), camera_b, options.max_error_px * max(1.0, std_px)
+    )
     if chance > options.max_chance:
         return _dropped(PairReason.EXPLAINED_BY_CHANCE, configuration, len(inliers))
     pose = geometry.cam2_from_cam1
@@ -97,17 +123,17 @@ def verify_matches(
     return TwoViewGeometry("", configuration, len(inliers), inliers, rotation, translation)
 
 
-def _chance(inliers: int, matches: int, camera: PinholeCamera, error_px: float) -> float:
-    """Probability that a given epipolar geometry has that many inliers among random matches.
+def _chance_of_inliers(inliers: int, matches: int, camera: PinholeCamera, error_px: float) -> float:
+    """Return the probability that a given epipolar geometry has the inliers by chance.
 
-    Those beyond the minimal sample fall into the band of the error around their epipolar line
-    (the Sampson error is the distance in both images together, hence the root of 2), which is at
-    most as long as the image's diagonal.
+    A random match is an inlier if it falls into the error band around its epipolar line. The line
+    is at most as long as the diagonal of the image. The Sampson error combines the distances in both
+    images, hence the factor ``sqrt(2)``. Matches of the minimal sample do not count. (A-contrario
+    test, Moisan and Stival, IJCV 2004.)
     """
     area = camera.width * camera.height
     band = 2 * math.sqrt(2) * error_px * math.hypot(camera.width, camera.height) / area
-    sample = 5
-    return float(bdtrc(inliers - sample - 1, matches - sample, min(band, 1.0)))
+    return float(bdtrc(inliers - _SAMPLE_SIZE - 1, matches - _SAMPLE_SIZE, min(band, 1.0)))
 
 
 def _dropped(reason: PairReason, configuration: str = "", num_inliers: int = 0) -> TwoViewGeometry:
@@ -121,14 +147,14 @@ def _colmap_options(
 ) -> pycolmap.TwoViewGeometryOptions:
     colmap = pycolmap.TwoViewGeometryOptions()
     colmap.min_num_inliers = options.min_inliers
-    colmap.min_E_F_inlier_ratio = options.min_e_f_ratio
-    colmap.max_H_inlier_ratio = options.max_h_ratio
+    colmap.min_E_F_inlier_ratio = _MIN_E_F_RATIO
+    colmap.max_H_inlier_ratio = _MAX_H_RATIO
     colmap.compute_relative_pose = True
     colmap.detect_watermark = False  # photos of this pipeline are the user's own
     ransac = colmap.ransac
     ransac.max_error = options.max_error_px * max(1.0, std_px)
-    ransac.min_inlier_ratio = options.min_inlier_ratio
-    ransac.max_num_trials = options.max_trials
-    ransac.confidence = options.confidence
+    ransac.min_inlier_ratio = _MIN_INLIER_RATIO
+    ransac.max_num_trials = _MAX_TRIALS
+    ransac.confidence = _CONFIDENCE
     ransac.random_seed = seed
     return colmap

@@ -1,4 +1,4 @@
-"""Which pairs of images are matched."""
+"""Generation of image pairs: exhaustive, sequential, by similarity or by numbered names."""
 
 from __future__ import annotations
 
@@ -11,56 +11,66 @@ from mpsfm_core.data import Float32, Float64
 from mpsfm_core.extraction.options import PairOptions
 
 Pair = tuple[int, int]
-"""Positions of two images, the smaller first."""
+"""Indices of two images, the smaller first."""
 
 _NUMBERED = re.compile(r"(.*?)(\d+)(\D*)")
-_ABOVE_NOTHING = float(np.finfo(np.float64).tiny)
+_SMALLEST_POSITIVE = float(np.finfo(np.float64).tiny)
 
 
 def exhaustive_pairs(count: int) -> list[Pair]:
-    """All pairs of ``count`` images."""
+    """Return all pairs of ``count`` images."""
     return [(a, b) for a in range(count) for b in range(a + 1, count)]
 
 
 def sequential_pairs(count: int, options: PairOptions) -> list[Pair]:
-    """Each image with the next ones, or with those 1, 2, 4, 8, ... further on."""
+    """Pair each image with the following ones, or with those at distance 1, 2, 4, 8 ..."""
     steps = range(options.overlap)
     offsets = [2**step if options.quadratic else step + 1 for step in steps]
-    return _unordered((a, a + d) for a in range(count) for d in offsets if a + d < count)
+    return _sort_pairs((a, a + d) for a in range(count) for d in offsets if a + d < count)
 
 
 def retrieval_pairs(descriptors: Sequence[Float32], options: PairOptions) -> list[Pair]:
-    """Each image with its most similar ones; descriptors (d,) are compared by dot product."""
+    """Pair each image with the most similar ones, by dot product of descriptors (d,)."""
     matrix = np.stack(descriptors).astype(np.float64)
-    least = max(options.min_similarity, -np.finfo(np.float64).max)
-    return most_similar_pairs(matrix @ matrix.T, options.top_k, least)
+    min_similarity = max(options.min_similarity, -np.finfo(np.float64).max)
+    return most_similar_pairs(matrix @ matrix.T, options.top_k, min_similarity)
 
 
 def most_similar_pairs(
-    likeness: Float64,
+    similarity: Float64,
     count: int,
-    least: float = _ABOVE_NOTHING,
+    min_similarity: float = _SMALLEST_POSITIVE,
     images: Iterable[int] | None = None,
 ) -> list[Pair]:
-    """Each of the ``images``, all if None, with the ``count`` others it is most like; ``likeness``
-    (n, n), those of a smaller one than ``least`` are left out."""
-    others = likeness.copy()
-    np.fill_diagonal(others, -np.inf)
-    best = np.argsort(-others, axis=1, kind="stable")[:, :count]
-    chosen = range(len(others)) if images is None else images
-    return _unordered((a, int(b)) for a in chosen for b in best[a] if others[a, b] >= least)
+    """Pair images with the images of largest similarity.
+
+    Args:
+        similarity: (n, n) similarity of all images.
+        count: Number of partners per image.
+        min_similarity: Minimum similarity of a pair.
+        images: Images that get partners; default: all.
+    """
+    ranked = similarity.copy()
+    np.fill_diagonal(ranked, -np.inf)
+    best = np.argsort(-ranked, axis=1, kind="stable")[:, :count]
+    chosen = range(len(ranked)) if images is None else images
+    return _sort_pairs(
+        (a, int(b)) for a in chosen for b in best[a] if ranked[a, b] >= min_similarity
+    )
 
 
 def numbered_neighbor_pairs(names: Sequence[str], options: PairOptions) -> list[Pair]:
-    """Each image with the next ones in its sequence; images belong to one when their names differ
-    by the last number in them only, and follow each other by that number."""
+    """Pair each image with the following ones of its sequence.
+
+    Images form a sequence if their names differ only in the last number, which gives the order.
+    """
     sequences: dict[tuple[str, str], list[tuple[int, int]]] = {}
     for index, name in enumerate(names):
-        found = _NUMBERED.fullmatch(name)
-        if found is not None:
-            before, number, after = found.groups()
-            sequences.setdefault((before, after), []).append((int(number), index))
-    return _unordered(
+        match = _NUMBERED.fullmatch(name)
+        if match is not None:
+            prefix, number, suffix = match.groups()
+            sequences.setdefault((prefix, suffix), []).append((int(number), index))
+    return _sort_pairs(
         (sequence[a][1], sequence[b][1])
         for sequence in map(sorted, sequences.values())
         for a, b in sequential_pairs(len(sequence), options)
@@ -70,14 +80,21 @@ def numbered_neighbor_pairs(names: Sequence[str], options: PairOptions) -> list[
 def filter_pairs(
     pairs: Sequence[Pair], names: Sequence[str], answers: Iterable[Iterable[tuple[str, str]]]
 ) -> list[Pair]:
-    """The pairs that every filter's answer (pairs of image names, in any order) contains."""
-    kept = [frozenset(frozenset(pair) for pair in answer) for answer in answers]
+    """Keep the pairs that every plugin's filter returned.
+
+    Args:
+        pairs: Pairs of image indices.
+        names: Names of all images.
+        answers: Pairs of image names of each filter, in any order.
+    """
+    accepted = [frozenset(frozenset(pair) for pair in answer) for answer in answers]
     return [
         (a, b)
         for a, b in pairs
-        if all(frozenset((names[a], names[b])) in answer for answer in kept)
+        if all(frozenset((names[a], names[b])) in answer for answer in accepted)
     ]
 
 
-def _unordered(pairs: Iterable[Pair]) -> list[Pair]:
+def _sort_pairs(pairs: Iterable[Pair]) -> list[Pair]:
+    """Order the images of each pair, and the pairs; drop duplicates."""
     return sorted({(min(pair), max(pair)) for pair in pairs})

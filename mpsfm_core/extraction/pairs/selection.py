@@ -1,4 +1,4 @@
-"""Which pairs of a set of photos are matched: chosen before, and again where photos stay apart."""
+"""Selection of the image pairs to match, and of further pairs between components."""
 
 from __future__ import annotations
 
@@ -17,96 +17,111 @@ from mpsfm_core.extraction.cache import content_key
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.features import FeatureTable
 from mpsfm_core.extraction.pairs import pairing as pairs
-from mpsfm_core.extraction.pairs import similarity as first_look
+from mpsfm_core.extraction.pairs import similarity as pair_similarity
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.providers import validation
 
 
 class PairSelection:
-    """Chooses pairs for the matcher; ``proposed`` counts those before the filters of plugins.
+    """Selects pairs for the matcher.
 
-    ``loose``: images that are matched again, of which one must be in a pair; None for any pair.
+    Args:
+        context: Options, cache and progress of the run.
+        table: Features of the images, None without a feature provider.
+        unconstrained: Images that are matched again: one of them must be in each pair. None allows
+            all pairs.
     """
 
     def __init__(
         self,
         context: ExtractionContext,
         table: FeatureTable | None,
-        loose: Collection[int] | None = None,
+        unconstrained: Collection[int] | None = None,
     ) -> None:
         self.proposed = 0
-        self._loose = loose
+        """Number of selected pairs before the filters of plugins."""
+        self._unconstrained = unconstrained
         self._context = context
         self._table = table
-        self._likeness: Float64 | None = None
-        self._asked: set[Pair] = set()
+        self._similarity: Float64 | None = None
+        self._selected: set[Pair] = set()
 
     def choose(self) -> list[Pair]:
-        """The pairs to match.
+        """Select the pairs of the first round.
 
-        Raises :class:`ConfigError` when retrieval is asked for without a provider.
+        Raises:
+            ConfigError: ``pairs.mode`` is retrieval, and there is no retrieval provider.
         """
         options, count = self._context.config.pairs, len(self._context.images)
         if options.mode == "sequential":
-            return self._ask(pairs.sequential_pairs(count, options))
+            return self._select(pairs.sequential_pairs(count, options))
         if options.mode == "retrieval":
-            return self._ask(pairs.retrieval_pairs(self._descriptors(), options))
+            return self._select(pairs.retrieval_pairs(self._descriptors(), options))
         if options.mode == "exhaustive" or count - 1 <= options.partners:
-            return self._ask(pairs.exhaustive_pairs(count))
-        self._likeness = self._look()
-        if self._likeness is None:
-            return self._ask(pairs.exhaustive_pairs(count))
-        alike = pairs.most_similar_pairs(self._likeness, self._partners, images=self._loose)
-        return self._ask(alike + pairs.numbered_neighbor_pairs(self._context.images.names, options))
+            return self._select(pairs.exhaustive_pairs(count))
+        self._similarity = self._compute_similarity()
+        if self._similarity is None:
+            return self._select(pairs.exhaustive_pairs(count))
+        similar = pairs.most_similar_pairs(
+            self._similarity, self._partners, images=self._unconstrained
+        )
+        return self._select(
+            similar + pairs.numbered_neighbor_pairs(self._context.images.names, options)
+        )
 
     def choose_again(self, verified: Sequence[Pair]) -> list[Pair]:
-        """More pairs where the verified ones leave photos apart: for each group but the largest,
-        those most like photos outside that were not tried. None where all was decided before."""
-        if self._likeness is None:
+        """Select further pairs between the components of the verified pairs.
+
+        Each component except the largest gets its most similar untried pairs with other images.
+        Only mode ``auto`` selects further pairs.
+        """
+        if self._similarity is None:
             return []
-        count = len(self._likeness)
+        count = len(self._similarity)
         rows, columns = np.array(verified, dtype=np.int64).reshape(-1, 2).T
         graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-        groups, group_of = connected_components(graph, directed=False)
-        sizes = np.bincount(group_of, minlength=groups)
-        more: list[Pair] = []
-        for group in np.flatnonzero(np.arange(groups) != sizes.argmax()):
-            inside = group_of == group
+        num_components, component_of = connected_components(graph, directed=False)
+        sizes = np.bincount(component_of, minlength=num_components)
+        further: list[Pair] = []
+        for component in np.flatnonzero(np.arange(num_components) != sizes.argmax()):
+            inside = component_of == component
             across = [
                 (min(a, b), max(a, b))
                 for a in np.flatnonzero(inside).tolist()
                 for b in np.flatnonzero(~inside).tolist()
             ]
-            untried = [pair for pair in across if pair not in self._asked]
-            untried.sort(key=lambda pair: (-self._like(pair), pair))
-            more += untried[: self._context.config.pairs.partners]
-        return self._ask(more)
+            untried = [pair for pair in across if pair not in self._selected]
+            untried.sort(key=lambda pair: (-self._pair_similarity(pair), pair))
+            further += untried[: self._context.config.pairs.partners]
+        return self._select(further)
 
     @property
     def _partners(self) -> int:
-        """Of each photo that asks for them."""
+        """Number of partners of an image."""
         config = self._context.config
-        if self._loose is None or config.fast_pass is None:
+        if self._unconstrained is None or config.fast_pass is None:
             return config.pairs.partners
         return config.fast_pass.partners
 
-    def _like(self, pair: Pair) -> float:
-        return 0.0 if self._likeness is None else float(self._likeness[pair])
+    def _pair_similarity(self, pair: Pair) -> float:
+        return 0.0 if self._similarity is None else float(self._similarity[pair])
 
-    def _ask(self, chosen: Sequence[Pair]) -> list[Pair]:
-        """The pairs that plugins let pass, sorted, each once."""
-        loose = self._loose
-        unique = sorted({(a, b) for a, b in chosen if loose is None or a in loose or b in loose})
-        self._asked.update(unique)
+    def _select(self, chosen: Sequence[Pair]) -> list[Pair]:
+        """Sort pairs, record them, and apply the filters of plugins."""
+        images = self._unconstrained
+        unique = sorted({(a, b) for a, b in chosen if images is None or a in images or b in images})
+        self._selected.update(unique)
         self.proposed += len(unique)
         names = self._context.images.names
         named = [(names[a], names[b]) for a, b in unique]
         answers = self._context.registry.call_hook("mpsfm_filter_pairs", pairs=named)
         return pairs.filter_pairs(unique, names, answers)
 
-    def _look(self) -> Float64 | None:
-        """Likeness of all photos (n, n): by retrieval where it is configured, else by features;
-        None where there is neither."""
+    def _compute_similarity(self) -> Float64 | None:
+        """Return the similarity (n, n) of all images by retrieval, or else by features.
+
+        None if neither is configured.
+        """
         backend = self._context.config.retrieval
         if backend is not None:
             descriptors = np.stack(self._descriptors()).astype(np.float64)
@@ -114,30 +129,35 @@ class PairSelection:
             return similarity
         if self._table is None:
             return None
-        return first_look.diffuse_similarity(self._evidence(self._table))
+        return pair_similarity.diffuse_similarity(self._match_scores(self._table))
 
-    def _evidence(self, table: FeatureTable) -> Float64:
+    def _match_scores(self, table: FeatureTable) -> Float64:
         context, count = self._context, len(self._context.images)
-        key = content_key(first_look.NUM_DESCRIPTORS, [table.key(index) for index in range(count)])
-        cached: Float64 | None = context.cache.load("first-look", key, np.ndarray)
+        key = content_key(
+            pair_similarity.NUM_DESCRIPTORS, [table.key(index) for index in range(count)]
+        )
+        cached: Float64 | None = context.cache.load("pair-similarity", key, np.ndarray)
         if cached is not None:
             return cached
-        strongest = [first_look.strongest_descriptors(table[index]) for index in range(count)]
-        found = np.zeros((count, count))
+        strongest = [pair_similarity.strongest_descriptors(table[index]) for index in range(count)]
+        scores = np.zeros((count, count))
 
         def compare(first: int) -> None:
             for other in range(first + 1, count):
-                found[first, other] = first_look.match_score(strongest[first], strongest[other])
+                scores[first, other] = pair_similarity.match_score(
+                    strongest[first], strongest[other]
+                )
 
-        context.each("first look", range(count), compare)
-        found += found.T
-        context.cache.store("first-look", key, found)
-        return found
+        context.each("similarity", range(count), compare)
+        scores += scores.T
+        context.cache.store("pair-similarity", key, scores)
+        return scores
 
     def describe(self, index: int) -> Any:
-        """The global descriptor (d,) of an image, cached.
+        """Return the global descriptor (d,) of an image; cached.
 
-        Raises :class:`ConfigError` without a retrieval provider.
+        Raises:
+            ConfigError: there is no retrieval provider.
         """
         context, provider = self._context, self._retrieval
         return context.result(

@@ -1,9 +1,11 @@
-"""Which photos are likely to show the same, told from a few of their features.
+"""Image similarity from a few local features, to select pairs without retrieval.
 
-Three steps. *Evidence*: mutual nearest neighbours among the strongest_descriptors
-descriptors, each weighted by how much nearer it is than the second nearest. *Excess*: a photo of
-bushes finds neighbours everywhere, so what two photos find by chance is taken off. *Likeness*:
-photos that are both like a third are like each other, which finds pairs with little in common.
+1. Match score: mutual nearest neighbors among the strongest descriptors, weighted by their ratio
+   to the second nearest neighbor.
+2. Excess: subtract the score that two images reach by chance, because images with repetitive
+   texture match everything.
+3. Diffusion: two images that are similar to a third are similar to each other. This finds pairs
+   of small overlap (Zhou et al., Ranking on Data Manifolds, NIPS 2003).
 """
 
 from __future__ import annotations
@@ -13,16 +15,15 @@ import numpy as np
 from mpsfm_core.data import Features, Float32, Float64
 
 NUM_DESCRIPTORS = 512
-"""Descriptors of each photo. (Ours: of the pairs of rendered_kitchen with more than 0.25 overlap
-512 find 99.3 % and 1024, at four times the cost, 99.8 %.)"""
+"""Descriptors of an image that are compared. Cost grows with the square.
+[tuned: benchmarks.pairs]"""
 DIFFUSION_RATIO = 0.8
-"""Share of its diffuse_similarity that a photo hands on to those like it (ours: 0.9 finds as many);
-the method is Zhou et al., Ranking on Data Manifolds, NIPS 2003."""
+"""Diffusion weight ``alpha`` of manifold ranking. [tuned: benchmarks.pairs]"""
 _TINY = np.float32(1e-12)
 
 
 def strongest_descriptors(features: Features) -> Float32:
-    """Descriptors (k, d) with the largest scores, the first where there are no scores."""
+    """Return the descriptors (k, d) with the largest scores; without scores, the first ones."""
     if features.scores is None:
         return features.descriptors[:NUM_DESCRIPTORS]
     order = np.argsort(-features.scores, kind="stable")[:NUM_DESCRIPTORS]
@@ -30,8 +31,12 @@ def strongest_descriptors(features: Features) -> Float32:
 
 
 def match_score(a: Float32, b: Float32) -> float:
-    """Number of mutual nearest neighbours of descriptors (n, d) and (m, d), each counted as
-    1 less the ratio of its distance to the second smallest of either side."""
+    """Sum ``1 - distance / second distance`` over mutual nearest neighbors.
+
+    Args:
+        a: (n, d) descriptors of the first image.
+        b: (m, d) descriptors of the second image.
+    """
     if not len(a) or not len(b):
         return 0.0
     squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)
@@ -44,18 +49,22 @@ def match_score(a: Float32, b: Float32) -> float:
     return float((1 - np.sqrt(np.minimum(first / np.maximum(second, _TINY), 1))).sum())
 
 
-def diffuse_similarity(found: Float64) -> Float64:
-    """How likely photos are to show the same, (n, n), larger is likelier and 0 is not at all.
+def diffuse_similarity(scores: Float64) -> Float64:
+    """Convert match scores to similarities by excess over chance and diffusion.
 
-    ``found``: match_score of each pair, (n, n), symmetric with a zero diagonal.
+    Args:
+        scores: (n, n) match scores of all pairs, symmetric with zero diagonal.
+
+    Returns:
+        (n, n) similarities, nonnegative.
     """
-    of_photo = found.sum(axis=1)
-    by_chance = np.outer(of_photo, of_photo) / max(of_photo.sum(), float(_TINY))
-    excess = np.maximum(found - by_chance, 0) / np.sqrt(by_chance + 1)
+    image_scores = scores.sum(axis=1)
+    by_chance = np.outer(image_scores, image_scores) / max(image_scores.sum(), float(_TINY))
+    excess = np.maximum(scores - by_chance, 0) / np.sqrt(by_chance + 1)
     np.fill_diagonal(excess, 0)
     degree = np.sqrt(np.maximum(excess.sum(axis=1), float(_TINY)))
     links = excess / np.outer(degree, degree)
-    handed_on: Float64 = np.linalg.inv(np.eye(len(found)) - DIFFUSION_RATIO * links)
-    np.fill_diagonal(handed_on, 0)
-    alike: Float64 = np.maximum((handed_on + handed_on.T) / 2, 0)
-    return alike
+    diffused: Float64 = np.linalg.inv(np.eye(len(scores)) - DIFFUSION_RATIO * links)
+    np.fill_diagonal(diffused, 0)
+    similarity: Float64 = np.maximum((diffused + diffused.T) / 2, 0)
+    return similarity

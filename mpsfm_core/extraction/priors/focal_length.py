@@ -1,4 +1,4 @@
-"""Focal lengths that the photos do not tell, from a depth provider that sees them."""
+"""Focal lengths of images without EXIF, estimated by the depth provider."""
 
 from __future__ import annotations
 
@@ -24,18 +24,24 @@ _log = logging.getLogger(__name__)
 def estimate_focal_lengths(
     images: ImageSet, config: Config, registry: Registry, events: ExtractionEvents | None = None
 ) -> ImageSet:
-    """The images with the depth provider's focal lengths, where they were the default.
+    """Replace default focal lengths by estimates of the depth provider.
 
-    Images of one camera get the median of their estimates. It stays a guess, which the mapper
-    refines. The images are returned as they are when all focal lengths are known, or when the
-    provider does not declare ``estimates-focal``.
+    Images of one camera get the median of their estimates, which the mapper refines. Without
+    default focal lengths, or without the capability ``estimates-focal``, nothing changes.
+
+    Args:
+        images: The images.
+        config: Configuration with resolved providers.
+        registry: The installed providers.
+        events: Receives progress.
 
     Raises:
         InputError: the provider or its weights are missing.
-        ProviderRunError, ProviderOutputError: it failed or broke its contract.
+        ProviderRunError: the provider failed.
+        ProviderOutputError: the provider broke its contract.
     """
-    guessed = [index for index, image in enumerate(images) if image.focal_source == "default"]
-    if not guessed:
+    unknown = [index for index, image in enumerate(images) if image.focal_source == "default"]
+    if not unknown:
         return images
     context = ExtractionContext(images, config, registry, events or NullExtractionEvents())
     provider = context.provider("depth", config.depth.model_copy(update={"wrap": ()}))
@@ -46,20 +52,20 @@ def estimate_focal_lengths(
         view = images.view(index)
 
         def compute(instance: Any) -> Float64:
-            found = validation.run_focal(provider.spec, instance, view)
-            return np.array(np.nan if found is None else found)
+            focal_px = validation.run_focal(provider.spec, instance, view)
+            return np.array(np.nan if focal_px is None else focal_px)
 
         focal = context.result(provider, np.ndarray, ["focal", images.pixel_key(index)], compute)
         return float(focal * images[index].camera.width / view.camera.width)
 
     with threadpool_limits(thread_count(config.runtime), user_api="blas"):
-        estimates = context.each("focal", guessed, estimate, provider, here=True)
+        estimates = context.each("focal", unknown, estimate, provider, local=True)
     by_camera: dict[int, list[float]] = defaultdict(list)
-    for index, focal in zip(guessed, estimates, strict=True):
+    for index, focal in zip(unknown, estimates, strict=True):
         if np.isfinite(focal):
             by_camera[images[index].camera.camera_id].append(focal)
-    medians = {number: float(np.median(found)) for number, found in by_camera.items()}
+    medians = {number: float(np.median(focals)) for number, focals in by_camera.items()}
     for number, focal in medians.items():
-        text = "camera %d: the depth provider %r sees a focal length of %.0f px"
+        text = "camera %d: the depth provider %r estimates a focal length of %.0f px"
         _log.warning(text, number, provider.spec.name, focal)
     return images.with_focals(medians)

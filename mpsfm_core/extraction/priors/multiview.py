@@ -1,4 +1,4 @@
-"""Depth of photos that a network sees together: which it is shown at once, and what it says."""
+"""Depth and poses from a multi-view network that sees groups of images."""
 
 from __future__ import annotations
 
@@ -14,16 +14,24 @@ from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.providers import validation
 
 Group = tuple[int, ...]
-"""Images that are shown together, the one that the group grew from first."""
+"""Indices of the images of a group, its first image first."""
 
 
 def choose_groups(count: int, matches: dict[Pair, int], size: int) -> list[tuple[Group, int]]:
-    """Groups of at most ``size`` images that see the same, so that each image is in one of them.
+    """Partition the images into groups that share verified matches.
 
-    ``matches``: verified matches of pairs of images. Each group is followed by the number of its
-    images that are in no group before; these come first. A group grows from the image with most
-    matches, by the image that has most matches to it; where no new one is left it is filled with
-    images of other groups, as a network sees more in more photos.
+    A group starts with the image with most matches and grows greedily by the image that shares
+    most matches with it. A group without further new images is filled with images of other
+    groups, because more images improve the prediction.
+
+    Args:
+        count: Number of images.
+        matches: Number of verified matches of each pair.
+        size: Maximum size of a group.
+
+    Returns:
+        Each group with the number of its own images, which come first. Each image is an own image
+        of exactly one group.
     """
     shared = np.zeros((count, count), dtype=np.int64)
     for (a, b), number in matches.items():
@@ -32,47 +40,47 @@ def choose_groups(count: int, matches: dict[Pair, int], size: int) -> list[tuple
     groups = []
     while free.any():
         first = int(np.where(free, shared[:, free].sum(axis=1), -1).argmax())
-        own = _grown([first], shared, free, size)
-        free[own] = False
-        group = _grown(own, shared, ~free, size)
-        groups.append((tuple(group), len(own)))
+        members = _grow_group([first], shared, free, size)
+        free[members] = False
+        group = _grow_group(members, shared, ~free, size)
+        groups.append((tuple(group), len(members)))
     return groups
 
 
-def _grown(group: list[int], shared: Int64, allowed: Any, size: int) -> list[int]:
-    """The group with the allowed images that share most with it, one after the other."""
+def _grow_group(group: list[int], shared: Int64, allowed: Any, size: int) -> list[int]:
+    """Add the allowed images with most shared matches, one after the other."""
     grown = list(group)
     while len(grown) < size:
-        ties = np.where(allowed, shared[:, grown].sum(axis=1), 0)
-        ties[grown] = 0
-        if not ties.any():
+        num_shared = np.where(allowed, shared[:, grown].sum(axis=1), 0)
+        num_shared[grown] = 0
+        if not num_shared.any():
             break
-        grown.append(int(ties.argmax()))
+        grown.append(int(num_shared.argmax()))
     return grown
 
 
 class GroupPriors:
-    """Runs the multi-view provider of a configuration on groups of images; cached."""
+    """Runs the multi-view provider on groups of images; cached."""
 
     def __init__(self, context: ExtractionContext) -> None:
         assert context.config.multiview is not None
         self.provider = context.provider("multiview", context.config.multiview)
         self.groups: list[tuple[Group, int]] = []
         self._context = context
-        self._place: dict[int, tuple[int, int]] = {}
+        self._position: dict[int, tuple[int, int]] = {}
         self._poses: list[Float64 | None] = []
 
     def run(self, matches: dict[Pair, int]) -> None:
-        """Choose the groups by verified matches, and ask about all of them."""
+        """Choose the groups by verified matches, and run the network on all groups."""
         size = self._context.config.extraction.group_size
         self.groups = choose_groups(len(self._context.images), matches, size)
-        for number, (group, own) in enumerate(self.groups):
-            self._place |= {image: (number, row) for row, image in enumerate(group[:own])}
+        for number, (group, num_own) in enumerate(self.groups):
+            self._position |= {image: (number, row) for row, image in enumerate(group[:num_own])}
         shown = [group for group, _ in self.groups]
-        self._poses = self._context.each("multiview", shown, self._see, self.provider)
+        self._poses = self._context.each("multiview", shown, self._predict_poses, self.provider)
 
     def predict(self, group: Group) -> MultiViewPrior:
-        """What the network says of a group."""
+        """Return the prediction of the network for a group."""
         context, provider = self._context, self.provider
 
         def compute(instance: Any) -> MultiViewPrior:
@@ -83,32 +91,32 @@ class GroupPriors:
         return context.result(provider, MultiViewPrior, inputs, compute, group)
 
     def depth(self, image: int) -> DepthPrior:
-        """Depth of an image, of the group that it belongs to."""
-        number, row = self._place[image]
+        """Return the depth of an image, predicted with its group."""
+        number, row = self._position[image]
         prior = self.predict(self.groups[number][0])
-        if not prior.depth:  # the provider failed, and the run goes on
+        if not prior.depth:  # the provider failed, and the run skips failures
             nothing: DepthPrior = EMPTY_RESULTS[DepthPrior]()  # type: ignore[assignment]
             return nothing
         return prior.depth[row]
 
     def place(self, image: int) -> tuple[int, Pose | None]:
-        """The number of an image's group, and the pose that the network proposes."""
-        number, row = self._place[image]
+        """Return the number of an image's group, and the pose that the network predicts."""
+        number, row = self._position[image]
         poses = self._poses[number]
         if poses is None or not len(poses):
             return number, None
         return number, (poses[row, :, :3].copy(), poses[row, :, 3].copy())
 
     def described(self) -> list[list[str]]:
-        """Names of the images of each group, for the report."""
+        """Return the image names of each group, for the report."""
         names = self._context.images.names
         return [[names[image] for image in group] for group, _ in self.groups]
 
-    def _see(self, group: Group) -> Float64 | None:
-        """The poses; leaves the maps in the cache: those of all images need not fit in memory."""
+    def _predict_poses(self, group: Group) -> Float64 | None:
+        """Return the poses of a group; its maps stay in the cache, to limit memory."""
         return self.predict(group).poses
 
 
 def consecutive_groups(images: Sequence[int], size: int) -> list[Group]:
-    """Groups of images that follow each other, for before anything is known of them."""
+    """Group images in their order, before matches are known."""
     return [tuple(images[start : start + size]) for start in range(0, len(images), size)]

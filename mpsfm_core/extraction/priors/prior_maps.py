@@ -1,4 +1,4 @@
-"""From the priors as networks or files give them to the maps the mapper works on."""
+"""Conversion of predicted priors to the grid of the mapper."""
 
 from __future__ import annotations
 
@@ -9,24 +9,23 @@ from mpsfm_core.data import Bool, DepthPrior, Float32, NormalPrior
 from mpsfm_core.geometry import log_depth_steps, resize_map
 
 EDGE_VARIANCE = 1e6
-"""rad^2, of a normal that is not trusted (reference)."""
+"""Variance of normals at depth edges, rad^2. [reference]"""
 _ALL_VALID = 1 - 1e-5
-"""A resized mask is 1 up to float32 rounding where all contributing pixels are valid."""
+"""Threshold of a resized mask: 1 up to float32 rounding if all contributing pixels are valid."""
 
 
 def integration_grid(size: tuple[int, int], longer_side: int) -> tuple[int, int]:
-    """(width, height) of the maps for an image of ``size``: the aspect ratio is kept."""
+    """Return (width, height) of the maps for an image of ``size``, with its aspect ratio."""
     factor = longer_side / max(size)
     return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
 
 
 def resize_depth(prior: DepthPrior, grid: tuple[int, int]) -> DepthPrior:
-    """The prior on another grid (width, height).
+    """Resize a depth prior to a grid (width, height).
 
-    Inverse depth and relative variance are interpolated bilinearly (averaged when shrinking):
-    inverse depth is linear in the image on a plane, so that planes stay planes; errors of
-    neighbours are correlated, so that averaging does not reduce their variance. A pixel is valid
-    when all that contribute are.
+    Interpolates inverse depth, which is linear on planes, and relative variance bilinearly, and
+    averages them when shrinking. Averaging does not reduce the variance, because errors of
+    neighbors are correlated. A pixel is valid if all contributing pixels are valid.
     """
     if (prior.shape[1], prior.shape[0]) == grid:
         return prior
@@ -42,8 +41,11 @@ def resize_depth(prior: DepthPrior, grid: tuple[int, int]) -> DepthPrior:
 
 
 def resize_normals(prior: NormalPrior, grid: tuple[int, int]) -> NormalPrior:
-    """The prior on another grid (width, height): normals are averaged and made unit again, the
-    variance is averaged. A pixel is valid when all that contribute are."""
+    """Resize a normal prior to a grid (width, height).
+
+    Averages normals, normalizes them, and averages the variance. A pixel is valid if all
+    contributing pixels are valid.
+    """
     if (prior.shape[1], prior.shape[0]) == grid:
         return prior
     valid = _resize_valid(prior.valid, grid)
@@ -53,25 +55,28 @@ def resize_normals(prior: NormalPrior, grid: tuple[int, int]) -> NormalPrior:
 
 
 def resize_mask(mask: Bool, grid: tuple[int, int]) -> Bool:
-    """A mask (H, W) of the view on the grid of the maps, by the nearest pixel."""
+    """Resize a mask (H, W) to a grid (width, height) by the nearest pixel."""
     resized = cv2.resize(mask.astype(np.uint8), grid, interpolation=cv2.INTER_NEAREST_EXACT)
     return np.asarray(resized > 0)
 
 
 def mask_depth(prior: DepthPrior, allowed: Bool) -> DepthPrior:
-    """The prior, valid only where allowed."""
+    """Invalidate depth where the mask is False."""
     return DepthPrior(prior.depth, prior.variance, prior.valid & allowed, prior.metric)
 
 
 def mask_normals(prior: NormalPrior, allowed: Bool) -> NormalPrior:
-    """The prior, valid only where allowed."""
+    """Invalidate normals where the mask is False."""
     return NormalPrior(prior.normals, prior.variance, prior.valid & allowed)
 
 
 def inflate_edge_variance(normals: NormalPrior, depth: DepthPrior, ratio: float) -> NormalPrior:
-    """Normals with :data:`EDGE_VARIANCE` on both sides of a depth step of more than ``ratio``.
+    """Set the variance of normals on both sides of depth edges to :data:`EDGE_VARIANCE`.
 
-    The variance must be there, and the grids the same. Steps to invalid pixels do not count.
+    Args:
+        normals: Normals with variance.
+        depth: Depth on the same grid. Steps to invalid pixels are not edges.
+        ratio: Ratio of neighboring depths that defines an edge.
     """
     edges = log_depth_steps(depth.depth, depth.valid) > np.log(ratio)
     variance = np.where(edges & normals.valid, np.float32(EDGE_VARIANCE), _variance(normals))

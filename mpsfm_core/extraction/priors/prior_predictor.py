@@ -1,4 +1,4 @@
-"""Depth and normals of the images, from their providers to the maps of the mapper."""
+"""Prior maps of the mapper: predicted, calibrated, resized and masked."""
 
 from __future__ import annotations
 
@@ -19,9 +19,13 @@ from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, Norma
 
 
 class PriorPredictor:
-    """Runs the depth and normals providers; calibrates, resizes and masks what they say.
+    """Runs the depth and normals providers; calibrates, resizes and masks their maps.
 
-    ``groups``: what the multi-view network said, where there is one.
+    Args:
+        context: Views, options and progress of the run.
+        matcher: Matcher that predicts pair depth, if depth comes from the matcher.
+        candidates: Candidate matches, to choose the best pair of each image.
+        groups: Predictions of the multi-view network, if there is one.
     """
 
     def __init__(
@@ -44,31 +48,31 @@ class PriorPredictor:
         self._best = _best_pairs(candidates) if config.depth.use == FROM_MATCHER else None
 
     def run(self) -> list[tuple[DepthPrior, NormalPrior]]:
-        """Run the stages; returns both priors of each image on its grid, with variances."""
+        """Return depth and normals of each image on the grid of the mapper, with variances."""
         images = range(len(self._context.images))
         depth = self._raw.depth
         if not depth.can("uncached"):
             self._context.each("depth", images, self._predict_only, depth)
         slowest = self._raw.normals or depth
-        here = self._best is not None or self._groups is not None
-        return self._context.each("normals", images, self._both, slowest, here=here)
+        local = self._best is not None or self._groups is not None
+        return self._context.each("normals", images, self._prepare_maps, slowest, local=local)
 
     def _predict_only(self, index: int) -> None:
-        """Leaves the result in the cache: full-size maps of all images need not fit in memory."""
+        """Predict into the cache, because full-size maps of all images may exceed memory."""
         self.predicted(index)
 
-    def _both(self, index: int) -> tuple[DepthPrior, NormalPrior]:
+    def _prepare_maps(self, index: int) -> tuple[DepthPrior, NormalPrior]:
         depth, normals = self.full_size(index)
         return self._on_grid(index, depth, self._normal_calibration.apply(normals))
 
     def full_size(self, index: int) -> tuple[DepthPrior, NormalPrior]:
-        """Calibrated depth of an image, and its normals as they are predicted; cached."""
+        """Return calibrated depth and uncalibrated normals of an image, in full size; cached."""
         raw_depth, normals = self.predicted(index)
         depth = self._depth_calibration.apply(raw_depth)
         return depth, self._raw.predict_normals(index, depth) if normals is None else normals
 
     def predicted(self, index: int) -> tuple[DepthPrior, NormalPrior | None]:
-        """Depth of an image as it is predicted, and its normals if they come along; cached."""
+        """Return uncalibrated depth, and normals if the same pass predicts them; cached."""
         if self._groups is not None:
             return self._groups.depth(index), None
         if self._best is not None:
@@ -76,7 +80,7 @@ class PriorPredictor:
         return self._raw.predict(index)
 
     def _from_matcher(self, index: int) -> DepthPrior:
-        """Depth of the pair whose prediction is most certain; none at all without a pair."""
+        """Return the pair depth of highest precision; an empty prior without a pair."""
         assert self._best is not None and self._matcher is not None
         if index not in self._best:
             empty = np.zeros((1, 1), dtype=np.float32)
@@ -103,7 +107,7 @@ class PriorPredictor:
 
 
 def _depth_calibration(config: Config, registry: Registry) -> DepthCalibration:
-    """Of the network that gives the depth, unless the configuration says something of it."""
+    """Return the configured calibration of depth, or that of the predicting network."""
     kind: Kind = "depth"
     backend = config.depth
     if backend.use == FROM_MULTIVIEW and config.multiview and backend.calibration is None:
@@ -114,17 +118,17 @@ def _depth_calibration(config: Config, registry: Registry) -> DepthCalibration:
 
 
 def check_depth_source(config: Config, registry: Registry) -> None:
-    """Raise :class:`ConfigError` if depth is to come from a matcher that predicts none."""
+    """Raise ConfigError if depth should come from a matcher without pair depth."""
     chosen = [b for b in (config.matcher, config.dense_matcher) if b is not None]
     specs = [registry.spec("matcher", backend.use) for backend in chosen]
-    able = any("pair-depth" in spec.capabilities for spec in specs)
-    if config.depth.use == FROM_MATCHER and not able:
+    predicts_depth = any("pair-depth" in spec.capabilities for spec in specs)
+    if config.depth.use == FROM_MATCHER and not predicts_depth:
         names = ", ".join(repr(spec.name) for spec in specs)
         raise ConfigError(f"depth.use: 'matcher': {names} predicts no depth (pair-depth)")
 
 
 def _best_pairs(candidates: list[CandidateMatches]) -> dict[int, tuple[CandidateMatches, int]]:
-    """For each image the pair, and its place in it, with the highest mean precision."""
+    """Return for each image its pair of highest precision, and its side in the pair."""
     best: dict[int, tuple[float, CandidateMatches, int]] = {}
     for matches in candidates:
         for side, image in enumerate(matches.pair):

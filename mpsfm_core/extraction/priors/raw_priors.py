@@ -1,4 +1,4 @@
-"""Depth and normals as the chosen providers give them, before calibration; cached."""
+"""Depth and normals as the providers predict them, before calibration; cached."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from mpsfm_core.providers import validation
 class RawPriors:
     """Runs the depth and normals providers of a configuration.
 
-    ``depth``, ``normals``: the providers in use; ``normals`` is None when one pass of the depth
-    provider gives both.
+    Attributes:
+        depth: The depth provider.
+        normals: The normals provider; None if one pass of the depth provider predicts both.
     """
 
     def __init__(self, context: ExtractionContext) -> None:
@@ -26,13 +27,15 @@ class RawPriors:
         self.normals = None if joint else context.provider("normals", context.config.normals)
 
     def predict(self, index: int) -> tuple[DepthPrior, NormalPrior | None]:
-        """Depth of an image, and its normals if they come along."""
+        """Return depth of an image, and normals if the same pass predicts them."""
         provider, context = self.depth, self._context
         inputs = context.view_inputs(index, provider)
         if self.normals is None:
 
             def compute_both(instance: Any) -> JointPrior:
-                return JointPrior(*validation.run_joint(provider.spec, instance, context.view(index)))
+                return JointPrior(
+                    *validation.run_joint(provider.spec, instance, context.view(index))
+                )
 
             both = context.result(provider, JointPrior, ["joint", *inputs], compute_both, [index])
             return both.depth, both.normals
@@ -43,8 +46,12 @@ class RawPriors:
         return context.result(provider, DepthPrior, inputs, compute, [index]), None
 
     def predict_normals(self, index: int, depth: DepthPrior | None) -> NormalPrior:
-        """Normals of an image by the normals provider; ``depth``: its calibrated depth, which a
-        provider that does not say ``needs-depth`` does without."""
+        """Return normals of an image by the normals provider.
+
+        Args:
+            index: The image.
+            depth: Calibrated depth, for providers with the capability ``needs-depth``.
+        """
         provider, context = self.normals, self._context
         assert provider is not None
         inputs = context.view_inputs(index, provider)
@@ -58,7 +65,7 @@ class RawPriors:
 
 
 def _is_joint(context: ExtractionContext, depth: ActiveProvider) -> bool:
-    """Whether one pass of the depth provider gives the normals too."""
-    wanted, normals = context.config.depth, context.config.normals
-    same = (wanted.use, wanted.options) == (normals.use, normals.options)
-    return depth.can("joint-normals") and same and not wanted.wrap and not normals.wrap
+    """Check whether one pass of the depth provider predicts the normals too."""
+    depth_config, normals = context.config.depth, context.config.normals
+    same = (depth_config.use, depth_config.options) == (normals.use, normals.options)
+    return depth.can("joint-normals") and same and not depth_config.wrap and not normals.wrap
