@@ -1,13 +1,14 @@
-"""Depth-regularised bundle adjustment (paper: C_BA + C_reg with the refined depth maps fixed).
+"""Bundle adjustment with depth regularization (paper 3.3, ``C_BA + C_reg``).
 
-Minimises over camera poses, 3D points and, if wanted, focal lengths and the scales ``exp(s)`` of
-depth maps
+Minimizes over camera poses, 3D points and, if variable, focal lengths and log scales ``s`` of depth
+maps::
 
     1/2 sum rho_r(|project(R X + t) - xy|^2 / std_px^2)
     + 1/2 sum rho_d((log z - log d - s)^2 / std^2) + 1/2 sum (s - expected)^2 / std_s^2
 
-with Levenberg-Marquardt: the points are eliminated (3 x 3 blocks), the cameras solved for, the
-points follow by back-substitution and then settle one by one.
+by Levenberg-Marquardt (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000). The Schur
+complement eliminates the points, the reduced camera system is solved, and back-substitution gives
+the points. Afterwards each point takes steps of its own with fixed cameras.
 """
 
 from __future__ import annotations
@@ -36,24 +37,23 @@ __all__ = ["BundleProblem", "BundleResult", "adjust_bundle"]
 INITIAL_DAMPING = 1e-4
 """Inverse of Ceres' initial trust-region radius. [Ceres initial_trust_region_radius]"""
 MIN_DAMPING = 1e-10
-"""Holds what nothing observes, as the depth of a point that is seen once (our choice)."""
+"""Smallest damping; it keeps unobserved parameters, as the depth of a single-view point. [ours]"""
 MAX_DAMPING = 1e16
+"""Damping above which the solver gives up. [ours]"""
 MAX_FOCAL_STEP = 1.0
-"""A focal length changes by at most a factor of e in a step (our choice)."""
+"""Largest change of a log focal length per step. [ours]"""
 CG_TOLERANCE = 1e-3
-"""Of the reduced system beyond ``dense_poses`` (our choice)."""
+"""Relative tolerance of conjugate gradients on the reduced camera system. [ours]"""
 MAX_CG_ITERATIONS = 500
+"""Maximum number of conjugate-gradient iterations per step. [ours]"""
 MIN_GAIN = 1e-3
-"""A step is taken if the cost falls by this part of the prediction (Ceres' default)."""
+"""Smallest ratio of actual and predicted decrease of an accepted step.
+[Ceres min_relative_decrease]"""
 
 
 @dataclass(frozen=True, eq=False)
 class BundleResult:
-    """The adjusted parameters, in the order of the problem, and how it went.
-
-    ``iterations`` counts the steps tried. ``converged`` is False when their limit was hit or
-    no step lowered the cost; ``message`` says which.
-    """
+    """Adjusted parameters in the order of the problem, and the summary of the solver."""
 
     rotations: Float64
     translations: Float64
@@ -63,21 +63,30 @@ class BundleResult:
     initial_cost: float
     final_cost: float
     iterations: int
+    """Number of steps, accepted or rejected."""
     converged: bool
+    """False if the iteration limit was reached or no step decreases the cost."""
     message: str
+    """Reason of the termination."""
 
 
 def adjust_bundle(problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:
-    """Adjust poses, points and focal lengths; the cost never increases.
+    """Adjust poses, points, focal lengths and depth scales; the cost never increases.
 
-    An observation whose point is behind its camera (z <= 1e-9) or at more than 89.9999 degrees
-    from its axis has residual 0, for reprojection as in COLMAP and for depth as in the
-    reference; but a step that makes it so is charged the cost it had before. The result is
-    the same bit for bit whatever the number of threads.
+    An observation whose point is behind its camera, or more than 89.9999 degrees off its axis, has
+    residual 0, as in COLMAP. A step that makes an observation invisible is charged its former cost.
+    The result does not depend on the number of threads, bit for bit.
+
+    Args:
+        problem: Parameters and observations; they are copied.
+        options: Losses and solver options.
+
+    Returns:
+        The adjusted parameters.
 
     Raises:
-        DataError: an array has a wrong shape, an index out of range, a value that is not finite,
-            or a standard deviation that is not positive.
+        DataError: An array has a wrong shape, an index is out of range, a value is not finite, or a
+            standard deviation is not positive.
     """
     options = options or BundleOptions()
     prepared = prepare_bundle(problem, options)
@@ -90,12 +99,12 @@ def adjust_bundle(problem: BundleProblem, options: BundleOptions | None = None) 
 
 @cache
 def _blas() -> ThreadpoolController:
-    # BLAS threads beside ours are slow, and looking the libraries up costs milliseconds
+    # nested BLAS threads are slow; the controller is cached because its creation takes milliseconds
     return ThreadpoolController()
 
 
 def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> BundleResult:
-    """Levenberg-Marquardt with Nielsen's damping, as Ceres has it."""
+    """Minimize by Levenberg-Marquardt with Nielsen's damping schedule, as Ceres."""
     state, trial = p.state, kernels.BundleParameters(*(np.empty_like(array) for array in p.state))
     normal = SchurComplementSolver(p, options, run)
     damping, growth = INITIAL_DAMPING, 2.0
@@ -104,18 +113,18 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
     for iteration in range(1, options.max_iterations + 1):
         cost = normal.linearize(state, damping)
         initial_cost = cost if iteration == 1 else initial_cost
-        trial_cost, decrease, promised = normal.step(state, trial, damping, cost)
-        tolerated = max(options.function_tolerance, np.finfo(float).eps) * cost
-        if np.isfinite(decrease) and decrease >= max(MIN_GAIN * promised, 0.0):
+        trial_cost, decrease, predicted = normal.step(state, trial, damping, cost)
+        min_decrease = max(options.function_tolerance, np.finfo(float).eps) * cost
+        if np.isfinite(decrease) and decrease >= max(MIN_GAIN * predicted, 0.0):
             state, trial, cost = trial, state, trial_cost
-            gain = min(decrease / promised, 1.0) if promised > 0 else 1.0
+            gain = min(decrease / predicted, 1.0) if predicted > 0 else 1.0
             damping = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), MIN_DAMPING)
             growth = 2.0
-            converged = bool(decrease <= tolerated)
+            converged = bool(decrease <= min_decrease)
         else:
             damping *= growth
             growth *= 2.0
-            converged = bool(promised <= tolerated)
+            converged = bool(predicted <= min_decrease)
         if converged:
             message = "cost change below the tolerance"
             break
@@ -126,7 +135,7 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
 
 
 class SchurComplementSolver:
-    """The linear system of one adjustment; its buffers are kept from step to step."""
+    """Normal equations of one adjustment, solved by the Schur complement; reuses its buffers."""
 
     def __init__(self, p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> None:
         layout = p.bundle.layout
@@ -147,7 +156,7 @@ class SchurComplementSolver:
         self.tolerance = options.function_tolerance
 
     def linearize(self, state: kernels.BundleParameters, damping: float) -> float:
-        """Fill the system at ``state``, eliminate its points, and return its cost."""
+        """Linearize at ``state``, eliminate the points, and return the cost."""
 
         def reduce(n: int, first: int, last: int) -> float:
             for array in self.parts[n]:
@@ -167,29 +176,29 @@ class SchurComplementSolver:
         cost = sum(self.run(reduce))
         self.total = self.parts[0]
         for part in self.parts[1:]:
-            for array, more in zip(self.total, part, strict=True):
-                array += more
-        self._expect_scales(state)
+            for array, summand in zip(self.total, part, strict=True):
+                array += summand
+        self._add_scale_prior(state)
         self.total.rhs[:] += self.total.gradient
-        self._hold()
+        self._fix_constants()
         return cost + self.p.scale_prior.cost(state)
 
-    def _expect_scales(self, state: kernels.BundleParameters) -> None:
-        """Add what is expected of the scales of depth maps."""
+    def _add_scale_prior(self, state: kernels.BundleParameters) -> None:
+        """Add the prior of the log scales to the reduced camera system."""
         prior, layout = self.p.scale_prior, self.p.bundle.layout
         rows = kernels.NUM_IMAGE_PARAMS * prior.slot + kernels.LOG_SCALE_IDX
-        own = layout.pair[prior.slot, prior.slot]
-        self.total.blocks[own, kernels.LOG_SCALE_IDX, kernels.LOG_SCALE_IDX] += prior.weight
+        block = layout.pair[prior.slot, prior.slot]
+        self.total.blocks[block, kernels.LOG_SCALE_IDX, kernels.LOG_SCALE_IDX] += prior.weight
         self.total.diagonal[rows] += prior.weight
-        off = state.log_scales[prior.image] - prior.log_scale
-        self.total.gradient[rows] += prior.weight * off
+        residuals = state.log_scales[prior.image] - prior.log_scale
+        self.total.gradient[rows] += prior.weight * residuals
 
-    def _hold(self) -> None:
-        """Take what does not move of images with a slot out of the system."""
+    def _fix_constants(self) -> None:
+        """Remove the constant parameters of images with a slot from the system."""
         held, pairs, blocks = self.p.held, self.p.pairs, self.total.blocks
-        some = np.asarray(held.any(axis=1))
+        has_constant = np.asarray(held.any(axis=1))
         for side, axis in ((0, 2), (1, 1)):
-            rows = np.flatnonzero(some[pairs[:, side]])
+            rows = np.flatnonzero(has_constant[pairs[:, side]])
             blocks[rows] *= np.expand_dims(~held[pairs[rows, side]], axis)
         entries = np.flatnonzero(held)
         self.total.border[:, entries] = 0.0
@@ -203,10 +212,11 @@ class SchurComplementSolver:
         damping: float,
         cost: float,
     ) -> tuple[float, float, float]:
-        """Write the next state to ``trial``.
+        """Write the next parameters to ``trial``.
 
-        Returns its cost, the decrease (what has left the view counts as unchanged) and the
-        decrease that the linear model promises. All infinite when there is no step.
+        Returns:
+            Cost of the visible observations, decrease (observations that become invisible count as
+            unchanged) and predicted decrease; infinite if the system has no finite solution.
         """
         diagonal = self.total.diagonal
         boost = np.where(diagonal > 0, damping * diagonal, 1.0)
@@ -234,10 +244,10 @@ class SchurComplementSolver:
             )
             return costs
 
-        visible, lost, promised = (float(x) for x in np.sum(self.run(move), axis=0))
+        visible, lost, predicted = (float(x) for x in np.sum(self.run(move), axis=0))
         visible += self.p.scale_prior.cost(trial)
-        promised += 0.5 * float(delta @ (boost * delta - self.total.gradient))
-        return visible, cost - visible - lost, promised
+        predicted += 0.5 * float(delta @ (boost * delta - self.total.gradient))
+        return visible, cost - visible - lost, predicted
 
     def _solve_dense(self, boost: Float64) -> Float64:
         if not len(boost):
@@ -249,14 +259,14 @@ class SchurComplementSolver:
         return solution if info == 0 else np.full_like(boost, np.nan)
 
     def _solve_sparse(self, boost: Float64) -> Float64:
-        """Conjugate gradients, preconditioned by the inverse of each pose's own block."""
+        """Solve by conjugate gradients with a block-Jacobi preconditioner."""
         total = self.total
         poses = total.border.shape[1]
-        own = np.triu(total.blocks[self.p.pairs[:, 0] == self.p.pairs[:, 1]])
-        own += np.triu(own, 1).transpose(0, 2, 1)
-        size = own.shape[-1]
-        own[:, range(size), range(size)] += boost[:poses].reshape(-1, size)
-        inverse = np.linalg.inv(own)
+        diagonal = np.triu(total.blocks[self.p.pairs[:, 0] == self.p.pairs[:, 1]])
+        diagonal += np.triu(diagonal, 1).transpose(0, 2, 1)
+        size = diagonal.shape[-1]
+        diagonal[:, range(size), range(size)] += boost[:poses].reshape(-1, size)
+        inverse = np.linalg.inv(diagonal)
         corner = np.diagonal(total.corner) + boost[poses:]
 
         def multiply(x: Float64) -> Float64:
@@ -276,7 +286,7 @@ def _conjugate_gradients(
     precondition: Callable[[Float64], Float64],
     rhs: Float64,
 ) -> Float64:
-    """Solve from 0 to :data:`CG_TOLERANCE` in the preconditioner's norm."""
+    """Solve from 0 to a relative residual of ``CG_TOLERANCE`` in the norm of the preconditioner."""
     solution, residual = np.zeros_like(rhs), rhs.copy()
     direction = precondition(residual)
     energy = float(residual @ direction)

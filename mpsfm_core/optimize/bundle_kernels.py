@@ -1,14 +1,14 @@
-"""Compiled inner loops of bundle adjustment.
+"""Compiled kernels of bundle adjustment: linearization, Schur complement, back-substitution.
 
-Kernels run on a range of points and write only to what belongs to that range, so that ranges can
-run in threads (the GIL is released) and the result does not depend on how many there are. They
-own no memory: numba's reference counting made them 1.7 times slower (our measurement), so it is
-off (``_nrt=False``) and the caller passes what they work in. Inlining halved the time before that.
+A kernel works on a range of points and writes only to the data of that range. Therefore ranges run
+in threads without the GIL, and results do not depend on the number of threads. Kernels allocate no
+memory: the caller passes buffers, and numba's reference counting is off (``_nrt=False``), which is
+1.7 times faster.
 
-BundleObservations are sorted by point, then by image. Poses and focal lengths that may move have a
-slot each; camera-side vectors hold 7 numbers for each pose slot (rotation, translation, logarithm
-of the scale of the image's depth map), then one for each focal slot. A pose moves as
-``R <- exp(w) R, t <- t + dt``, the scale as ``s <- s + ds``, a focal length as ``f <- f exp(a)``.
+Observations are sorted by point, then by image. Each variable image and focal length has a slot.
+Camera-side vectors hold 7 parameters per image slot (rotation, translation, log scale of the depth
+map), then one per focal slot. The updates are ``R <- exp(w) R``, ``t <- t + dt``, ``s <- s + ds``
+and ``f <- f exp(a)``.
 """
 
 from __future__ import annotations
@@ -25,46 +25,49 @@ from mpsfm_core.support import jit
 Int32 = NDArray[np.int32]
 
 MIN_DEPTH = 1e-9
-"""Points at or below this depth do not project (COLMAP: machine epsilon)."""
+"""Depth up to which a point does not project. [COLMAP: machine epsilon]"""
 MAX_SLOPE = 1e6
-"""Points whose ray is flatter than this do not project; keeps every derivative finite."""
+"""Slope of a ray above which a point does not project; keeps all derivatives finite. [ours]"""
 MIN_DEPTH_RATIO = 0.1
-"""A point's step is shortened until no depth falls below this part of itself (our choice): the
-linearised log depth would otherwise throw a point that is e times too far behind its camera."""
+"""Smallest ratio of depth after and before a step of a point. Without this limit the linearized log
+depth would move distant points behind the camera. [ours]"""
 STEP_REDUCTION = 0.25
+"""Factor on a step of a point that violates the limit. [ours]"""
 MIN_STEP_LENGTH = 0.01
-"""A step that is still not safe at this part of its length is not taken at all."""
+"""Relative step length below which a point is not moved. [ours]"""
 MAX_POINT_STEPS = 10
-"""After a joint step, each point may take this many of its own, with the cameras fixed. RobustLosses
-losses make points with outliers converge slowly; this takes a third of the iterations and half of
-the time, to a lower cost at the same tolerance (our measurement)."""
+"""Number of steps of each point with fixed cameras after a joint step. Points with outliers
+converge slowly under robust losses; these steps halve the run time.
+[tuned: benchmarks.bundle_adjustment]"""
 POINT_STEP_DAMPING = 1e-6
+"""Damping of these steps. [ours]"""
 NUM_IMAGE_PARAMS, NUM_FOCAL_PARAMS = np.int64(7), np.int64(1)
-"""Numbers of a view (its pose, then the scale of its depth map) and of a focal length."""
+"""Number of parameters of an image (pose and log scale of its depth map) and of a focal length."""
 LOG_SCALE_IDX = 6
-"""Which of them the scale is."""
+"""Index of the log scale among the parameters of an image."""
 _ONLY = np.int64(0)
-"""Row of a block that has one row."""
+"""Index of a block buffer with one row."""
 
 
 class BundleObservations(NamedTuple):
-    """BundleObservations sorted by point, then image; those of point p are ``start[p]:start[p + 1]``.
-
-    ``weight`` is 1 / std of the pixel, ``depth_weight`` 1 / std of the log depth (0: no depth).
-    """
+    """Observations sorted by point, then image."""
 
     start: Int64
+    """(p + 1,) the observations of point p are ``start[p]:start[p + 1]``."""
     image: Int32
     xy: Float64
     weight: Float64
+    """Inverse standard deviation of the keypoint."""
     log_depth: Float64
     depth_weight: Float64
+    """Inverse standard deviation of the log depth; 0 without depth."""
 
 
 class ParameterLayout(NamedTuple):
-    """Which parameters move (slot -1: constant), and where pairs of poses are stored:
-    ``pair[i, j]``, ``i <= j``, is the row of pose slots i, j in :attr:`ReducedCameraSystem.blocks`, or -1. Of an
-    image with a pose slot the scale may move (``variable_scale``), or the pose, or both."""
+    """Slots of the variable parameters; slot -1 is constant.
+
+    An image has a pose slot if its pose, its log scale or both are variable.
+    """
 
     camera_of_image: Int32
     pose_slot: Int32
@@ -72,10 +75,11 @@ class ParameterLayout(NamedTuple):
     variable_point: Bool
     variable_scale: Bool
     pair: Int32
+    """(s, s) row in :attr:`ReducedCameraSystem.blocks` of pose slots ``i <= j``, or -1."""
 
 
 class RobustLosses(NamedTuple):
-    """Loss codes and scales, both for whitened residuals."""
+    """Loss codes and scales, for whitened residuals."""
 
     reprojection_loss: int
     reprojection_scale: float
@@ -84,7 +88,7 @@ class RobustLosses(NamedTuple):
 
 
 class BundleData(NamedTuple):
-    """What does not change during an adjustment."""
+    """Data that is constant during an adjustment."""
 
     obs: BundleObservations
     layout: ParameterLayout
@@ -92,58 +96,63 @@ class BundleData(NamedTuple):
 
 
 class BundleParameters(NamedTuple):
-    """What is estimated: cam_from_world (n, 3, 3), (n, 3); logarithms of the scales by which depth
-    maps are multiplied (n,); intrinsics (k, 4); points (p, 3)."""
+    """Parameters of bundle adjustment."""
 
     rotations: Float64
+    """(n, 3, 3) rotation of ``cam_from_world``."""
     translations: Float64
+    """(n, 3) translation of ``cam_from_world``."""
     log_scales: Float64
+    """(n,) log of the factor on the depth map of each image."""
     intrinsics: Float64
+    """(k, 4) fx, fy, cx, cy in pixels."""
     points: Float64
+    """(p, 3) world points."""
 
 
 class ReducedCameraSystem(NamedTuple):
-    """The camera-side normal equations of a range of points, or summed over all.
-
-    ``blocks`` (pairs, 7, 7), ``border`` (focals, 7 poses) and ``corner`` (focals, focals) hold
-    the reduced matrix, of a pose with itself only the upper triangle; ``gradient`` and
-    ``diagonal`` (d,) are those before the points are eliminated, ``rhs`` (d,) is what
-    elimination adds to the gradient.
-    """
+    """Reduced camera system of a range of points, or its sum over all ranges."""
 
     blocks: Float64
+    """(pairs, 7, 7) blocks of pairs of images; diagonal blocks hold the upper triangle."""
     border: Float64
+    """(focals, 7 poses) coupling of focal lengths and images."""
     corner: Float64
+    """(focals, focals) block of the focal lengths."""
     gradient: Float64
+    """(d,) gradient before the elimination of points."""
     diagonal: Float64
+    """(d,) diagonal of the Gauss-Newton matrix before the elimination of points."""
     rhs: Float64
+    """(d,) change of the gradient by the elimination."""
 
 
 class EliminationBuffers(NamedTuple):
-    """Working memory of one range for tracks of up to ``longest`` observations.
-
-    ``y``, ``yf``: (longest, 3, 7) and (longest, 3, 1), coupling of the point with pose slots
-    ``slots`` and focal slots ``focals``. ``before``: (longest, 2), cost and depth. ``block``:
-    (1, 10), laid out as a row of ``eliminated``.
-    """
+    """Working memory of one range for tracks of up to ``longest`` observations."""
 
     slots: Int64
+    """(longest,) pose slots of the current point."""
     focals: Int64
+    """(longest,) focal slots of the current point."""
     y: Float64
+    """(longest, 3, 7) coupling of the point with its pose slots."""
     yf: Float64
+    """(longest, 3, 1) coupling of the point with its focal slots."""
     columns: Float64
     before: Float64
+    """(longest, 2) cost and depth of each observation before a step."""
     block: Float64
+    """(1, 10) normal equations of one point, laid out as a row of ``eliminated``."""
     vector: Float64
 
 
 class LinearizedObservation(NamedTuple):
-    """One observation in one state, in the camera frame.
+    """Linearization of one observation in the camera frame.
 
-    ``q`` is the rotated point, ``x, y, z`` the camera point; ``g`` is the gradient of the cost
-    with respect to it and ``h`` the Gauss-Newton matrix (``hxy`` is 0). Pose, point and focal
-    length all act by displacing the camera point: by ``w x q + dt``, ``R dX``, ``(x, y, 0) da``.
-    ``gs``, ``hss`` and ``hzs``: the same of the scale of the depth map, which is no displacement.
+    ``q`` is the rotated point and ``x, y, z`` the camera point. ``g`` is the gradient of the cost
+    with respect to the camera point, and ``h`` the Gauss-Newton matrix (``hxy`` is 0). Pose, point
+    and focal length displace the camera point by ``w x q + dt``, ``R dX`` and ``(x, y, 0) da``.
+    ``gs``, ``hss`` and ``hzs`` belong to the log scale of the depth map.
     """
 
     visible: bool
@@ -168,7 +177,7 @@ class LinearizedObservation(NamedTuple):
 
 
 def allocate_buffers(longest: int) -> EliminationBuffers:
-    """Working memory for tracks of up to ``longest`` observations."""
+    """Allocate working memory for tracks of up to ``longest`` observations."""
     longest = max(longest, 1)
     return EliminationBuffers(
         slots=np.empty(longest, np.int64),
@@ -188,10 +197,13 @@ _kernel, _helper = jit.kernel(**_OPTIONS), jit.helper(**_OPTIONS)
 
 @_kernel
 def counting_sort(keys: Int32, previous: Int64, start: Int64, order: Int64) -> None:
-    """Stable counting sort of the rows ``previous`` by ``keys[row]``.
+    """Sort the rows ``previous`` by ``keys[row]`` (stable counting sort).
 
-    ``start`` (keys + 2,) comes zeroed and leaves with the first position of each key in
-    ``start[key]``; ``order`` gets the sorted rows.
+    Args:
+        keys: Key of each row.
+        previous: Rows in their previous order.
+        start: (keys + 2,) zeros; receives the first position of each key.
+        order: Receives the sorted rows.
     """
     for row in previous:
         start[keys[row] + 2] += 1
@@ -206,9 +218,16 @@ def counting_sort(keys: Int32, previous: Int64, start: Int64, order: Int64) -> N
 def number_covisible_poses(
     obs: BundleObservations, pose_slot: Int32, variable: Bool, pair: Int32
 ) -> int:
-    """Number the pairs of pose slots that share a variable point; returns their count.
+    """Number the pairs of pose slots that share a variable point.
 
-    ``pair`` (s, s) comes filled with -1 and is left so below the diagonal.
+    Args:
+        obs: Observations.
+        pose_slot: (n,) pose slot of each image.
+        variable: (p,) bool.
+        pair: (s, s) filled with -1; receives the numbers on and above the diagonal.
+
+    Returns:
+        Number of pairs.
     """
     for p in range(len(obs.start) - 1):
         if variable[p]:
@@ -232,7 +251,7 @@ def number_covisible_poses(
 def linearize_observation(
     k: int, p: int, bundle: BundleData, state: BundleParameters
 ) -> LinearizedObservation:
-    """See observation ``k`` of point ``p``; cost and derivatives are 0 where it is not visible."""
+    """Linearize observation ``k`` of point ``p``; cost and derivatives are 0 if invisible."""
     obs, robust = bundle.obs, bundle.robust
     image = obs.image[k]
     rotation, points = state.rotations, state.points
@@ -283,7 +302,7 @@ def linearize_observation(
 
 @_helper
 def _fill_pose_columns(s: LinearizedObservation, columns: Float64) -> None:
-    """columns (3, 7) <- h [dx/dw | dx/dt | scale]."""
+    """Compute ``columns (3, 7) <- h [dx/dw | dx/dt | scale]``."""
     columns[0, 0] = s.hxz * s.qy
     columns[0, 1] = s.hxx * s.qz - s.hxz * s.qx
     columns[0, 2] = -s.hxx * s.qy
@@ -307,7 +326,7 @@ def _fill_pose_columns(s: LinearizedObservation, columns: Float64) -> None:
 def _add_pose(
     s: LinearizedObservation, columns: Float64, slot: int, row: int, system: ReducedCameraSystem
 ) -> None:
-    """Add the pose's gradient, diagonal and the upper triangle of its own block."""
+    """Add gradient, diagonal and the upper triangle of the diagonal block of a pose."""
     blocks, gradient, diagonal = system.blocks, system.gradient, system.diagonal
     n = NUM_IMAGE_PARAMS * slot
     gradient[n] += s.qy * s.gz - s.qz * s.gy
@@ -349,7 +368,7 @@ def _add_focal(
     poses: int,
     system: ReducedCameraSystem,
 ) -> None:
-    """Add the focal length's gradient, diagonal, own entry and coupling with the pose."""
+    """Add gradient, diagonal, corner entry and pose coupling of a focal length."""
     own = s.x * s.x * s.hxx + s.y * s.y * s.hyy
     system.gradient[NUM_IMAGE_PARAMS * poses + focal] += s.x * s.gx + s.y * s.gy
     system.diagonal[NUM_IMAGE_PARAMS * poses + focal] += own
@@ -365,7 +384,7 @@ def _add_focal(
 def _add_point(
     s: LinearizedObservation, rotation: Float64, image: int, block: Float64, p: int
 ) -> None:
-    """block[p] (10,) += packed lower triangle of R^T h R at 0..5 and R^T g at 6..8."""
+    """Add the packed lower triangle of ``R^T h R`` to ``block[p, :6]``, ``R^T g`` to ``[6:9]``."""
     r = rotation
     for a in range(3):
         r0, r1, r2 = r[image, 0, a], r[image, 1, a], r[image, 2, a]
@@ -383,7 +402,7 @@ def _add_point(
 def _add_coupling(
     columns: Float64, width: int, rotation: Float64, image: int, y: Float64, n: int, fresh: bool
 ) -> None:
-    """y[n] (3, width) = (fresh) or += R^T columns."""
+    """Set (if ``fresh``) or add ``y[n] (3, width)`` to ``R^T columns``."""
     for c in range(3):
         r0, r1, r2 = rotation[image, 0, c], rotation[image, 1, c], rotation[image, 2, c]
         for a in range(width):
@@ -393,11 +412,14 @@ def _add_coupling(
 
 @_helper
 def _invert_factor(block: Float64, p: int, damping: float) -> bool:
-    """Replace the packed V in block[p, :6] by L^-1, where V + damping m I = L L^T; m, the mean
-    of V's diagonal, goes to block[p, 9]. False (nothing replaced) if it is not positive definite.
+    """Replace the packed V in ``block[p, :6]`` by ``L^-1``, with ``V + damping m I = L L^T``.
 
-    The same damping in all directions lets a point that is seen once move sideways only; scaled
-    by V's own diagonal it would slide along its ray.
+    ``m`` is the mean of the diagonal of V and is written to ``block[p, 9]``. Isotropic damping lets
+    a single-view point move only sideways; damping by the diagonal would let it slide along its
+    ray.
+
+    Returns:
+        False, and no change of V, if the damped block is not positive definite.
     """
     block[p, 9] = (block[p, 0] + block[p, 2] + block[p, 5]) / 3.0
     boost = damping * block[p, 9]
@@ -424,7 +446,7 @@ def _invert_factor(block: Float64, p: int, damping: float) -> bool:
 
 @_helper
 def _whiten(block: Float64, p: int, y: Float64, n: int, width: int) -> None:
-    """y[n] (3, width) <- L^-1 y[n]."""
+    """Compute ``y[n] (3, width) <- L^-1 y[n]``."""
     i00, i10, i11 = block[p, 0], block[p, 1], block[p, 2]
     i20, i21, i22 = block[p, 3], block[p, 4], block[p, 5]
     for a in range(width):
@@ -436,7 +458,7 @@ def _whiten(block: Float64, p: int, y: Float64, n: int, width: int) -> None:
 
 @_helper
 def _point_step(block: Float64, p: int, g0: float, g1: float, g2: float, step: Float64) -> float:
-    """step (3,) <- -V^-1 g; returns the decrease of cost that the linear model promises."""
+    """Compute ``step (3,) <- -V^-1 g``; returns the predicted decrease of the cost."""
     i00, i10, i11 = block[p, 0], block[p, 1], block[p, 2]
     i20, i21, i22 = block[p, 3], block[p, 4], block[p, 5]
     z0 = i00 * g0
@@ -445,8 +467,8 @@ def _point_step(block: Float64, p: int, g0: float, g1: float, g2: float, step: F
     step[0] = -(i00 * z0 + i10 * z1 + i20 * z2)
     step[1] = -(i11 * z1 + i21 * z2)
     step[2] = -i22 * z2
-    promised: float = 0.5 * (z0 * z0 + z1 * z1 + z2 * z2)
-    return promised
+    predicted: float = 0.5 * (z0 * z0 + z1 * z1 + z2 * z2)
+    return predicted
 
 
 @_helper
@@ -459,7 +481,7 @@ def _eliminate_from_poses(
     system: ReducedCameraSystem,
     scratch: EliminationBuffers,
 ) -> None:
-    """Schur complement of a point on its poses: S_ij -= Y_i^T Y_j, rhs_i -= Y_i^T z."""
+    """Subtract the Schur complement of a point: ``S_ij -= Y_i^T Y_j``, ``rhs_i -= Y_i^T z``."""
     blocks, rhs, slots, y = system.blocks, system.rhs, scratch.slots, scratch.y
     for a in range(count):
         own = pair[slots[a], slots[a]]
@@ -487,7 +509,7 @@ def _eliminate_from_focals(
     system: ReducedCameraSystem,
     scratch: EliminationBuffers,
 ) -> None:
-    """Schur complement of a point on its focal lengths, against its poses and each other."""
+    """Subtract the Schur complement of a point from the blocks of its focal lengths."""
     focals, yf, slots, y = scratch.focals, scratch.yf, scratch.slots, scratch.y
     for f in range(num_focals):
         y0, y1, y2 = yf[f, 0, 0], yf[f, 1, 0], yf[f, 2, 0]
@@ -523,11 +545,21 @@ def eliminate_points(
     eliminated: Float64,
     scratch: EliminationBuffers,
 ) -> float:
-    """Linearise the points ``first:last``, eliminate them, and return their cost.
+    """Linearize and eliminate the points ``first:last``.
 
-    Adds to ``system``, undamped on the camera side. Fills ``eliminated`` (p, 10): packed L^-1 of
-    the damped 3 x 3 block V, its gradient, the mean of V's diagonal. A row is 0, so that the
-    point stays, if it is constant or its block is not definite (nothing sees it).
+    Args:
+        first: First point.
+        last: End of the range.
+        damping: Damping of the point blocks; the camera side stays undamped.
+        bundle: Constant data.
+        state: Parameters.
+        system: Reduced camera system that is added to.
+        eliminated: (p, 10); receives the packed ``L^-1`` of the damped 3 x 3 block V, its gradient,
+            and the mean of the diagonal of V. The row of a constant or unobserved point is 0.
+        scratch: Buffers.
+
+    Returns:
+        Cost of the points.
     """
     obs, layout = bundle.obs, bundle.layout
     slots, focals, columns = scratch.slots, scratch.focals, scratch.columns
@@ -554,7 +586,7 @@ def eliminate_points(
                 continue
             _add_point(s, state.rotations, image, eliminated, p)
             if slot >= 0:
-                # a track may see an image twice; sorted by image, only the last slot can be equal
+                # a track may contain an image twice; sorted by image, only the last slot can repeat
                 fresh = count == 0 or slots[count - 1] != slot
                 if fresh:
                     slots[count] = slot
@@ -599,10 +631,12 @@ def _joint_step(
     eliminated: Float64,
     scratch: EliminationBuffers,
 ) -> float:
-    """Back-substitute: scratch.vector <- -V^-1 (g + W^T delta), the point's part of the step.
+    """Back-substitute: ``scratch.vector <- -V^-1 (g + W^T delta)``, the step of the point.
 
-    Fills ``scratch.before`` with each observation's cost (-1 if not visible) and depth, and
-    returns the decrease of cost that the linear model promises.
+    Fills ``scratch.before`` with cost (-1 if invisible) and depth of each observation.
+
+    Returns:
+        Predicted decrease of the cost.
     """
     obs, layout, rotation = bundle.obs, bundle.layout, state.rotations
     g0, g1, g2 = eliminated[p, 6], eliminated[p, 7], eliminated[p, 8]
@@ -630,18 +664,22 @@ def _joint_step(
         g2 += rotation[image, 0, 2] * ux + rotation[image, 1, 2] * uy + rotation[image, 2, 2] * uz
     step = scratch.vector
     _point_step(eliminated, p, g0, g1, g2, step)
-    promised = 0.0
+    predicted = 0.0
     for a in range(3):
-        promised += step[a] * (damping * eliminated[p, 9] * step[a] - eliminated[p, 6 + a])
-    return 0.5 * promised
+        predicted += step[a] * (damping * eliminated[p, 9] * step[a] - eliminated[p, 6 + a])
+    return 0.5 * predicted
 
 
 @_helper
 def _look(
     p: int, bundle: BundleData, trial: BundleParameters, scratch: EliminationBuffers
 ) -> tuple[float, float, bool]:
-    """Cost of a point after a step, cost before it of what it lost from view, and whether its
-    depths are safe. Fills ``scratch.block`` with the point's own normal equations."""
+    """Evaluate a point after a step; fills ``scratch.block`` with its normal equations.
+
+    Returns:
+        Cost after the step, cost before the step of observations that became invisible, and whether
+        all depths satisfy ``MIN_DEPTH_RATIO``.
+    """
     obs, before, block = bundle.obs, scratch.before, scratch.block
     cost = lost = 0.0
     safe = True
@@ -672,17 +710,19 @@ def update_points(
     eliminated: Float64,
     scratch: EliminationBuffers,
 ) -> tuple[float, float, float]:
-    """Move the points ``first:last`` of ``trial``, whose cameras have moved by ``delta``; then
-    each point by itself, while that promises to lower its cost by the part ``tolerance``.
+    """Update the points ``first:last`` of ``trial`` after a camera step, then each point alone.
 
-    Returns ``(cost, lost, promised)``: the cost of what is visible after the step; the cost
-    before it of observations that it loses from view; and the decrease of cost that the linear
-    model promises for the points' part of the joint step.
+    A point takes steps of its own while the predicted relative decrease exceeds ``tolerance``.
+
+    Returns:
+        ``(cost, lost, predicted)``. ``cost`` is the cost of the visible observations after the
+        step, ``lost`` the former cost of observations that became invisible. ``predicted`` is the
+        predicted decrease by the joint step of the points.
     """
     points, step = trial.points, scratch.vector
-    total = total_lost = promised = 0.0
+    total = total_lost = predicted = 0.0
     for p in range(first, last):
-        promised += _joint_step(p, damping, delta, bundle, state, eliminated, scratch)
+        predicted += _joint_step(p, damping, delta, bundle, state, eliminated, scratch)
         for a in range(3):
             points[p, a] = state.points[p, a] + step[a]
         cost, lost, safe = _look(p, bundle, trial, scratch)
@@ -709,12 +749,12 @@ def update_points(
             cost, lost = own_cost, own_lost
         total += cost
         total_lost += lost
-    return total, total_lost, promised
+    return total, total_lost, predicted
 
 
 @_kernel
 def rotation_from_vector(x: float, y: float, z: float) -> Any:
-    """Rodrigues' formula, row by row; the series near 0 keeps full precision."""
+    """Convert a rotation vector to rows of a matrix by Rodrigues' formula, by a series near 0."""
     squared = x * x + y * y + z * z
     angle = np.sqrt(squared)
     if angle < 1e-4:
@@ -734,7 +774,7 @@ def rotation_from_vector(x: float, y: float, z: float) -> Any:
 def update_cameras(
     delta: Float64, layout: ParameterLayout, state: BundleParameters, trial: BundleParameters
 ) -> None:
-    """Move the cameras of ``trial``, a copy of those of ``state``, by ``delta``."""
+    """Update the cameras of ``trial``, a copy of those of ``state``, by ``delta``."""
     for image in range(len(layout.pose_slot)):
         slot = layout.pose_slot[image]
         if slot < 0:
@@ -761,7 +801,7 @@ def update_cameras(
 def assemble_reduced_matrix(
     system: ReducedCameraSystem, boost: Float64, pair: Int32, out: Float64
 ) -> None:
-    """Write the lower triangle of the reduced matrix plus ``boost`` on its diagonal."""
+    """Write the lower triangle of the reduced camera matrix, with ``boost`` on the diagonal."""
     poses = len(pair)
     for i in range(poses):
         for j in range(i, poses):
@@ -784,7 +824,7 @@ def assemble_reduced_matrix(
 def multiply_reduced_matrix(
     system: ReducedCameraSystem, boost: Float64, pairs: Int64, x: Float64, out: Float64
 ) -> None:
-    """out (d,) <- (reduced matrix + diag(boost)) x; ``pairs`` (n, 2) are the slots of blocks."""
+    """Compute ``out (d,) <- (reduced matrix + diag(boost)) x`` with the slots ``pairs`` (n, 2)."""
     for a in range(len(x)):
         out[a] = boost[a] * x[a]
     for n in range(len(pairs)):
@@ -817,7 +857,7 @@ def invert_point_blocks(
     scratch: EliminationBuffers,
     out: Float64,
 ) -> None:
-    """Inverse of ``V + damping I`` of each of the points ``first:last``, to out (p, 3, 3)."""
+    """Write the inverse of ``V + damping I`` of the points ``first:last`` to ``out`` (p, 3, 3)."""
     block = scratch.block
     for p in range(first, last):
         for a in range(10):
@@ -827,7 +867,7 @@ def invert_point_blocks(
             s = linearize_observation(k, p, bundle, state)
             _add_point(s, state.rotations, bundle.obs.image[k], block, _ONLY)
         if not _invert_factor(block, _ONLY, 0.0):
-            # an unobserved direction beside strong ones: the damping drowned in rounding
+            # an unobserved direction with strong other ones: rounding cancelled the damping
             _invert_factor(block, _ONLY, 1e-12)
         i00, i10, i11 = block[0, 0], block[0, 1], block[0, 2]
         i20, i21, i22 = block[0, 3], block[0, 4], block[0, 5]

@@ -1,4 +1,4 @@
-"""What bundle adjustment is asked: its problem and options, checked and brought into order."""
+"""Problem of bundle adjustment: input arrays, validation, and layout for the kernels."""
 
 from __future__ import annotations
 
@@ -18,103 +18,111 @@ from mpsfm_core.optimize.options import BundleOptions
 from mpsfm_core.support.threads import thread_limit
 
 RANGE_SIZE = 8000
-"""Observations that are worth a thread of their own (our choice; about 2 ms a step)."""
+"""Number of observations per range of points; a step on a range takes about 2 ms. [ours]"""
 MAX_RANGES = 8
+"""Maximum number of ranges, which run in parallel. [ours]"""
 MAX_BUFFER_BYTES = 1 << 30
-"""Fewer ranges when their copies of the reduced system would take more than this."""
+"""Memory of the copies of the reduced camera system above which fewer ranges are used. [ours]"""
 
 Result = TypeVar("Result")
 PointRange = tuple[int, int, int]
-"""Number of the range, first point, end."""
+"""Number of the range, its first point, and the end."""
 
 
 @dataclass(frozen=True, eq=False)
 class BundleProblem:
-    """What to adjust, as arrays; nothing is changed in place.
+    """Parameters and observations of a bundle adjustment with n images, k cameras and p points.
 
-    ``rotations`` (n, 3, 3), ``translations`` (n, 3): cam_from_world. ``intrinsics`` (k, 4):
-    fx, fy, cx, cy in pixels. ``camera_of_image`` (n,) int: row of ``intrinsics``. ``points``
-    (p, 3): world. Observation j sees point ``obs_point[j]`` in image ``obs_image[j]`` at
-    ``obs_xy[j]`` (m, 2), COLMAP pixels, with standard deviation ``obs_std_px`` ((m,) or one
-    number). ``obs_log_depth`` (m,): log of the depth map there, NaN where it has none (None:
-    nowhere); ``obs_std_log_depth`` ((m,) or one number) its standard deviation, the square root
-    of variance / depth^2. The depth of image i is multiplied by a scale of logarithm
-    ``log_scales[i]`` ((n,), None: 0), expected at ``expected_log_scales`` (the same) give or take
-    ``std_log_scales`` ((n,) or one number, may be infinite).
-
-    ``variable_pose`` (n,), ``variable_point`` (p,), ``variable_focal`` (k,), bool: what moves;
-    None: all poses, all points, no focal length. A focal length keeps its aspect ratio; images
-    with the same camera share it. ``variable_scale`` (n,) bool, None: none. Gauge: hold a pose
-    constant. Where no depth fixes the scale,
-    ``scale_anchor`` is the index of a variable pose of which one translation coordinate is held
-    too: the one that a change of scale about the first constant pose moves most.
+    Gauge: keep a pose constant. If no depth determines the scale, set ``scale_anchor`` too.
     """
 
     rotations: Float64
+    """(n, 3, 3) rotation of ``cam_from_world``."""
     translations: Float64
+    """(n, 3) translation of ``cam_from_world``."""
     intrinsics: Float64
+    """(k, 4) fx, fy, cx, cy in pixels."""
     camera_of_image: NDArray[np.integer[Any]]
+    """(n,) row of ``intrinsics`` of each image."""
     points: Float64
+    """(p, 3) world points."""
     obs_image: NDArray[np.integer[Any]]
+    """(m,) image of each observation."""
     obs_point: NDArray[np.integer[Any]]
+    """(m,) point of each observation."""
     obs_xy: Float64
+    """(m, 2) keypoint of each observation, in COLMAP's pixel coordinates."""
     obs_std_px: Float64 | float = 1.0
+    """(m,) or one number, standard deviation of the keypoints."""
     obs_log_depth: Float64 | None = None
+    """(m,) log of the depth map at each observation, NaN where invalid; None without depth."""
     obs_std_log_depth: Float64 | float = 1.0
+    """(m,) or one number, standard deviation of the log depth: sqrt(variance) / depth."""
     variable_pose: Bool | None = None
+    """(n,) bool; None makes all poses variable."""
     variable_point: Bool | None = None
+    """(p,) bool; None makes all points variable."""
     variable_focal: Bool | None = None
+    """(k,) bool, cameras whose focal length is variable, with constant aspect ratio; None: none."""
     log_scales: Float64 | None = None
+    """(n,) log of the factor on the depth map of each image; None: 0."""
     expected_log_scales: Float64 | None = None
+    """(n,) mean of the prior of the log scales; None: 0."""
     std_log_scales: Float64 | float = np.inf
+    """(n,) or one number, standard deviation of that prior; infinite without a prior."""
     variable_scale: Bool | None = None
+    """(n,) bool, images whose log scale is variable; None: none."""
     scale_anchor: int | None = None
+    """A variable pose of which one translation coordinate is kept constant: the coordinate that a
+    change of scale about the first constant pose changes most."""
 
 
 class ScalePrior(NamedTuple):
-    """Expected logarithms of the scales of some depth maps: ``image`` (s,), ``slot`` (s,) their
-    pose slots, ``log_scale`` (s,), ``weight`` (s,) 1 / variance."""
+    """Normal prior of the variable log scales."""
 
     image: Int64
+    """(s,) image of each log scale."""
     slot: Int64
+    """(s,) pose slot of the image."""
     log_scale: Float64
+    """(s,) mean."""
     weight: Float64
+    """(s,) inverse variance."""
 
     def cost(self, state: kernels.BundleParameters) -> float:
-        """Half the sum of squares."""
-        off = state.log_scales[self.image] - self.log_scale
-        return 0.5 * float(off @ (self.weight * off))
+        """Return half the weighted sum of squares."""
+        residuals = state.log_scales[self.image] - self.log_scale
+        return 0.5 * float(residuals @ (self.weight * residuals))
 
 
 class PreparedBundle(NamedTuple):
-    """A checked problem as the kernels want it.
-
-    ``pairs`` (b, 2): pose slots of each block of the reduced matrix. ``scale_prior``: what is
-    expected of the scales that move. ``held`` (s, 7) bool: what does not move of images with a
-    slot. ``longest``: observations of a point.
-    """
+    """Validated problem in the layout of the kernels."""
 
     bundle: kernels.BundleData
     state: kernels.BundleParameters
     pairs: Int64
+    """(b, 2) pose slots of each block of the reduced camera system."""
     scale_prior: ScalePrior
     held: Bool
+    """(s, 7) bool, constant parameters of the images with a pose slot."""
     ranges: list[PointRange]
     longest: int
+    """Length of the longest track."""
 
 
 class RangeExecutor(Protocol):
-    """Calls ``function(*range)`` for each range of points, maybe in threads; returns the results
-    in the order of the ranges."""
+    """Callable that runs a function on all ranges of points, possibly in threads."""
 
-    def __call__(self, function: Callable[[int, int, int], Result]) -> list[Result]: ...
+    def __call__(self, function: Callable[[int, int, int], Result]) -> list[Result]:
+        """Return the results in the order of the ranges."""
 
 
 def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBundle:
-    """Check the problem, copy what will change, and sort the observations by point.
+    """Validate a problem, copy its variable arrays, and sort its observations by point.
 
     Raises:
-        DataError: a shape, an index, a value that is not finite or a std that is not positive.
+        DataError: A shape or index is wrong, a value is not finite, or a standard deviation is not
+            positive.
     """
     state = _state(problem)
     images, points, cameras = (len(a) for a in (state.rotations, state.points, state.intrinsics))
@@ -158,7 +166,7 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
 
 @contextmanager
 def range_executor(ranges: list[PointRange], threads: int | None) -> Iterator[RangeExecutor]:
-    """Threads, if there are several ranges and processors, for as long as the context lasts."""
+    """Provide an executor, with threads if there are several ranges and processors."""
     count = min(len(ranges), threads or thread_limit())
     if count < 2:
 
@@ -208,7 +216,7 @@ def _observations(problem: BundleProblem, images: int, points: int) -> kernels.B
 def _sorted_by_point(
     image: NDArray[np.int32], point: NDArray[np.int32], images: int, points: int
 ) -> tuple[Int64, Int64]:
-    """``(start, order)``: observations by point, then image."""
+    """Sort observations by point, then image; returns ``(start, order)``."""
     by_image, order = np.empty(len(image), np.int64), np.empty(len(image), np.int64)
     start = np.zeros(points + 2, np.int64)
     kernels.counting_sort(image, np.arange(len(image)), np.zeros(images + 2, np.int64), by_image)
@@ -272,9 +280,11 @@ def _slots(variable: Bool) -> NDArray[np.int32]:
 
 
 def _scale_gauge(anchor: int, variable: Bool, state: kernels.BundleParameters) -> tuple[int, int]:
-    """The image and the coordinate of its pose that is held for a scale."""
+    """Return the image and the pose coordinate that fix the scale gauge."""
     if not (0 <= anchor < len(variable) and variable[anchor]) or variable.all():
-        raise DataError("scale_anchor", "must be a variable pose beside a constant one")
+        raise DataError(
+            "scale_anchor", "must be a variable pose, and another pose must be constant"
+        )
     first = int(np.argmin(variable))
     center = -state.rotations[first].T @ state.translations[first]
     offset = state.rotations[anchor] @ center + state.translations[anchor]
@@ -282,9 +292,9 @@ def _scale_gauge(anchor: int, variable: Bool, state: kernels.BundleParameters) -
 
 
 def _ranges(start: Int64, pairs: int) -> list[PointRange]:
-    """Ranges of points with about equally many observations; the problem alone decides."""
-    room = MAX_BUFFER_BYTES // (8 * int(kernels.NUM_IMAGE_PARAMS) ** 2 * max(pairs, 1))
-    count = max(1, min(MAX_RANGES, int(start[-1]) // RANGE_SIZE, room))
+    """Split points into ranges of similar numbers of observations, independent of threads."""
+    max_count = MAX_BUFFER_BYTES // (8 * int(kernels.NUM_IMAGE_PARAMS) ** 2 * max(pairs, 1))
+    count = max(1, min(MAX_RANGES, int(start[-1]) // RANGE_SIZE, max_count))
     ends = np.searchsorted(start, start[-1] * np.arange(1, count) / count)
     edges = [0, *ends.tolist(), len(start) - 1]
     return [(i, edges[i], edges[i + 1]) for i in range(count)]

@@ -1,4 +1,4 @@
-"""Covariances of 3D points, and what they say about depth."""
+"""Covariances of 3D points, and the variance of their depth."""
 
 from __future__ import annotations
 
@@ -12,26 +12,32 @@ from mpsfm_core.optimize.bundle_problem import BundleProblem, prepare_bundle, ra
 from mpsfm_core.optimize.options import BundleOptions
 
 DAMPING = 1e-8
-"""Added to the information of each coordinate, so that it has an inverse (COLMAP's default)."""
+"""Damping of the information of each coordinate, which makes it invertible. [COLMAP damping]"""
 
 
 def compute_point_covariances(
     problem: BundleProblem, options: BundleOptions | None = None
 ) -> Float64:
-    """Covariance of each point for fixed cameras: (p, 3, 3) float64, world frame, squared units.
+    """Compute the covariance of each point for fixed cameras.
 
-    The inverse of the point's block of the normal equations, with the weights of the robust
-    losses, which is what COLMAP's ``estimate_ba_covariance`` gives for points. Observations that
-    do not project count nothing. A direction that nothing observes has variance
-    1 / :data:`DAMPING`. What is variable in the problem does not matter.
+    The covariance is the inverse of the block of the point in the normal equations, with the IRLS
+    weights of the robust losses, as in COLMAP's ``estimate_ba_covariance``. An unobserved
+    direction has variance ``1 / DAMPING``.
+
+    Args:
+        problem: The problem; which parameters are variable has no effect.
+        options: Losses and number of threads.
+
+    Returns:
+        (p, 3, 3) float64 covariances in the world frame, in squared world units.
 
     Raises:
-        DataError: as :func:`~mpsfm_core.optimize.bundle_adjustment.adjust_bundle`.
+        DataError: See :func:`~mpsfm_core.optimize.bundle_adjustment.adjust_bundle`.
     """
     options = options or BundleOptions()
-    nothing = np.zeros(len(problem.rotations), dtype=np.bool_)
-    held = replace(problem, variable_pose=nothing, variable_scale=None, scale_anchor=None)
-    p = prepare_bundle(held, options)
+    no_pose = np.zeros(len(problem.rotations), dtype=np.bool_)
+    fixed = replace(problem, variable_pose=no_pose, variable_scale=None, scale_anchor=None)
+    p = prepare_bundle(fixed, options)
     covariances = np.empty((len(p.state.points), 3, 3))
     scratch = [kernels.allocate_buffers(0) for _ in p.ranges]
     with range_executor(p.ranges, options.threads) as run:
@@ -44,10 +50,16 @@ def compute_point_covariances(
 
 
 def propagate_depth_variance(covariances: Float64, rotations: Float64) -> Float64:
-    """Variance of the depth z of points in a camera: (m,) float64, squared units.
+    """Propagate point covariances to the variance of depth in a camera.
 
-    ``covariances``: (m, 3, 3), world frame. ``rotations``: (m, 3, 3) or (3, 3), of
-    cam_from_world. This is the last diagonal entry of R S R^T (the published code has R^T S R).
+    The variance is the last diagonal entry of ``R S R^T``; the published code has ``R^T S R``.
+
+    Args:
+        covariances: (m, 3, 3) covariances S in the world frame.
+        rotations: (m, 3, 3) or (3, 3) rotation R of ``cam_from_world``.
+
+    Returns:
+        (m,) float64 variance of z in squared world units.
     """
     axis = rotations[..., 2, :]
     variance: Float64 = np.einsum("...a,...ab,...b->...", axis, covariances, axis)

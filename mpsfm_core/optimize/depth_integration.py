@@ -1,8 +1,8 @@
-"""Refine the depth map of one image with its normals and with triangulated points.
+"""Refinement of a depth map with normals and triangulated points (paper appendix B).
 
-The energy and why its minimisation descends: `integration_energy`. Each re-weighting gives a linear
-system with a five-point stencil; a few multigrid-preconditioned CG iterations lower it far enough.
-Large maps are refined on every second pixel first.
+IRLS minimizes the energy of :mod:`mpsfm_core.optimize.integration_energy`. Each re-weighting gives
+a linear system with a five-point stencil, which a few multigrid-preconditioned CG iterations
+decrease. Large maps are first refined on every second pixel.
 """
 
 from __future__ import annotations
@@ -37,33 +37,34 @@ from mpsfm_core.optimize.subsampling import (
     upsample,
 )
 
-# Where there are normals but no prior, the filled-in depth is a prior of this variance (log depth):
-# it says next to nothing, but nothing is left undetermined.
 _FILLED_LOG_VARIANCE = 1.0
-# Maps of twice so many columns are refined on every second pixel first, and then at most so many
-# times re-weighted. Ours: at 768 x 512 an energy and errors lower than without, in 0.8 of the time.
+"""Variance of the log depth of pixels that have a normal but no prior: weak, but determined."""
 _COARSE_COLUMNS = 300
+"""Half the width from which maps are first refined on every second pixel; it takes 0.8 of the time
+and reaches a lower energy. [tuned: benchmarks.depth_integration]"""
 _FINE_ITERATIONS = 3
-# Depth that is continued along normals stays within this factor of what is known (ours): a normal
-# that grazes the line of sight says that the next pixel is at any distance.
-_MAX_CONTINUATION = 100.0
+"""Maximum number of re-weightings after the coarse refinement. [ours]"""
+_MAX_EXTRAPOLATION = 100.0
+"""Largest ratio of integrated depth to known depth; grazing normals would exceed it. [ours]"""
 POINT_MAX_RATIO = 1.5
-"""Largest ratio of a point's depth and the scaled prior for which the point counts. [reference]"""
-# Weight that holds known depth fixed, against couplings below 1e12.
-_FIXED = 1e15
+"""Largest ratio of the depth of a point and the scaled prior for which the point counts.
+[reference]"""
+_FIXED_WEIGHT = 1e15
+"""Weight that fixes known depth, against couplings below 1e12."""
 
 
 class Anchors(NamedTuple):
-    """Sparse points seen in the image: what triangulation says about single pixels.
+    """Triangulated points that constrain single pixels of a map.
 
-    `xy` (n, 2): pixels of the map's grid (first centre at (0.5, 0.5)), taken to the nearest pixel;
-    `depth` (n,) along z in the unit of the scaled prior; `variance` (n,) of that depth. Ignored are
-    points outside the map, on invalid pixels, or with a depth or variance that is not positive.
+    Points outside the map, on invalid pixels, or with non-positive depth or variance are ignored.
     """
 
     xy: Float64
+    """(n, 2) pixels of the grid of the map; the nearest pixel is constrained."""
     depth: Float64
+    """(n,) depth z in the unit of the scaled prior."""
     variance: Float64
+    """(n,) variance of the depth."""
 
 
 NO_ANCHORS = Anchors(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
@@ -71,31 +72,33 @@ NO_ANCHORS = Anchors(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 @dataclass(frozen=True, eq=False)
 class RefinedDepth:
-    """A refined map and how it came about.
-
-    `log_depth` (h, w) float64, natural logarithm in the unit of the scaled prior; `valid` (h, w)
-    bool, False where neither prior says anything (the value there is the prior's median).
-    `initial_energy` is that of the map the refinement started from, under the same anchors;
-    `energy` never exceeds it, and `point_energy` is the mean of its points' share. `converged`:
-    stopped by the tolerance. `iterations` and `cg_iterations` count those on the whole map.
-    `skipped`: the points agree with the start about as well as those it was refined with; its map
-    is returned, and the energies remain those of the last solve.
-    """
+    """Refined depth map, and the summary of its refinement."""
 
     log_depth: Float64
+    """(h, w) float64 natural logarithm of depth in the unit of the scaled prior."""
     valid: Bool
+    """(h, w) bool; False without prior and without connected normal (the value is the median)."""
     scale: float
+    """Scale of the prior."""
     initial_energy: float
+    """Energy of the initial map with the same anchors."""
     energy: float
+    """Energy of the refined map; at most ``initial_energy``."""
     point_energy: float
+    """Mean energy of an anchor."""
     iterations: int
+    """Number of re-weightings on the whole map."""
     cg_iterations: int
+    """Number of conjugate-gradient iterations on the whole map."""
     converged: bool
+    """Whether the tolerance stopped the refinement."""
     skipped: bool
+    """Whether the map was not refined again, because the anchors fit about as well as before; the
+    energies are those of the last refinement."""
 
     @property
     def depth(self) -> Float32:
-        """Depth (h, w) float32."""
+        """(h, w) float32 depth."""
         return np.exp(self.log_depth).astype(np.float32)
 
 
@@ -117,11 +120,19 @@ class _Solver:
 
 
 class DepthIntegrator:
-    """The priors of one image, ready to be refined under changing points and scales.
+    """Depth integration of one image for changing points and scales.
 
-    `depth` and `normals` with variances on the grid of `camera`. Pixels with a normal but no depth
-    are integrated from their surroundings. Instances are immutable and may be used from several
-    threads at once; results do not depend on the number of threads.
+    Pixels with a normal but without depth are integrated from their surroundings. Instances are
+    immutable, so that several threads may use them.
+
+    Args:
+        depth: Depth prior with variance, on the grid of ``camera``.
+        normals: Normal prior with variance, on the same grid.
+        camera: Intrinsics of the grid.
+        options: Options of the integration.
+
+    Raises:
+        DataError: The grids differ or a variance is missing.
     """
 
     def __init__(
@@ -131,7 +142,6 @@ class DepthIntegrator:
         camera: PinholeCamera,
         options: IntegrationOptions | None = None,
     ) -> None:
-        """Raises DataError when grids differ or a variance is missing."""
         if depth.variance is None or normals.variance is None:
             raise DataError("variance", "depth integration needs one for depth and for normals")
         if not depth.shape == normals.shape == (camera.height, camera.width):
@@ -167,10 +177,14 @@ class DepthIntegrator:
         scale: float = 1.0,
         start: RefinedDepth | None = None,
     ) -> RefinedDepth:
-        """The map that agrees best with `scale` * depth prior, normals and anchors.
+        """Refine the map for new anchors or a new scale.
 
-        Starts from the scaled prior, or from an earlier result of this instance (whose map is
-        rescaled when the scale has changed), which is returned as it is when little is new.
+        Args:
+            anchors: Triangulated points.
+            scale: Scale of the depth prior.
+            start: Earlier result of this instance, which is rescaled and used as initial map. It is
+                returned unrefined if the anchors fit about as well as before. None starts from the
+                scaled prior.
         """
         if start is None:
             solver = _Solver(self._terms(anchors, scale))
@@ -185,10 +199,13 @@ class DepthIntegrator:
         return self._descend(z, solver.majorize(z), solver, scale)
 
     def variance(self, refined: RefinedDepth, anchors: Anchors = NO_ANCHORS) -> Float32:
-        """Marginal variance of the refined log depth, (h, w) float32; infinite where not valid.
+        """Compute the marginal variance of the refined log depth; takes 10 to 15 refinements.
 
-        The true diagonal of the inverse Hessian under these anchors, with the robust weights as
-        they are; times depth^2 it is the variance of depth. Costs 10 to 15 refinements.
+        The variance is the exact diagonal of the inverse Gauss-Newton Hessian with the present IRLS
+        weights. Multiply by depth^2 for the variance of depth.
+
+        Returns:
+            (h, w) float32; infinite where invalid.
         """
         terms = self._terms(anchors, refined.scale)
         here = majorize(refined.log_depth, terms)
@@ -202,7 +219,7 @@ class DepthIntegrator:
         anchors: Anchors,
         scale: float,
     ) -> RefinedDepth:
-        """Descend from the scaled prior, or from what every second pixel makes of it."""
+        """Descend from the scaled prior, or from the result of the coarse grid."""
         if self._coarse is None:
             return self._descend(prior, here, solver, scale)
         coarse = self._coarse.refine(
@@ -225,7 +242,7 @@ class DepthIntegrator:
         scale: float,
         max_iterations: int | None = None,
     ) -> RefinedDepth:
-        """Re-weighted least squares from z; every accepted step lowers the energy."""
+        """Minimize by IRLS from z; every accepted step decreases the energy."""
         options = self.options
         limit = options.max_iterations if max_iterations is None else max_iterations
         initial_energy = here.energy
@@ -273,7 +290,7 @@ class DepthIntegrator:
         )
 
     def _point_terms(self, anchors: Anchors, prior: Float64) -> PointTerms:
-        """Anchors as log depth of pixels, without those that cannot or should not be used."""
+        """Convert anchors to log depth of pixels, without unusable anchors and outliers."""
         height, width = prior.shape
         columns, rows = np.asarray(anchors.xy, np.float64).reshape(-1, 2).T
         depth, variance = np.asarray(anchors.depth), np.asarray(anchors.variance)
@@ -287,24 +304,24 @@ class DepthIntegrator:
         return PointTerms(rows[near], columns[near], log_depth[near], precision)
 
     def _integrate_from(self, known: Bool) -> Float64:
-        """The map that continues known log depth along the normals, with quadratic losses."""
-        blunt = EnergyLosses(sharpness=1e-9, normal_limit=1e12, prior_scale=1e6, point_scale=1.0)
+        """Integrate normals from known log depth, with quadratic losses."""
+        losses = EnergyLosses(sharpness=1e-9, normal_limit=1e12, prior_scale=1e6, point_scale=1.0)
         terms = EnergyTerms(
             build_normal_terms(self._normals, self.camera, self._active, 1.0),
-            PriorTerms(self._log_depth, known.astype(np.float32), _FIXED),
+            PriorTerms(self._log_depth, known.astype(np.float32), _FIXED_WEIGHT),
             self._point_terms(NO_ANCHORS, self._log_depth),
-            blunt,
+            losses,
         )
         solver = _Solver(terms)
         step = solver.step(solver.majorize(self._log_depth), iterations=50, tolerance=1e-3)
         low, high = self._log_depth[known].min(), self._log_depth[known].max()
-        margin = np.log(_MAX_CONTINUATION)
+        margin = np.log(_MAX_EXTRAPOLATION)
         filled: Float64 = np.nan_to_num(self._log_depth + step.x, nan=0.5 * (low + high))
         return np.clip(filled, low - margin, high + margin)
 
 
 def _reachable(depth_valid: Bool, normals_valid: Bool) -> Bool:
-    """Pixels with a depth, and those with a normal that connect to one through such pixels."""
+    """Return pixels with depth, and pixels with a normal that connect to one of them."""
     active: Bool = depth_valid | normals_valid
     if depth_valid.all():
         return active

@@ -1,12 +1,10 @@
-"""Marginal variances: the true diagonal of the inverse of a five-point grid operator.
+"""Marginal variances: the exact diagonal of the inverse of a five-point grid operator.
 
-Selected inversion by nested dissection. Lines of pixels halve the grid until small blocks remain.
-Blocks and then lines are eliminated bottom-up, each leaving a dense matrix on the pixels around its
-part; top-down, the entries of the inverse that belong to these matrices are recovered. Parts of one
-size are treated together as stacked dense matrices.
-
-For n pixels this takes O(n^1.5) operations and O(n log n) memory, whatever the couplings, and is
-exact. Solving for one pixel after another is slower from a few dozen pixels on.
+Selected inversion by nested dissection (George, 1973). Separator lines halve the grid until small
+blocks remain. Blocks and then separators are eliminated bottom-up, each leaving a dense Schur
+complement on its boundary. Top-down, the entries of the inverse on these boundaries follow. Parts
+of equal size are processed together as stacked dense matrices. For n pixels this takes O(n^1.5)
+operations and O(n log n) memory.
 """
 
 from __future__ import annotations
@@ -18,14 +16,14 @@ from threadpoolctl import threadpool_limits
 
 from mpsfm_core.data import Float32, Float64, Int64
 
-# Blocks of at most this many pixels a side are not divided; the fastest of 3 to 12.
 _BLOCK_SIDE = 6
+"""Largest side of a block that is not divided. [ours, fastest of 3 to 12]"""
 
 _Pixel = tuple[int, int]
 
 
 class _Part(NamedTuple):
-    """A rectangle of the grid: its size, and on which sides it has neighbours."""
+    """Rectangle of the grid: its size, and the sides on which it has neighbors."""
 
     height: int
     width: int
@@ -36,42 +34,53 @@ class _Part(NamedTuple):
 
 
 class _Child(NamedTuple):
-    """One half of every part of a group: `members` of the group of number `group`, whose outer
-    pixels stand at `where` among the inner and outer pixels of the whole."""
+    """One half of every part of a group."""
 
     group: int
+    """Number of the group that contains the halves."""
     members: slice
+    """Halves within that group."""
     where: Int64
+    """Indices of the boundary pixels of a half among the inner and outer pixels of the part."""
 
 
 class _Group(NamedTuple):
-    """Equal parts: their top left pixels (m, 2); the pixels to eliminate and those around the part,
-    relative to these; and no children or two."""
+    """Parts of equal shape."""
 
     origins: Int64
+    """(m, 2) top left pixel of each part."""
     inner: list[_Pixel]
+    """Pixels to eliminate, relative to the origin."""
     outer: list[_Pixel]
+    """Boundary pixels around the part, relative to the origin."""
     children: list[_Child]
+    """Two halves, or none."""
 
 
 class _Elimination(NamedTuple):
-    """For the parts of a group, `inverse` (m, s, s) of the inner block, and `gain` (m, s, b) =
-    inverse @ coupling of inner to outer pixels."""
+    """Elimination of the inner pixels of the parts of a group."""
 
     inverse: Float64
+    """(m, s, s) inverse of the inner block."""
     gain: Float64
+    """(m, s, b) inverse @ coupling of inner to outer pixels."""
 
 
 def compute_inverse_diagonal(east: Float32, south: Float32, mass: Float32) -> Float64:
-    """diag(A^-1), (h, w) float64, of the operator A that `multigrid` describes.
+    """Compute ``diag(A^-1)`` of the operator A that ``multigrid`` describes.
 
-    Pixels without any coupling and mass get infinity. Every other connected set of pixels needs
-    mass somewhere.
+    Args:
+        east: (h, w) couplings to the next pixel to the right.
+        south: (h, w) couplings to the next pixel below.
+        mass: (h, w) masses; every connected set of pixels needs a positive one.
+
+    Returns:
+        (h, w) float64; infinite for pixels without couplings and mass.
     """
     planes = np.zeros((2, mass.shape[0] + 1, mass.shape[1] + 1))
     planes[0, :-1, :-2] = east[:, :-1]
     planes[1, :-2, :-1] = south[:-1]
-    # Index -1 is the last row or column, which is zero.
+    # index -1 is the last row or column, which is zero
     diagonal = sum(plane + np.roll(plane, 1, 1 - axis) for axis, plane in enumerate(planes))
     diagonal = diagonal[:-1, :-1] + mass
     detached = diagonal == 0
@@ -85,7 +94,7 @@ def compute_inverse_diagonal(east: Float32, south: Float32, mass: Float32) -> Fl
 
 
 def _dissect(height: int, width: int) -> list[_Group]:
-    """Groups in an order that has parents before children; the first is the whole grid."""
+    """Dissect the grid into groups, parents before children; the first is the whole grid."""
     groups: list[_Group] = []
     level = {_Part(height, width): [np.zeros((1, 2), np.int64)]}
     while level:
@@ -114,7 +123,7 @@ def _dissect(height: int, width: int) -> list[_Group]:
 
 
 def _halve(part: _Part) -> tuple[list[_Pixel], list[tuple[_Pixel, _Part]]]:
-    """The pixels to eliminate last in a part, and the offsets and parts that these separate."""
+    """Return the separator of a part, and offsets and shapes of the separated halves."""
     height, width = part.height, part.width
     if max(height, width) <= _BLOCK_SIDE:
         return [(r, c) for r in range(height) for c in range(width)], []
@@ -134,6 +143,7 @@ def _halve(part: _Part) -> tuple[list[_Pixel], list[tuple[_Pixel, _Part]]]:
 
 
 def _surrounding(part: _Part) -> list[_Pixel]:
+    """Return the boundary pixels around a part."""
     rows, columns = range(part.height), range(part.width)
     return (
         [(-1, c) for c in columns if part.top]
@@ -144,7 +154,7 @@ def _surrounding(part: _Part) -> list[_Pixel]:
 
 
 def _eliminate(groups: list[_Group], planes: Float64, diagonal: Float64) -> list[_Elimination]:
-    """Bottom-up: what each part leaves on the pixels around it goes into its parent's matrix."""
+    """Eliminate bottom-up; the Schur complement of a part is added to the matrix of its parent."""
     eliminations: dict[int, _Elimination] = {}
     remainders: dict[int, Float64] = {}
     for number in reversed(range(len(groups))):
@@ -163,25 +173,25 @@ def _eliminate(groups: list[_Group], planes: Float64, diagonal: Float64) -> list
 
 
 def _add_stencil(front: Float64, group: _Group, planes: Float64, diagonal: Float64) -> None:
-    """Add the operator's entries in the rows of the inner pixels."""
+    """Add the rows of the operator that belong to the inner pixels."""
     index = {pixel: k for k, pixel in enumerate(group.inner + group.outer)}
     rows, columns = group.origins.T
     for k, (r, c) in enumerate(group.inner):
         front[:, k, k] += diagonal[rows + r, columns + c]
-        for axis, neighbour, (dr, dc) in (
+        for axis, neighbor, (dr, dc) in (
             (0, (r, c + 1), (r, c)),
             (0, (r, c - 1), (r, c - 1)),
             (1, (r + 1, c), (r, c)),
             (1, (r - 1, c), (r - 1, c)),
         ):
-            if neighbour in index:
-                front[:, k, index[neighbour]] -= planes[axis, rows + dr, columns + dc]
+            if neighbor in index:
+                front[:, k, index[neighbor]] -= planes[axis, rows + dr, columns + dc]
 
 
 def _recover(
     groups: list[_Group], eliminations: list[_Elimination], shape: tuple[int, int]
 ) -> Float64:
-    """Top-down: covariances of the pixels around a part give those of its inner pixels."""
+    """Recover variances top-down: boundary covariances give those of the inner pixels."""
     variance = np.empty(shape)
     around = [np.empty((len(g.origins), len(g.outer), len(g.outer))) for g in groups]
     for group, (inverse, gain), outer in zip(groups, eliminations, around, strict=True):

@@ -1,26 +1,26 @@
-"""The energy of depth integration and its quadratic majorizer around a map.
+"""Energy of depth integration and its quadratic majorizer.
 
-Over the log depth z of all pixels (paper appendix B; the logarithm makes perspective linear):
+The variable is the log depth z of all pixels (paper appendix B; the logarithm makes the perspective
+residuals linear)::
 
-    energy = sum over pixels and both axes of  w_n / var_r * soft_min(r_+^2, r_-^2, limit)
-           + sum over pixels of                w_d * charbonnier((z - log d)^2 / var_log_d)
-           + sum over sparse points of         cauchy((z - log D)^2 / var_log_D)
+    energy = sum over pixels and axes of   w_n / var_r * soft_min(r_+^2, r_-^2, limit)
+           + sum over pixels of            w_d * charbonnier((z - log d)^2 / var_log_d)
+           + sum over sparse points of     cauchy((z - log D)^2 / var_log_D)
 
-r_+ and r_- are the one-sided residuals of bilateral normal integration (Cao et al., ECCV 2022),
+r_+ and r_- are the one-sided residuals of bilateral normal integration (Cao et al., ECCV 2022)::
 
-    r_+ = s (z[p + e] - z[p]) + n,    s = f (n . ray),    n = n_x or n_y,
+    r_+ = s (z[p + e] - z[p]) + n,    s = f (n . ray),    n = n_x or n_y
 
-var_r = var_n |e - ray n / (n . ray)|^2 is the exact propagation of an isotropic normal variance,
-and with sharpness k
+``var_r = var_n |e - ray n / (n . ray)|^2`` propagates an isotropic normal variance. With sharpness
+k::
 
     soft_min(a, b, limit) = -log((exp(-k a) + exp(-k b) + exp(-k limit)) / (2 + exp(-k limit))) / k
 
-says that the surface continues to one side, to the other, or to none. Its derivatives are the
-sigmoid weights of the published method, which never had an energy of its own. The prior's loss goes
-on growing, 2 c^2 (sqrt(1 + s / c^2) - 1): a truncated one, as in the paper, loses strips at depth
-edges to the vague normals there. All three losses are concave in the squared residuals, so that
-re-weighted least squares majorizes this energy: a step that lowers the quadratic, however inexact,
-cannot raise the energy.
+The soft minimum continues the surface to one side, to the other, or to none. Its derivatives are
+the sigmoid weights of the published method. The Charbonnier loss
+``2 c^2 (sqrt(1 + s / c^2) - 1)`` replaces the truncated loss of the paper, which loses strips at
+depth discontinuities. All losses are concave in the squared residuals, so that IRLS is a
+majorize-minimize algorithm: a step that decreases the quadratic decreases the energy.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from mpsfm_core.support import jit
 
 _kernel, _helper = jit.kernel(fastmath=True), jit.helper(fastmath=True)
 
-_MISSING = 1e30  # squared residual of a side that does not exist
+_MISSING = 1e30
+"""Squared residual of a side without a neighbor."""
 _SQRT_3 = 1.7320508075688772
-
-# No prior is better than 0.6 deg or 0.1 % of depth, and a factor of e^10 says nothing about depth:
-# beyond, weights would only spoil the condition of the system.
 _MIN_NORMAL_VARIANCE = 1e-4
+"""Smallest variance of a normal, (0.6 deg)^2; smaller ones spoil the condition of the system."""
 MIN_LOG_VARIANCE = 1e-6
+"""Smallest variance of log depth, (0.1 %)^2."""
 MAX_LOG_VARIANCE = 1e2
-# Normals seen under more than 89.9 deg say nothing about the slope of depth.
+"""Largest variance of log depth; beyond, depth carries no information."""
 _MIN_FACING = 2e-3
+"""Smallest -n . ray; normals beyond 89.9 deg carry no information about the slope of depth."""
 
 
 class EnergyLosses(NamedTuple):
-    """`sharpness` and `normal_limit` of the soft minimum (in squared residuals), and the scales of
-    the other losses in standard deviations."""
+    """Soft minimum in squared residuals, and scales of the losses in standard deviations."""
 
     sharpness: float
     normal_limit: float
@@ -57,20 +57,20 @@ class EnergyLosses(NamedTuple):
 
 
 class NormalTerms(NamedTuple):
-    """Normal residuals, framed (2, h + 2, w + 2): first along x, then along y.
-
-    `slope` s, `normal` n, `weight` w_n / var_r (float32, zero without a normal); `link` (bool):
-    the pixel and the next one along the axis may be linked.
-    """
+    """Normal residuals with a frame of one pixel, (2, h + 2, w + 2): along x, then along y."""
 
     slope: Float32
+    """s of each pixel."""
     normal: Float32
+    """n of each pixel."""
     weight: Float32
+    """w_n / var_r; 0 without a normal."""
     link: Bool
+    """Whether the pixel and the next one along the axis may be linked."""
 
 
 class PriorTerms(NamedTuple):
-    """Depth prior: log depth float64 (h, w), 1 / var_log_d float32 (h, w), and w_d."""
+    """Depth prior: log depth (h, w), precision 1 / var_log_d (h, w), and weight w_d."""
 
     log_depth: Float64
     precision: Float32
@@ -78,7 +78,7 @@ class PriorTerms(NamedTuple):
 
 
 class PointTerms(NamedTuple):
-    """Sparse points, (n,): pixel, log depth and 1 / var_log_D."""
+    """Sparse points (n,): pixel, log depth and precision 1 / var_log_D."""
 
     rows: Int64
     columns: Int64
@@ -87,7 +87,7 @@ class PointTerms(NamedTuple):
 
 
 class EnergyTerms(NamedTuple):
-    """Everything the energy of one image is made of."""
+    """Terms of the energy of one image."""
 
     normals: NormalTerms
     prior: PriorTerms
@@ -96,11 +96,13 @@ class EnergyTerms(NamedTuple):
 
 
 class QuadraticMajorizer(NamedTuple):
-    """energy + 2 gradient . step + step' A step, with A as in `multigrid`; maps are (h, w)."""
+    """Quadratic ``energy + 2 gradient . step + step' A step``, with A as in ``multigrid``."""
 
     energy: float
-    point_energy: float  # mean share of a sparse point
-    gradient: Float64  # half the gradient of the energy
+    point_energy: float
+    """Mean energy of a sparse point."""
+    gradient: Float64
+    """(h, w) half the gradient of the energy."""
     east: Float32
     south: Float32
     mass: Float32
@@ -109,7 +111,7 @@ class QuadraticMajorizer(NamedTuple):
 def build_normal_terms(
     normals: NormalPrior, camera: PinholeCamera, active: Bool, weight: float
 ) -> NormalTerms:
-    """Residuals of a normal map (with variance) between active pixels (h, w)."""
+    """Build the residuals of a normal map with variance between active pixels (h, w)."""
     shape = (2, active.shape[0] + 2, active.shape[1] + 2)
     link = np.zeros(shape, np.bool_)
     link[0, 1:-1, 1:-2] = active[:, :-1] & active[:, 1:]
@@ -117,21 +119,23 @@ def build_normal_terms(
     terms = NormalTerms._make([*np.zeros((3, *shape), np.float32), link])
     usable = normals.valid & active
     assert normals.variance is not None
-    # for arrays that may not be written to the kernel would be compiled anew
-    own, variance = (np.require(a, None, ("C", "W")) for a in (normals.normals, normals.variance))
-    _fill_normal_terms(own, variance, usable, camera.params, weight, terms)
+    # a read-only array is another type to numba, which would compile the kernel again
+    values, variance = (
+        np.require(a, None, ("C", "W")) for a in (normals.normals, normals.variance)
+    )
+    _fill_normal_terms(values, variance, usable, camera.params, weight, terms)
     return terms
 
 
 def compute_mean_point_energy(z: Float64, points: PointTerms, scale: float) -> float:
-    """Mean share of the sparse points in the energy of a map of log depth (h, w); 0 without any."""
+    """Compute the mean energy of sparse points for a map of log depth (h, w), or 0."""
     offset = z[points.rows, points.columns] - points.log_depth
     energies = scale**2 * np.log1p(points.precision * offset**2 / scale**2)
     return float(energies.mean()) if len(energies) else 0.0
 
 
 def majorize(z: Float64, terms: EnergyTerms) -> QuadraticMajorizer:
-    """Energy of a map of log depth (h, w), and the quadratic that touches it there."""
+    """Compute the energy of a map of log depth (h, w) and its majorizer at that map."""
     framed = np.zeros((z.shape[0] + 2, z.shape[1] + 2))
     framed[1:-1, 1:-1] = z
     gradient = np.zeros_like(framed)
@@ -187,9 +191,9 @@ def _add_normals(
     coupling: Float32,
     gradient: Float64,
 ) -> float:
-    """Energy of the residuals along one axis; adds to the couplings and to half the gradient.
+    """Return the energy along one axis; adds to the couplings and to half the gradient.
 
-    All maps are framed and contiguous: the next pixel of the axis is `stride` further in memory.
+    All maps have a frame and are contiguous: ``stride`` is the distance of neighbors in memory.
     """
     height, width = z.shape
     stride = 1 if axis == 0 else width
@@ -243,9 +247,9 @@ def _link_row(
     force_ahead: Float64,
     force_behind: Float64,
 ) -> float:
-    """Energy of a row of pixels, as many as weights; coupling and half the force to both sides.
+    """Return the energy of a row of pixels; writes couplings and half the forces to both sides.
 
-    Where one side is missing, the choice is between the other one and the limit.
+    If one side is missing, the soft minimum is over the other side and the limit.
     """
     k, limit = losses.sharpness, losses.normal_limit
     two_sides, one_side = np.log(2.0 + np.exp(-k * limit)), np.log(1.0 + np.exp(-k * limit))
@@ -256,7 +260,7 @@ def _link_row(
         a = ahead * ahead if link_ahead[j] else _MISSING
         b = behind * behind if link_behind[j] else _MISSING
 
-        # Exponentials relative to the smallest of a, b and the limit, which has 1.
+        # exponentials relative to the smallest of a, b and the limit, against underflow
         low, high = min(a, b), max(a, b)
         of_gap = _exp(-k * abs(limit - low))
         of_low, of_limit = (1.0, of_gap) if low < limit else (of_gap, 1.0)
@@ -275,7 +279,7 @@ def _link_row(
 
 @_helper
 def _exp(x: float) -> float:
-    """exp(x) for x <= 0 to 1e-14, and exp(-60) below; unlike a library call, it vectorises."""
+    """Compute exp(x) for x <= 0 to 1e-14, bounded by exp(-60) below; the code vectorizes."""
     scaled = max(x, -60.0) * 1.4426950408889634
     whole = np.floor(scaled + 0.5)
     f = (scaled - whole) * 0.6931471805599453
@@ -296,7 +300,7 @@ def _exp(x: float) -> float:
 
 @_helper
 def _log(x: float) -> float:
-    """log(x) for x in [1, 3] to 1e-11, by the series of the area hyperbolic tangent at sqrt(3)."""
+    """Compute log(x) for x in [1, 3] to 1e-11 by the artanh series at sqrt(3)."""
     u = (x - _SQRT_3) / (x + _SQRT_3)
     q = u * u
     p = 1 / 13 + q * (1 / 15)
@@ -312,7 +316,7 @@ def _log(x: float) -> float:
 def _add_prior(
     z: Float64, prior: PriorTerms, scale: float, mass: Float32, gradient: Float64
 ) -> float:
-    """Charbonnier loss of the depth prior; sets the mass. The gradient is framed."""
+    """Return the Charbonnier energy of the depth prior; sets the mass, adds to the gradient."""
     energy, square = 0.0, scale * scale
     for i in range(z.shape[0]):
         for j in range(z.shape[1]):
@@ -330,7 +334,7 @@ def _add_prior(
 def _add_points(
     z: Float64, points: PointTerms, scale: float, mass: Float32, gradient: Float64
 ) -> float:
-    """Cauchy loss of the sparse points; adds to the mass. The gradient is framed."""
+    """Return the Cauchy energy of the sparse points; adds to mass and gradient."""
     energy = 0.0
     for k in range(points.rows.size):
         i, j = points.rows[k], points.columns[k]

@@ -1,10 +1,9 @@
-"""Robust losses, in Ceres' convention.
+"""Robust losses in the convention of Ceres.
 
-A loss takes the squared residual ``s`` and its scale (the residual at which it starts to bend, in
-the residual's unit) and returns ``(rho(s), rho'(s))``. An objective is ``sum(rho(s)) / 2`` and
-``rho'`` is the weight of the residual in iteratively re-weighted least squares. Each function
-works on numpy arrays and, inside of numba kernels, on scalars; :func:`evaluate_loss` selects one by
-its :class:`Loss`.
+A loss maps the squared residual ``s`` and the scale ``a``, in the unit of the residual, to
+``(rho(s), rho'(s))``. An objective is ``sum(rho(s)) / 2``, and ``rho'`` is the weight in
+iteratively re-weighted least squares (IRLS). The functions accept numpy arrays and, in kernels,
+scalars. :func:`evaluate_loss` selects a function by its :class:`Loss`.
 """
 # mypy: allow-untyped-decorators
 
@@ -24,27 +23,27 @@ from mpsfm_core.support import jit
 
 @register_jitable
 def trivial(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
-    """``rho = s``: the quadratic loss; the scale is ignored."""
+    """Evaluate ``rho = s``, the quadratic loss; the scale has no effect."""
     return s, 0.0 * s + 1.0
 
 
 @register_jitable
 def soft_l1(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
-    """``rho = 2 a^2 (sqrt(1 + s / a^2) - 1)``: linear in the residual beyond the scale a."""
+    """Evaluate ``rho = 2 a^2 (sqrt(1 + s / a^2) - 1)``, linear in large residuals."""
     root = np.sqrt(1.0 + s / (scale * scale))
     return 2.0 * s / (root + 1.0), 1.0 / root
 
 
 @register_jitable
 def cauchy(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
-    """``rho = a^2 log(1 + s / a^2)``: the influence of large residuals vanishes."""
+    """Evaluate ``rho = a^2 log(1 + s / a^2)``; the influence of large residuals vanishes."""
     ratio = s / (scale * scale)
     return scale * scale * np.log1p(ratio), 1.0 / (1.0 + ratio)
 
 
 @register_jitable
 def truncated(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
-    """``rho = min(s, a^2)``: residuals beyond the scale have no influence at all."""
+    """Evaluate ``rho = min(s, a^2)``; residuals above the scale have no influence."""
     return np.minimum(s, scale * scale), (s < scale * scale) * 1.0
 
 
@@ -56,12 +55,12 @@ LOSSES: Mapping[Loss, Callable[[NDArray[Any], float], tuple[Any, Any]]] = Mappin
         Loss.TRUNCATED: truncated,
     }
 )
-"""The functions by name, for numpy arrays; kernels use :func:`evaluate_loss`."""
+"""Functions by :class:`Loss`, for numpy arrays; kernels use :func:`evaluate_loss`."""
 
 
 @jit.helper()
 def evaluate_loss(loss: int, s: float, scale: float) -> Any:
-    """``(rho, rho')`` of one squared residual; ``loss`` is a :class:`Loss` as an int."""
+    """Evaluate ``(rho, rho')`` of a squared residual; ``loss`` is a :class:`Loss` as int."""
     if loss == 1:
         return soft_l1(s, scale)
     if loss == 2:

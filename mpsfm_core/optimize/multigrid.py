@@ -1,24 +1,19 @@
-"""Conjugate gradients with a black-box multigrid preconditioner for SPD systems on image grids.
+"""Conjugate gradients with a black-box multigrid preconditioner on image grids.
 
-The operator is a weighted graph on the pixels: non-negative couplings between horizontal and
-vertical neighbours plus a non-negative mass per pixel,
+The SPD operator is a weighted graph on the pixels, with non-negative couplings between horizontal
+and vertical neighbors and a non-negative mass per pixel::
 
-    x' A x = sum east (x[i, j] - x[i, j+1])^2 + sum south (x[i, j] - x[i+1, j])^2 + sum mass x^2.
+    x' A x = sum east (x[i, j] - x[i, j+1])^2 + sum south (x[i, j] - x[i+1, j])^2 + sum mass x^2
 
-Couplings may jump by many orders of magnitude (depth edges cut them), which breaks geometric
-multigrid. Following Dendy ("Black box multigrid", 1982) the interpolation is derived from the
-operator and the coarse operators are Galerkin products, with nine-point stencils.
+Couplings jump by orders of magnitude at depth discontinuities, which breaks geometric multigrid.
+Following black-box multigrid (Dendy, 1982), the interpolation is derived from the operator, and the
+coarse operators are Galerkin products with nine-point stencils.
 
-Everything is in double precision. A region of weak mass that edges cut off is held by 1e-7 of its
-own couplings; in single precision its step is rounding noise, and re-weighting amplifies that:
-energies after six steps differed by 1 % between two orders of the same sums (our measurement).
-Double precision takes 1.2 times as long.
+The smoother relaxes whole lines of the rows and columns that the next coarser grid omits, because
+strips of one pixel width have no coarse pixel. All arrays are double precision. In single
+precision, regions with weak mass behind discontinuities take steps of rounding noise.
 
-The smoother solves whole lines of those rows and columns that the next coarser grid leaves out:
-strips one pixel wide, cut off from their surroundings, have no coarse pixel that could help them.
-This costs 1.7 times a point smoother and leaves 40 times less error after eight CG iterations.
-
-Arrays of a level carry a frame of one zero pixel, so that no kernel branches at borders.
+Arrays of a level have a frame of one zero pixel, so that no kernel branches at borders.
 """
 
 from __future__ import annotations
@@ -36,37 +31,36 @@ _kernel, _helper = (
 )
 
 SOLVED = 1e-10
-"""Relative error that only rounding is left below."""
-_TINY = 1e-30  # less is nothing
+"""Relative error below which only rounding errors remain."""
+_TINY = 1e-30
+"""Value up to which a diagonal counts as zero."""
 _PLANES, _FIRST_WEIGHTS = 19, 11
-"""Of a level, and the first of those that hold its interpolation weights."""
+"""Number of planes of a level, and index of its first interpolation weights."""
 _Squares = tuple[float, ...]
-"""Six couplings, then four masses, of a cell."""
+"""Six couplings and four masses of a cell."""
 _Corners = tuple[float, float, float, float]
 _NO_SQUARES: _Squares = (0.0,) * 10
 
 
 class LinearSolution(NamedTuple):
-    """`x` (h, w) float64, CG iterations done, and the relative error when it was last looked at.
-
-    That is sqrt(r' M r) with the preconditioner M, close to the energy norm of the error, relative
-    to x = 0; the last of all iterations made may have lowered it further.
-    """
+    """Solution of a linear system by conjugate gradients."""
 
     x: Float64
+    """(h, w) float64."""
     iterations: int
+    """Number of conjugate-gradient iterations."""
     relative_error: float
+    """``sqrt(r' M r)`` with the preconditioner M, relative to x = 0, before the last iteration."""
 
 
 class _Level(NamedTuple):
-    """One grid of shape (h + 2, w + 2), frame included.
+    """Multigrid level of shape (h + 2, w + 2), with frame.
 
-    `east`, `south`, `southeast`, `southwest` couple a pixel to the neighbour of that name; the
-    diagonal ones are zero on the finest level. `diagonal` is 1 for pixels without any coupling and
-    mass. The pivots are the inverse ones of the smoother's lines. `weights` (8, ...) say how the
-    pixels of the next finer grid are interpolated, a cell at a time: the pixel to the right of a
-    coarse pixel from its (left, right) neighbours, the one below from (top, bottom), the one
-    diagonally below from the corners (top left, top right, bottom left, bottom right).
+    ``east``, ``south``, ``southeast`` and ``southwest`` couple a pixel to the neighbor of that
+    name; the last two are zero on the finest level. ``diagonal`` is 1 for pixels without coupling
+    and mass. The pivots are inverse pivots of the line smoother. ``weights`` (8, h, w) interpolate
+    the next finer grid by cells. The pixel to the right of a coarse pixel uses (left, right), the
+    pixel below (top, bottom), and the pixel diagonally below the four corners.
     """
 
     east: Float64
@@ -84,10 +78,10 @@ class _Level(NamedTuple):
 
 
 class Multigrid:
-    """Solver for one grid size; `update` sets the operator, `solve` may then be called repeatedly.
+    """Solver for one grid size: ``update`` sets the operator, ``solve`` solves.
 
-    Deterministic and single-threaded; the kernels release the interpreter lock, so that several
-    instances can run in threads. An instance must not be shared between threads.
+    The solver is deterministic and single-threaded. Its kernels release the GIL, so that several
+    instances may run in threads; an instance must not be shared.
     """
 
     def __init__(self, height: int, width: int) -> None:
@@ -97,16 +91,20 @@ class Multigrid:
             shapes.append((height, width))
         framed = np.array(shapes, dtype=np.int64) + 2
         first = np.concatenate([[0], np.cumsum(_PLANES * framed.prod(axis=1))])
-        # One block of memory: large enough for huge pages, which matters from about 300 000 pixels.
+        # one block of memory, large enough for huge pages
         self._grids = _Grids(np.zeros(first[-1]), first, framed)
         self._levels = [_level(self._grids, number) for number in range(len(framed))]
         self._vectors = np.zeros((3, *self._levels[0].x.shape))
 
     def update(self, east: Float32, south: Float32, mass: Float32) -> None:
-        """Set couplings and mass, each (h, w) and non-negative; costs about 1.3 V-cycles.
+        """Set the operator; takes as long as 1.3 V-cycles.
 
-        `east[:, -1]` and `south[-1]` are ignored. Pixels without couplings and mass are detached:
-        they stay zero, and so must their right-hand side be.
+        Pixels without couplings and mass stay zero, and their right-hand side must be zero.
+
+        Args:
+            east: (h, w) non-negative couplings to the right; the last column is ignored.
+            south: (h, w) non-negative couplings below; the last row is ignored.
+            mass: (h, w) non-negative masses.
         """
         finest = self._levels[0]
         finest.east[1:-1, 1:-2] = east[:, :-1]
@@ -115,7 +113,7 @@ class Multigrid:
         _derive_levels(self._grids)
 
     def solve(self, rhs: Float64, iterations: int, tolerance: float = 0.0) -> LinearSolution:
-        """Preconditioned conjugate gradients for A x = rhs (h, w) from x = 0."""
+        """Solve ``A x = rhs`` (h, w) by preconditioned conjugate gradients from x = 0."""
         x, direction, _ = self._vectors
         x[:] = direction[:] = 0
         self._levels[0].rhs[1:-1, 1:-1] = rhs
@@ -124,8 +122,11 @@ class Multigrid:
 
 
 class _Grids(NamedTuple):
-    """The levels, finest first, one after the other in `memory`: `first` (n + 1,) where each
-    begins, `shapes` (n, 2) of their grids, frame included."""
+    """Memory of all levels, the finest first.
+
+    ``first`` (n + 1,) is the start of each level in ``memory``, and ``shapes`` (n, 2) the shape of
+    its grid with frame.
+    """
 
     memory: Float64
     first: Int64
@@ -134,10 +135,11 @@ class _Grids(NamedTuple):
 
 @_helper
 def _level(grids: _Grids, number: int) -> _Level:
+    """Return a level as views of the memory."""
     height, width = grids.shapes[number]
     planes = grids.memory[grids.first[number] : grids.first[number + 1]]
     p = planes.reshape((_PLANES, height, width))
-    # one by one, as compiled code wants it
+    # numba cannot unpack an array into a named tuple
     return _Level(
         p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[_FIRST_WEIGHTS:]
     )
@@ -145,7 +147,7 @@ def _level(grids: _Grids, number: int) -> _Level:
 
 @_kernel
 def _derive_levels(grids: _Grids) -> None:
-    """All levels from the couplings and the mass of the finest."""
+    """Derive all levels from couplings and mass of the finest level."""
     last = len(grids.shapes) - 1
     for number in range(last):
         fine, coarse = _level(grids, number), _level(grids, number + 1)
@@ -159,9 +161,10 @@ def _derive_levels(grids: _Grids) -> None:
 def _conjugate_gradients(
     grids: _Grids, vectors: Float64, iterations: int, tolerance: float
 ) -> tuple[int, float]:
-    """Solve for `rhs` of the finest level; iterations and the relative error as in `LinearSolution`.
+    """Solve for ``rhs`` of the finest level, which becomes the residual.
 
-    `vectors`: x, direction and image, framed. What is left of the right-hand side takes its place.
+    ``vectors`` are x, direction and the image of the direction, with frame. Returns iterations and
+    relative error as in :class:`LinearSolution`.
     """
     finest = _level(grids, 0)
     x, direction, image, residual = vectors[0], vectors[1], vectors[2], finest.rhs
@@ -185,7 +188,7 @@ def _conjugate_gradients(
 
 @_helper
 def _v_cycle(grids: _Grids) -> None:
-    """A V-cycle: `x` of the finest level becomes an approximate solution for its `rhs`."""
+    """Run a V-cycle: ``x`` of the finest level approximates the solution for its ``rhs``."""
     last = len(grids.shapes) - 1
     for number in range(last):
         fine = _level(grids, number)
@@ -201,7 +204,7 @@ def _v_cycle(grids: _Grids) -> None:
 
 @_helper
 def _prepare_smoother(level: _Level) -> None:
-    """Diagonal and line pivots; in a form without differences, exact for any ratio of sizes."""
+    """Compute the diagonal and the line pivots, in a form without cancellation."""
     east, south, southeast, southwest = level.east, level.south, level.southeast, level.southwest
     height, width = level.mass.shape
     above, rest, pivot = np.zeros(width), level.work, level.row_pivot
@@ -232,21 +235,22 @@ def _prepare_smoother(level: _Level) -> None:
 
 
 @_helper
-def _chain(hold: float, coupling: float, rest: float) -> float:
-    """What holds the next pixel of a line: the rest of its diagonal, and the line up to it."""
+def _chain(stiffness: float, coupling: float, rest: float) -> float:
+    """Return the stiffness of the next pixel of a line, including the line before it."""
     coupling = max(coupling, 0.0)
-    total: float = max(rest, 0.0) + coupling * hold * _inverse(coupling + hold)
+    total: float = max(rest, 0.0) + coupling * stiffness * _inverse(coupling + stiffness)
     return total
 
 
 @_helper
 def _inverse(value: float) -> float:
+    """Return the inverse, 0 for values that count as zero."""
     return 1.0 / value if value > _TINY else 0.0
 
 
 @_helper
 def _smooth(level: _Level, nine_point: bool, backward: bool) -> None:
-    """Gauss-Seidel over three blocks, forward from x = 0; `backward` is the adjoint of that."""
+    """Smooth by Gauss-Seidel over three blocks from x = 0; ``backward`` is its adjoint."""
     if backward:
         _relax_columns(level, nine_point)
         _relax_rows(level, nine_point)
@@ -259,7 +263,7 @@ def _smooth(level: _Level, nine_point: bool, backward: bool) -> None:
 
 @_helper
 def _start_points(level: _Level) -> None:
-    """`_relax_points` from x = 0."""
+    """Relax the points as ``_relax_points``, from x = 0."""
     x = level.x
     x[:] = 0
     for i in range(1, x.shape[0] - 1, 2):
@@ -269,7 +273,7 @@ def _start_points(level: _Level) -> None:
 
 @_helper
 def _relax_points(level: _Level, nine_point: bool) -> None:
-    """Solve the pixels that the coarser grid keeps, one by one."""
+    """Relax the pixels that the coarser grid keeps, one by one."""
     x, row = level.x, level.work[0]
     for i in range(1, x.shape[0] - 1, 2):
         _residual_row(level, i, nine_point, row)
@@ -279,10 +283,7 @@ def _relax_points(level: _Level, nine_point: bool) -> None:
 
 @_helper
 def _relax_rows(level: _Level, nine_point: bool) -> None:
-    """Solve each row that the coarser grid leaves out.
-
-    Four at a time: each waits for its own recurrences, not for those of the others.
-    """
+    """Relax the rows that the coarser grid omits, four at a time to overlap their recurrences."""
     east, pivot, x, rows = level.east, level.row_pivot, level.x, level.work
     height, width = x.shape
     last = height - 2 - height % 2
@@ -293,7 +294,7 @@ def _relax_rows(level: _Level, nine_point: bool) -> None:
                 _residual_row(level, first + 2 * k, nine_point, rows[k])
         p, q, r, s = 0.0, 0.0, 0.0, 0.0
         for j in range(1, width - 1):
-            # Everything but one multiply-add is kept out of the recurrences.
+            # the recurrences contain only one multiply-add
             p = rows[0, j] * pivot[a, j] + max(east[a, j - 1], 0.0) * pivot[a, j] * p
             q = rows[1, j] * pivot[b, j] + max(east[b, j - 1], 0.0) * pivot[b, j] * q
             r = rows[2, j] * pivot[c, j] + max(east[c, j - 1], 0.0) * pivot[c, j] * r
@@ -314,13 +315,13 @@ def _relax_rows(level: _Level, nine_point: bool) -> None:
 
 @_helper
 def _four_rows(first: int, last: int) -> tuple[int, int, int, int]:
-    """Every second row from `first` on; the last one again where there are no more."""
+    """Return four rows with step 2 from ``first``, bounded by ``last``."""
     return first, min(first + 2, last), min(first + 4, last), min(first + 6, last)
 
 
 @_helper
 def _relax_columns(level: _Level, nine_point: bool) -> None:
-    """Solve each column that the coarser grid leaves out (all are prepared: it vectorises)."""
+    """Relax the columns that the coarser grid omits; all are computed, so that it vectorizes."""
     south, pivot, x, change = level.south, level.column_pivot, level.x, level.work
     height, width = x.shape
     change[0] = 0
@@ -338,13 +339,13 @@ def _relax_columns(level: _Level, nine_point: bool) -> None:
 
 @_helper
 def _residual_row(level: _Level, i: int, nine_point: bool, row: Float64) -> None:
-    """rhs - A x of one row."""
+    """Compute ``rhs - A x`` of one row."""
     east, south, southeast, southwest = level.east, level.south, level.southeast, level.southwest
     x = level.x
     for j in range(1, x.shape[1] - 1):
-        own = level.rhs[i, j] - level.diagonal[i, j] * x[i, j]
+        center = level.rhs[i, j] - level.diagonal[i, j] * x[i, j]
         horizontal = east[i, j] * x[i, j + 1] + east[i, j - 1] * x[i, j - 1]
-        row[j] = own + horizontal + south[i, j] * x[i + 1, j] + south[i - 1, j] * x[i - 1, j]
+        row[j] = center + horizontal + south[i, j] * x[i + 1, j] + south[i - 1, j] * x[i - 1, j]
     if nine_point:
         for j in range(1, x.shape[1] - 1):
             falling = southeast[i, j] * x[i + 1, j + 1] + southeast[i - 1, j - 1] * x[i - 1, j - 1]
@@ -354,7 +355,7 @@ def _residual_row(level: _Level, i: int, nine_point: bool, row: Float64) -> None
 
 @_helper
 def _restrict(fine: _Level, coarse: _Level, nine_point: bool) -> None:
-    """The right-hand side of `coarse` is the residual of `fine`, gathered by the interpolation."""
+    """Restrict the residual of ``fine`` to ``rhs`` of ``coarse``, by transposed interpolation."""
     residual, weights = fine.work, coarse.weights
     for i in range(1, fine.x.shape[0] - 1):
         _residual_row(fine, i, nine_point, residual[i])
@@ -377,7 +378,7 @@ def _restrict(fine: _Level, coarse: _Level, nine_point: bool) -> None:
 
 @_helper
 def _prolong(coarse: _Level, fine: _Level) -> None:
-    """Add the interpolated correction of `coarse` to `fine`."""
+    """Add the interpolated correction of ``coarse`` to ``fine``."""
     weights, x = coarse.weights, coarse.x
     for i in range(1, x.shape[0] - 1):
         r = 2 * i - 1
@@ -394,7 +395,7 @@ def _prolong(coarse: _Level, fine: _Level) -> None:
 
 @_helper
 def _derive_interpolation(fine: _Level, coarse: _Level) -> None:
-    """Dendy's weights: each fine pixel solves its own equation, collapsed onto its line."""
+    """Derive Dendy's weights: each fine pixel solves its equation, collapsed onto its line."""
     east, south, southeast, southwest = fine.east, fine.south, fine.southeast, fine.southwest
     weights = coarse.weights
     rows, columns = fine.x.shape[0] - 2, fine.x.shape[1] - 2
@@ -442,10 +443,10 @@ def _derive_interpolation(fine: _Level, coarse: _Level) -> None:
 
 @_helper
 def _shares(first: float, second: float, mass: float) -> tuple[float, float]:
-    """Interpolation weights of two neighbours.
+    """Return the interpolation weights of two neighbors.
 
-    Coarse couplings and masses can be negative. A negative mass keeps a pixel by itself as a
-    positive one does: it comes from strong couplings across this line.
+    Coarse couplings and masses can be negative. A negative mass, which comes from strong couplings
+    across the line, reduces the weights as a positive one does.
     """
     first, second = max(first, 0.0), max(second, 0.0)
     inverse = _inverse(first + second + abs(mass))
@@ -454,7 +455,7 @@ def _shares(first: float, second: float, mass: float) -> tuple[float, float]:
 
 @_helper
 def _coarsen(fine: _Level, coarse: _Level, nine_point: bool) -> None:
-    """Galerkin product, cell by cell: each fine coupling and mass is a square of coarse values."""
+    """Compute the Galerkin product by cells: fine terms are squares of coarse values."""
     weights = coarse.weights
     for plane in (coarse.east, coarse.south, coarse.southeast, coarse.southwest, coarse.mass):
         plane[:] = 0
@@ -462,7 +463,7 @@ def _coarsen(fine: _Level, coarse: _Level, nine_point: bool) -> None:
         r = 2 * i - 1
         for j in range(1, coarse.x.shape[1] - 1):
             c = 2 * j - 1
-            # What the fine pixels of a cell are in terms of its four corners.
+            # fine pixels of a cell in terms of its four corners
             c00, c01 = (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0)
             c10, c11 = (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)
             top = (weights[0, i, j], weights[1, i, j], 0.0, 0.0)
@@ -508,11 +509,11 @@ def _coarsen(fine: _Level, coarse: _Level, nine_point: bool) -> None:
 
 @_helper
 def _add_mass(q: _Squares, mass: float, a: _Corners) -> _Squares:
-    """Add mass * (a . corners)^2 to the couplings (6) and masses (4) `q` of a cell.
+    """Add ``mass * (a . corners)^2`` to the couplings (6) and masses (4) of a cell.
 
-    Positive masses are lumped, which keeps couplings from getting negative at isolated heavy
-    pixels. That is an upper bound, as a preconditioner may have; for negative ones it would be a
-    lower bound, and the coarse operator could lose its definiteness.
+    Positive masses are lumped, which avoids negative couplings at isolated large masses. Lumping is
+    an upper bound. For negative masses it would be a lower bound, and the coarse operator could
+    become indefinite; they are added exactly.
     """
     a0, a1, a2, a3 = a[0], a[1], a[2], a[3]
     heavy, light = max(mass, 0.0), min(mass, 0.0)
@@ -534,7 +535,7 @@ def _add_mass(q: _Squares, mass: float, a: _Corners) -> _Squares:
 
 @_helper
 def _add_coupling(q: _Squares, coupling: float, a: _Corners, b: _Corners) -> _Squares:
-    """Add coupling * ((a - b) . corners)^2 to a cell."""
+    """Add ``coupling * ((a - b) . corners)^2`` to a cell."""
     v0, v1, v2, v3 = a[0] - b[0], a[1] - b[1], a[2] - b[2], a[3] - b[3]
     total = v0 + v1 + v2 + v3
     return (
@@ -553,7 +554,7 @@ def _add_coupling(q: _Squares, coupling: float, a: _Corners, b: _Corners) -> _Sq
 
 @_helper
 def _apply(level: _Level, x: Float64, image: Float64) -> float:
-    """`image` = A x on the finest level; returns x' A x."""
+    """Compute ``image = A x`` on the finest level; returns ``x' A x``."""
     east, south, mass = level.east, level.south, level.mass
     curvature = 0.0
     for i in range(1, x.shape[0] - 1):
@@ -569,6 +570,7 @@ def _apply(level: _Level, x: Float64, image: Float64) -> float:
 
 @_helper
 def _step(length: float, direction: Float64, image: Float64, x: Float64, residual: Float64) -> None:
+    """Move x along the direction and update the residual."""
     for i in range(1, x.shape[0] - 1):
         for j in range(1, x.shape[1] - 1):
             x[i, j] += length * direction[i, j]
@@ -577,6 +579,7 @@ def _step(length: float, direction: Float64, image: Float64, x: Float64, residua
 
 @_helper
 def _turn(factor: float, preconditioned: Float64, direction: Float64) -> None:
+    """Compute the next conjugate direction."""
     for i in range(1, direction.shape[0] - 1):
         for j in range(1, direction.shape[1] - 1):
             direction[i, j] = preconditioned[i, j] + factor * direction[i, j]
@@ -584,6 +587,7 @@ def _turn(factor: float, preconditioned: Float64, direction: Float64) -> None:
 
 @_helper
 def _dot(a: Float64, b: Float64) -> float:
+    """Return the dot product of the interiors."""
     total = 0.0
     for i in range(1, a.shape[0] - 1):
         for j in range(1, a.shape[1] - 1):

@@ -1,9 +1,8 @@
-"""Pose of one camera from pixels whose points lie somewhere on a segment each.
+"""Refinement of a camera pose from keypoints and 3D segments.
 
-Depth bounds the point of a match along the ray of the other image, from near to far; where it is
-known the two are the same. The objective is the sum of Tukey's biweight of each pixel's distance
-to the projected segment: quadratic for small distances, no influence from a limit on. Its
-Gauss-Newton steps move the pose as bundle adjustment does, ``R <- exp(w) R, t <- t + dt``.
+Depth bounds the 3D point of a match to a segment on the ray of the other image; both ends are equal
+if the point is known. The objective is Tukey's biweight of the distances between keypoints and
+projected segments, minimized by IRLS with Gauss-Newton steps ``R <- exp(w) R, t <- t + dt``.
 """
 
 from __future__ import annotations
@@ -17,31 +16,32 @@ from mpsfm_core.optimize.bundle_kernels import MIN_DEPTH, rotation_from_vector
 from mpsfm_core.support import jit
 
 DAMPING = 1e-6
-"""Relative, of the normal equations: keeps few matches from being singular (ours)."""
+"""Relative damping of the normal equations, against singular problems. [ours]"""
 MAX_TURN = 1.0
-"""Radians; a step that turns more comes from matches that determine no pose (ours)."""
+"""Largest rotation of a step in radians; a larger one comes from matches without a pose. [ours]"""
 
 
 class RaySegments(NamedTuple):
-    """Pixels and the segments they may see.
-
-    ``near``, ``far``: (m, 3) world points; ``xy`` (m, 2) pixels; ``limit`` (m,) px, distance that
-    has no influence any more; ``weight`` (m,).
-    """
+    """Keypoints and the 3D segments that contain their points."""
 
     near: Float64
+    """(m, 3) world point at the near end."""
     far: Float64
+    """(m, 3) world point at the far end."""
     xy: Float64
+    """(m, 2) keypoints in pixels."""
     limit: Float64
+    """(m,) distance in pixels from which a match has no influence."""
     weight: Float64
+    """(m,) weight of the match."""
 
 
 class _NearestPoint(NamedTuple):
-    """Where a projected segment comes nearest to its pixel.
+    """Nearest point of a projected segment to its keypoint.
 
-    ``near``, ``far``: the ends in the camera, their rotated world points being ``near_q`` and
-    ``far_q``; ``share`` of the way between their projections; ``du``, ``dv`` px from the pixel;
-    ``au``, ``av`` the segment's direction if the foot can slide along it, else 0.
+    ``near`` and ``far`` are the ends in the camera frame, ``near_q`` and ``far_q`` their rotated
+    world points. ``share`` is the position between the projected ends. ``du``, ``dv`` are the
+    residual in pixels. ``au``, ``av`` is the direction of the segment, or 0 at an end.
     """
 
     visible: bool
@@ -57,16 +57,23 @@ class _NearestPoint(NamedTuple):
 
 
 POSE = np.int64(6)
-"""Numbers of a pose."""
+"""Number of parameters of a pose."""
 _kernel, _helper = jit.kernel(), jit.helper()
 
 
 def measure_segments(
     pose: Pose, intrinsics: Float64, segments: RaySegments
 ) -> tuple[Float64, Float64]:
-    """(m,) px between pixels and projected segments, and the depth of the nearest point there.
+    """Measure distances between keypoints and projected segments.
 
-    Both are NaN where an end is not in front of the camera. ``intrinsics``: fx, fy, cx, cy.
+    Args:
+        pose: ``cam_from_world``.
+        intrinsics: (4,) fx, fy, cx, cy.
+        segments: Keypoints and segments.
+
+    Returns:
+        Distances (m,) in pixels and depths (m,) of the nearest points; NaN if an end is behind the
+        camera.
     """
     distances, depths = np.empty((2, len(segments.xy)))
     rotation, translation = map(np.ascontiguousarray, pose)
@@ -77,10 +84,16 @@ def measure_segments(
 def refine_pose(
     pose: Pose, intrinsics: Float64, segments: RaySegments, *, scales: Float64
 ) -> tuple[Float64, Float64]:
-    """The pose after a Gauss-Newton step for each of the ``scales`` of the limits.
+    """Refine a pose by one Gauss-Newton step per scale of the limits.
 
-    Large scales first let matches pull that are far off yet. Matches that determine no pose leave
-    it where it was.
+    Args:
+        pose: Initial ``cam_from_world``.
+        intrinsics: (4,) fx, fy, cx, cy.
+        segments: Keypoints and segments.
+        scales: Factors on the limits, the largest first (graduated non-convexity).
+
+    Returns:
+        The refined pose, or the last one if the matches determine no pose.
     """
     rotation, translation = map(np.ascontiguousarray, pose)
     matrix, vector = np.empty((POSE, POSE)), np.empty(POSE)
@@ -107,11 +120,14 @@ def linearize_pose(
     matrix: Float64,
     gradient: Float64,
 ) -> float:
-    """Write the Gauss-Newton matrix (6, 6) and the gradient (6,) of the objective, return it.
+    """Write the Gauss-Newton matrix (6, 6) and the gradient (6,) of the objective.
 
-    The objective is ``sum(weight (1 - (1 - s)^3)) / 6`` of ``s = min(1, (distance / limit)^2)``,
-    with the limits times ``scale``; so its gradient is that of ``sum(w distance^2) / 2`` with
-    fixed weights.
+    The objective is ``sum(weight (1 - (1 - s)^3)) / 6`` with ``s = min(1, (distance / limit)^2)``
+    and limits times ``scale``. Its gradient is that of ``sum(w distance^2) / 2`` with the IRLS
+    weights ``w``.
+
+    Returns:
+        The objective.
     """
     matrix[:] = 0.0
     gradient[:] = 0.0
@@ -206,7 +222,7 @@ def _differentiate(
     intrinsics: Float64,
     out: Float64,
 ) -> None:
-    """out (2, 6) <- d(u, v) / d(w, dt) of a point's projection."""
+    """Compute ``out (2, 6) <- d(u, v) / d(w, dt)`` of the projection of a point."""
     inverse = 1.0 / point[2]
     fx, fy = intrinsics[0] * inverse, intrinsics[1] * inverse
     a, b = point[0] * inverse, point[1] * inverse

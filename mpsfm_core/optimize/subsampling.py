@@ -1,4 +1,4 @@
-"""Every n-th pixel of a map: coarser grids for work that needs no more, and the way back."""
+"""Subsampling of maps, priors and cameras, and bilinear upsampling."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 Prior = TypeVar("Prior", DepthPrior, NormalPrior)
 
 
-def compute_subsampling_step(columns: int, wanted: int) -> int:
-    """n such that every n-th of so many columns leaves about the wanted number."""
-    return max(1, round(columns / wanted))
+def compute_subsampling_step(num_columns: int, max_columns: int) -> int:
+    """Return the step that reduces ``num_columns`` to about ``max_columns``."""
+    return max(1, round(num_columns / max_columns))
 
 
 def subsample(values: NDArray[Scalar], step: int) -> NDArray[Scalar]:
-    """(h, w, ...): every ``step``-th row and column, from the middle of the first ``step``."""
-    # in one piece, as kernels are compiled for
+    """Return every ``step``-th row and column of a map (h, w, ...), starting at ``step // 2``."""
+    # contiguous, because kernels are compiled for contiguous arrays
     return np.ascontiguousarray(values[step // 2 :: step, step // 2 :: step])
 
 
 def subsample_prior(prior: Prior, step: int) -> Prior:
-    """A depth or normal prior on the grid that :func:`subsample` leaves; itself for a step of 1."""
+    """Subsample a depth or normal prior; a step of 1 returns the prior itself."""
     if step == 1:
         return prior
     maps: dict[str, Any] = {
@@ -38,7 +38,7 @@ def subsample_prior(prior: Prior, step: int) -> Prior:
 
 
 def subsample_camera(camera: PinholeCamera, step: int) -> PinholeCamera:
-    """The camera of the grid that :func:`subsample` leaves of a map."""
+    """Return the camera of a subsampled map."""
     columns, rows = (len(range(step // 2, size, step)) for size in camera.size)
     fx, fy, cx, cy = camera.params
     offset = _offset(step)
@@ -48,15 +48,15 @@ def subsample_camera(camera: PinholeCamera, step: int) -> PinholeCamera:
 
 
 def subsample_pixels(xy: Float64, step: int) -> Float64:
-    """Pixels (n, 2) of a map in its thinned grid."""
+    """Convert pixels (n, 2) of a map to pixels of the subsampled map."""
     pixels: Float64 = xy / step - _offset(step)
     return pixels
 
 
 def upsample(values: Float64, valid: Bool, shape: tuple[int, int]) -> Float32:
-    """Bilinear interpolation of a thinned map back to the grid ``shape`` (h, w) it came from.
+    """Upsample a subsampled map bilinearly to the grid ``shape`` (h, w) that it came from.
 
-    Pixels that are not valid count nothing; 0 where nothing valid is near.
+    Invalid pixels have no weight. The result is 0 without a valid pixel in reach.
     """
     rows, columns = shape
     step = compute_subsampling_step(columns, values.shape[1])
@@ -67,7 +67,7 @@ def upsample(values: Float64, valid: Bool, shape: tuple[int, int]) -> Float32:
 
 
 def _stretched(values: Float32, size: int, step: int) -> Float32:
-    """Linear interpolation along the first axis; the outermost values continue."""
+    """Interpolate linearly along the first axis; the outermost values extend to the border."""
     at = (np.arange(size) + 0.5) / step - _offset(step) - 0.5
     at = np.clip(at, 0, len(values) - 1)
     low = np.minimum(at.astype(np.int64), max(len(values) - 2, 0))
@@ -78,5 +78,5 @@ def _stretched(values: Float32, size: int, step: int) -> Float32:
 
 
 def _offset(step: int) -> float:
-    """Where pixel coordinate 0 of a thinned grid's own scale lies, in its pixels."""
+    """Return the offset between pixel coordinates of both grids, in subsampled pixels."""
     return (step // 2 + 0.5) / step - 0.5

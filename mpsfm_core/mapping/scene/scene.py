@@ -176,7 +176,7 @@ class Scene:
         """Project world points (m, 3) into the images of keypoints (m,).
 
         Returns:
-            ``(errors_px, depth)``, both (m,) float64; the reprojection error is inf behind the camera.
+            ``(errors_px, depth)``, both (m,) float64; the error is inf behind the camera.
         """
         images = self.graph.image_of[keypoints]
         camera = np.einsum("nij,nj->ni", self.rotations[images], points)
