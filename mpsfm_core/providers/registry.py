@@ -9,9 +9,10 @@ from __future__ import annotations
 import importlib
 import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
+from types import MappingProxyType
 from typing import Any, Literal
 
 import pluggy
@@ -41,6 +42,7 @@ from mpsfm_core.providers.environments.remote_provider import EnvironmentHooks, 
 from mpsfm_core.providers.first_party import requirement_for
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.validation import validate_filtered_pairs
 
 _log = logging.getLogger(__name__)
 
@@ -52,6 +54,11 @@ TIMEOUT_VARIABLE = "MPSFM_PLUGIN_TIMEOUT_S"
 
 DEFAULT_TIMEOUT_S = 10.0
 """Time limit for loading one plugin: milliseconds are normal, a network disk takes seconds."""
+
+_HOOK_VALIDATORS: Mapping[str, Callable[..., Any]] = MappingProxyType(
+    {"mpsfm_filter_pairs": validate_filtered_pairs}
+)
+"""Validator by hook: receives the answer and the hook's arguments, returns the answer."""
 
 Calibration = DepthCalibration | NormalCalibration
 
@@ -348,8 +355,8 @@ class Registry:
     def call_hook(self, name: str, /, **arguments: Any) -> list[Any]:
         """Call a hook of every plugin and return the answers that are not None.
 
-        A plugin that raises is skipped with a warning, and not called for this hook again. A broken
-        viewer or logger must not end a run.
+        A plugin that raises or answers wrongly is skipped with a warning that names it, and not
+        called for this hook again. A broken viewer or logger must not end a run.
 
         Args:
             name: Name of the hook.
@@ -365,6 +372,8 @@ class Registry:
             given = {key: arguments[key] for key in implementation.argnames}
             try:
                 answer = implementation.function(**given)
+                if answer is not None and name in _HOOK_VALIDATORS:
+                    answer = _HOOK_VALIDATORS[name](answer, **arguments)
             except Exception as error:
                 self._muted.add((implementation.plugin_name, name))
                 text = f"plugin {implementation.plugin_name!r} failed in {name} and is left out"

@@ -8,7 +8,7 @@ because arrays are mutable, and against the view and the capabilities of the spe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -312,6 +312,41 @@ def validate_mask(spec: ProviderSpec, view: View, output: object) -> Bool:
         if mask.shape != expected:
             raise DataError("mask", f"must have the view's shape {expected}, got {mask.shape}")
         return mask
+
+
+def validate_filtered_pairs(
+    answer: object, pairs: Sequence[tuple[str, str]]
+) -> list[tuple[str, str]]:
+    """Validate the answer of the hook ``mpsfm_filter_pairs``.
+
+    Args:
+        answer: Answer of a plugin.
+        pairs: Candidate pairs of image names.
+
+    Returns:
+        The answer as a list. Pairs that are no candidates remain and have no effect.
+
+    Raises:
+        TypeError: The answer is not an iterable of pairs of image names.
+        ValueError: The answer has pairs, but none of them is a candidate.
+    """
+    if not isinstance(answer, Iterable):
+        raise TypeError(f"must return pairs of image names, got {_type(answer)}")
+    filtered: list[tuple[str, str]] = []
+    for pair in answer:
+        if not (isinstance(pair, Sequence) and len(pair) == 2):
+            raise TypeError(f"must return pairs of image names, got {pair!r}")
+        first, second = pair
+        if not (isinstance(first, str) and isinstance(second, str)):
+            raise TypeError(f"must return pairs of image names, got {pair!r}")
+        filtered.append((first, second))
+    candidates = {frozenset(pair) for pair in pairs}
+    if filtered and not any(frozenset(pair) in candidates for pair in filtered):
+        raise ValueError(
+            f"returns no candidate pair, for example {filtered[0]!r}: image names have their "
+            f"folder and extension, such as {pairs[0] if pairs else ('a.jpg', 'b.jpg')!r}"
+        )
+    return filtered
 
 
 @contextmanager

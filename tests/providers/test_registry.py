@@ -232,6 +232,47 @@ class TestDiscovery:
             "mpsfm_filter_pairs", pairs=[("a", "b"), ("a", "bad")]
         )
 
+    @pytest.mark.parametrize(
+        ("answer", "message"),
+        [
+            ("[0, 2]", "must return pairs of image names, got 0"),
+            ("[(0, 1)]", "must return pairs of image names, got (0, 1)"),
+            ("[('a', 'b')]", "returns no candidate pair, for example ('a', 'b')"),
+            ("7", "must return pairs of image names, got int"),
+        ],
+    )
+    def test_pair_filter_with_invalid_answer_is_skipped_and_named(
+        self,
+        answer: str,
+        message: str,
+        install_plugin: InstallPlugin,
+        caplog: pytest.LogCaptureFixture,
+    ) -> None:
+        source = f"""
+            from mpsfm_core import hookimpl
+            @hookimpl
+            def mpsfm_filter_pairs(pairs):
+                return {answer}
+        """
+        install_plugin("mpsfm-filter", source)
+        registry = Registry.discover()
+        assert registry.call_hook("mpsfm_filter_pairs", pairs=[("a.jpg", "b.jpg")]) == []
+        assert "mpsfm-filter" in caplog.text and message in caplog.text
+
+    def test_pair_filter_may_return_no_pairs_or_a_generator(
+        self, install_plugin: InstallPlugin
+    ) -> None:
+        source = """
+            from mpsfm_core import hookimpl
+            @hookimpl
+            def mpsfm_filter_pairs(pairs):
+                return ((b, a) for a, b in pairs if "bad" not in b)
+        """
+        install_plugin("mpsfm-filter", source)
+        registry = Registry.discover()
+        assert registry.call_hook("mpsfm_filter_pairs", pairs=[("a", "b")]) == [[("b", "a")]]
+        assert registry.call_hook("mpsfm_filter_pairs", pairs=[("a", "bad")]) == [[]]
+
     def test_an_unknown_hook_is_told_and_the_providers_stay(
         self, install_plugin: InstallPlugin
     ) -> None:
