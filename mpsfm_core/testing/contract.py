@@ -243,7 +243,8 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
 
     Raises:
         InputError: Nothing has that name.
-        ProviderError: The plugin exists but has no providers or failed to load.
+        ProviderError: The plugin exists but has no providers or failed to load, or a provider of
+            the named distribution is unavailable.
     """
     lines = [line for line in registry.status() if line.kind != "plugin"]
     matching = [
@@ -259,6 +260,11 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
             raise ProviderError(f"{name} {plugin.reason}; {plugin.install_hint}")
         candidates = {n for line in registry.status() for n in (line.name, line.distribution)}
         raise InputError(f"no provider or plugin {name!r}{did_you_mean(name, candidates)}")
+    for line in lines:
+        # Looking it up by kind and name would test the provider of another distribution.
+        if line.distribution == name and not line.available:
+            hint = f"; {line.install_hint}" if line.install_hint else ""
+            raise ProviderError(f"{line.kind} provider {line.name!r} of {name} {line.reason}{hint}")
     return [(kind, name) for kind, name in matching if kind != "plugin"]
 
 

@@ -165,3 +165,11 @@ def test_ids_are_unique_and_every_check_says_what_it_is_about() -> None:
     assert all(find_check(name) is check for name, check in zip(ids, checks, strict=True))
     assert all((check.__doc__ or "").strip().endswith(".") for check in checks)
     assert set(CHECKS_BY_KIND) == set(KINDS)
+
+
+def test_find_providers_of_a_distribution_never_returns_another_ones_provider() -> None:
+    registry = Registry.discover(environments=False)
+    registry.add(ProviderSpec("depth", "flat", PaintedDepth), distribution="mpsfm-other")
+    with pytest.raises(ProviderError, match="'flat' of mpsfm-other has a name that belongs to"):
+        find_providers(registry, "mpsfm-other")
+    assert ("depth", "flat") in find_providers(registry, "mpsfm-core")
