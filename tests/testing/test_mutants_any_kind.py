@@ -260,6 +260,31 @@ def test_a_plugin_that_imports_what_it_does_not_need(install_plugin: Callable[..
     assert (result.status, result.message.split()[-1]) == ("fail", "scipy")
 
 
+@pytest.mark.parametrize(
+    ("statement", "status", "message"),
+    [
+        ("time.sleep(2.5)", "fail", "takes 2."),
+        ("print('torch')", "pass", "s to import"),
+        ("import os; os.write(1, b'torch scipy')", "pass", "s to import"),
+    ],
+)
+def test_light_import_measures_time_and_ignores_output(
+    statement: str, status: str, message: str, install_plugin: Callable[..., str]
+) -> None:
+    source = f"""
+        import time
+        from mpsfm_core import ProviderSpec, hookimpl
+        {statement}
+        @hookimpl
+        def mpsfm_providers():
+            factory = "tests.support.reference_providers:PaintedDepth"
+            return [ProviderSpec("depth", "heavy", factory)]
+    """
+    install_plugin("mpsfm-heavy", source)
+    (result,) = run_checks(Registry.discover(), "depth", "heavy", PAINTED, only={"light-import"})
+    assert result.status == status and message in result.message, result.message
+
+
 def test_every_common_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
     """But for the one that cannot fail."""
     caught = named(test_caught) | {"specification", "construction", "light-import"}

@@ -31,7 +31,8 @@ SOURCE = """
 
     def contract(folder):
         from mpsfm_core.testing import ContractSetup
-        return ContractSetup(truth_source="painted", expected_failures={"flat": "is too honest to pass"})
+        failures = {"flat": "is too honest to pass"}
+        return ContractSetup(truth_source="painted", expected_failures=failures)
 
     @hookimpl
     def mpsfm_providers():

@@ -12,6 +12,7 @@ small network. Answers are compared bit for bit, because the cache of a run has 
 from __future__ import annotations
 
 import gc
+import json
 import pickle
 import socket
 import subprocess
@@ -36,8 +37,14 @@ from mpsfm_core.testing.contract_case import ContractCase, describe_difference
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
-HEAVY_MODULES = ("torch", "onnxruntime", "tensorflow", "jax", "kornia", "cv2", "scipy", "pycolmap")
+HEAVY_MODULES = (
+    *("torch", "torchvision", "onnxruntime", "tensorflow", "jax", "kornia", "transformers"),
+    *("cv2", "scipy", "pycolmap", "pandas", "sklearn", "skimage", "matplotlib", "numba"),
+)
 """Libraries that a plugin module must not import: together they cost seconds at every start."""
+MAX_IMPORT_S = 2.0
+"""Largest time to import a plugin module and list its providers. Light modules take milliseconds;
+the limit leaves time for a busy machine."""
 
 _NUM_MEMORY_CALLS = 4
 _MAX_RETAINED_BYTES = 20_000
@@ -66,26 +73,41 @@ def check_construction(case: ContractCase) -> None:
     assert case.provider is not None
 
 
-def check_light_import(case: ContractCase) -> None:
-    """Require that importing the plugin's module imports no heavy library.
+def check_light_import(case: ContractCase) -> str:
+    """Require that importing the plugin's module is fast and imports no heavy library.
 
     Every start of MP-SfM imports the modules of all plugins.
     """
     modules = _find_plugin_modules(case)
     if not modules:
         raise CheckSkipped("registered in this process, not by an entry point")
-    script = (
-        "import importlib, sys\n"
-        f"import mpsfm_core.providers.registry\nbefore = set(sys.modules)\n"
-        f"[importlib.import_module(name).mpsfm_providers() for name in {modules!r}]\n"
-        f"print(*sorted(set({HEAVY_MODULES!r}) & (set(sys.modules) - before)))"
-    )
-    paths = f"import sys; sys.path[:] = {sys.path!r}\n"
-    run = subprocess.run([sys.executable, "-c", paths + script], capture_output=True, text=True)
-    if run.returncode:
-        raise CheckFailed(f"importing it fails: {run.stderr.strip().splitlines()[-1]}")
-    if run.stdout.strip():
-        raise CheckFailed(f"importing {modules[0]!r} imports {run.stdout.strip()}")
+    command = [sys.executable, "-c", _IMPORT_SCRIPT, json.dumps([sys.path, modules, HEAVY_MODULES])]
+    process = subprocess.run(command, capture_output=True, text=True)
+    if process.returncode:
+        last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
+        raise CheckFailed(f"importing it fails: {last_line}")
+    # Only the last line is ours: native code of a plugin may print too.
+    seconds, heavy = json.loads(process.stdout.splitlines()[-1])
+    if heavy:
+        raise CheckFailed(f"importing {modules[0]!r} imports {' '.join(heavy)}")
+    if seconds > MAX_IMPORT_S:
+        raise CheckFailed(f"importing {modules[0]!r} takes {seconds:.1f} s")
+    return f"{seconds:.3f} s to import"
+
+
+_IMPORT_SCRIPT = """
+import contextlib, importlib, json, sys, time
+sys.path[:], modules, heavy = json.loads(sys.argv[1])
+import mpsfm_core.providers.registry
+before = set(sys.modules)
+started = time.perf_counter()
+with contextlib.redirect_stdout(sys.stderr):
+    for name in modules:
+        importlib.import_module(name).mpsfm_providers()
+seconds = time.perf_counter() - started
+print()
+print(json.dumps([seconds, sorted(set(heavy) & (set(sys.modules) - before))]))
+"""
 
 
 def check_output_rules(case: ContractCase) -> None:
