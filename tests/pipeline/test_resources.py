@@ -72,7 +72,7 @@ def test_estimate_counts_workers_and_networks_of_each_worker() -> None:
 @pytest.mark.parametrize(
     ("megapixels", "workers", "measured_mb"),
     # Three photos of each size with the configuration "sift", peak resident memory.
-    [(3, 1, 1161), (3, 4, 2812), (24, 4, 6189), (48, 1, 2641)],
+    [(3, 1, 1161), (3, 4, 2812), (12, 1, 2323), (24, 4, 6189), (48, 1, 2641)],
 )
 def test_estimate_agrees_with_measured_peak(
     megapixels: float, workers: int, measured_mb: float
