@@ -1,7 +1,8 @@
-"""Calibrate a provider on a folder of photos: with true maps, with a model, or with nothing.
+"""Calibration of a provider on a folder of images.
 
-This stands above the pipeline, which it uses; the model of calibrations itself
-(:mod:`mpsfm_core.providers.uncertainty.calibration`) is below all providers.
+The truth are true maps, the points of a COLMAP model, or a reconstruction of the images.
+
+The calibration model itself is in :mod:`mpsfm_core.providers.uncertainty.calibration`.
 """
 
 from __future__ import annotations
@@ -47,27 +48,32 @@ from mpsfm_core.providers.uncertainty.calibration_file import (
 _log = logging.getLogger(__name__)
 
 MAX_ROUNDS = 4
-"""Reconstructions of a self-calibration (ours)."""
-SETTLED = 0.05
-"""A round that changes the median std by less than this share is the last (ours)."""
-_KEPT_METRICS = ("coverage", "coverage_without_scaling", "z_mad", "nll", "nll_heavy", "ause")
+"""Maximum number of reconstructions of a self-calibration [ours]."""
+CONVERGENCE_RATIO = 0.05
+"""Relative change of the median std below which a self-calibration has converged [ours]."""
+_METRICS = ("coverage", "coverage_without_scaling", "z_mad", "nll", "nll_heavy", "ause")
 
 
 @dataclass(frozen=True)
 class CalibrationImages:
-    """The images to calibrate on, as :func:`mpsfm_core.reconstruct` takes them."""
+    """Images to calibrate on, as in :func:`mpsfm_core.reconstruct`."""
 
     folder: Path
+    """Folder of the images."""
     intrinsics: Path | None = None
+    """File or model with the cameras."""
     image_list: Path | None = None
+    """File with the names of the images to use."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """``file``: the calibration with its provenance. ``report``: all numbers, plain data."""
+    """Result of a calibration."""
 
     file: CalibrationFile
+    """Calibration with provenance."""
     report: dict[str, Any]
+    """All values of the report as plain data."""
 
 
 def calibrate(
@@ -84,29 +90,32 @@ def calibrate(
     """Calibrate the depth or normals provider of a configuration.
 
     Args:
-        photos: the images. config: its ``depth`` or ``normals`` block is what is calibrated.
-        ground_truth: options of the provider ``files`` that reads the true maps.
-        model: COLMAP model whose points are true depth. Without either, depth is compared with
-            the points of our own reconstruction, which is repeated until the std settles.
-        alignments: what may be tried for depth; by default the scale for metric networks, and
-            all three for others. options: of the fit.
-        registry: the providers to choose from, by default those of all installed plugins.
+        photos: Images to calibrate on.
+        config: Configuration; its ``depth`` or ``normals`` provider is calibrated.
+        kind: Kind of the provider.
+        ground_truth: Options of the provider ``files`` for the true maps.
+        model: COLMAP model whose points are true depth. Without maps and model, the images are
+            reconstructed repeatedly until the std converges.
+        alignments: Candidate alignments of depth; by default the scale for metric networks and all
+            for others.
+        options: Options of the fit.
+        registry: Registry of plugins; by default all installed plugins.
 
     Raises:
-        InputError: what was given is wrong, or does not suffice for a fit.
-        ReconstructionError: without truth, and nothing could be reconstructed.
+        InputError: An argument is wrong, or the data do not suffice for a fit.
+        ReconstructionError: Self-calibration without a reconstruction.
     """
     if ground_truth is not None and model is not None:
-        raise InputError("give true maps or a model, not both")
+        raise InputError("give true maps or a model for the calibration, not both")
     if kind == "normals" and ground_truth is None:
-        raise InputError("normals can only be calibrated with true normal maps")
+        raise InputError("normals need true normal maps for calibration; give --ground-truth")
     registry = registry or Registry.discover()
     run = _Run(photos, config, kind, registry, alignments, options or StudyOptions())
     with threadpool_limits(thread_count(config.runtime), user_api="blas"):
         run.prepare()
         if ground_truth is not None:
             return run.with_files(ground_truth)
-        return run.alone() if model is None else run.with_model(model)
+        return run.self_calibrate() if model is None else run.with_model(model)
 
 
 def compare_prior(
@@ -119,9 +128,21 @@ def compare_prior(
     options: StudyOptions | None = None,
     registry: Registry | None = None,
 ) -> CalibrationData:
-    """A prior beside true maps or a model's points, for :func:`mpsfm_core.calibration.cross_validation.evaluate_calibrations`.
+    """Compare a prior with true maps or the points of a model.
 
-    Arguments and errors as of :func:`calibrate`; one of ``ground_truth`` and ``model``.
+    The result is for :func:`~mpsfm_core.calibration.cross_validation.evaluate_calibrations`.
+
+    Args:
+        photos: Images to compare on.
+        config: Configuration with the provider.
+        ground_truth: Options of the provider ``files`` for the true maps.
+        kind: Kind of the provider.
+        model: COLMAP model whose points are true depth.
+        options: Options of the sampling.
+        registry: Registry of plugins.
+
+    Raises:
+        InputError: Not exactly one of `ground_truth` and `model` is given, or both lack data.
     """
     if (ground_truth is None) == (model is None):
         raise InputError("give true maps or a model")
@@ -136,7 +157,7 @@ def compare_prior(
 
 
 class _Run:
-    """One calibration."""
+    """Run of a calibration."""
 
     def __init__(
         self,
@@ -148,7 +169,7 @@ class _Run:
         options: StudyOptions,
     ) -> None:
         stages = Stages(registry)
-        needed = ("depth", "normals", "masks")  # a reconstruction sees to the others itself
+        needed = ("depth", "normals", "masks")  # a reconstruction resolves the other providers
         config = resolve_providers(config, registry, stages, needed).config
         self._photos, self._config, self._kind = photos, config, kind
         self._registry, self._options = registry, options
@@ -159,7 +180,7 @@ class _Run:
         self._comparison = PriorComparison(self._context, kind, alignments, options)
 
     def prepare(self) -> None:
-        """Run the mask providers: what they mask is not compared."""
+        """Run the mask providers; masked pixels are not compared."""
         self._context.run_masks()
 
     def with_files(self, options: Mapping[str, Any]) -> CalibrationResult:
@@ -172,33 +193,35 @@ class _Run:
         return self._finish(self.data_of_model(folder), f"points of a model: {folder.name}")
 
     def data_of_files(self, options: Mapping[str, Any]) -> CalibrationData:
-        """The prior beside true maps."""
+        """Compare the prior with true maps."""
         return self._comparison.with_files(options)
 
     def data_of_model(self, folder: Path) -> CalibrationData:
-        """The prior beside the points of a COLMAP model."""
-        truth = depth_truth_from_model(read_model(folder), self._context.images)
+        """Compare the prior with the points of a COLMAP model."""
+        truth = depth_truth_from_model(
+            read_model(folder, self._photos.folder), self._context.images
+        )
         if not truth:
             raise InputError(f"{folder}: the model has no points in any of the images")
         return self._comparison.with_points(truth)
 
-    def alone(self) -> CalibrationResult:
-        """Reconstruct, compare with what the rays of its points say, and again."""
+    def self_calibrate(self) -> CalibrationResult:
+        """Self-calibrate: reconstruct, fit to depth triangulated from rays, and repeat."""
         current, rounds = self._declared, []
-        quick = self._options.model_copy(update={"bootstraps": 0})
+        without_bootstrap = self._options.model_copy(update={"bootstraps": 0})
         for _ in range(MAX_ROUNDS):
             data = self._comparison.with_points(self._reconstruct(current))
-            fitted = run_study(data, self._declared, quick).calibration
+            fitted = run_study(data, self._declared, without_bootstrap).calibration
             change = _median_change(data, current, fitted)
             rounds.append({"calibration": fitted.model_dump(mode="json"), "change": change})
             current = fitted
-            if change < SETTLED:
+            if change < CONVERGENCE_RATIO:
                 break
         result = self._finish(data, f"own reconstruction, {len(rounds)} rounds")
         return CalibrationResult(result.file, {**result.report, "rounds": rounds})
 
     def _reconstruct(self, calibration: Calibration) -> dict[str, DepthTruth]:
-        """True depth by the rays of all models that can be made with a calibration."""
+        """Reconstruct with a calibration and triangulate true depth from the rays of all models."""
         values = calibration.model_dump(mode="json")
         backend = self._backend.model_copy(update={"calibration": values})
         result = reconstruct(
@@ -233,7 +256,7 @@ class _Run:
             provider=provider.spec.name,
             distribution=self._registry.version(provider.kind, provider.spec.name),
             wrappers=tuple(wrapper.use for wrapper in self._backend.wrap),
-            options=_without_folders(chosen["options"]),
+            options=_strip_folders(chosen["options"]),
             weights=_weights(provider),
             truth=truth,
             data=f"{len(self._context.images)} images of {_last_folders(self._photos.folder)}",
@@ -241,9 +264,9 @@ class _Run:
             core=core_version(),
             images=len(report["images"]),
             pixels=report["samples"],
-            intervals_95=_short(report["intervals_95"]),
+            intervals_95=_round_values(report["intervals_95"]),
             metrics={
-                when: _short({name: metrics[name] for name in _KEPT_METRICS if name in metrics})
+                when: _round_values({name: metrics[name] for name in _METRICS if name in metrics})
                 for when, metrics in report["metrics"].items()
             },
             warnings=found.warnings,
@@ -251,7 +274,7 @@ class _Run:
 
 
 def _median_change(data: CalibrationData, before: Calibration, after: Calibration) -> float:
-    """Median over the samples of how much the std changed, as a share."""
+    """Return the median relative change of the std over the samples."""
     stds = [std_of(c, data.residuals(c)) for c in (before, after)]
     return float(np.expm1(np.median(np.abs(np.log(stds[1] / stds[0])))))
 
@@ -259,28 +282,28 @@ def _median_change(data: CalibrationData, before: Calibration, after: Calibratio
 def _weights(provider: ActiveProvider) -> dict[str, str]:
     files: dict[str, str] = {}
     for part in provider.identity["providers"]:
-        files |= {_without_folders(uri): sha256 for uri, sha256 in part["files"].items()}
+        files |= {_strip_folders(uri): sha256 for uri, sha256 in part["files"].items()}
     return files
 
 
-def _short(value: Any) -> Any:
-    """Plain data with numbers of four digits, for files that people read."""
+def _round_values(value: Any) -> Any:
+    """Round the numbers of plain data to four digits."""
     if isinstance(value, dict):
-        return {key: _short(content) for key, content in value.items()}
+        return {key: _round_values(content) for key, content in value.items()}
     if isinstance(value, list):
-        return [_short(content) for content in value]
+        return [_round_values(content) for content in value]
     return round_significant(value) if isinstance(value, float) else value
 
 
 def _last_folders(folder: Path) -> str:
-    """``scene/images``: many folders of photos have one name."""
+    """Return the last two folders, because many image folders have the same name."""
     return "/".join(folder.resolve().parts[-2:])
 
 
-def _without_folders(value: Any) -> Any:
-    """Plain data with the names of files for their paths: what is shipped names no machine."""
+def _strip_folders(value: Any) -> Any:
+    """Replace existing paths in plain data by file names, so that results are portable."""
     if isinstance(value, dict):
-        return {key: _without_folders(content) for key, content in value.items()}
+        return {key: _strip_folders(content) for key, content in value.items()}
     if isinstance(value, list):
-        return [_without_folders(content) for content in value]
+        return [_strip_folders(content) for content in value]
     return PurePath(value).name if isinstance(value, str) and Path(value).exists() else value

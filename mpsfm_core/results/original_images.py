@@ -63,6 +63,13 @@ class OriginalImages:
         """Return whether a registered image has lens distortion."""
         return any(not is_pinhole(self.source(image).camera) for image in reconstruction.images)
 
+    def any_rotated(self, reconstruction: Reconstruction) -> bool:
+        """Return whether the stored pixels of a registered image are not upright.
+
+        The model belongs to upright images, and other programs often ignore EXIF orientation.
+        """
+        return any(self.source(image).orientation != 1 for image in reconstruction.images)
+
     def write_view(self, image: RegisteredImage, path: Path) -> None:
         """Write the undistorted view with :func:`export_view`."""
         export_view(self._images, self._rows[image.name], path)

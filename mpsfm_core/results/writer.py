@@ -6,7 +6,8 @@
            sparse_text/     the same model as text (results.text_model)
            components/N/    models of further components, largest first, each with depth/ and
                             dense.ply
-           undistorted/     images/ and sparse/ with pinhole cameras, if an image is distorted
+           undistorted/     images/ and sparse/ with pinhole cameras, if an image is distorted or
+                            rotated by EXIF
            points.ply       triangulated points of the largest component
            dense.ply        fused depth maps
            depth/NAME.npz   refined depth, variance and camera of each registered image
@@ -119,7 +120,9 @@ def write_results(
             _write_dense(subfolder, component, photos, options, seed)
         write_ply(folder / POINTS, largest.reconstruction.points, largest.colors)
         _write_dense(folder, largest, photos, options, seed)
-        if photos.any_distorted(largest.reconstruction):
+        if photos.any_distorted(largest.reconstruction) or photos.any_rotated(
+            largest.reconstruction
+        ):
             _write_undistorted(folder / UNDISTORTED, largest, photos)
         if options.nerfstudio:
             _write_nerfstudio(folder / TRANSFORMS, output, largest, photos)
@@ -179,7 +182,8 @@ def _write_nerfstudio(
 ) -> None:
     """Write ``transforms.json`` of the originals, or of views if the format needs it."""
     images = component.reconstruction.images
-    if all(supports_camera(camera) for camera in component.model.cameras.values()):
+    has_cameras = all(supports_camera(camera) for camera in component.model.cameras.values())
+    if has_cameras and not photos.any_rotated(component.reconstruction):
         model = component.model
         files = {image.name: os.path.relpath(photos.source(image).path, output) for image in images}
     else:

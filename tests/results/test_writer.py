@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.decisions import ImageReason
@@ -116,6 +117,35 @@ def test_a_distorted_camera_gives_the_original_and_an_undistorted_model(
     for image in undistorted.images.values():
         picture = cv2.imread(str(output / "undistorted" / "images" / image.name))
         assert picture.shape == (camera.height, camera.width, 3)
+
+
+@pytest.mark.parametrize("flag", [3, 6])
+def test_photos_that_exif_rotates_get_upright_images(solved, tmp_path: Path, flag: int) -> None:
+    """Most programs ignore the flag, so the model does not fit the photos themselves."""
+    plain = photos_of(solved, tmp_path / "photos", PINHOLE)
+    turn = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90}[flag]
+    exif = Image.Exif()
+    exif[0x0112] = flag
+    for source in plain:
+        Image.open(source.path).transpose(turn).save(source.path, exif=exif)
+    images = ImageSet([replace(source, orientation=flag) for source in plain], InputOptions())
+    problem, reconstruction = seen_through(solved, images)
+    photos = OriginalImages(images, problem)
+    component = ComponentResult.of(reconstruction, photos)
+    output = tmp_path / "out"
+    options = ResultOptions(nerfstudio=True)
+    write_results(output, [component], photos, options, lambda: {"status": "success"})
+    undistorted = pycolmap.Reconstruction(str(output / "undistorted" / "sparse"))
+    assert undistorted.compute_mean_reprojection_error() < 1e-6
+    frames = json.loads((output / "transforms.json").read_text())["frames"]
+    assert len(frames) == len(undistorted.images)
+    for frame in frames:
+        with Image.open(output / frame["file_path"]) as picture:
+            assert picture.size == (frame["w"], frame["h"]) == (160, 120)
+            assert picture.getexif().get(0x0112, 1) == 1
+            name = frame["file_path"].removeprefix("undistorted/images/")
+            expected = solved.views[name].image
+            assert np.abs(np.asarray(picture).astype(int) - expected).mean() < 3
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV"])
