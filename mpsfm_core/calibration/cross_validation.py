@@ -1,5 +1,4 @@
-"""From samples to a calibration with its evidence: fit, intervals, and how it does on images that
-it was not fitted to."""
+"""Calibration study: fit, bootstrap intervals, and cross-validation over images."""
 
 from __future__ import annotations
 
@@ -27,50 +26,53 @@ from mpsfm_core.geometry.statistics import MAD_TO_STD
 from mpsfm_core.providers.uncertainty.calibration import Calibration
 
 FEW_IMAGES = 10
-"""Fewer images than these do not show how images differ (ours)."""
+"""Number of images below which a warning appears [ours]."""
 WIDE_INTERVAL = 0.25
-"""Half width of an interval, as a share of the value, that calls for more data (ours)."""
+"""Relative half width of an interval above which a warning appears [ours]."""
 MANY_GROSS = 0.2
-"""Share of gross errors above which the truth itself is in doubt (ours)."""
+"""Ratio of gross errors above which the truth is doubtful [ours]."""
 _INTERVAL = (2.5, 97.5)
 
 CalibrationData: TypeAlias = DepthData | NormalData
 
 
 class StudyOptions(Options):
-    """How a calibration is fitted."""
+    """Options of a calibration study."""
 
     seed: int = Field(0, ge=0)
-    """Of the choice of pixels and of the bootstrap_fit."""
+    """Seed of the pixel sampling and of the bootstrap."""
     folds: int = Field(4, ge=2)
-    """Each of so many groups of successive images is held out once: the model is chosen and fitted
-    on the others and judged on it. Successive, as neighbours in a video are nearly the same image;
-    if the images lie in several folders, each is a scene that is held out as a whole. The final
-    values are fitted to all."""
+    """Number of folds of the cross-validation.
+
+    A fold is a group of successive images, because neighbors in a video are nearly equal. With
+    several folders, a fold is a group of folders. The final values are fitted to all images."""
     bootstraps: int = Field(100, ge=0)
-    """Fits on images drawn with replacement, for confidence intervals; 0 for none."""
+    """Number of bootstrap samples for confidence intervals; 0 for none."""
     samples_per_image: int = Field(500, ge=20)
-    """Pixels of dense truth that are used of each image; its errors are far from independent."""
+    """Maximum number of pixels of dense truth per image; their errors are correlated."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationStudy:
-    """A calibration and how it was found.
-
-    ``report``: everything the report shows, plain data. ``warnings``: what makes it doubtful.
-    """
+    """Result of a calibration study."""
 
     calibration: Calibration
+    """Fitted calibration."""
     report: dict[str, Any]
+    """All values of the report as plain data."""
     warnings: tuple[str, ...]
+    """Reasons to doubt the calibration."""
 
 
 def run_study(
     data: CalibrationData, declared: Calibration, options: StudyOptions
 ) -> CalibrationStudy:
-    """StdFit a calibration and compare it with the declared one on images it has not seen.
+    """Fit a calibration and compare with the declared one by cross-validation.
 
-    ``data``: one image at least.
+    Args:
+        data: Samples of at least one image.
+        declared: Calibration that the plugin declares.
+        options: Options of the study.
     """
     candidates = data.fit()
     best = select_candidate(candidates)
@@ -104,7 +106,7 @@ def run_study(
 
 
 def _folds(names: Sequence[str], wanted: int) -> list[tuple[Int64, Int64]]:
-    """Images to fit on and images to evaluate_calibrations on, for each fold; none for a single image."""
+    """Return indices of training and test images of each fold; none for a single image."""
     if len(names) < 2:
         return []
     folders, scene = np.unique([str(PurePosixPath(n).parent) for n in names], return_inverse=True)
@@ -118,8 +120,11 @@ def _folds(names: Sequence[str], wanted: int) -> list[tuple[Int64, Int64]]:
 def evaluate_calibrations(
     held_out: Sequence[CalibrationData], calibrations: Sequence[Calibration]
 ) -> dict[str, Any]:
-    """How good each calibration is on its images: metrics over all of them after each image's own
-    scale, coverage of each part, and coverage of a metric prior without scaling."""
+    """Compute the metrics of each calibration on its test images.
+
+    The metrics pool all images after the scale of each image. Coverage is also reported per fold,
+    and for metric priors without scaling.
+    """
     scaled, std = _apply(held_out, calibrations, scaled=True)
     metrics = compute_metrics(concatenate_residuals(scaled), np.concatenate(std))
     metrics["coverage_of_folds"] = [_coverage(r, s)[0] for r, s in zip(scaled, std, strict=True)]
@@ -135,7 +140,7 @@ def evaluate_calibrations(
 def _apply(
     held_out: Sequence[CalibrationData], calibrations: Sequence[Calibration], *, scaled: bool
 ) -> tuple[list[Residuals], list[Float64]]:
-    """Errors of each fold and the std that its calibration declares for them."""
+    """Return errors and declared std of each fold."""
     parts = [d.residuals(c, scaled=scaled) for d, c in zip(held_out, calibrations, strict=True)]
     return parts, [std_of(c, r) for c, r in zip(calibrations, parts, strict=True)]
 
@@ -145,14 +150,14 @@ def _coverage(residuals: Residuals, std: Float64) -> list[float]:
 
 
 def _place(data: CalibrationData) -> str:
-    """What errors are broken down by, with its unit."""
+    """Return the label of the quantity that errors are broken down by."""
     if isinstance(data, NormalData):
         return "slant (degrees)"
     return "depth (m)" if data.in_meters else "depth (unit of the model)"
 
 
 def _scale(data: CalibrationData, calibration: Calibration) -> dict[str, float] | None:
-    """True depth over prior depth: median over images, and the spread of its log."""
+    """Return the ratio of true to prior depth: median over images, and std of its log."""
     if isinstance(data, NormalData):
         return None
     scales = data.residuals(calibration).scales
@@ -164,7 +169,7 @@ def _scale(data: CalibrationData, calibration: Calibration) -> dict[str, float] 
 def _intervals(
     residuals: Residuals, fit: StdFit, count: int, rng: np.random.Generator
 ) -> dict[str, list[float]]:
-    """95 % intervals of what the fit determines; angles in degrees."""
+    """Compute 95 % intervals of the determined factors; angles in degrees."""
     if count == 0 or residuals.images < 2:
         return {}
     low, high = np.percentile(bootstrap_fit(residuals, fit, count, rng), _INTERVAL, axis=0)
@@ -194,11 +199,11 @@ def _describe(candidate: Candidate) -> dict[str, Any]:
 
 def _warnings(images: int, intervals: dict[str, list[float]], fit: StdFit) -> Iterator[str]:
     if images < FEW_IMAGES:
-        yield f"fitted to only {images} images: too few to know how images differ"
+        yield f"fitted to only {images} images: add more images"
     if images < 2:
-        yield "no image is held out: the metrics are those of the image it was fitted to"
+        yield "no cross-validation: the metrics are those of the only image; add more images"
     for name, (low, high) in intervals.items():
         if high - low > WIDE_INTERVAL * (high + low):
-            yield f"{name} is somewhere between {low:.3g} and {high:.3g}: more images are needed"
+            yield f"{name} is between {low:.3g} and {high:.3g}: add more images"
     if fit.gross > MANY_GROSS:
-        yield f"{fit.gross:.0%} of the errors are gross: is the truth of these images right?"
+        yield f"{fit.gross:.0%} of the errors are gross: check the truth of these images"

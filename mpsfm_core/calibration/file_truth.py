@@ -1,4 +1,4 @@
-"""True depth and normals from files, read as the provider ``files`` reads them."""
+"""True depth and normals from files, read by the provider ``files``."""
 
 from __future__ import annotations
 
@@ -19,13 +19,18 @@ from mpsfm_core.providers.builtin.options import DepthFileOptions, FileOptions, 
 from mpsfm_core.providers.provider_config import ProviderConfig
 
 EXACT = 1e-4
-"""Relative std of depth files for which none is given: exact for every prior, and positive."""
+"""Default relative std of true depth: negligible for every prior, and positive."""
 
 
 class FileTruth:
-    """Reads the true map of an image and chooses pixels of it.
+    """Reader of true maps that samples pixels of an image.
 
-    ``options``: of the provider ``files``. ``count``: pixels of an image at most.
+    Args:
+        context: Extraction context.
+        kind: ``depth`` or ``normals``.
+        options: Options of the provider ``files``.
+        count: Maximum number of pixels per image.
+        seed: Seed of the sampling.
     """
 
     def __init__(
@@ -47,7 +52,7 @@ class FileTruth:
         self._count, self._seed = count, seed
 
     def has(self, view: View) -> bool:
-        """Whether there is a file for a view."""
+        """Return True if a view has a true map."""
         try:
             find_file(self._options, view, "ground truth")
         except InputError:
@@ -55,22 +60,24 @@ class FileTruth:
         return True
 
     def depth(self, view: View, index: int) -> DepthTruth:
-        """Depth at pixels of a view that the truth and the view's mask have."""
+        """Sample true depth at valid, unmasked pixels of a view."""
         true = validation.run_depth(self._provider.spec, self._provider.instance, view)
-        rows, xy = self._choose(true.valid, view, index)
+        rows, xy = self._sample_pixels(true.valid, view, index)
         depth = true.depth[rows].astype(np.float64)
         assert true.variance is not None  # the files provider declares one
         return DepthTruth(xy, depth, np.sqrt(true.variance[rows]) / depth)
 
     def normals(self, view: View, index: int) -> NormalTruth:
-        """Normals at pixels of a view that the truth and the view's mask have."""
+        """Sample true normals at valid, unmasked pixels of a view."""
         true = validation.run_normals(self._provider.spec, self._provider.instance, view)
-        rows, xy = self._choose(true.valid, view, index)
+        rows, xy = self._sample_pixels(true.valid, view, index)
         std = np.zeros(len(xy)) if true.variance is None else np.sqrt(true.variance[rows])
         return NormalTruth(xy, true.normals[rows].astype(np.float64), std.astype(np.float64))
 
-    def _choose(self, valid: Bool, view: View, index: int) -> tuple[tuple[Int64, Int64], Float64]:
-        """Rows and columns of chosen pixels, and their places (n, 2) in the view."""
+    def _sample_pixels(
+        self, valid: Bool, view: View, index: int
+    ) -> tuple[tuple[Int64, Int64], Float64]:
+        """Sample valid pixels; returns rows and columns, and pixels (n, 2) of the view."""
         height, width = valid.shape
         centers = scale_pixels(pixel_centers(width, height), (width, height), view.camera.size)
         if view.mask is not None:

@@ -1,4 +1,4 @@
-"""How trustworthy a declared std is: coverage, sensitivity and calibration curves."""
+"""Metrics of a declared std: coverage, sensitivity and calibration curves."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.geometry.statistics import MAD_TO_STD, weighted_quantile
 
 CURVE_POINTS = 50
+"""Points of a sensitivity curve."""
 BINS = 10
+"""Bins of a calibration curve."""
 RANGES = 5
+"""Ranges of depth or slant."""
 NORMAL_COVERAGE = (ONE_SIGMA, 0.9545, 0.9973)
-"""Of normal errors, within 1, 2 and 3 standard deviations."""
+"""Probabilities of a normal error within 1, 2 and 3 stds."""
 
 
 def compute_metrics(residuals: Residuals, std: Float64) -> dict[str, Any]:
-    """All metrics of a std (n,), as plain data. Every image counts the same but in the curves.
+    """Compute all metrics of a std (n,); images have equal weight except in the curves.
 
     ``coverage``: share of errors within 1, 2, 3 std. ``z_mad``: 1.4826 times the median of
     ``|error / std|``, 1 when right. ``nll``: mean negative log density if errors were normal,
@@ -49,16 +52,17 @@ def compute_metrics(residuals: Residuals, std: Float64) -> dict[str, Any]:
 
 
 def compute_coverage(error: Float64, std: Float64, weights: Float64) -> list[float]:
-    """Share of errors (n,) within 1, 2 and 3 standard deviations (n,)."""
+    """Compute the ratio of errors (n,) within 1, 2 and 3 stds (n,)."""
     z = np.abs(error) / std
     return [float(np.average(z <= limit, weights=weights)) for limit in (1, 2, 3)]
 
 
 def sensitivity_curve(errors: Float64, std: Float64) -> dict[str, list[float]]:
-    """RMSE of the share of samples with the smallest std, and with the smallest errors.
+    """Compute the sensitivity (sparsification) curve [paper, appendix C].
 
-    Paper figure of appendix C (sparsification). ``recall`` in (0, 1]; both curves are divided by
-    the RMSE of all samples.
+    Returns:
+        ``recall`` in (0, 1]; ``predicted`` and ``ideal``: RMSE of the samples with the smallest std
+        and with the smallest errors, relative to the RMSE of all samples.
     """
     count = len(errors)
     ends = np.unique(np.ceil(np.linspace(0, 1, CURVE_POINTS + 1)[1:] * count).astype(np.int64))
@@ -69,7 +73,7 @@ def sensitivity_curve(errors: Float64, std: Float64) -> dict[str, list[float]]:
         means = np.cumsum(squared[order])[ends - 1] / ends
         return [float(value) for value in np.sqrt(means) / total]
 
-    # Samples of equal std keep a fixed random order, not that of the images they come from.
+    # Samples of equal std have a fixed random order, independent of the image.
     shuffled = np.random.default_rng(0).permutation(count)
     predicted = shuffled[np.argsort(std[shuffled], kind="stable")]
     return {
@@ -80,7 +84,7 @@ def sensitivity_curve(errors: Float64, std: Float64) -> dict[str, list[float]]:
 
 
 def _curve_by_std(error: Float64, total: Float64) -> list[dict[str, float]]:
-    """Expected and actual spread of samples of similar std."""
+    """Compute declared and actual std in bins of similar declared std."""
     return [
         {
             "std": float(np.sqrt((total[rows] ** 2).mean())),
@@ -93,6 +97,7 @@ def _curve_by_std(error: Float64, total: Float64) -> list[dict[str, float]]:
 
 
 def _by_range(residuals: Residuals, total: Float64) -> list[dict[str, Any]]:
+    """Compute coverage in ranges of depth or slant."""
     weights = residuals.weights()
     return [
         {
@@ -112,7 +117,7 @@ def _summary(error: Float64, total: Float64, weights: Float64) -> dict[str, Any]
 
 
 def _quantile_bins(values: Float64, count: int) -> list[Bool]:
-    """Rows of about equally many samples, from small to large; fewer bins for few values."""
+    """Split values into bins of similar size, from small to large; returns masks (n,)."""
     edges = np.unique(np.quantile(values, np.linspace(0, 1, count + 1)[1:-1]))
     number = np.searchsorted(edges, values, side="right")
     rows = [number == bin_ for bin_ in range(len(edges) + 1)]

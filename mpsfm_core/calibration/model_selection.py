@@ -1,7 +1,7 @@
-"""Choosing and fitting the calibration of a kind of prior.
+"""Model selection: fit calibration models of growing complexity and select the best.
 
-Several models are fitted, from the simplest on. A richer one is taken only when it explains the
-errors better by more than two standard errors over the images.
+A more complex model must improve the mean log density by more than two standard errors over the
+images.
 """
 
 from __future__ import annotations
@@ -30,21 +30,20 @@ from mpsfm_core.providers.uncertainty.calibration import (
 )
 
 Alignment = Literal["scale", "scale-shift", "disparity"]
-"""What an image's depth is unknown up to: a factor; and a shift of depth, or of inverse depth."""
+"""Ambiguity of the depth of an image: a scale; a scale and a shift of depth or of inverse depth."""
 
 EDGE_RATIOS = (1.05, 1.1, 1.2)
-"""Ratios of neighbouring depths that are tried as edges (ours; a slanted plane on a coarse map
-has steps of 2 or 3 %)."""
+"""Candidate ratios of neighboring depths at edges; slanted planes have steps of 2 to 3 % [ours]."""
 SHIFT_RANGE = (-0.95, 5.0)
-"""Of shifts, in medians of the map (ours)."""
+"""Range of shifts in medians of the depth map [ours]."""
 DEFAULT_FLOOR = 0.02
-"""Metres, where the data do not determine the floor (paper appendix C)."""
-CLEARLY = 2.0
-"""Standard errors by which a richer model must be better (ours)."""
+"""Floor of the std in meters if the data do not determine it [paper, appendix C]."""
+MIN_GAIN_STD_ERRORS = 2.0
+"""Minimum gain of a more complex model in standard errors [ours]."""
 MIN_GAIN = 1e-3
-"""Of the mean log density (ours): a std that is 2 % off costs less."""
-_DIGITS = 4
-_GRID = 61
+"""Minimum gain of the mean log density [ours]; less than the cost of a std that is 2 % off."""
+_NUM_DIGITS = 4
+_NUM_SHIFTS = 61
 _SPACES: Mapping[Alignment, Literal["depth", "disparity"]] = {
     "scale-shift": "depth",
     "disparity": "disparity",
@@ -53,19 +52,24 @@ _SPACES: Mapping[Alignment, Literal["depth", "disparity"]] = {
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One model that was tried. ``gain``: of the mean log density over the one chosen before it,
-    with its standard error over images; both 0 for the first."""
+    """Fitted calibration model."""
 
     name: str
+    """Description of the model."""
     fit: StdFit
+    """Fitted std."""
     calibration: Calibration
+    """Fitted calibration."""
     gain: float
+    """Gain of the mean log density over the previous selection; 0 for the first model."""
     standard_error: float
+    """Standard error of the gain over the images; 0 for the first model."""
     chosen: bool
+    """True if the model is better than all before."""
 
 
 def std_of(calibration: Calibration, residuals: Residuals) -> Float64:
-    """The std that a calibration declares for these errors, (n,), of log depth or in rad."""
+    """Compute the std (n,) that a calibration declares, of log depth or in rad."""
     if isinstance(calibration, DepthCalibration):
         factors = {
             "std_scale": calibration.std_scale * calibration.use_network_variance,
@@ -91,7 +95,7 @@ def std_of(calibration: Calibration, residuals: Residuals) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class DepthData:
-    """Samples of depth priors, one entry an image.
+    """Samples of depth priors, one entry per image.
 
     ``alignments``: what may be tried, the simplest first. ``in_meters``: whether the truth is.
     """
@@ -101,16 +105,16 @@ class DepthData:
     in_meters: bool = True
 
     def of(self, images: Int64) -> DepthData:
-        """The data of some images."""
+        """Return the data of some images."""
         return replace(self, samples=tuple(self.samples[i] for i in images))
 
     def residuals(self, calibration: Calibration, *, scaled: bool = True) -> Residuals:
-        """Errors after the calibration's shift and, if ``scaled``, each image's own scale."""
+        """Compute errors after the shift and, if `scaled`, after the scale of each image."""
         assert isinstance(calibration, DepthCalibration)
         return depth_residuals(self.samples, calibration, scaled=scaled)
 
     def fit(self) -> list[Candidate]:
-        """StdFit alignment, terms and edges in this order; :func:`select_candidate` is the result."""
+        """Fit alignment, terms and edges in this order, for :func:`select_candidate`."""
         floor = ("std_floor",) * self.samples[0].metric
         search = _ModelSearch()
         for alignment in self.alignments:
@@ -128,20 +132,20 @@ class DepthData:
 
 @dataclass(frozen=True, eq=False)
 class NormalData:
-    """Samples of normal priors, one entry an image."""
+    """Samples of normal priors, one entry per image."""
 
     samples: tuple[NormalSamples, ...]
 
     def of(self, images: Int64) -> NormalData:
-        """The data of some images."""
+        """Return the data of some images."""
         return replace(self, samples=tuple(self.samples[i] for i in images))
 
     def residuals(self, calibration: Calibration, *, scaled: bool = True) -> Residuals:
-        """Errors along both tangent directions; normals have no scale."""
+        """Return errors along both tangent directions; normals have no scale."""
         return normal_residuals(self.samples)
 
     def fit(self) -> list[Candidate]:
-        """StdFit a constant std, and a scale of the network's own with a floor if it has one."""
+        """Fit a constant std, and a scaled network std with a floor if available."""
         base = NormalCalibration()
         residuals = self.residuals(base)
         search = _ModelSearch()
@@ -153,37 +157,37 @@ class NormalData:
 
 
 def select_candidate(candidates: Sequence[Candidate]) -> Candidate:
-    """The chosen model: the last that was better than all before it."""
+    """Return the selected model: the last that was better than all before."""
     return next(c for c in reversed(candidates) if c.chosen)
 
 
 def calibration_from_fit(base: Calibration, fit: StdFit) -> Calibration:
-    """A fit as a calibration, with the shift of ``base``, round_significant to four digits.
+    """Convert a fit to a calibration with the shift of `base`, rounded to four digits.
 
-    What the data do not determine, as it is the largest nearly nowhere, is left out; a floor is
-    then the usual one.
+    Terms that the data do not determine, because they are rarely the largest, are left out. The
+    floor then has its default value.
     """
-    found = {
+    factors = {
         name: round_significant(value)
         for name, value, share in zip(fit.names, fit.values, fit.shares, strict=True)
         if share >= DOMINANT_SHARE
     }
     network = {
-        "std_scale": found.get("std_scale", 1.0),
-        "use_network_variance": "std_scale" in found,
+        "std_scale": factors.get("std_scale", 1.0),
+        "use_network_variance": "std_scale" in factors,
     }
     if isinstance(base, NormalCalibration):
-        floor = round_significant(np.degrees(found.get("std_floor_deg", 0.0)))
-        if "std_scale" in found:
+        floor = round_significant(np.degrees(factors.get("std_floor_deg", 0.0)))
+        if "std_scale" in factors:
             return NormalCalibration(**network, std_floor_deg=floor)
-        usual = min(NormalCalibration().std_floor_deg, floor)
-        return NormalCalibration(**network, std_floor_deg=usual, std_default_deg=floor)
+        floor_default = min(NormalCalibration().std_floor_deg, floor)
+        return NormalCalibration(**network, std_floor_deg=floor_default, std_default_deg=floor)
     limits = dict(zip(fit.names, fit.limits, strict=True))
-    usual = min(DEFAULT_FLOOR, limits.get("std_floor", DEFAULT_FLOOR))
+    floor_default = min(DEFAULT_FLOOR, limits.get("std_floor", DEFAULT_FLOOR))
     return DepthCalibration(
         **network,
-        relative_std=found.get("relative_std", 0.0),
-        std_floor=found.get("std_floor", round_significant(usual)),
+        relative_std=factors.get("relative_std", 0.0),
+        std_floor=factors.get("std_floor", round_significant(floor_default)),
         shift=round_significant(base.shift),
         shift_space=base.shift_space,
         edge_ratio=fit.edge_ratio,
@@ -192,7 +196,7 @@ def calibration_from_fit(base: Calibration, fit: StdFit) -> Calibration:
 
 
 class _CandidateModel(NamedTuple):
-    """A model to fit: ``base`` has its shift."""
+    """Model to fit; `base` has the shift."""
 
     base: Calibration
     residuals: Residuals
@@ -201,7 +205,7 @@ class _CandidateModel(NamedTuple):
 
 
 class _ModelSearch:
-    """Tries models of growing richness and remembers the best."""
+    """Search over models of growing complexity."""
 
     def __init__(self) -> None:
         self.candidates: list[Candidate] = []
@@ -209,7 +213,7 @@ class _ModelSearch:
         self._density: Float64 | None = None
 
     def offer(self, name: str, attempts: Sequence[_CandidateModel]) -> None:
-        """StdFit variants of one model; take the likeliest if it is better than the best so far."""
+        """Fit variants of a model; select the most likely if better than the selection."""
         fits = [fit_std(a.residuals, a.names, a.edge_ratio) for a in attempts]
         place = int(np.argmax([fit.log_density.mean() for fit in fits]))
         attempt, fit = attempts[place], fits[place]
@@ -217,7 +221,7 @@ class _ModelSearch:
         if self._density is not None:
             differences = fit.log_density - self._density
             gain, error = float(differences.mean()), _standard_error(differences)
-        chosen = self._density is None or gain > max(CLEARLY * error, MIN_GAIN)
+        chosen = self._density is None or gain > max(MIN_GAIN_STD_ERRORS * error, MIN_GAIN)
         calibration = calibration_from_fit(attempt.base, fit)
         self.candidates.append(Candidate(name, fit, calibration, gain, error, chosen))
         if chosen:
@@ -225,12 +229,12 @@ class _ModelSearch:
 
 
 def _standard_error(values: Float64) -> float:
-    """Of the mean; infinite for a single value, which shows no spread."""
+    """Return the standard error of the mean; infinite for a single value."""
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.inf
 
 
 def _shift(samples: Sequence[DepthSamples], alignment: Alignment) -> DepthCalibration:
-    """The model with the shift that leaves the smallest mean error of log depth."""
+    """Find the shift with the smallest mean error of log depth."""
     if alignment == "scale":
         return DepthCalibration()
     space = _SPACES[alignment]
@@ -238,21 +242,21 @@ def _shift(samples: Sequence[DepthSamples], alignment: Alignment) -> DepthCalibr
     def loss(shift: float) -> float:
         return _shift_loss(samples, DepthCalibration(shift=shift, shift_space=space))
 
-    grid = np.linspace(*SHIFT_RANGE, _GRID)
+    grid = np.linspace(*SHIFT_RANGE, _NUM_SHIFTS)
     losses = [loss(shift) for shift in grid]
     place = int(np.argmin(losses))
-    around = (grid[max(place - 1, 0)], grid[min(place + 1, _GRID - 1)])
+    around = (grid[max(place - 1, 0)], grid[min(place + 1, _NUM_SHIFTS - 1)])
     shift = float(minimize_scalar(loss, bounds=around, method="bounded").x)
     return DepthCalibration(shift=shift, shift_space=space)
 
 
 def _shift_loss(samples: Sequence[DepthSamples], model: DepthCalibration) -> float:
-    """Mean absolute error of log depth; a pixel whose depth the shift destroys is grossly wrong."""
+    """Compute the mean absolute error of log depth; pixels that the shift invalidates are gross."""
     residuals = depth_residuals(samples, model)
     lost = sum(len(image.prior) for image in samples) - len(residuals)
     return float((np.abs(residuals.error).sum() + lost * GROSS_DEPTH) / (len(residuals) + lost))
 
 
 def round_significant(value: float) -> float:
-    """A value to four significant digits: more would pretend."""
-    return float(f"{value:.{_DIGITS}g}")
+    """Round a value to four significant digits."""
+    return float(f"{value:.{_NUM_DIGITS}g}")

@@ -1,11 +1,11 @@
-"""The points of a COLMAP model as true depth.
+"""True depth from the points of a COLMAP model.
 
-The model's poses are kept; every point is placed anew where its rays alone want it. So the depth
-that a reconstruction of ours was given has no part in the depth that it is compared with, and the
-covariance of a point is that of its rays.
+The poses of the model are kept, and every point is triangulated again from its rays alone. Depth
+priors of the reconstruction therefore do not influence the truth, and the covariance of a point is
+that of its rays.
 
-Points crowd where there is texture, and there networks err less than on blank walls. What is
-compared is therefore not the points but pixels drawn evenly, each with the point nearest to it.
+Points concentrate on texture, where networks have smaller errors than on blank walls. Pixels are
+therefore sampled evenly, each with its nearest point.
 """
 
 from __future__ import annotations
@@ -28,33 +28,32 @@ from mpsfm_core.optimize.covariance import compute_point_covariances, propagate_
 from mpsfm_core.optimize.options import SOFT_L1_OPTIONS
 
 MIN_ANGLE_DEG = 2.0
-"""Points of a smaller triangulation angle are no truth (reference: robust_triangles)."""
+"""Minimum triangulation angle of a true point [reference: robust_triangles]."""
 MAX_LOG_STD = 0.05
-"""Nor is a depth that its rays leave less certain than this share of it (ours)."""
+"""Maximum relative std of a true depth [ours]."""
 MAX_ERROR_STD = 4.0
-"""Nor is a point with an observation this many standard deviations off (reference: 4 px)."""
+"""Maximum reprojection error of a true point in stds [reference: 4 px]."""
 STD_PX_RANGE = (0.3, 3.0)
-"""Bounds of the measured noise of keypoints (ours)."""
+"""Bounds of the measured keypoint noise in pixels [ours]."""
 REACH = 0.08
-"""A pixel farther than this share of the view's width from all points is not compared (ours; 0.04
-to 0.15 gave stds within 12 % in the HoloLens room)."""
+"""Maximum distance of a pixel to its nearest point, relative to the image width [ours]."""
 
 
 def depth_truth_from_model(
     model: pycolmap.Reconstruction, images: ImageSet
 ) -> dict[str, DepthTruth]:
-    """True depth at the observed points of each image that both the model and the set have."""
+    """Triangulate true depth at the observed points of each common image, by image name."""
     seen = _observe(model, images)
     if not len(seen.points):
         return {}
     problem = _triangulate(seen)
-    depth = _in_camera(problem)[:, 2]
+    depth = _camera_points(problem)[:, 2]
     variance = propagate_depth_variance(
         compute_point_covariances(problem, SOFT_L1_OPTIONS)[seen.point],
         problem.rotations[seen.image],
     )
     std = np.sqrt(variance) / np.maximum(depth, 1e-9)
-    good = _well_placed(problem)[seen.point] & (depth > 0) & (std < MAX_LOG_STD)
+    good = _reliable_points(problem)[seen.point] & (depth > 0) & (std < MAX_LOG_STD)
     truth = {}
     for number, name in enumerate(seen.names):
         rows = good & (seen.image == number)
@@ -65,10 +64,15 @@ def depth_truth_from_model(
 def sample_evenly(
     truth: DepthTruth, size: tuple[int, int], count: int, rng: np.random.Generator
 ) -> DepthTruth:
-    """The points nearest to ``count`` pixels drawn evenly from a view of ``size`` (width, height).
+    """Sample pixels uniformly and take the nearest point of each.
 
-    A point occurs as often as it stands for a pixel, a pixel without a point in :data:`REACH` is
-    left out.
+    A point may occur repeatedly. Pixels without a point within :data:`REACH` are left out.
+
+    Args:
+        truth: True depth at points.
+        size: (width, height) of the view.
+        count: Number of pixels.
+        rng: Random generator.
     """
     pixels = rng.uniform((0.0, 0.0), size, (count, 2))
     reach = REACH * size[0]
@@ -78,25 +82,30 @@ def sample_evenly(
 
 
 class _ModelObservations(NamedTuple):
-    """Observations of a model, sorted by point.
-
-    ``names``: of the images, ``rotations`` (n, 3, 3), ``translations`` (n, 3), ``focals`` (n,).
-    ``points``: (p, 3). ``image``, ``point``: (m,), ``xy``: (m, 2), undistorted and relative to the
-    principal point; ``view_xy``: (m, 2), pixels of the view.
-    """
+    """Observations of a model with n images, p points and m observations, sorted by point."""
 
     names: list[str]
+    """Names of the images."""
     rotations: Float64
+    """(n, 3, 3) rotations of ``cam_from_world``."""
     translations: Float64
+    """(n, 3) translations of ``cam_from_world``."""
     focals: Float64
+    """(n,) focal lengths in pixels."""
     points: Float64
+    """(p, 3) points, world frame."""
     image: Int64
+    """(m,) image of each observation."""
     point: Int64
+    """(m,) point of each observation."""
     xy: Float64
+    """(m, 2) undistorted pixels relative to the principal point."""
     view_xy: Float64
+    """(m, 2) pixels of the view."""
 
 
 def _observe(model: pycolmap.Reconstruction, images: ImageSet) -> _ModelObservations:
+    """Collect the observations of the common images."""
     sources = {image.name: image for image in images}
     posed = [i for i in model.images.values() if i.has_pose and i.name in sources]
     posed.sort(key=lambda image: str(image.name))
@@ -130,7 +139,7 @@ def _observe(model: pycolmap.Reconstruction, images: ImageSet) -> _ModelObservat
 
 
 def _triangulate(seen: _ModelObservations) -> BundleProblem:
-    """Points where their rays want them for the given poses; the noise of keypoints measured."""
+    """Triangulate all points for fixed poses and measure the keypoint noise."""
     zeros = np.zeros(len(seen.focals))
     problem = BundleProblem(
         seen.rotations,
@@ -148,19 +157,19 @@ def _triangulate(seen: _ModelObservations) -> BundleProblem:
 
 
 def _noise_px(problem: BundleProblem) -> float:
-    """Std of keypoints, from the residuals of points that more than two images see."""
+    """Estimate the std of keypoints from the residuals of tracks longer than two."""
     lengths = np.bincount(problem.obs_point)[problem.obs_point]
     long = lengths > 2
     if not long.any():
         return 1.0
-    # A point has three coordinates that fit themselves to its 2 x length residuals.
+    # A point has 3 parameters for 2 x length residuals, so 2 x length - 3 degrees of freedom.
     lost = np.sqrt(2 * lengths[long] / (2 * lengths[long] - 3))
     residuals = _residuals(problem)[long] * lost[:, None]
     return float(np.clip(MAD_TO_STD * np.median(np.abs(residuals)), *STD_PX_RANGE))
 
 
-def _well_placed(problem: BundleProblem) -> Bool:
-    """(p,) points that are seen under a large angle and agree with all their observations."""
+def _reliable_points(problem: BundleProblem) -> Bool:
+    """Return the mask (p,) of points with a large angle and small errors in all images."""
     centers = camera_center(problem.rotations, problem.translations)[problem.obs_image]
     angles = compute_max_triangulation_angles(
         problem.points, np.asarray(problem.obs_point, dtype=np.int64), centers
@@ -172,8 +181,8 @@ def _well_placed(problem: BundleProblem) -> Bool:
     return good
 
 
-def _in_camera(problem: BundleProblem) -> Float64:
-    """Points (m, 3) of all observations in their camera frames."""
+def _camera_points(problem: BundleProblem) -> Float64:
+    """Transform the points of all observations to their camera frames, (m, 3)."""
     points: Float64 = np.einsum(
         "nij,nj->ni", problem.rotations[problem.obs_image], problem.points[problem.obs_point]
     )
@@ -182,8 +191,8 @@ def _in_camera(problem: BundleProblem) -> Float64:
 
 
 def _residuals(problem: BundleProblem) -> Float64:
-    """Reprojection residuals (m, 2), pixels; infinite behind the camera."""
-    points = _in_camera(problem)
+    """Compute reprojection residuals (m, 2) in pixels; infinite behind the camera."""
+    points = _camera_points(problem)
     focal = problem.intrinsics[problem.camera_of_image[problem.obs_image], 0]
     front = points[:, 2] > 0
     projected = points[:, :2] / np.where(front, points[:, 2], 1.0)[:, None] * focal[:, None]

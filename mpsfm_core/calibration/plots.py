@@ -1,4 +1,4 @@
-"""The plots of a calibration report as one drawing. Needs matplotlib: ``mpsfm-core[report]``."""
+"""Plots of a calibration report; requires matplotlib (``mpsfm-core[report]``)."""
 
 from __future__ import annotations
 
@@ -18,9 +18,12 @@ Metrics = Mapping[str, Any]
 
 
 def draw_plots(metrics: Mapping[str, Metrics], place: str, error: str) -> tuple[str, bytes]:
-    """Four plots of the metrics ``before`` and ``after``: an SVG element, and a PNG file.
+    """Draw four plots of the metrics ``before`` and ``after`` as SVG element and PNG file.
 
-    ``place``: what errors are broken down by, ``error``: what they are, both with units.
+    Args:
+        metrics: Metrics by ``before`` and ``after``.
+        place: Label of the quantity that errors are broken down by.
+        error: Label of the errors.
     """
     panels: tuple[Callable[[Axes, Mapping[str, Metrics]], None], ...] = (
         _sensitivity,
@@ -28,7 +31,7 @@ def draw_plots(metrics: Mapping[str, Metrics], place: str, error: str) -> tuple[
         _coverage,
         _ranges,
     )
-    # Fixed salt and no date: the same numbers give the same file.
+    # Fixed salt and no date, so that equal values give equal files.
     with mpl.rc_context({"svg.hashsalt": "mpsfm", "font.size": 9, "svg.fonttype": "none"}):
         figure = Figure(figsize=(10, 7.5), layout="constrained")
         for axes, panel in zip(figure.subplots(2, 2).flat, panels, strict=True):
@@ -51,7 +54,7 @@ def _sensitivity(axes: Axes, metrics: Mapping[str, Metrics]) -> None:
         axes.plot(curve["recall"], curve["predicted"], color, label=f"{when} (AUSE {area:.3f})")
     curve = metrics["after"]["sensitivity"]
     axes.plot(curve["recall"], curve["ideal"], IDEAL, ls="--", label="by true error")
-    axes.set(xlabel="share of pixels, most certain first", ylabel="RMSE / RMSE of all")
+    axes.set(xlabel="ratio of pixels, most certain first", ylabel="RMSE / RMSE of all")
     axes.set_title("Sensitivity")
 
 
@@ -73,7 +76,7 @@ def _coverage(axes: Axes, metrics: Mapping[str, Metrics]) -> None:
         axes.bar([k + offset for k in (1, 2, 3)], shares, 0.34, color=color, label=when)
     sigmas = np.arange(1, 4)
     axes.hlines(NORMAL_COVERAGE, sigmas - 0.4, sigmas + 0.4, IDEAL, ls="--", label="normal")
-    axes.set(xlabel="standard deviations", ylabel="share of errors within", xticks=(1, 2, 3))
+    axes.set(xlabel="standard deviations", ylabel="ratio of errors within", xticks=(1, 2, 3))
     axes.set_title("Coverage on held-out images")
 
 
@@ -83,5 +86,5 @@ def _ranges(axes: Axes, metrics: Mapping[str, Metrics]) -> None:
         middle = [(b["from"] + b["to"]) / 2 for b in bins]
         axes.plot(middle, [b["coverage"][0] for b in bins], color, marker="o", ms=4, label=when)
     axes.axhline(NORMAL_COVERAGE[0], color=IDEAL, ls="--", label="ideal")
-    axes.set(ylim=(0, 1), ylabel="share within 1 std")
+    axes.set(ylim=(0, 1), ylabel="ratio within 1 std")
     axes.set_title("Coverage by range")

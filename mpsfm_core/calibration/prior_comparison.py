@@ -1,4 +1,4 @@
-"""Runs the provider that is to be calibrated on all images and compares it with the truth."""
+"""Comparison of a provider's priors with the truth on all images."""
 
 from __future__ import annotations
 
@@ -30,12 +30,17 @@ from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 Samples = TypeVar("Samples", DepthSamples, NormalSamples)
 
 ALL_ALIGNMENTS: tuple[Alignment, ...] = ("scale", "scale-shift", "disparity")
+"""Alignments of priors that are not metric."""
 
 
 class PriorComparison:
-    """Samples of one kind of prior beside the truth.
+    """Comparison of one kind of prior with the truth.
 
-    ``alignments``: what may be tried for depth, None for what suits the provider.
+    Args:
+        context: Extraction context.
+        kind: Kind of the prior.
+        alignments: Candidate alignments of depth; None for the default of the provider.
+        options: Options of the study.
     """
 
     def __init__(
@@ -53,14 +58,17 @@ class PriorComparison:
 
     @property
     def provider(self) -> ActiveProvider:
-        """The provider that is calibrated."""
+        """Provider to calibrate."""
         return (self._kind == "normals" and self._raw.normals) or self._raw.depth
 
     def with_files(self, options: Mapping[str, Any]) -> CalibrationData:
         """Compare with true maps in files; images without a file are left out.
 
+        Args:
+            options: Options of the provider ``files``.
+
         Raises:
-            InputError: no image has one, or none has enough valid pixels.
+            InputError: No image has a file or enough valid pixels.
         """
         sampling = self._options
         truth = FileTruth(
@@ -68,7 +76,10 @@ class PriorComparison:
         )
         known = [i for i in range(len(self._context.images)) if truth.has(self._context.view(i))]
         if not known:
-            raise InputError(f"{options['directory']} has no file for any of the images")
+            raise InputError(
+                f"{options['directory']} has no file for any of the images; "
+                "files must be named like the images"
+            )
         if self._kind == "normals":
             return NormalData(self._compare(known, lambda i: self._normals(i, truth)))
 
@@ -78,10 +89,13 @@ class PriorComparison:
         return self._depth_data(self._compare(known, depth), in_meters=True)
 
     def with_points(self, truth: Mapping[str, DepthTruth]) -> CalibrationData:
-        """Compare with depth at points of any unit, by image name; each counts by its area.
+        """Compare with true depth at points, weighted by image area.
+
+        Args:
+            truth: True depth by image name, in any unit.
 
         Raises:
-            InputError: no image has enough of them.
+            InputError: No image has enough points.
         """
         names, sampling = self._context.images.names, self._options
         points = {i: truth[name] for i, name in enumerate(names) if name in truth}

@@ -1,5 +1,4 @@
-"""The report of a calibration: one HTML page that needs nothing else, its plots as PNG, and its
-numbers as JSON."""
+"""Report of a calibration: self-contained HTML page, plots as PNG, values as JSON."""
 
 from __future__ import annotations
 
@@ -34,7 +33,7 @@ _METRICS = {
     "rmse": "RMSE",
 }
 FORMAT = 1
-"""Of ``NAME.report.json``."""
+"""Format version of ``NAME.report.json``."""
 _IDEAL = {
     "coverage": NORMAL_COVERAGE,
     "coverage_of_folds": NORMAL_COVERAGE[:1],
@@ -44,10 +43,16 @@ _IDEAL = {
 
 
 def write_report(calibration_file: Path, report: Mapping[str, Any]) -> tuple[Path, Path]:
-    """Write ``NAME.report.html``, ``.json`` and ``.png`` beside ``NAME.yaml``.
+    """Write ``NAME.report.html``, ``.json`` and ``.png`` next to ``NAME.yaml``.
 
-    The plots need matplotlib; without it there is no PNG, and the page says so. Returns the paths
-    of page and numbers.
+    Without matplotlib there is no PNG, and the page has a hint.
+
+    Args:
+        calibration_file: Calibration file ``NAME.yaml`` or ``NAME.json``.
+        report: Values of the report.
+
+    Returns:
+        Paths of the HTML page and the JSON file.
     """
     page = calibration_file.with_suffix(".report.html")
     numbers = calibration_file.with_suffix(".report.json")
@@ -68,17 +73,17 @@ def _page(report: Mapping[str, Any], plots: str) -> str:
         *(f'<p class="warning">{escape(text)}</p>' for text in report["warnings"]),
         "<h2>Values</h2>",
         _table(("", "before", "after", "95 % interval", "largest for"), _values(report)),
-        f"<h2>On images held out ({report['folds']} folds)</h2>",
+        f"<h2>Cross-validation ({report['folds']} folds)</h2>",
         _table(("", "before", "after", "ideal"), _metrics(report["metrics"])),
         plots,
         f"<h2>By {escape(report['place'])}</h2>",
         _table(("from", "to", "pixels", "std", "before", "after", "z after"), _ranges(report)),
         "<h2>Models tried</h2>",
-        "<p>A model is chosen when it explains the errors better than the one chosen before it by "
-        "more than two standard errors over the images.</p>",
+        "<p>A model is selected if it improves the log density over the previous selection by more "
+        "than two standard errors over the images.</p>",
         _table(("model", "log density", "gain", "standard error", "chosen"), _candidates(report)),
         *_rounds(report),
-        "<h2>Where it comes from</h2>",
+        "<h2>Provenance</h2>",
         _table((), [(key, _text(value)) for key, value in made.items() if key != "metrics"]),
     ]
     head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{_STYLE}</style>'
@@ -102,8 +107,8 @@ def _abstract(report: Mapping[str, Any]) -> str:
     return (
         f"{text} The std is that of depth after each image was given its own scale, as the mapper "
         f"does. True over predicted depth is {scale['median']:.3f} in the median image, and its "
-        f"log has a spread of {scale['log_spread']:.3f} over the images; who uses the depth "
-        f"without estimating scales has to add this."
+        f"log has a std of {scale['log_spread']:.3f} over the images. Without "
+        f"scale estimation, add this std."
     )
 
 
@@ -138,7 +143,7 @@ def _candidates(report: Mapping[str, Any]) -> Iterable[Sequence[str]]:
 
 
 def _rounds(report: Mapping[str, Any]) -> Iterable[str]:
-    """The rounds of a self-calibration."""
+    """Format the rounds of a self-calibration."""
     rounds = report.get("rounds", [])
     if rounds:
         rows = [
@@ -150,11 +155,11 @@ def _rounds(report: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _plots(report: Mapping[str, Any]) -> tuple[str, bytes | None]:
-    """For the page, and as a PNG file."""
+    """Return the plots for the page and as PNG file; None without matplotlib."""
     try:
         from mpsfm_core.calibration.plots import draw_plots
     except ImportError:
-        return "<p>The plots need matplotlib: pip install 'mpsfm-core[report]'</p>", None
+        return "<p>The plots require matplotlib: pip install 'mpsfm-core[report]'</p>", None
     return draw_plots(report["metrics"], report["place"], _ERRORS[report["kind"]])
 
 

@@ -1,4 +1,4 @@
-"""A prior beside the truth: what is compared, and the errors that a calibration is fitted to."""
+"""Samples of a prior and the truth, and the errors that a calibration is fitted to."""
 
 from __future__ import annotations
 
@@ -19,101 +19,114 @@ from mpsfm_core.geometry import (
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, depth_medians
 
 MIN_SAMPLES = 20
-"""An image with fewer says nothing about its scale and is left out (ours)."""
+"""Minimum number of samples to estimate the scale of an image [ours]."""
 GROSS_DEPTH = float(np.log(4))
+"""Largest error of log depth, for the density of gross errors [ours]."""
 GROSS_NORMAL = float(np.pi / 2)
-"""Largest errors of log depth and of a normal's direction, for the density of gross errors: a
-factor of 4 is no estimate any more (ours)."""
+"""Largest error of a normal in rad, for the density of gross errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthTruth:
-    """True depth z at some pixels of a view.
-
-    ``xy``: (n, 2) float64, COLMAP pixels of the view. ``depth``: (n,) float64, > 0. ``std``: (n,)
-    float64, of the log of the true depth, 0 where it is exact.
-    """
+    """True depth at n pixels of a view."""
 
     xy: Float64
+    """(n, 2) float64, COLMAP pixels of the view."""
     depth: Float64
+    """(n,) float64 z-depth > 0."""
     std: Float64
+    """(n,) float64 std of the log of the true depth; 0 if exact."""
 
 
 @dataclass(frozen=True, eq=False)
 class NormalTruth:
-    """True normals (n, 3), unit, camera frame, at pixels ``xy`` (n, 2) of a view; ``std``: (n,)
-    rad, along each of the two tangent directions."""
+    """True normals at n pixels of a view."""
 
     xy: Float64
+    """(n, 2) float64, COLMAP pixels of the view."""
     normals: Float64
+    """(n, 3) unit normals, camera frame."""
     std: Float64
+    """(n,) std in rad along each tangent direction."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthSamples:
-    """Prior and true depth at ``n`` pixels of one image; all (n,) float64.
-
-    ``network_std`` is None when the network gives none. ``step``: largest step of log depth to a
-    neighbour. ``depth_medians``: of depth and of inverse depth over the prior's map.
-    """
+    """Prior and true depth at n pixels of one image."""
 
     name: str
+    """Name of the image."""
     prior: Float64
+    """(n,) prior depth."""
     network_std: Float64 | None
+    """(n,) std that the network predicts; None without."""
     step: Float64
+    """(n,) largest step of log depth to a neighbor."""
     truth: Float64
+    """(n,) true depth."""
     truth_std: Float64
+    """(n,) std of the log of the true depth."""
     depth_medians: tuple[float, float]
+    """Medians of depth and of inverse depth over the depth map."""
     metric: bool
+    """True if the prior is in meters."""
 
 
 @dataclass(frozen=True, eq=False)
 class NormalSamples:
-    """Predicted and true normals (n, 3) at ``n`` pixels of one image; stds (n,) in rad."""
+    """Predicted and true normals at n pixels of one image."""
 
     name: str
+    """Name of the image."""
     prior: Float64
+    """(n, 3) predicted normals."""
     network_std: Float64 | None
+    """(n,) std that the network predicts in rad; None without."""
     truth: Float64
+    """(n, 3) true normals."""
     truth_std: Float64
+    """(n,) std of the true normals in rad."""
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Errors of a prior and what their std may be made of; all (n,) float64 but where said.
-
-    ``error``: of log depth, or of a normal along one tangent direction in rad. ``noise``: std of
-    the truth in the same unit. ``terms``: (n, m), the std is ``max_j(theta_j * terms_j)``;
-    ``names``: of the ``theta_j``. ``step``: of log depth beside the pixel, 0 for normals.
-    ``image``: (n,) int64. ``magnitude``: the error as a user sees it (metres, rad), and ``unit``:
-    what turns a std into it. ``place``: what errors are broken down by (depth; slant in degrees).
-    ``images``: number of images. ``limit``: largest error; those beyond are as gross as it.
-    ``scales``: log of each image's scale, empty for normals.
-    """
+    """Errors of a prior at n samples, with the m terms of their std ``max_j(theta_j * term_j)``."""
 
     error: Float64
+    """(n,) errors of log depth, or of a normal along one tangent direction in rad."""
     noise: Float64
+    """(n,) std of the truth in the unit of ``error``."""
     terms: Float64
+    """(n, m) terms of the std."""
     names: tuple[str, ...]
+    """(m,) names of the factors ``theta_j``."""
     step: Float64
+    """(n,) largest step of log depth to a neighbor; 0 for normals."""
     image: Int64
+    """(n,) index of the image."""
     magnitude: Float64
+    """(n,) absolute error in meters or rad."""
     unit: Float64
+    """(n,) factor that converts the std to the unit of ``magnitude``."""
     place: Float64
+    """(n,) quantity that errors are broken down by: depth, or slant in degrees."""
     images: int
+    """Number of images."""
     limit: float
+    """Largest error; larger errors are clipped."""
     scales: Float64
+    """(images,) log of the scale of each image; empty for normals."""
 
     def __len__(self) -> int:
         return len(self.error)
 
     def weights(self) -> Float64:
-        """(n,), 1 / the number of samples of the image: every image counts the same."""
+        """Return weights (n,), the inverse number of samples of the image."""
         return 1.0 / np.bincount(self.image, minlength=self.images)[self.image]
 
 
 def concatenate_residuals(parts: Sequence[Residuals]) -> Residuals:
-    """Residuals of different images as one."""
+    """Concatenate the residuals of different images."""
     names = ("error", "noise", "terms", "step", "magnitude", "unit", "place", "scales")
     arrays: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}
     firsts = np.cumsum([0, *(part.images for part in parts)])
@@ -124,9 +137,16 @@ def concatenate_residuals(parts: Sequence[Residuals]) -> Residuals:
 def compare_depth(
     name: str, prior: DepthPrior, size: tuple[int, int], truth: DepthTruth
 ) -> DepthSamples | None:
-    """Sample the prior of a view of ``size`` (width, height) where the truth is known.
+    """Sample a depth prior bilinearly where the truth is known, as the mapper does at keypoints.
 
-    Bilinear, as the mapper does at keypoints. None when fewer than :data:`MIN_SAMPLES` are valid.
+    Args:
+        name: Name of the image.
+        prior: Depth prior.
+        size: (width, height) of the view.
+        truth: True depth.
+
+    Returns:
+        The samples, or None with fewer than :data:`MIN_SAMPLES` valid samples.
     """
     xy = scale_pixels(truth.xy, size, (prior.shape[1], prior.shape[0]))
     depth, ok = sample_bilinear(prior.depth, prior.valid, xy)
@@ -151,7 +171,7 @@ def compare_depth(
 def compare_normals(
     name: str, prior: NormalPrior, size: tuple[int, int], truth: NormalTruth
 ) -> NormalSamples | None:
-    """Take the prior's nearest pixel where the truth is known; None as :func:`compare_depth`."""
+    """Sample the nearest normals where the truth is known; see :func:`compare_depth`."""
     xy = scale_pixels(truth.xy, size, (prior.shape[1], prior.shape[0]))
     ok = sample_nearest(prior.valid, xy)
     if ok.sum() < MIN_SAMPLES:
@@ -166,7 +186,7 @@ def compare_normals(
 def depth_residuals(
     samples: Sequence[DepthSamples], model: DepthCalibration, *, scaled: bool = True
 ) -> Residuals:
-    """Errors of log depth after the model's shift and, if ``scaled``, each image's own scale.
+    """Compute errors of log depth after the shift and, if `scaled`, the scale per image.
 
     The scale of an image is the median ratio of truth to prior, as in the mapper.
     """
@@ -190,11 +210,11 @@ def depth_residuals(
         columns = (error, noise, image.step[ok], magnitude, unit, truth)
         parts.append((np.stack(columns), np.stack(terms, axis=1), np.full(len(depth), number)))
     names = ("std_scale",) * network + ("relative_std",) + ("std_floor",) * samples[0].metric
-    return _joined(parts, names, GROSS_DEPTH, np.array(scales))
+    return _build_residuals(parts, names, GROSS_DEPTH, np.array(scales))
 
 
 def normal_residuals(samples: Sequence[NormalSamples]) -> Residuals:
-    """Errors of normals along both tangent directions, in rad; each pixel counts twice."""
+    """Compute errors of normals along both tangent directions in rad; a pixel gives two errors."""
     network = all(image.network_std is not None for image in samples)
     parts = []
     for number, image in enumerate(samples):
@@ -209,12 +229,19 @@ def normal_residuals(samples: Sequence[NormalSamples]) -> Residuals:
             columns = (component, image.truth_std, 0 * ones, angle, ones, slant)
             parts.append((np.stack(columns), np.stack(terms, axis=1), np.full(len(ones), number)))
     names = ("std_scale",) * network + ("std_floor_deg",)
-    return _joined(parts, names, GROSS_NORMAL, np.zeros(0))
+    return _build_residuals(parts, names, GROSS_NORMAL, np.zeros(0))
 
 
 def tangent_errors(prior: Float64, truth: Float64) -> Float64:
-    """Where the true normals (n, 3) lie as seen from the predicted ones: (n, 2) rad, along two
-    orthogonal tangent directions; the length is the angle between them."""
+    """Compute the tangent vectors from predicted to true normals.
+
+    Args:
+        prior: (n, 3) predicted unit normals.
+        truth: (n, 3) true unit normals.
+
+    Returns:
+        (n, 2) rad along two orthogonal tangent directions; the length is the angle.
+    """
     first = np.cross(prior, np.array([0.0, 1.0, 0.0]))
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
     second = np.cross(prior, first)
@@ -225,7 +252,7 @@ def tangent_errors(prior: Float64, truth: Float64) -> Float64:
     return errors
 
 
-def _joined(
+def _build_residuals(
     parts: list[tuple[Float64, Float64, Int64]],
     names: tuple[str, ...],
     limit: float,

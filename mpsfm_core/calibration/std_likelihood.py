@@ -1,14 +1,13 @@
-"""Fitting a std of the form ``max_j(theta_j * term_j)`` to errors.
+"""Maximum-likelihood fit of a std ``max_j(theta_j * term_j)`` to errors.
 
-Criterion. An error has the modelled variance plus the truth's and a Student t distribution, as
-networks err more often by a lot than a normal distribution has it; or, with a small probability
-that is fitted too, it is gross: uniform up to the largest possible error. Maximising this
-likelihood finds the proportions of the terms without being led by outliers. Their common factor
-is then set by coverage, which a user can check: 68.27 % of the errors that are not gross lie
-within one std. Every image counts the same, however many pixels it has.
+The likelihood is a mixture. An inlier error has a Student t distribution with the modeled variance
+plus the variance of the truth, because networks have heavier tails than a normal distribution. A
+gross error is uniform up to the largest possible error; the ratio of gross errors is fitted, too.
+Maximum likelihood determines the proportions of the terms. Their common factor is set by coverage:
+68.27 % of the inlier errors are within one std. All images have equal weight.
 
-The paper chose the factors of appendix C by looking at calibration plots and at the area under
-sensitivity curves; the likelihood rewards both the ranking and the size of the std.
+The paper chose the factors of appendix C from calibration plots and the area under sensitivity
+curves. The likelihood rewards both the ranking and the size of the std.
 """
 
 from __future__ import annotations
@@ -27,46 +26,54 @@ from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.geometry.statistics import MAD_TO_STD, weighted_quantile
 
 ONE_SIGMA = 0.6827
-"""Share of normal errors within one std."""
+"""Probability of a normal error within one std."""
 FREEDOM = 4.0
-"""Degrees of freedom of the errors (Lange, Little & Taylor, JASA 1989: 4 as a robust choice)."""
+"""Degrees of freedom of the Student t distribution [Lange, Little & Taylor, JASA 1989]."""
 MAX_GROSS = 0.5
+"""Maximum ratio of gross errors."""
 DOMINANT_SHARE = 0.01
-"""A term that is the largest for fewer of the samples is not determined by them (ours)."""
+"""Minimum ratio of samples with a dominant term that determine the term [ours]."""
 STD_OF_T = float(student_t(FREEDOM).ppf(0.5 + ONE_SIGMA / 2))
-"""Scales of that distribution that cover as much as one std of a normal one."""
+"""Scale factor of the t distribution with the coverage of one normal std."""
 _NORMALISER = gamma(0.5 * (FREEDOM + 1)) / gamma(0.5 * FREEDOM) / np.sqrt(FREEDOM * np.pi)
 _RESTARTS = 5
 _SMALLEST_GAIN = 1e-6
 _RANGE = 1e4
-"""A factor lies within this of what it is as the only one."""
+"""Bound of a factor relative to its value as the only term."""
 
 
 @dataclass(frozen=True, eq=False)
 class StdFit:
-    """A fitted std.
-
-    ``names``: of the terms used, ``values``: (m,) their factors. ``edge_ratio``: pixels beside a
-    larger ratio of depths have ``edge_scale`` times the std; None: no edges. ``gross``: share of
-    gross errors. ``shares``: (m,), of how many samples each term is the largest; ``limits``: (m,),
-    factors up to which a term is the largest for so few that it is not determined.
-    ``log_density``: (images,), mean of each image.
-    """
+    """Fitted std with m terms."""
 
     names: tuple[str, ...]
+    """Names of the terms."""
     values: Float64
+    """(m,) factors of the terms."""
     edge_ratio: float | None
+    """Minimum ratio of neighboring depths at an edge; None without edges."""
     edge_scale: float
+    """Factor of the std at edges."""
     gross: float
+    """Ratio of gross errors."""
     shares: Float64
+    """(m,) ratio of samples for which each term is the largest."""
     limits: Float64
+    """(m,) factors up to which a term is not determined, because it is rarely the largest."""
     log_density: Float64
+    """(images,) mean log density per image."""
 
 
 def fit_std(
     residuals: Residuals, names: Sequence[str] | None = None, edge_ratio: float | None = None
 ) -> StdFit:
-    """StdFit the factors of some terms (all by default) and, if asked, of edges."""
+    """Fit the factors of the terms and of edges.
+
+    Args:
+        residuals: Errors and terms.
+        names: Names of the terms; all by default.
+        edge_ratio: Minimum ratio of neighboring depths at an edge; None for no edges.
+    """
     problem = _Problem(residuals, tuple(names or residuals.names), edge_ratio)
     best = min((problem.solve(start) for start in problem.starts()), key=lambda found: found[1])
     return problem.finish(best[0])
@@ -75,7 +82,11 @@ def fit_std(
 def bootstrap_fit(
     residuals: Residuals, fit: StdFit, count: int, rng: np.random.Generator
 ) -> Float64:
-    """The fit repeated on images drawn with replacement: (count, m + 1), factors and edge scale."""
+    """Repeat a fit on bootstrap samples of images.
+
+    Returns:
+        (count, m + 1) factors and edge scale.
+    """
     problem = _Problem(residuals, fit.names, fit.edge_ratio)
     start = problem.vector(fit)
     drawn = np.empty((count, len(fit.names) + 1))
@@ -90,18 +101,26 @@ def bootstrap_fit(
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """All that the likelihood and its gradient are made of, at one parameter vector."""
+    """Terms of the likelihood and its gradient for n errors at one parameter vector."""
 
     largest: Int64
+    """(n,) index of the largest term."""
     variance: Float64
+    """(n,) modeled variance."""
     total: Float64
+    """(n,) modeled variance plus variance of the truth."""
     inlier: Float64
+    """(n,) posterior probability of an inlier."""
     log_density: Float64
+    """(n,) log density."""
 
 
 class _Problem:
-    """Parameters: logs of the factors, log of the edge scale if there are edges, logit of the
-    share of gross errors over its maximum."""
+    """Optimization problem of the fit.
+
+    The parameters are the logs of the factors, the log of the edge scale (with edges), and the
+    logit of the ratio of gross errors relative to its maximum.
+    """
 
     def __init__(
         self, residuals: Residuals, names: tuple[str, ...], edge_ratio: float | None
@@ -122,13 +141,13 @@ class _Problem:
         self._alone = self._factors_alone()
 
     def reweighted(self, repeats: Int64) -> _Problem:
-        """The same with each image counted this often."""
+        """Return the problem with each image repeated the given number of times."""
         other = copy(self)
         other._weights = self._weights * repeats[self._residuals.image]
         return other
 
     def starts(self) -> list[Float64]:
-        """All terms alike, and each term the largest in turn."""
+        """Return start vectors: all terms equal, and each term dominant in turn."""
         count = len(self._names)
         rest = [0.0] * (self._edge_ratio is not None) + [-2.0]
         mixes = [np.zeros(count)]
@@ -137,18 +156,18 @@ class _Problem:
         return [np.concatenate([self._alone + mix, rest]) for mix in mixes]
 
     def vector(self, fit: StdFit) -> Float64:
-        """The parameters of a fit."""
+        """Return the parameter vector of a fit."""
         edges = [np.log(fit.edge_scale)] * (self._edge_ratio is not None)
         share = np.clip(fit.gross / MAX_GROSS, 1e-4, 1 - 1e-4)
         return np.concatenate([np.log(fit.values), edges, [np.log(share / (1 - share))]])
 
     def solve(self, start: Float64) -> tuple[Float64, float]:
-        """Parameters and negative log likelihood of the maximum near a start."""
+        """Minimize the negative log likelihood from a start; returns parameters and minimum."""
         span = np.log(_RANGE)
         bounds = [(v - span, v + span) for v in self._alone]
         bounds += [(0.0, span)] * (self._edge_ratio is not None) + [(-9.0, 9.0)]
         best = minimize(self._objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
-        for _ in range(_RESTARTS):  # the largest term changes, where its memory is of no use
+        for _ in range(_RESTARTS):  # changes of the largest term invalidate the L-BFGS memory
             again = minimize(self._objective, best.x, jac=True, method="L-BFGS-B", bounds=bounds)
             gain = best.fun - again.fun
             best = again if gain > 0 else best
@@ -157,7 +176,7 @@ class _Problem:
         return np.asarray(best.x), float(best.fun)
 
     def finish(self, vector: Float64) -> StdFit:
-        """Set the common factor by coverage and describe the result."""
+        """Set the common factor by coverage and build the fit."""
         state = self._evaluate(vector)
         count = len(self._names)
         inside = np.maximum(self._squared - self._noise, 0) / state.variance
@@ -182,7 +201,7 @@ class _Problem:
         )
 
     def _limits(self, vector: Float64) -> Float64:
-        """Factors up to which each term is hidden by the others; infinite for a single term."""
+        """Compute factors up to which other terms dominate; infinite for a single term."""
         count = len(self._names)
         limits = np.full(count, np.inf)
         scaled = self._terms * np.exp(vector[:count])
@@ -192,7 +211,7 @@ class _Problem:
         return limits
 
     def _factors_alone(self) -> Float64:
-        """Log of each factor if its term were the only one, by the median error."""
+        """Compute the log of each factor as the only term, from the median error."""
         spread = MAD_TO_STD * np.median(np.abs(self._residuals.error))
         values: Float64 = np.log(max(spread, 1e-9) / np.median(self._terms, axis=0))
         return values
@@ -216,7 +235,7 @@ class _Problem:
         return self._squared * (STD_OF_T**2 / FREEDOM) / total
 
     def _objective(self, vector: Float64) -> tuple[float, Float64]:
-        """Negative mean log density and its gradient."""
+        """Compute the negative mean log density and its gradient."""
         state, weights, count = self._evaluate(vector), self._weights, len(self._names)
         # d log density / d log std, through the variance
         far = self._far(state.total)
@@ -233,4 +252,5 @@ class _Problem:
 
 
 def _gross(logit: float) -> float:
+    """Convert the logit parameter to the ratio of gross errors."""
     return float(MAX_GROSS / (1 + np.exp(-logit)))

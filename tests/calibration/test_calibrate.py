@@ -86,7 +86,7 @@ def test_the_report_has_plots_and_numbers(calibrated: Path) -> None:
     page = calibrated.with_suffix(".report.html").read_text()
     assert page.count("<svg") == 1
     assert not re.search(r"<script|(src|href)=.http|url\(http", page)
-    for text in ("Sensitivity", "AUSE", "1.4826 MAD", "too few to know", "std_scale"):
+    for text in ("Sensitivity", "AUSE", "1.4826 MAD", "add more images", "std_scale"):
         assert text in page
     numbers = json.loads(calibrated.with_suffix(".report.json").read_text())
     assert numbers["provenance"] == provenance(calibrated)
