@@ -142,7 +142,7 @@ def main() -> int:
             overrides=("runtime.workers=1",),
             workers=arguments.workers,
         )
-        records = run_benchmark(plan, output, done=print_progress)
+        records = run_benchmark(plan, output, on_record=print_progress)
         write_report(output, records)
         pooled = [_pooled(record) for record in records]
         rows = build_rows(pooled)

@@ -58,7 +58,7 @@ def main() -> None:
         options = prepared.config.mapper_options()
         for item in sets:
             truth = {name: scene.truth[name] for name in item.images}
-            plain = prepared.of(item)
+            plain = prepared.build_problem(item)
             for start, run in (("own", plain), ("true poses", _posed(plain, truth))):
                 models = reconstruct(run, options).reconstructions
                 poses = models[0].poses if models else {}

@@ -133,7 +133,7 @@ def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Recon
         options = options.model_copy(update={"known_poses": "fixed"})
     mapped = []
     for item in sets:
-        problem = prepared.of(item).with_poses(truth)
+        problem = prepared.build_problem(item).with_poses(truth)
         mapped.append(reconstruct(problem, options).reconstructions[0])
     stored.write_bytes(pickle.dumps(mapped))
     return mapped

@@ -52,7 +52,7 @@ def main() -> None:
     output = parser.parse_args().output / "device_poses"
     folder = shared_folder() / "data" / SCENE
     frames = frame_names(folder)
-    (hard,) = (item.images for item in read_scene(folder).chosen([BUCKET]))
+    (hard,) = (item.images for item in read_scene(folder).select_sets([BUCKET]))
     stems = [PurePosixPath(image).stem for image in hard]
     around = [_around(*pair, frames) for pair in combinations(stems, 2)]
     sets = {"around": [window for window in around if window], BUCKET: [stems]}
@@ -66,7 +66,7 @@ def main() -> None:
         peers=PEERS,
         overrides=("runtime.workers=1",),
     )
-    records = run_benchmark(plan, output, done=print_progress)
+    records = run_benchmark(plan, output, on_record=print_progress)
     text = (
         f"# Accuracy of the device poses, {SCENE} `{BUCKET}`\n\n"
         "AUC@20 in percent of the one set of the bucket, if the pose of one pair is taken from "

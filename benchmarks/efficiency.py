@@ -44,14 +44,14 @@ def _step(*functions: tuple[str, str], paper: tuple[float, ...] = ()) -> Step:
 
 STEPS: Mapping[str, Step] = MappingProxyType(
     {
-        "placing all images at once": _step(("global_initialization.py", "estimate_global_poses")),
+        "global initialization": _step(("global_initialization.py", "estimate_global_poses")),
         "bundle adjustment": _step(
             ("bundle_adjustment.py", "adjust_bundle"), paper=(3.43, 21.34, 48.59, 636.6)
         ),
         "depth refinement, with covariances": _step(
             ("refinement.py", "integrate"), paper=(9.19, 34.1, 81.33, 472.54)
         ),
-        "of it covariances of points": _step(
+        "of which point covariances": _step(
             ("refinement.py", "_covariances"), paper=(2.26, 11.06, 19.94, 153.8)
         ),
         "depth check": _step(
@@ -84,7 +84,7 @@ def main() -> None:
         theirs = [f"{step.paper[n]:g}" if step.paper else "" for n in (25, 44, 110, 505)]
         print(f"| {' | '.join([name, *ours, *theirs])} |")
     peaks = [f"{columns[views]['peak']:.0f}" for views in sizes]
-    print(f"| {' | '.join(['peak of memory, MiB', *peaks])} | | | | |")
+    print(f"| {' | '.join(['peak memory, MiB', *peaks])} | | | | |")
 
 
 def _measured(views: int) -> dict[str, float]:

@@ -27,9 +27,9 @@ from benchmarks._sift import extract, match
 from mpsfm_core.data import Pose
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
-from mpsfm_core.extraction.cache import CACHE_VARIABLE
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.models import read_poses, reconstruction_poses
+from mpsfm_core.support.user_folders import CACHE_VARIABLE
 
 SCENES = ("fountain", "rendered_kitchen", "hololens_room")
 OURS = ("sift", "fast-cpu")

@@ -32,9 +32,9 @@ from mpsfm_core.testing.synthetic.halls import QUALITIES, HallProblem, make_hall
 PEER = "colmap"
 VARIANTS: Mapping[str, Mapping[str, object]] = {
     "default": {},
-    "start from a pair": {"initialization": {"global_initialization": False}},
-    "reprojection loss not measured": {"refinement": {"measure_keypoint_noise": False}},
-    "evidence not weighed": {"consistency": {"weigh_evidence": False}},
+    "initialization from one pair": {"initialization": {"global_initialization": False}},
+    "reprojection loss not estimated": {"refinement": {"measure_keypoint_noise": False}},
+    "evidence not weighted": {"consistency": {"weigh_evidence": False}},
     "no depth check": {"consistency": {"enabled": False}},
 }
 CONVENTION = CONVENTIONS["paper"]

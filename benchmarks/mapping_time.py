@@ -41,7 +41,7 @@ def main() -> None:
         plan = BenchmarkPlan(
             (folder,), priors=("sensor",), peers=PEERS, overrides=("runtime.workers=1",), workers=1
         )
-        records = run_benchmark(plan, output, done=print_progress)
+        records = run_benchmark(plan, output, on_record=print_progress)
         parts.append(f"## {name}\n\n{_table(sizes, records)}")
     text = "\n\n".join(parts) + "\n"
     RESULTS.mkdir(exist_ok=True)

@@ -134,7 +134,7 @@ def _real(name: str, output: Path) -> Case:
     for (a, b), outcome in zip(true, outcomes, strict=True):
         rotation = scene.truth[names[b]][0] @ scene.truth[names[a]][0].T
         cosine = (np.trace(outcome.rotation @ rotation.T) - 1) / 2
-        if not outcome.reason and cosine > math.cos(math.radians(RIGHT_DEG)):
+        if not outcome.dropped and cosine > math.cos(math.radians(RIGHT_DEG)):
             matched.append((a, b))
     descriptors = [
         pair_similarity.strongest_descriptors(table[index]) for index in range(len(names))

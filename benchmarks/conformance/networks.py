@@ -84,9 +84,9 @@ def _moge(answer: tuple[DepthPrior, NormalPrior], theirs: Arrays) -> Differences
 
 
 def _dsine(answer: NormalPrior, theirs: Arrays) -> Differences:
-    from mpsfm_onnx.decode import expected_angle
+    from mpsfm_onnx.decode import compute_expected_angle
 
-    std = expected_angle(theirs["kappa"].astype(np.float64))
+    std = compute_expected_angle(theirs["kappa"].astype(np.float64))
     assert answer.variance is not None
     return {
         "normals, deg": angle_deg(answer.normals, -theirs["normal"], answer.valid),
@@ -131,14 +131,14 @@ def _mast3r(answer: PairMatches, theirs: Arrays) -> Differences:
 
 
 def _metric3d(answer: tuple[DepthPrior, NormalPrior], theirs: Arrays) -> Differences:
-    from mpsfm_onnx.decode import expected_angle
+    from mpsfm_onnx.decode import compute_expected_angle
 
     depth, normals = answer
     height, width = depth.shape
     expected = {name: resize_map(values, width, height) for name, values in theirs.items()}
     std = expected["depth"] * (1 - np.clip(expected["confidence"], 0, 1))
     assert depth.variance is not None and normals.variance is not None
-    angle = expected_angle(expected["kappa"].astype(np.float64))
+    angle = compute_expected_angle(expected["kappa"].astype(np.float64))
     certain = depth.valid & (std > 1e-3 * expected["depth"])
     return {
         "depth": relative(depth.depth, expected["depth"], depth.valid),

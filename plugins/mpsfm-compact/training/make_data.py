@@ -68,11 +68,13 @@ def make_triangulated(output: Path, images: Path, model: Path, name: str) -> Non
 
     def samples(folder: Path) -> Iterator[Sample]:
         pycolmap.undistort_images(folder, model, images)
-        found = pycolmap.Reconstruction(folder / "sparse")
-        for image in sorted(found.images.values(), key=lambda i: str(i.name)):
+        reconstruction = pycolmap.Reconstruction(folder / "sparse")
+        for image in sorted(reconstruction.images.values(), key=lambda i: str(i.name)):
             picture = cv2.imread(str(folder / "images" / image.name))[..., ::-1]
             camera = np.array(image.camera.params, np.float32)
-            seen = [found.points3D[p.point3D_id] for p in image.points2D if p.has_point3D()]
+            seen = [
+                reconstruction.points3D[p.point3D_id] for p in image.points2D if p.has_point3D()
+            ]
             exact = [p.xyz for p in seen if p.error < _EXACT and p.track.length() > 2]
             points = image.cam_from_world() * np.array(exact).reshape(-1, 3)
             yield _sparse(picture, points, camera)

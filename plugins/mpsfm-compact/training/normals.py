@@ -32,8 +32,8 @@ def normals_of_depth(
     def total(field: NDArray[np.float64]) -> NDArray[np.float64]:
         return cv2.boxFilter(np.where(known, field, 0.0), cv2.CV_64F, (side, side), normalize=False)
 
-    one = np.ones_like(inverse)
-    basis = (x, y, one)
+    ones = np.ones_like(inverse)
+    basis = (x, y, ones)
     matrix = np.stack([np.stack([total(a * b) for b in basis], -1) for a in basis], -2)
     right = np.stack([total(a * inverse) for a in basis], -1)
     count = matrix[..., 2, 2]

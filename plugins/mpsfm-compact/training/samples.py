@@ -40,21 +40,21 @@ class Sample:
 
 def write_shard(folder: Path, samples: Iterable[Sample]) -> int:
     """Write one shard atomically as a folder; return its number of samples."""
-    kept = list(samples)
-    if not kept:
+    stored = list(samples)
+    if not stored:
         return 0
     building = folder.with_name(folder.name + ".part")
     building.mkdir(parents=True, exist_ok=True)
-    np.save(building / "image.npy", np.stack([s.image for s in kept]))
-    np.save(building / "depth.npy", np.stack([s.depth for s in kept]).astype(np.float16))
-    coded = [np.round(127 * s.normals).astype(np.int8) for s in kept]
+    np.save(building / "image.npy", np.stack([s.image for s in stored]))
+    np.save(building / "depth.npy", np.stack([s.depth for s in stored]).astype(np.float16))
+    coded = [np.round(127 * s.normals).astype(np.int8) for s in stored]
     np.save(building / "normals.npy", np.stack(coded))
-    np.save(building / "kind.npy", np.stack([s.kind for s in kept]))
-    np.save(building / "camera.npy", np.stack([s.camera for s in kept]).astype(np.float32))
-    np.save(building / "metric.npy", np.array([s.metric for s in kept]))
-    (building / "shard.json").write_text(json.dumps({"samples": len(kept)}))
+    np.save(building / "kind.npy", np.stack([s.kind for s in stored]))
+    np.save(building / "camera.npy", np.stack([s.camera for s in stored]).astype(np.float32))
+    np.save(building / "metric.npy", np.array([s.metric for s in stored]))
+    (building / "shard.json").write_text(json.dumps({"samples": len(stored)}))
     building.rename(folder)
-    return len(kept)
+    return len(stored)
 
 
 class Shard:

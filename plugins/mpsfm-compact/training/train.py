@@ -61,16 +61,18 @@ def train(
     torch.backends.cudnn.benchmark = True
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     shards = list(find_shards(data))
-    kept = [s for s in shards if not any(name in s.name for name in held_out)]
-    judged = [s for s in shards if s not in kept]
+    training_shards = [s for s in shards if not any(name in s.name for name in held_out)]
+    judged = [s for s in shards if s not in training_shards]
     shares = {
         "drawn": 1 - schedule.real_share - schedule.view_share,
         "real": schedule.real_share,
         "view": schedule.view_share,
         "sky": schedule.sky_share,
     }
-    sources = {kind: [s for s in kept if s.name.startswith(kind)] for kind in shares}
-    sampler = Sampler([(found, shares[kind]) for kind, found in sources.items() if found])
+    sources = {kind: [s for s in training_shards if s.name.startswith(kind)] for kind in shares}
+    sampler = Sampler(
+        [(shard_list, shares[kind]) for kind, shard_list in sources.items() if shard_list]
+    )
     network = CompactNetwork()
     _begin(network, start)
     network.to(device, memory_format=torch.channels_last)
@@ -89,7 +91,7 @@ def train(
         mean.load_state_dict(state["mean"])
         optimizer.load_state_dict(state["optimizer"])
         step = int(state["step"])
-    counts = ", ".join(f"{len(found)} {kind}" for kind, found in sources.items())
+    counts = ", ".join(f"{len(shard_list)} {kind}" for kind, shard_list in sources.items())
     print(f"shards: {counts}; from step {step}", flush=True)  # noqa: T201
     network.train()
     recent: dict[str, float] = {}

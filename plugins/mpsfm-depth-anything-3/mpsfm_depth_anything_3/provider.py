@@ -65,10 +65,10 @@ class DepthAnything3:
             image[top : top + h, left : left + w] = (rgb - _MEAN) / _STD
         given = torch.from_numpy(pixels).permute(0, 3, 1, 2)[None].contiguous()
         with inference():
-            found = self._network(given.to(self._device))
-        depth, confidence = (found[key][0].cpu().numpy() for key in ("depth", "depth_conf"))
+            prediction = self._network(given.to(self._device))
+        depth, confidence = (prediction[key][0].cpu().numpy() for key in ("depth", "depth_conf"))
         mean = float(depth.mean())
-        metric = bool(found.get("is_metric", False))
+        metric = bool(prediction.get("is_metric", False))
         priors = []
         for (left, top), (w, h), z, sure in zip(starts, sizes, depth, confidence, strict=True):
             inside = slice(top, top + h), slice(left, left + w)
@@ -76,8 +76,8 @@ class DepthAnything3:
             priors.append(DepthPrior.from_arrays(z[inside], std**2, metric=metric))
         return MultiViewPrior(
             tuple(priors),
-            found["extrinsics"][0, :, :3].double().cpu().numpy(),
-            _intrinsics(found["intrinsics"][0].double().cpu().numpy(), views, starts, sizes),
+            prediction["extrinsics"][0, :, :3].double().cpu().numpy(),
+            _intrinsics(prediction["intrinsics"][0].double().cpu().numpy(), views, starts, sizes),
         )
 
 
@@ -109,13 +109,13 @@ def _network_size(view: View, longest: int) -> tuple[int, int]:
 
 
 def _intrinsics(
-    found: Float64,
+    matrices: Float64,
     views: Sequence[View],
     starts: Sequence[tuple[int, int]],
     sizes: Sequence[tuple[int, int]],
 ) -> Float64:
     """Convert matrices (n, 3, 3) of the network grid to fx, fy, cx, cy of the views."""
     scale = np.array([view.camera.size for view in views]) / np.array(sizes)
-    focal = found[:, [0, 1], [0, 1]] * scale
-    center = (found[:, :2, 2] - np.array(starts)) * scale
+    focal = matrices[:, [0, 1], [0, 1]] * scale
+    center = (matrices[:, :2, 2] - np.array(starts)) * scale
     return np.concatenate([focal, center], axis=1)

@@ -18,7 +18,7 @@ ENCODERS = {"": 5, "b0": 0, "b5": 5}
 _SIDES = ((96, 128), (160, 96))
 
 
-class Last(torch.nn.Module):
+class LastRefinement(torch.nn.Module):
     """Module that returns the last refinement, as the authors' scripts do."""
 
     def __init__(self, model: torch.nn.Module) -> None:
@@ -27,11 +27,11 @@ class Last(torch.nn.Module):
 
     def forward(self, image: torch.Tensor, intrins: torch.Tensor) -> torch.Tensor:
         """Run the network."""
-        found: torch.Tensor = self.model(image, intrins=intrins.clone(), mode="test")[-1]
-        return found
+        output: torch.Tensor = self.model(image, intrins=intrins.clone(), mode="test")[-1]
+        return output
 
 
-class _Here:
+class _CpuCoordinates:
     """Context that keeps the constructor's coordinates on the CPU instead of the first GPU."""
 
     def __init__(self, coordinates: torch.Tensor) -> None:
@@ -41,7 +41,7 @@ class _Here:
         return self._coordinates
 
 
-def network(encoder: int) -> Last:
+def network(encoder: int) -> LastRefinement:
     """Create the network of the authors' experiment exp002_kappa, with EfficientNet-B0 or -B5."""
     settings = SimpleNamespace(
         NNET_encoder_B=encoder,
@@ -58,12 +58,12 @@ def network(encoder: int) -> Last:
         NRN_ray_relu=True,
     )
     coordinates, create = v02_kappa.get_pixel_coords, geffnet.create_model
-    v02_kappa.get_pixel_coords = lambda h, w: _Here(coordinates(h, w))
+    v02_kappa.get_pixel_coords = lambda h, w: _CpuCoordinates(coordinates(h, w))
     geffnet.create_model = lambda name, pretrained: create(name, pretrained=False)
-    return Last(v02_kappa.DSINE_v02_kappa(settings)).eval()
+    return LastRefinement(v02_kappa.DSINE_v02_kappa(settings)).eval()
 
 
-def export(job: ExportJob, model: Last) -> None:
+def export(job: ExportJob, model: LastRefinement) -> None:
     """Export the network for images of any size in steps of 32, with their intrinsics."""
     examples = []
     for height, width in _SIDES:

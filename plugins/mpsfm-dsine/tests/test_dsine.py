@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpsfm_dsine.options import DsineOptions
 from mpsfm_dsine.provider import Dsine
-from mpsfm_onnx.decode import expected_angle
+from mpsfm_onnx.decode import compute_expected_angle
 
 from mpsfm_core import PinholeCamera, View
 from mpsfm_core.data.errors import ConfigError
@@ -72,7 +72,9 @@ def test_intrinsics_follow_resizing_and_padding(model, size, context):
     expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
     assert prior.valid.all()
     np.testing.assert_allclose(prior.normals, expected, atol=1e-5)
-    np.testing.assert_allclose(prior.variance, expected_angle(np.array(12.0)) ** 2, rtol=1e-5)
+    np.testing.assert_allclose(
+        prior.variance, compute_expected_angle(np.array(12.0)) ** 2, rtol=1e-5
+    )
 
 
 def test_black_padding_before_normalisation(write_onnx, context):

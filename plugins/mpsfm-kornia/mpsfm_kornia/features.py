@@ -23,7 +23,7 @@ from mpsfm_kornia.options import (
     SiftOptions,
     XFeatOptions,
 )
-from mpsfm_kornia.runtime import Grid, fill, load_weights, usable
+from mpsfm_kornia.runtime import Grid, is_inside_mask, load_state, load_weights
 
 _Detections = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
@@ -55,11 +55,11 @@ class KorniaFeatures(ABC):
         """
         grid = Grid.fit(view, self._options.resize, self.multiple)
         with inference():
-            found = self._detect(grid.image(view, self._device))
-        xy, scores, descriptors = (tensor.float().cpu().numpy() for tensor in found)
+            detections = self._detect(grid.image(view, self._device))
+        xy, scores, descriptors = (tensor.float().cpu().numpy() for tensor in detections)
         keypoints = grid.to_view(xy.astype(np.float64) + 0.5)
         order = np.argsort(-scores, kind="stable")
-        order = order[usable(view, keypoints[order])][: self._options.max_keypoints]
+        order = order[is_inside_mask(view, keypoints[order])][: self._options.max_keypoints]
         return Features(
             keypoints=keypoints[order],
             descriptors=descriptors[order],
@@ -76,7 +76,7 @@ class XFeatFeatures(KorniaFeatures):
     def __init__(self, options: XFeatOptions, context: ProviderContext) -> None:
         super().__init__(options, context)
         self._network = XFeat(options.max_keypoints, options.detection_threshold)
-        fill(
+        load_state(
             self._network.net,
             load_weights(context, options.weights, options.sha256),
             options.weights,
@@ -84,8 +84,8 @@ class XFeatFeatures(KorniaFeatures):
         self._network.eval().to(self._device)
 
     def _detect(self, image: torch.Tensor) -> _Detections:
-        found = self._network.detectAndCompute(image)[0]
-        return found["keypoints"], found["scores"], found["descriptors"]
+        output = self._network.detectAndCompute(image)[0]
+        return output["keypoints"], output["scores"], output["descriptors"]
 
 
 class AlikedFeatures(KorniaFeatures):
@@ -100,12 +100,12 @@ class AlikedFeatures(KorniaFeatures):
             nms_radius=options.nms_radius,
         )
         uri = options.weights_uri
-        fill(self._network, load_weights(context, uri, options.sha256), uri)
+        load_state(self._network, load_weights(context, uri, options.sha256), uri)
         self._network.to(self._device)
 
     def _detect(self, image: torch.Tensor) -> _Detections:
-        found = self._network(image)[0]
-        return found.keypoints, found.keypoint_scores, found.descriptors
+        output = self._network(image)[0]
+        return output.keypoints, output.keypoint_scores, output.descriptors
 
 
 class DiskFeatures(KorniaFeatures):
@@ -121,19 +121,19 @@ class DiskFeatures(KorniaFeatures):
         self._threshold = options.detection_threshold
         self._network = DISK()
         state = load_weights(context, options.weights, options.sha256)
-        fill(self._network, state.get("extractor", state), options.weights)
+        load_state(self._network, state.get("extractor", state), options.weights)
         self._network.to(self._device)
 
     def _detect(self, image: torch.Tensor) -> _Detections:
-        found = self._network(
+        output = self._network(
             image,
             n=self._options.max_keypoints,
             window_size=self._window,
             score_threshold=self._threshold,
             pad_if_not_divisible=True,
         )[0]
-        heat = found.detection_scores
-        return found.keypoints, heat / (1 + heat), found.descriptors
+        heat = output.detection_scores
+        return output.keypoints, heat / (1 + heat), output.descriptors
 
 
 class DedodeFeatures(KorniaFeatures):
@@ -146,7 +146,7 @@ class DedodeFeatures(KorniaFeatures):
             (self._network.detector, options.detector_weights, options.detector_sha256),
             (self._network.descriptor, options.weights, options.sha256),
         ):
-            fill(module, load_weights(context, uri, sha256), uri)
+            load_state(module, load_weights(context, uri, sha256), uri)
         self._network.to(self._device)
 
     def _detect(self, image: torch.Tensor) -> _Detections:

@@ -14,7 +14,7 @@ from mpsfm_core.providers import require_features
 from mpsfm_core.providers.torch_runtime import inference, use_threads
 from mpsfm_kornia.attention import fuse_cross_attention
 from mpsfm_kornia.options import LightGlueOptions
-from mpsfm_kornia.runtime import fill, load_weights
+from mpsfm_kornia.runtime import load_state, load_weights
 
 # Every key that shapes the network is named: kornia's defaults are a class attribute, which
 # other packages are known to overwrite.
@@ -49,7 +49,7 @@ class LightGlueMatcher:
             filter_threshold=options.filter_threshold,
         )
         state = load_weights(context, options.weights, options.sha256)
-        fill(self._network, _renamed(state), options.weights)
+        load_state(self._network, _renamed(state), options.weights)
         if self._device == "cpu":
             fuse_cross_attention(self._network)
         self._network.to(self._device)
@@ -79,8 +79,8 @@ class LightGlueMatcher:
             "image1": self._input(view_b, features_b),
         }
         with inference():
-            found = self._network(data)
-        return _matches(found["matches"][0].cpu().numpy(), found["scores"][0].cpu().numpy())
+            output = self._network(data)
+        return _matches(output["matches"][0].cpu().numpy(), output["scores"][0].cpu().numpy())
 
     def _input(self, view: View, features: Features) -> dict[str, torch.Tensor]:
         dimension = features.descriptors.shape[1]

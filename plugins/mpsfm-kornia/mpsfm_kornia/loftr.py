@@ -13,7 +13,7 @@ from kornia.feature.loftr.loftr import default_cfg
 from mpsfm_core import DenseMatches, Features, PairMatches, ProviderContext, View
 from mpsfm_core.providers.torch_runtime import inference, use_threads
 from mpsfm_kornia.options import LoftrOptions
-from mpsfm_kornia.runtime import Grid, fill, load_weights, usable
+from mpsfm_kornia.runtime import Grid, is_inside_mask, load_state, load_weights
 
 _MULTIPLE = 8
 """The coarse level has one cell per 8 pixels."""
@@ -38,7 +38,7 @@ class LoftrMatcher:
         config["coarse"]["temp_bug_fix"] = options.corrected_encoding
         self._network = LoFTR(pretrained=None, config=config)
         state = load_weights(context, options.weights, options.sha256)
-        fill(self._network, state.get("state_dict", state), options.weights)
+        load_state(self._network, state.get("state_dict", state), options.weights)
         self._network.to(self._device)
 
     def match(
@@ -54,13 +54,13 @@ class LoftrMatcher:
             self._gray(grid, view) for grid, view in zip(grids, (view_a, view_b), strict=True)
         ]
         with inference():
-            found = self._network({"image0": images[0], "image1": images[1]})
+            output = self._network({"image0": images[0], "image1": images[1]})
         points = [
-            grid.to_view(found[key].double().cpu().numpy())
+            grid.to_view(output[key].double().cpu().numpy())
             for grid, key in zip(grids, ("keypoints0", "keypoints1"), strict=True)
         ]
-        scores = np.clip(found["confidence"].float().cpu().numpy(), 0, 1)
-        keep = usable(view_a, points[0]) & usable(view_b, points[1])
+        scores = np.clip(output["confidence"].float().cpu().numpy(), 0, 1)
+        keep = is_inside_mask(view_a, points[0]) & is_inside_mask(view_b, points[1])
         return PairMatches(
             dense=DenseMatches(
                 points[0][keep],

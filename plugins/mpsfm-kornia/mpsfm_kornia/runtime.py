@@ -24,7 +24,7 @@ def load_weights(context: ProviderContext, uri: str, sha256: str | None) -> dict
     return load_torch_state(context.resolve_weights(uri, sha256 or KNOWN_HASHES.get(uri)))
 
 
-def fill(module: torch.nn.Module, state: dict[str, Any], uri: str) -> None:
+def load_state(module: torch.nn.Module, state: dict[str, Any], uri: str) -> None:
     """Load all learned values of a network and switch it to evaluation.
 
     Raises:
@@ -41,7 +41,7 @@ def fill(module: torch.nn.Module, state: dict[str, Any], uri: str) -> None:
     module.eval()
 
 
-def usable(view: View, xy: Float64) -> Bool:
+def is_inside_mask(view: View, xy: Float64) -> Bool:
     """Return which pixels (n, 2) are inside the view and its mask."""
     ok = inside(xy, view.camera.size)
     return ok if view.mask is None else ok & sample_nearest(view.mask, xy)

@@ -79,8 +79,8 @@ class AnySize(torch.nn.Module):
         (feat1, pos1), (feat2, pos2) = (self._encoded(image) for image in images)
         heads = model.downstream_head1, model.downstream_head2
         sides = zip(images, heads, model._decoder(feat1, pos1, feat2, pos2), strict=True)
-        found = [head(tokens, image.shape[-2:]) for image, head, tokens in sides]
-        return tuple(view[key] for view in found for key in _KEYS)
+        predictions = [head(tokens, image.shape[-2:]) for image, head, tokens in sides]
+        return tuple(view[key] for view in predictions for key in _KEYS)
 
     def _encoded(self, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         patches = self.model.patch_embed.proj(image)
@@ -93,11 +93,11 @@ class AnySize(torch.nn.Module):
         return self.model.enc_norm(tokens), positions
 
 
-def arguments(said: str) -> dict[str, Any]:
+def arguments(constructor_call: str) -> dict[str, Any]:
     """Parse the arguments of the constructor call in a checkpoint, without executing it."""
-    call = ast.parse(said.replace("inf", _INFINITE), mode="eval").body
+    call = ast.parse(constructor_call.replace("inf", _INFINITE), mode="eval").body
     if not (isinstance(call, ast.Call) and ast.unparse(call.func) == AsymmetricMASt3R.__name__):
-        raise SystemExit(f"the checkpoint is of another network: {said}")
+        raise SystemExit(f"the checkpoint is of another network: {constructor_call}")
     given = {str(word.arg): ast.literal_eval(word.value) for word in call.keywords}
     return {**given, "patch_embed_cls": "PatchEmbedDust3R", "landscape_only": False}
 
@@ -124,9 +124,9 @@ def export(job: ExportJob, model: AsymmetricMASt3R) -> None:
     def all_rotations(self: RoPE2D, dimensions: int, count: int, *of: Any) -> Any:
         return rotations(self, dimensions, _POSITIONS, *of)
 
-    said = run_network(TwoViews(model), given)
+    outputs = run_network(TwoViews(model), given)
     RoPE2D.get_cos_sin = all_rotations
-    job.export(AnySize(model), given, _OUTPUTS, axes, said)
+    job.export(AnySize(model), given, _OUTPUTS, axes, outputs)
 
 
 def main() -> None:

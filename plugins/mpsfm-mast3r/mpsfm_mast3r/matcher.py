@@ -23,8 +23,8 @@ from mpsfm_core import (
 from mpsfm_core.data import Float32, Int64
 from mpsfm_core.geometry import inside
 from mpsfm_core.providers import require_features
-from mpsfm_mast3r.neighbours import mutual, reciprocal
-from mpsfm_mast3r.network import OnnxPairNetwork, PairNetwork, Seen
+from mpsfm_mast3r.neighbors import find_mutual, find_reciprocal
+from mpsfm_mast3r.network import OnnxPairNetwork, PairNetwork, ViewOutput
 from mpsfm_mast3r.options import DenseSearch, SparseSearch
 
 _STD_NETWORK_PX = 0.5
@@ -49,9 +49,9 @@ class DenseMatcher:
     ) -> PairMatches:
         """Return the matches of both passes; duplicates keep the larger score."""
         passes = self._network.both(view_a, view_b)
-        found = [self._reciprocal(a, b) for a, b in passes]
-        scores = [_scores(a, b, pairs) for (a, b), pairs in zip(passes, found, strict=True)]
-        pairs, certain = _merge(np.concatenate(found), np.concatenate(scores))
+        pairs_by_pass = [self._reciprocal(a, b) for a, b in passes]
+        scores = [_scores(a, b, pairs) for (a, b), pairs in zip(passes, pairs_by_pass, strict=True)]
+        pairs, certain = _merge(np.concatenate(pairs_by_pass), np.concatenate(scores))
         a, b = passes[0]
         xy_a, xy_b = a.positions(pairs[:, 0]), b.positions(pairs[:, 1])
         keep = inside(xy_a, view_a.camera.size) & inside(xy_b, view_b.camera.size)
@@ -59,14 +59,14 @@ class DenseMatcher:
         dense = DenseMatches(xy_a[keep], xy_b[keep], certain[keep], std_px)
         return PairMatches(dense=dense, depth=_depth(passes))
 
-    def _reciprocal(self, a: Seen, b: Seen) -> Int64:
+    def _reciprocal(self, a: ViewOutput, b: ViewOutput) -> Int64:
         """Find pairs (m, 2) of cells, searching from both sides."""
-        there = reciprocal(a.descriptors, b.descriptors, self._start(a))
-        back = reciprocal(b.descriptors, a.descriptors, self._start(b))
+        there = find_reciprocal(a.descriptors, b.descriptors, self._start(a))
+        back = find_reciprocal(b.descriptors, a.descriptors, self._start(b))
         return np.unique(np.concatenate([there, back[:, ::-1]]), axis=0)
 
-    def _start(self, seen: Seen) -> Int64:
-        width, height = seen.canvas.size
+    def _start(self, output: ViewOutput) -> Int64:
+        width, height = output.canvas.size
         step = self._subsample
         rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
         start: Int64 = (rows * width + columns).reshape(-1).astype(np.int64)
@@ -101,7 +101,7 @@ class SparseMatcher:
         similarity = np.mean(
             [a.descriptors[cells_a] @ b.descriptors[cells_b].T for a, b in passes], axis=0
         )
-        pairs = mutual(similarity)
+        pairs = find_mutual(similarity)
         pairs = pairs[similarity[pairs[:, 0], pairs[:, 1]] >= self._min_similarity]
         cells = np.stack([cells_a[pairs[:, 0]], cells_b[pairs[:, 1]]], axis=1)
         scores = np.max([_scores(a, b, cells) for a, b in passes], axis=0)
@@ -109,7 +109,7 @@ class SparseMatcher:
         return PairMatches(sparse=SparseMatches(indices, scores), depth=_depth(passes))
 
 
-def _scores(a: Seen, b: Seen, cells: Int64) -> Float32:
+def _scores(a: ViewOutput, b: ViewOutput, cells: Int64) -> Float32:
     """Compute scores ``c / (1 + c)`` in [0, 1) of pairs (m, 2) of cells.
 
     c is the geometric mean of both descriptor confidences [reference].
@@ -126,6 +126,8 @@ def _merge(pairs: Int64, scores: Float32) -> tuple[Int64, Float32]:
     return unique, scores[order][first]
 
 
-def _depth(passes: tuple[tuple[Seen, Seen], tuple[Seen, Seen]]) -> PairDepth:
+def _depth(
+    passes: tuple[tuple[ViewOutput, ViewOutput], tuple[ViewOutput, ViewOutput]],
+) -> PairDepth:
     """Return the depth of each view from the pass with this view first."""
     return PairDepth(passes[0][0].depth(), passes[1][1].depth())

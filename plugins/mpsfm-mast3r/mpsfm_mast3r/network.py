@@ -23,7 +23,7 @@ _TENSORS = ("pts3d", "conf", "desc", "desc_conf")
 
 
 @dataclass(frozen=True)
-class Seen:
+class ViewOutput:
     """Outputs of one pass for one view, on its canvas (h, w).
 
     ``points``: (h, w, 3), in the camera frame of the first view. ``certainty``: (h, w), >= 1.
@@ -86,21 +86,25 @@ class PairNetwork(ABC):
             descriptors (h, w, d) and their confidence (h, w).
         """
 
-    def both(self, view_a: View, view_b: View) -> tuple[tuple[Seen, Seen], tuple[Seen, Seen]]:
+    def both(
+        self, view_a: View, view_b: View
+    ) -> tuple[tuple[ViewOutput, ViewOutput], tuple[ViewOutput, ViewOutput]]:
         """Run both passes: ``(a, b)`` with a first, and ``(a, b)`` with b first."""
         backward = self._run(view_b, view_a)
         return self._run(view_a, view_b), (backward[1], backward[0])
 
-    def _run(self, first: View, second: View) -> tuple[Seen, Seen]:
+    def _run(self, first: View, second: View) -> tuple[ViewOutput, ViewOutput]:
         views = (first, second)
         canvases = [Canvas.plan(self._rule.size, view.camera.size) for view in views]
         images = (
             canvas.paint(view.image, self._rule)
             for canvas, view in zip(canvases, views, strict=True)
         )
-        seen = zip(views, canvases, self.answer(*images), strict=True)
-        one, two = (_seen(view, canvas, parts) for view, canvas, parts in seen)
-        return one, two
+        outputs = zip(views, canvases, self.answer(*images), strict=True)
+        first_output, second_output = (
+            _view_output(view, canvas, tensors) for view, canvas, tensors in outputs
+        )
+        return first_output, second_output
 
 
 class OnnxPairNetwork(PairNetwork):
@@ -123,7 +127,7 @@ class OnnxPairNetwork(PairNetwork):
         return tensors[:4], tensors[4:]
 
 
-def _seen(view: View, canvas: Canvas, tensors: Tensors) -> Seen:
+def _view_output(view: View, canvas: Canvas, tensors: Tensors) -> ViewOutput:
     points, certainty, descriptors, match_certainty = (t.astype(np.float32) for t in tensors)
     flat = descriptors.reshape(-1, descriptors.shape[-1])
-    return Seen(view, canvas, points, certainty, flat, match_certainty.reshape(-1))
+    return ViewOutput(view, canvas, points, certainty, flat, match_certainty.reshape(-1))

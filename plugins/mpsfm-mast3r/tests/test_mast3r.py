@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mpsfm_mast3r.matcher import DenseMatcher, SparseMatcher
-from mpsfm_mast3r.neighbours import mutual, nearest, reciprocal
+from mpsfm_mast3r.neighbors import find_mutual, find_nearest, find_reciprocal
 from mpsfm_mast3r.options import DenseOptions, SparseOptions
 
 from mpsfm_core import Features, PinholeCamera, View
@@ -169,12 +169,12 @@ def test_reciprocal_search_finds_what_brute_force_finds():
     similarity = a @ b.T
     there, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
     expected = [(i, there[i]) for i in range(300) if back[there[i]] == i]
-    np.testing.assert_array_equal(reciprocal(a, b, np.arange(300)), expected)
-    np.testing.assert_array_equal(mutual(similarity), expected)
-    np.testing.assert_array_equal(nearest(a, b), there)
-    some = reciprocal(a, b, np.arange(0, 300, 7))
+    np.testing.assert_array_equal(find_reciprocal(a, b, np.arange(300)), expected)
+    np.testing.assert_array_equal(find_mutual(similarity), expected)
+    np.testing.assert_array_equal(find_nearest(a, b), there)
+    some = find_reciprocal(a, b, np.arange(0, 300, 7))
     assert 0 < len(some) < len(expected) and set(map(tuple, some)) <= set(map(tuple, expected))
-    assert mutual(np.empty((0, 5))).shape == (0, 2)
+    assert find_mutual(np.empty((0, 5))).shape == (0, 2)
 
 
 def test_model_with_other_tensors_raises(write_onnx, context):

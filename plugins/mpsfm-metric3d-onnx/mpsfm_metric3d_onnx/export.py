@@ -59,8 +59,8 @@ class Named(torch.nn.Module):
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Run the network."""
         normalised = (image - self.mean) / self.std
-        depth, confidence, found = self.model.inference({"input": normalised})
-        normal = found["prediction_normal"]
+        depth, confidence, outputs = self.model.inference({"input": normalised})
+        normal = outputs["prediction_normal"]
         return depth, normal[:, :3], normal[:, 3], confidence
 
 

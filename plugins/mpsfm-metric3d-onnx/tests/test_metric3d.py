@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpsfm_metric3d_onnx.options import SIZES, Metric3dOptions
 from mpsfm_metric3d_onnx.provider import Metric3dDepth, Metric3dNormals
-from mpsfm_onnx.decode import expected_angle
+from mpsfm_onnx.decode import compute_expected_angle
 
 from mpsfm_core import PinholeCamera, View
 from mpsfm_core.data.errors import ConfigError, WeightsError
@@ -51,7 +51,9 @@ def test_canonical_camera_padding_and_normals(model, context):
     focal = (700 + 720) / 2 * 616 / 480
     np.testing.assert_allclose(depth.depth, 90 * focal / 1000, rtol=1e-5)
     np.testing.assert_allclose(normals.normals[300, 400], [0.6, 0.0, -0.8], rtol=1e-5)
-    np.testing.assert_allclose(normals.variance, expected_angle(np.array(20.0)) ** 2, rtol=1e-5)
+    np.testing.assert_allclose(
+        normals.variance, compute_expected_angle(np.array(20.0)) ** 2, rtol=1e-5
+    )
     alone = Metric3dNormals(Metric3dOptions(**model), context).predict(view)
     np.testing.assert_array_equal(alone.normals, normals.normals)
 

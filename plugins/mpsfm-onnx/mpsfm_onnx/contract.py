@@ -123,8 +123,8 @@ def stand_in(description: Description, folder: Path) -> Path:
         graph.add("Add", "nothing", graph.array([certainty]), to=parts[1])
         if normals == kappa:
             graph.add("Concat", *parts, to=normals, axis=1)
-    told = rule.intrinsics.name if rule.intrinsics else None
-    return graph.save(sorted(outputs.names()), told, folder / f"{description.name}.onnx")
+    intrinsics_name = rule.intrinsics.name if rule.intrinsics else None
+    return graph.save(sorted(outputs.names()), intrinsics_name, folder / f"{description.name}.onnx")
 
 
 class _Graph:

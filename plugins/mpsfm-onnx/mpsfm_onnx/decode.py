@@ -27,7 +27,7 @@ floor.
 """
 
 
-def planes(output: NDArray[Any], layout: Layout) -> Float32:
+def to_planes(output: NDArray[Any], layout: Layout) -> Float32:
     """Convert an output tensor of one image to (h, w, c) float32; add a missing channel axis."""
     array = np.asarray(output, dtype=np.float32)
     if array.ndim == 4 or (array.ndim == 3 and array.shape[0] == 1):
@@ -84,7 +84,7 @@ def _network_depth(
             return np.asarray(np.exp(quantity))
         if rule.output == "points":
             points = value.astype(np.float64)
-            quantity = points[..., 2] + z_shift(points, xy, valid)
+            quantity = points[..., 2] + estimate_z_shift(points, xy, valid)
         positive: Float64 = np.where(quantity > 0, quantity, np.nan)
         if rule.output == "disparity":
             positive = 1.0 / positive
@@ -93,7 +93,7 @@ def _network_depth(
         return positive
 
 
-def z_shift(points: Float64, xy: Float64, valid: Bool | None = None) -> float:
+def estimate_z_shift(points: Float64, xy: Float64, valid: Bool | None = None) -> float:
     """Estimate the unknown shift of z of points (h, w, 3) on given rays ``(x, y, 1)``.
 
     The shift t minimizes the reprojection error ``sum |(x_i, y_i) / (z_i + t) - xy_i|^2`` over a
@@ -158,10 +158,10 @@ def decode_normals(
 def angular_std(value: Float32, rule: KappaOutput) -> Float64:
     """Compute the std of normals about each axis in rad, (h, w), from the uncertainty tensor."""
     tensor = value[..., rule.channel].astype(np.float64)
-    return expected_angle(tensor) if rule.output == "kappa" else np.maximum(tensor, 0)
+    return compute_expected_angle(tensor) if rule.output == "kappa" else np.maximum(tensor, 0)
 
 
-def expected_angle(kappa: Float64) -> Float64:
+def compute_expected_angle(kappa: Float64) -> Float64:
     """Compute the mean angular error in rad of a normal with concentration ``kappa``.
 
     The density over the sphere is ``(k^2 + 1) exp(-k a) / (2 pi (1 + exp(-k pi)))`` (Bae et al.,

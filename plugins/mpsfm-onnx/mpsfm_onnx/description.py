@@ -177,8 +177,8 @@ class Outputs(Options):
 
     def numbers(self) -> set[str]:
         """Return the names of the tensors with a single number."""
-        found = (self.depth.assumed_focal, self.depth.multiplier) if self.depth else ()
-        return {name for name in found if name}
+        names = (self.depth.assumed_focal, self.depth.multiplier) if self.depth else ()
+        return {name for name in names if name}
 
     @model_validator(mode="after")
     def _complete(self) -> Outputs:

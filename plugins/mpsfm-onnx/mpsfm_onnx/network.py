@@ -10,13 +10,13 @@ from mpsfm_core import PinholeCamera, ProviderContext, View
 from mpsfm_core.data import Float32, Float64
 from mpsfm_core.geometry import pixel_centers, rays
 from mpsfm_onnx.canvas import Canvas
-from mpsfm_onnx.decode import planes
+from mpsfm_onnx.decode import to_planes
 from mpsfm_onnx.description import Description, FixedSize, ImageInput, IntrinsicsInput, SideSize
 from mpsfm_onnx.model import Model
 
 
 @dataclass(frozen=True)
-class Answer:
+class NetworkOutput:
     """Outputs for a view: maps (h, w, c) that cover it, and single numbers, by name.
 
     ``canvas``: position of the view on the network input.
@@ -61,7 +61,7 @@ class Network:
         self._model.require(inputs, self._outputs, f"description {description.name!r}")
         self._size = _own_size(rule, self._model.shapes[self._image])
 
-    def run(self, view: View) -> Answer:
+    def run(self, view: View) -> NetworkOutput:
         """Run the network on a view."""
         rule, outputs = self.description.input, self.description.outputs
         canvas = Canvas.plan(self._size, view.camera.size)
@@ -76,8 +76,8 @@ class Network:
             if name in outputs.numbers():
                 numbers[name] = float(tensor.reshape(-1)[0])
             else:
-                maps[name] = canvas.cut(planes(tensor, outputs.layout))
-        return Answer(maps, numbers, canvas)
+                maps[name] = canvas.cut(to_planes(tensor, outputs.layout))
+        return NetworkOutput(maps, numbers, canvas)
 
 
 def _own_size(rule: ImageInput, shape: tuple[object, ...]) -> FixedSize | SideSize:

@@ -16,7 +16,7 @@ from mpsfm_onnx.description import (
     Outputs,
     load_description,
 )
-from mpsfm_onnx.network import Answer, Network
+from mpsfm_onnx.network import Network, NetworkOutput
 from mpsfm_onnx.options import MOGE_2, Moge2Options, OnnxOptions
 
 
@@ -49,7 +49,7 @@ class DescribedDepth:
         answer = self._network.run(view)
         return answer.numbers[self._rule.assumed_focal] * view.camera.width / answer.canvas.image[0]
 
-    def _depth(self, view: View, answer: Answer) -> DepthPrior:
+    def _depth(self, view: View, answer: NetworkOutput) -> DepthPrior:
         rule, outputs = self._rule, self._network.description.outputs
         certainty = outputs.confidence
         std = answer.maps.get(certainty.name) if certainty else None
@@ -146,19 +146,21 @@ class OnnxJoint(DescribedJoint):
         super().__init__(description, context, options.model, options.sha256)
 
 
-def _normals(view: View, answer: Answer, outputs: Outputs, rule: NormalsOutput) -> NormalPrior:
+def _normals(
+    view: View, answer: NetworkOutput, outputs: Outputs, rule: NormalsOutput
+) -> NormalPrior:
     known = outputs.kappa
     std = angular_std(answer.maps[known.name], known) if known else None
     valid = _mask(outputs, answer)
     return decode_normals(answer.maps[rule.name], rule, view.camera, std, valid)
 
 
-def _mask(outputs: Outputs, answer: Answer) -> Bool | None:
+def _mask(outputs: Outputs, answer: NetworkOutput) -> Bool | None:
     rule = outputs.mask
     return None if rule is None else answer.maps[rule.name][..., 0] > rule.minimum
 
 
-def _factor(rule: DepthOutput, answer: Answer, camera: PinholeCamera) -> float:
+def _factor(rule: DepthOutput, answer: NetworkOutput, camera: PinholeCamera) -> float:
     """Compute the depth factor: focal length of the resized image, and scale of the network."""
     resized, factor = camera.resized(*answer.canvas.image), 1.0
     if rule.canonical_focal is not None:

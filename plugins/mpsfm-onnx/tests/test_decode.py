@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from mpsfm_onnx.decode import decode_depth, decode_normals, expected_angle, planes, z_shift
+from mpsfm_onnx.decode import (
+    compute_expected_angle,
+    decode_depth,
+    decode_normals,
+    estimate_z_shift,
+    to_planes,
+)
 from mpsfm_onnx.description import ConfidenceOutput, DepthOutput, NormalsOutput
 from scipy.integrate import quad
 from scipy.optimize import least_squares
@@ -40,7 +46,7 @@ def test_expected_angle_is_the_mean_of_the_density(kappa):
     total, _ = quad(density, 0, np.pi, points=peak)
     mean, _ = quad(lambda a: a * density(a), 0, np.pi, points=peak)
     assert total == pytest.approx(1, rel=1e-7)
-    assert expected_angle(np.array(kappa)) == pytest.approx(mean, rel=1e-7)
+    assert compute_expected_angle(np.array(kappa)) == pytest.approx(mean, rel=1e-7)
 
 
 def test_cautious_side_of_the_squared_angle():
@@ -49,7 +55,9 @@ def test_cautious_side_of_the_squared_angle():
     density = [lambda a, p=p: a**p * np.exp(-kappa * a) * np.sin(a) for p in (0, 2)]
     norm, second = (quad(f, 0, np.pi, points=[1 / kappa])[0] for f in density)
     per_direction = second / norm / 2
-    assert per_direction / expected_angle(np.array(kappa)) ** 2 == pytest.approx(0.75, rel=0.01)
+    assert per_direction / compute_expected_angle(np.array(kappa)) ** 2 == pytest.approx(
+        0.75, rel=0.01
+    )
 
 
 def test_disparity_and_log_depth():
@@ -118,7 +126,7 @@ def test_the_shift_minimises_the_reprojection_error_of_noisy_points():
         return (points[..., :2] / (points[..., 2:] + shift) - xy).ravel()
 
     best = least_squares(miss, x0=0, method="lm").x[0]
-    assert z_shift(points, xy) == pytest.approx(best, rel=1e-5)
+    assert estimate_z_shift(points, xy) == pytest.approx(best, rel=1e-5)
 
 
 def test_normals_are_turned_into_our_frame_and_normalised():
@@ -134,9 +142,9 @@ def test_normals_are_turned_into_our_frame_and_normalised():
 def test_planes_of_every_rank(layout):
     grid = np.arange(6, dtype=np.float32).reshape(2, 3)
     stacked = np.stack([grid, grid + 10, grid + 20], axis=0 if layout == "NCHW" else -1)
-    for tensor in (grid, grid[None], planes(grid, layout)[..., 0][None]):
-        np.testing.assert_array_equal(planes(tensor, layout), grid[..., None])
+    for tensor in (grid, grid[None], to_planes(grid, layout)[..., 0][None]):
+        np.testing.assert_array_equal(to_planes(tensor, layout), grid[..., None])
     for tensor in (stacked, stacked[None]):
-        found = planes(tensor, layout)
+        found = to_planes(tensor, layout)
         assert found.shape == (2, 3, 3)
         np.testing.assert_array_equal(found[..., 2], grid + 20)

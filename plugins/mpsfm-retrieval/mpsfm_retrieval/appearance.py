@@ -43,10 +43,10 @@ class Appearance:
         return np.concatenate([local, colours]).astype(np.float32)
 
     def _local(self, view: View) -> Float64:
-        found = self._sift.extract(view)
-        descriptors = found.descriptors
+        features = self._sift.extract(view)
+        descriptors = features.descriptors
         if view.mask is not None:
-            descriptors = descriptors[sample_nearest(view.mask, found.keypoints)]
+            descriptors = descriptors[sample_nearest(view.mask, features.keypoints)]
         if not len(descriptors):
             return np.zeros(len(self._phases))
         return _unit(np.cos(descriptors @ self._frequencies + self._phases).mean(axis=0))

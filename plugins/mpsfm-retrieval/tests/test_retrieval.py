@@ -124,7 +124,7 @@ class TestAppearance:
         for path in sorted(folder.iterdir()):
             image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
             vectors.append(provider.describe(view_of(image)))
-        pairs = retrieval_pairs(vectors, PairOptions(mode="retrieval_pairs", top_k=2))
+        pairs = retrieval_pairs(vectors, PairOptions(mode="retrieval", top_k=2))
         near = [pair for pair in pairs if pair[1] - pair[0] <= 2]
         assert len(vectors) == 11 and len(near) >= 0.8 * len(pairs)
         assert {(i, i + 1) for i in range(10)} <= set(pairs)

@@ -42,9 +42,9 @@ class DenseMatcher:
         there, back = self._network.warps(view_a, view_b)
         xy_a, xy_b, scores = self._thinned(there)
         if back is not None:
-            more_b, more_a, more = self._thinned(back)
+            more_b, more_a, scores_back = self._thinned(back)
             xy_a, xy_b = np.concatenate([xy_a, more_a]), np.concatenate([xy_b, more_b])
-            scores = np.concatenate([scores, more])
+            scores = np.concatenate([scores, scores_back])
         return PairMatches(dense=DenseMatches(xy_a, xy_b, scores))
 
     def _thinned(self, warp: Warp) -> tuple[Float64, Float64, Float32]:
@@ -80,8 +80,8 @@ class SparseMatcher:
         xy_a, xy_b = features_a.keypoints, features_b.keypoints
         pairs, scores = self._snapped(there, xy_a, xy_b)
         if back is not None:
-            more, certain = self._snapped(back, xy_b, xy_a)
-            pairs = np.concatenate([pairs, more[:, ::-1]])
+            pairs_back, certain = self._snapped(back, xy_b, xy_a)
+            pairs = np.concatenate([pairs, pairs_back[:, ::-1]])
             scores = np.concatenate([scores, certain])
         return PairMatches(sparse=SparseMatches.from_best_scores(pairs, scores))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mpsfm_onnx.canvas import Canvas
-from mpsfm_onnx.decode import planes
+from mpsfm_onnx.decode import to_planes
 from mpsfm_onnx.description import FixedSize, ImageInput
 from mpsfm_onnx.model import Model
 
@@ -41,6 +41,6 @@ class SkyNetwork:
         """Predict a mask that is False on sky."""
         canvas = Canvas.plan(self._rule.size, view.camera.size)
         feed = {self._image: canvas.paint(view.image, self._rule)}
-        sky = planes(self._model.run(feed, [self._sky])[0], "NCHW")[..., 0]
+        sky = to_planes(self._model.run(feed, [self._sky])[0], "NCHW")[..., 0]
         keep: Bool = resize_map(sky, *view.camera.size) <= self._threshold
         return keep

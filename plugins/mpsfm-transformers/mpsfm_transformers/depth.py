@@ -16,7 +16,7 @@ from mpsfm_core.providers.builtin.files import DepthFiles
 from mpsfm_core.providers.builtin.options import DepthFileOptions
 from mpsfm_core.providers.torch_runtime import inference
 from mpsfm_transformers.hub import LoadedModel
-from mpsfm_transformers.options import DepthOptions, Output, PromptOptions, known
+from mpsfm_transformers.options import DepthOptions, Output, PromptOptions, look_up_model
 from mpsfm_transformers.placement import Preparation, preparation_for
 
 _PROMPTED = "prompt_depth_anything"
@@ -40,7 +40,7 @@ class HubDepth:
                 f"{options.model} needs depth maps of a sensor: use the provider "
                 f"prompt-depth-anything"
             )
-        self._output, self._metric = meaning(config, options)
+        self._output, self._metric = resolve_output(config, options)
         self._preparation = preparation_for(self._model)
         self._by_focal = config.model_type == "depth_pro"
 
@@ -67,9 +67,9 @@ class HubDepth:
         """Run the network on a view; return its map, and the angle of view in degrees or None."""
         prepared = self._preparation(view)
         with inference():
-            found = self._model.network(pixel_values=prepared.pixels.to(self._model.device))
-        angle = getattr(found, "field_of_view", None)
-        value = prepared.cut(found.predicted_depth[0].float().cpu().numpy())
+            prediction = self._model.network(pixel_values=prepared.pixels.to(self._model.device))
+        angle = getattr(prediction, "field_of_view", None)
+        value = prepared.cut(prediction.predicted_depth[0].float().cpu().numpy())
         return value, None if angle is None else float(angle.reshape(-1)[0])
 
 
@@ -99,11 +99,11 @@ class PromptDepth:
         prepared = self._preparation(view)
         pixels = prepared.pixels.to(self._model.device)
         with inference():
-            found = self._model.network(pixel_values=pixels, prompt_depth=prompt)
-        return DepthPrior.from_arrays(prepared.cut(found.predicted_depth[0].cpu().numpy()))
+            prediction = self._model.network(pixel_values=pixels, prompt_depth=prompt)
+        return DepthPrior.from_arrays(prepared.cut(prediction.predicted_depth[0].cpu().numpy()))
 
 
-def meaning(config: Any, options: DepthOptions) -> tuple[Output, bool]:
+def resolve_output(config: Any, options: DepthOptions) -> tuple[Output, bool]:
     """Determine the output of a model and if it is metric.
 
     The options have priority over the table of known models and the model configuration.
@@ -118,9 +118,9 @@ def meaning(config: Any, options: DepthOptions) -> tuple[Output, bool]:
     if family == "depth_anything":
         metric = config.depth_estimation_type == "metric"
     output: Output = "depth" if metric and family != "depth_pro" else "disparity"
-    entry = known(options.model)
-    told = [(entry.output, entry.metric), (options.output, options.metric)]
-    for said_output, said_metric in told:
+    entry = look_up_model(options.model)
+    sources = [(entry.output, entry.metric), (options.output, options.metric)]
+    for said_output, said_metric in sources:
         output = said_output or output
         metric = metric if said_metric is None else said_metric
     return output, metric

@@ -8,7 +8,7 @@ from transformers import SuperPointForKeypointDetection
 from mpsfm_core import Features, ProviderContext, View
 from mpsfm_core.geometry import scale_pixels
 from mpsfm_core.providers.torch_runtime import inference
-from mpsfm_transformers.grid import gray_image, network_size, usable
+from mpsfm_transformers.grid import gray_image, is_inside_mask, network_size
 from mpsfm_transformers.hub import LoadedModel
 from mpsfm_transformers.options import SuperPointOptions
 
@@ -33,16 +33,16 @@ class SuperPointFeatures:
         """
         size = network_size(view, self._options.resize, _CELL)
         with inference():
-            found = self._model.network(gray_image(view, size, self._model.device))
-        count = int(found.mask[0].sum())
+            prediction = self._model.network(gray_image(view, size, self._model.device))
+        count = int(prediction.mask[0].sum())
         relative, scores, descriptors = (
             tensor[0, :count].cpu().numpy()
-            for tensor in (found.keypoints, found.scores, found.descriptors)
+            for tensor in (prediction.keypoints, prediction.scores, prediction.descriptors)
         )
         pixels = np.round(relative.astype(np.float64) * size) + 0.5
         keypoints = scale_pixels(pixels, size, view.camera.size)
         order = np.argsort(-scores, kind="stable")
-        order = order[usable(view, keypoints[order])][: self._options.max_keypoints]
+        order = order[is_inside_mask(view, keypoints[order])][: self._options.max_keypoints]
         pixel_size = max(v / n for v, n in zip(view.camera.size, size, strict=True))
         return Features(
             keypoints=keypoints[order],

@@ -36,7 +36,7 @@ def gray_image(view: View, size: tuple[int, int], device: str) -> torch.Tensor:
     return gray.expand(-1, 3, -1, -1)
 
 
-def usable(view: View, xy: Float64) -> Bool:
+def is_inside_mask(view: View, xy: Float64) -> Bool:
     """Return which pixels (n, 2) are inside the view and its mask."""
     ok = inside(xy, view.camera.size)
     return ok if view.mask is None else ok & sample_nearest(view.mask, xy)

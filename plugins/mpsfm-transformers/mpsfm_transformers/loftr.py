@@ -9,7 +9,7 @@ from transformers import EfficientLoFTRForKeypointMatching
 from mpsfm_core import DenseMatches, Features, PairMatches, ProviderContext, View
 from mpsfm_core.geometry import scale_pixels
 from mpsfm_core.providers.torch_runtime import inference
-from mpsfm_transformers.grid import gray_image, network_size, usable
+from mpsfm_transformers.grid import gray_image, is_inside_mask, network_size
 from mpsfm_transformers.hub import LoadedModel
 from mpsfm_transformers.options import EfficientLoftrOptions
 
@@ -55,16 +55,16 @@ class EfficientLoftrMatcher:
         sizes = [network_size(view, self._longest, _MULTIPLE) for view in views]
         canvas = max(width for width, _ in sizes), max(height for _, height in sizes)
         with inference():
-            found = self._model.network(self._pair(views, sizes, canvas))
-        scores = found.matching_scores[0].cpu().numpy()
-        chosen = (found.matches[0].cpu().numpy() >= 0) & (scores > 0)
-        relative = found.keypoints[0].double().cpu().numpy()
+            prediction = self._model.network(self._pair(views, sizes, canvas))
+        scores = prediction.matching_scores[0].cpu().numpy()
+        chosen = (prediction.matches[0].cpu().numpy() >= 0) & (scores > 0)
+        relative = prediction.keypoints[0].double().cpu().numpy()
         points = [
             scale_pixels(relative[side][chosen[side]] * canvas, size, view.camera.size)
             for side, (view, size) in enumerate(zip(views, sizes, strict=True))
         ]
         certain = np.clip(scores[0][chosen[0]], 0, 1).astype(np.float32)
-        keep = usable(view_a, points[0]) & usable(view_b, points[1])
+        keep = is_inside_mask(view_a, points[0]) & is_inside_mask(view_b, points[1])
         pixel_size = max(
             v / n
             for view, size in zip(views, sizes, strict=True)

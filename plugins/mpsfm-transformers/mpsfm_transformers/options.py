@@ -27,8 +27,8 @@ RELATIVE = DepthCalibration(std_scale=1.0, relative_std=0.16, shift_space="dispa
 
 
 @dataclass(frozen=True)
-class Known:
-    """Known properties of models whose name matches ``pattern``.
+class KnownModel:
+    """KnownModel properties of models whose name matches ``pattern``.
 
     ``license``: license of the weights, from their model card. ``output``, ``metric``: only if the
     model's ``config.json`` does not define them.
@@ -44,29 +44,29 @@ class Known:
 _NON_COMMERCIAL = "CC-BY-NC-4.0"
 _MAGIC_LEAP = "Magic Leap: non-commercial research only"
 KNOWN = (
-    Known("depth-anything/Depth-Anything-V2-Metric-*-Small-hf", "Apache-2.0"),
-    Known("depth-anything/Depth-Anything-V2-Metric-*", _NON_COMMERCIAL),
-    Known("depth-anything/Depth-Anything-V2-Small-hf", "Apache-2.0", RELATIVE),
-    Known("depth-anything/Depth-Anything-V2-*", _NON_COMMERCIAL, RELATIVE),
-    Known("LiheYoung/depth-anything-*", "Apache-2.0", RELATIVE),
-    Known("apple/DepthPro-hf", "Apple ML research terms", DEPTH_PRO),
-    Known("Intel/zoedepth-*", "MIT"),
-    Known("facebook/dpt-dinov2-*-nyu", "Apache-2.0", output="depth", metric=True),
-    Known("facebook/dpt-dinov2-*-kitti", "Apache-2.0", output="depth", metric=True),
-    Known("Intel/dpt-*", "Apache-2.0 or MIT, see its card", RELATIVE),
-    Known("magic-leap-community/*", _MAGIC_LEAP),
-    Known("ETH-CVG/lightglue_superpoint", f"Apache-2.0; its SuperPoint {_MAGIC_LEAP}"),
-    Known("zju-community/efficientloftr", "Apache-2.0"),
-    Known("facebook/dinov2-*", "Apache-2.0"),
-    Known("facebook/dinov3-*", "DINOv3 License"),
+    KnownModel("depth-anything/Depth-Anything-V2-Metric-*-Small-hf", "Apache-2.0"),
+    KnownModel("depth-anything/Depth-Anything-V2-Metric-*", _NON_COMMERCIAL),
+    KnownModel("depth-anything/Depth-Anything-V2-Small-hf", "Apache-2.0", RELATIVE),
+    KnownModel("depth-anything/Depth-Anything-V2-*", _NON_COMMERCIAL, RELATIVE),
+    KnownModel("LiheYoung/depth-anything-*", "Apache-2.0", RELATIVE),
+    KnownModel("apple/DepthPro-hf", "Apple ML research terms", DEPTH_PRO),
+    KnownModel("Intel/zoedepth-*", "MIT"),
+    KnownModel("facebook/dpt-dinov2-*-nyu", "Apache-2.0", output="depth", metric=True),
+    KnownModel("facebook/dpt-dinov2-*-kitti", "Apache-2.0", output="depth", metric=True),
+    KnownModel("Intel/dpt-*", "Apache-2.0 or MIT, see its card", RELATIVE),
+    KnownModel("magic-leap-community/*", _MAGIC_LEAP),
+    KnownModel("ETH-CVG/lightglue_superpoint", f"Apache-2.0; its SuperPoint {_MAGIC_LEAP}"),
+    KnownModel("zju-community/efficientloftr", "Apache-2.0"),
+    KnownModel("facebook/dinov2-*", "Apache-2.0"),
+    KnownModel("facebook/dinov3-*", "DINOv3 License"),
 )
 """Table of known models; the first match counts."""
 
 
-def known(model: str) -> Known:
+def look_up_model(model: str) -> KnownModel:
     """Look up the known properties of a model by its name."""
     name = model.partition("@")[0]
-    unknown = Known("*", "of the chosen model, see its card", RELATIVE)
+    unknown = KnownModel("*", "of the chosen model, see its card", RELATIVE)
     return next((entry for entry in KNOWN if fnmatch(name, entry.pattern)), unknown)
 
 
@@ -99,7 +99,7 @@ class HubOptions(Options):
 
     def files(self) -> tuple[WeightsFile, ...]:
         """Return :data:`FILES` as weights to locate or download."""
-        license = known(self.model).license
+        license = look_up_model(self.model).license
         hashes = (None, None, self.sha256)
         return tuple(
             WeightsFile(uri, sha256, license)

@@ -87,10 +87,10 @@ class _ByProcessor:
         return Prepared(pixels, start.astype(np.float64), inner.astype(np.float64))
 
     def _pixels(self, image: Any, **settings: bool) -> torch.Tensor:
-        found = self._processor(
+        processed = self._processor(
             images=image, return_tensors="pt", input_data_format="channels_last", **settings
         )
-        pixels: torch.Tensor = found["pixel_values"]
+        pixels: torch.Tensor = processed["pixel_values"]
         return pixels.float()
 
 

@@ -92,7 +92,7 @@ def mpsfm_calibration(
     if isinstance(options, opt.PromptOptions):
         return opt.METRIC
     if isinstance(options, opt.DepthOptions):
-        entry = opt.known(options.model)
+        entry = opt.look_up_model(options.model)
         unsaid = entry.pattern == "*" and options.metric
         return opt.METRIC if unsaid else entry.calibration
     return None
@@ -121,7 +121,7 @@ def _spec(
         requires=("torch", "transformers"),
         install_hint="pip install mpsfm-transformers",
         code_license="Apache-2.0",
-        weights_license=weights_license or opt.known(model).license,
+        weights_license=weights_license or opt.look_up_model(model).license,
         weights=opt.hub_files,
         accuracy=_OF_THE_MODEL,
         tags=tags,

@@ -30,7 +30,7 @@ class Dino:
             for key in ("image_mean", "image_std")
         )
         with inference():
-            found = self._model.network(pixel_values=(image - mean) / std)
-        token = found.last_hidden_state[0, 0].cpu().numpy()
+            prediction = self._model.network(pixel_values=(image - mean) / std)
+        token = prediction.last_hidden_state[0, 0].cpu().numpy()
         unit: Float32 = token / np.float32(max(float(np.linalg.norm(token)), 1e-12))
         return unit

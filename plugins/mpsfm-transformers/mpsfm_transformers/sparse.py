@@ -22,7 +22,7 @@ from mpsfm_transformers.hub import LoadedModel
 from mpsfm_transformers.options import LightGlueOptions, SparseOptions, SuperGlueOptions
 
 
-class _Given(nn.Module):
+class _GivenKeypoints(nn.Module):
     """Replacement of the detector that returns the given keypoints of two images."""
 
     def __init__(self) -> None:
@@ -43,7 +43,7 @@ class GivenKeypointsMatcher:
     ) -> None:
         self._model = LoadedModel(family, options, context, **config)
         self._dimension = self._model.network.config.keypoint_detector_config.descriptor_decoder_dim
-        self._given = _Given()
+        self._given = _GivenKeypoints()
         self._model.network.keypoint_detector = self._given
 
     def match(
@@ -72,11 +72,11 @@ class GivenKeypointsMatcher:
         self._given.found = self._tensors((view_a, view_b), features)
         size_only = torch.empty(1, device=self._model.device).expand(1, 2, 1, height, width)
         with inference():
-            found = self._model.network(size_only)
+            prediction = self._model.network(size_only)
         # (1, 2, n), or (2, n) for a LightGlue without early stopping
         partners, scores = (
             tensor.reshape(2, -1)[0, : len(features[0])].cpu().numpy()
-            for tensor in (found.matches, found.matching_scores)
+            for tensor in (prediction.matches, prediction.matching_scores)
         )
         rows = np.flatnonzero((partners >= 0) & (partners < len(features[1])))
         return _matches(np.stack([rows, partners[rows]], axis=1), scores[rows])
@@ -95,7 +95,9 @@ class GivenKeypointsMatcher:
         mask = np.zeros((2, count), dtype=np.int32)
         size = np.array(views[0].camera.size)
         for index, (view, one) in enumerate(zip(views, features, strict=True)):
-            keypoints[index, : len(one)] = _as_in(one.keypoints, view, views[0]) / size
+            keypoints[index, : len(one)] = (
+                _to_first_view_pixels(one.keypoints, view, views[0]) / size
+            )
             scores[index, : len(one)] = 1 if one.scores is None else one.scores
             descriptors[index, : len(one)] = one.descriptors
             mask[index, : len(one)] = 1
@@ -130,14 +132,16 @@ class SuperGlueMatcher(GivenKeypointsMatcher):
         super().__init__(SuperGlueForKeypointMatching, options, context, **config)
 
 
-def _as_in(xy: Float64, view: View, first: View) -> Float64:
+def _to_first_view_pixels(xy: Float64, view: View, first: View) -> Float64:
     """Move pixels of a view such that normalization by the size of the first view is correct.
 
     The network uses one image size for both views, half of the longer side as unit, and integer
     pixel centers.
     """
-    own, other = np.array(view.camera.size), np.array(first.camera.size)
-    moved: Float64 = (xy - 0.5 - own / 2) * (other.max() / own.max()) + other / 2
+    view_size, first_size = np.array(view.camera.size), np.array(first.camera.size)
+    moved: Float64 = (xy - 0.5 - view_size / 2) * (
+        first_size.max() / view_size.max()
+    ) + first_size / 2
     return moved
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from mpsfm_transformers import stand_in
 from mpsfm_transformers.depth import HubDepth
-from mpsfm_transformers.options import DepthOptions, DinoOptions, known
+from mpsfm_transformers.options import DepthOptions, DinoOptions, look_up_model
 from mpsfm_transformers.retrieval import Dino
 
 from mpsfm_core import ProviderContext
@@ -114,7 +114,10 @@ def test_dino(context, photo, tmp_path, make):
 
 
 def test_licenses_by_name():
-    assert known("depth-anything/Depth-Anything-V2-Small-hf").license == "Apache-2.0"
-    assert known("depth-anything/Depth-Anything-V2-Large-hf@abc").license == "CC-BY-NC-4.0"
-    assert known("depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf").license == "Apache-2.0"
-    assert "see its card" in known("org/name").license
+    assert look_up_model("depth-anything/Depth-Anything-V2-Small-hf").license == "Apache-2.0"
+    assert look_up_model("depth-anything/Depth-Anything-V2-Large-hf@abc").license == "CC-BY-NC-4.0"
+    assert (
+        look_up_model("depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf").license
+        == "Apache-2.0"
+    )
+    assert "see its card" in look_up_model("org/name").license

@@ -32,7 +32,7 @@ def load(name: str, context: ProviderContext, max_keypoints: int = 2048) -> Any:
     return vismatch.get_matcher(name, device=context.device, max_num_keypoints=max_keypoints)
 
 
-def at_home(matcher: Any) -> AbstractContextManager[Any]:
+def provide_imports(matcher: Any) -> AbstractContextManager[Any]:
     """Provide the import path that the code of a matcher expects."""
     home = type(matcher).__module__
     if not home.startswith("vismatch."):
@@ -43,7 +43,7 @@ def at_home(matcher: Any) -> AbstractContextManager[Any]:
     return sandbox
 
 
-def part(matcher: Any, name: str, *attributes: str) -> Any:
+def get_inner_network(matcher: Any, name: str, *attributes: str) -> Any:
     """Return the inner network of a matcher, whose attribute name differs between matchers."""
     for attribute in attributes:
         if hasattr(matcher, attribute):

@@ -11,7 +11,7 @@ from mpsfm_mast3r.network import PairNetwork, Tensors
 from mpsfm_core import ProviderContext
 from mpsfm_core.data import Float32
 from mpsfm_core.providers.torch_runtime import inference
-from mpsfm_vismatch.collection import at_home, load, part
+from mpsfm_vismatch.collection import get_inner_network, load, provide_imports
 
 
 class TorchPairNetwork(PairNetwork):
@@ -20,7 +20,7 @@ class TorchPairNetwork(PairNetwork):
     def __init__(self, options: Any, context: ProviderContext) -> None:
         super().__init__(options.size)
         self._matcher = load(options.network, context)
-        self._network = part(self._matcher, options.network, "model").eval()
+        self._network = get_inner_network(self._matcher, options.network, "model").eval()
         self._device = context.device
 
     def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
@@ -34,7 +34,7 @@ class TorchPairNetwork(PairNetwork):
             }
             for side, image in enumerate((first, second))
         ]
-        with inference(), at_home(self._matcher):
+        with inference(), provide_imports(self._matcher):
             one, two = self._network(*views)
         in_first = ("pts3d", "pts3d_in_other_view")
         return _tensors(one, in_first[0]), _tensors(two, in_first[1])

@@ -58,17 +58,17 @@ class DenseMatcher:
         np.random.seed(self._seed)  # some networks sample a warp, with one of these attributes
         torch.manual_seed(self._seed)
         with inference():
-            found = self._matcher(*images)
+            output = self._matcher(*images)
         points = [
-            self._in_view(view, image, found[f"matched_kpts{side}"])
+            self._in_view(view, image, output[f"matched_kpts{side}"])
             for side, (view, image) in enumerate(zip(views, images, strict=True))
         ]
-        scores = found["matched_confidences"]
+        scores = output["matched_confidences"]
         if scores is None:
             scores = np.ones(len(points[0]))
         keep = inside(points[0], views[0].camera.size) & inside(points[1], views[1].camera.size)
         pixel = max(v.camera.width / i.shape[2] for v, i in zip(views, images, strict=True))
-        std_px = _STD_DETECTED_PX if len(found["all_kpts0"]) else _STD_DENSE_PX
+        std_px = _STD_DETECTED_PX if len(output["all_kpts0"]) else _STD_DENSE_PX
         certain: Float32 = np.clip(scores, 0, 1).astype(np.float32)
         return DenseMatches(
             points[0][keep], points[1][keep], certain[keep], max(1.0, std_px * pixel)
@@ -110,15 +110,17 @@ class SparseMatcher(DenseMatcher):
     ) -> PairMatches:
         """Match keypoints one-to-one, the most certain first."""
         given = require_features("vismatch-sparse matches keypoints", features_a, features_b)
-        found = self._matched(view_a, view_b)
-        nearest = np.empty((len(found), 2), dtype=np.int64)
-        near = np.ones(len(found), dtype=np.bool_)
+        matches = self._matched(view_a, view_b)
+        nearest = np.empty((len(matches), 2), dtype=np.int64)
+        near = np.ones(len(matches), dtype=np.bool_)
         for side, (features, xy) in enumerate(
-            zip(given, (found.points_a, found.points_b), strict=True)
+            zip(given, (matches.points_a, matches.points_b), strict=True)
         ):
             if not len(features):
                 near[:] = False
                 continue
             distance, nearest[:, side] = cKDTree(features.keypoints).query(xy)
             near &= distance <= self._snap_px
-        return PairMatches(sparse=SparseMatches.from_best_scores(nearest[near], found.scores[near]))
+        return PairMatches(
+            sparse=SparseMatches.from_best_scores(nearest[near], matches.scores[near])
+        )

@@ -14,7 +14,7 @@ from PIL import Image
 
 from mpsfm_core import ProviderContext, View
 from mpsfm_core.providers.torch_runtime import inference
-from mpsfm_vismatch.collection import at_home, load, part
+from mpsfm_vismatch.collection import get_inner_network, load, provide_imports
 from mpsfm_vismatch.options import RomaNetwork
 
 
@@ -26,7 +26,9 @@ class TorchWarpNetwork(WarpNetwork):
 
     def __init__(self, options: RomaNetwork, context: ProviderContext) -> None:
         self._matcher = load(options.network, context)
-        self._network = part(self._matcher, options.network, "roma_model", "matcher", "model")
+        self._network = get_inner_network(
+            self._matcher, options.network, "roma_model", "matcher", "model"
+        )
         self._device = context.device
 
     def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
@@ -36,7 +38,7 @@ class TorchWarpNetwork(WarpNetwork):
             for side, view in zip("ab", (view_a, view_b), strict=True):
                 paths.append(str(Path(folder, f"{side}.png")))
                 Image.fromarray(view.image).save(paths[-1], compress_level=0)
-            with at_home(self._matcher):
+            with provide_imports(self._matcher):
                 warp, certainty = self._network.match(*paths, device=self._device)
         arrays = (np.squeeze(t.float().cpu().numpy()) for t in (warp, certainty))
         return *arrays, bool(self._network.symmetric)

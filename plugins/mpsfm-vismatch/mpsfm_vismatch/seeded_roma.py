@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 import torch
 
-from mpsfm_vismatch.collection import at_home
+from mpsfm_vismatch.collection import provide_imports
 
 COARSE, FINE = 560, 280
 """Sides of the images of both passes; the published ones are 560 and 864. For a first pass other
@@ -48,5 +48,5 @@ class Matcher:
     def __init__(self, device: str = "cpu", max_num_keypoints: int = 2048) -> None:
         from vismatch.im_models.roma import roma_outdoor
 
-        with at_home(self):
+        with provide_imports(self):
             self.roma_model = network(roma_outdoor, device)

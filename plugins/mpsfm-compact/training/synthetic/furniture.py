@@ -89,8 +89,8 @@ def clutter(f: Frame, u: float, v: float, z: float, largest: float = 0.35) -> No
         f.ball(u, v, z + h, (r * 1.5, r * 1.5, r), b.look(glow=_between(b, 0, 1)))
 
 
-def _scatter(f: Frame, z: float, width: float, v0: float, v1: float, most: int) -> None:
-    for _ in range(f.build.rng.integers(0, most + 1)):
+def _scatter(f: Frame, z: float, width: float, v0: float, v1: float, max_objects: int) -> None:
+    for _ in range(f.build.rng.integers(0, max_objects + 1)):
         clutter(f, _between(f.build, -width / 2, width / 2), _between(f.build, v0, v1), z)
 
 

@@ -79,15 +79,15 @@ def _hit(kind, inverse, origin, direction):
 def _first(solids, chosen, count, origin, direction):
     """Find distance, solid (-1: none) and axis of the first hit among chosen solids."""
     kinds, inverses, centers, radii = solids
-    best, found, face = np.inf, -1, 0
+    best, solid, face = np.inf, -1, 0
     for k in range(count):
         i = chosen[k]
         if not _near(centers[i], radii[i], origin, direction, best):
             continue
         t, axis = _hit(kinds[i], inverses[i], origin, direction)
         if t < best:
-            best, found, face = t, i, axis
-    return best, found, face
+            best, solid, face = t, i, axis
+    return best, solid, face
 
 
 @_compiled

@@ -12,7 +12,7 @@ _ROUNDS = 10
 """Maximum number of iterations [MASt3R]; nearly all searches converge in three."""
 
 
-def nearest(queries: Float32, base: Float32) -> Int64:
+def find_nearest(queries: Float32, base: Float32) -> Int64:
     """Find the row of ``base`` (m, d) with the largest dot product for each query (n, d)."""
     step = max(1, _BLOCK // max(len(base), 1))
     blocks = [
@@ -22,26 +22,26 @@ def nearest(queries: Float32, base: Float32) -> Int64:
     return np.concatenate([np.empty(0, dtype=np.int64), *blocks])
 
 
-def reciprocal(a: Float32, b: Float32, start: Int64) -> Int64:
+def find_reciprocal(a: Float32, b: Float32, start: Int64) -> Int64:
     """Find pairs (m, 2) of rows that are mutual nearest neighbors, from rows ``start`` of ``a``.
 
     Iterate from a row to its nearest neighbor and back until the pair is stable (fast reciprocal
     matching, Leroy et al., ECCV 2024).
     """
-    found = [np.empty((0, 2), dtype=np.int64)]
+    pairs = [np.empty((0, 2), dtype=np.int64)]
     current = start
     for _ in range(_ROUNDS):
-        there = nearest(a[current], b)
-        back = nearest(b[there], a)
+        there = find_nearest(a[current], b)
+        back = find_nearest(b[there], a)
         settled = back == current
-        found.append(np.stack([current[settled], there[settled]], axis=1))
+        pairs.append(np.stack([current[settled], there[settled]], axis=1))
         current = np.unique(back[~settled])
         if not len(current):
             break
-    return np.unique(np.concatenate(found), axis=0)
+    return np.unique(np.concatenate(pairs), axis=0)
 
 
-def mutual(similarity: Float32) -> Int64:
+def find_mutual(similarity: Float32) -> Int64:
     """Find pairs (m, 2) of row and column that are each other's largest entry of a matrix."""
     if not similarity.size:
         return np.empty((0, 2), dtype=np.int64)
