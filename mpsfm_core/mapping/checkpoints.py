@@ -65,7 +65,7 @@ class Checkpointer:
         return MapperProgress(runs, mapper)
 
     def save_if_due(self, progress: MapperProgress, num_registered: int) -> None:
-        """Save a checkpoint if the store asks for one."""
+        """Save a checkpoint if one is due."""
         if self._store is not None and self._store.due():
             self._save(progress, num_registered)
 

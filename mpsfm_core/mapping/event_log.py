@@ -36,7 +36,7 @@ class EventLog:
         self._events.image_registered(images[image].name, count, len(images))
 
     def scene_changed(self, scene: Scene) -> None:
-        """Forward a change of the scene; a receiver that asks for the state pays for the copy."""
+        """Forward a change of the scene; the state is copied only if a receiver requests it."""
         self._events.scene_changed(lambda: capture_scene_state(scene))
 
     def rejected(self, image: int, reason: Reason) -> None:

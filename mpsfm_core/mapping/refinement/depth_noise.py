@@ -82,8 +82,8 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
 
     The median residual of a pair is subtracted, because the scales of its images, which are
     parameters of bundle adjustment, may cause it. The variance is the sum of squares divided by the
-    effective number of residuals minus the number of fitted parameters (scales and poses); the
-    declared variance counts as one more residual (a unit information prior).
+    degrees of freedom: effective number of residuals minus fitted scales and poses. The declared
+    variance counts as one more residual (a unit information prior).
 
     Returns:
         The noise; the declared one if too few residuals exist.

@@ -1,9 +1,9 @@
 """Measurement of the noise of keypoints: normal errors, or errors with heavy tails.
 
 Two models of the epipolar errors of matches compete by likelihood. If the errors are normal, a loss
-near least squares is efficient. If they have heavy tails, as those of learned keypoints often have,
-the Cauchy loss of the options is kept: with scale ``c`` it is the likelihood of Student's t
-distribution, ``c^2 = nu s^2``, with ``nu`` degrees of freedom and scale ``s``.
+near least squares is efficient. If they have heavy tails, as learned keypoints often have, the
+Cauchy loss of the options is kept. A Cauchy loss of scale ``c`` is the likelihood of Student's t
+distribution with ``nu`` degrees of freedom and scale ``s``, ``c^2 = nu s^2``.
 
 Reprojection errors of points would be biased, because a robustly fitted point passes through some
 of its keypoints. Epipolar errors depend on the poses alone.
