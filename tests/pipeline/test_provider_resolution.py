@@ -316,7 +316,7 @@ def test_a_cheap_fault_is_found_before_a_download(
     assert not server.requests
 
 
-def test_config_show_says_what_would_be_chosen(tmp_path: Path) -> None:
+def test_config_show_lists_choices_and_hides_expert_settings(tmp_path: Path) -> None:
     settings = ["--set", f"runtime.cache_dir={tmp_path}", "--offline"]
     shown = CliRunner().invoke(build_app(), ["config", "show", "default", *settings]).output
     config, _, comment = shown.partition("# providers on this machine:\n")
@@ -326,4 +326,8 @@ def test_config_show_says_what_would_be_chosen(tmp_path: Path) -> None:
     assert lines.keys() == fast_pass | {"features", "matcher", "depth", "normals"}
     assert "not moge-2-small" in lines["depth"]
     (tmp_path / "shown.yaml").write_text(shown)
-    assert load_config(tmp_path / "shown.yaml").to_yaml() == config.rstrip("\n") + "\n"
+    loaded = load_config(tmp_path / "shown.yaml")
+    assert loaded.to_yaml(expert_settings=False) == config.rstrip("\n") + "\n"
+    expert = CliRunner().invoke(build_app(), ["config", "show", "default", "--expert", *settings])
+    assert "max_pixels:" in expert.output and "max_pixels:" not in config
+    assert expert.output.startswith(loaded.to_yaml())
