@@ -49,7 +49,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_the_priors_of_the_sample_scene_promise_too_little(calibrated: Path) -> None:
+def test_calibrate_sample_scene_finds_overestimated_std(calibrated: Path) -> None:
     """Its README: rms of error over declared std 0.90, with the scale errors that we take out."""
     calibration = load_calibration(calibrated)
     assert isinstance(calibration, DepthCalibration)
@@ -58,7 +58,7 @@ def test_the_priors_of_the_sample_scene_promise_too_little(calibrated: Path) -> 
     assert provenance(calibrated)["metrics"]["before"]["coverage"][0] > 0.8
 
 
-def test_the_file_says_where_it_comes_from(calibrated: Path) -> None:
+def test_calibration_file_has_provenance(calibrated: Path) -> None:
     found = provenance(calibrated)
     assert found["provider"] == "files"
     assert found["distribution"].startswith("mpsfm-core ")
@@ -71,7 +71,7 @@ def test_the_file_says_where_it_comes_from(calibrated: Path) -> None:
     assert str(SCENE) not in calibrated.read_text()
 
 
-def test_a_configuration_uses_it(calibrated: Path, tmp_path: Path) -> None:
+def test_config_loads_calibration_file(calibrated: Path, tmp_path: Path) -> None:
     config = tmp_path / "run.yaml"
     config.write_text(
         f"extends: demo\n"
@@ -81,7 +81,7 @@ def test_a_configuration_uses_it(calibrated: Path, tmp_path: Path) -> None:
     assert load_config(config).depth.calibration == expected
 
 
-def test_the_report_has_plots_and_numbers(calibrated: Path) -> None:
+def test_report_has_plots_and_values(calibrated: Path) -> None:
     pytest.importorskip("matplotlib")
     page = calibrated.with_suffix(".report.html").read_text()
     assert page.count("<svg") == 1
@@ -93,7 +93,7 @@ def test_the_report_has_plots_and_numbers(calibrated: Path) -> None:
     assert len(numbers["images"]) == 8
 
 
-def test_every_plot_is_labelled_and_shows_both_calibrations(calibrated: Path) -> None:
+def test_plots_are_labeled(calibrated: Path) -> None:
     pytest.importorskip("matplotlib")
     page = calibrated.with_suffix(".report.html").read_text()
     root = ElementTree.fromstring(page[page.index("<svg") : page.index("</svg>") + len("</svg>")])
@@ -120,7 +120,7 @@ def test_every_plot_is_labelled_and_shows_both_calibrations(calibrated: Path) ->
             assert (quarter == bgr).all(axis=2).sum() > 100
 
 
-def test_without_matplotlib_the_page_says_what_is_missing(
+def test_report_without_matplotlib_has_hint(
     calibrated: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.delitem(sys.modules, "mpsfm_core.calibration.plots", raising=False)
@@ -133,12 +133,12 @@ def test_without_matplotlib_the_page_says_what_is_missing(
     assert not (tmp_path / "again.report.png").exists()
 
 
-def test_the_same_command_fits_the_same_values(calibrated: Path, tmp_path: Path) -> None:
+def test_calibrate_is_deterministic(calibrated: Path, tmp_path: Path) -> None:
     assert run(tmp_path / "again.json", "-q", *PRIOR, *DEPTH).output == ""
     assert load_calibration(tmp_path / "again.json") == load_calibration(calibrated)
 
 
-def test_a_std_declared_5_times_too_small_is_found_out(calibrated: Path, tmp_path: Path) -> None:
+def test_calibrate_corrects_std_5_times_too_small(calibrated: Path, tmp_path: Path) -> None:
     wrong = "calibration={std_scale: 0.2, relative_std: 0.0, std_floor: 0.0}"
     assert run(tmp_path / "c.yaml", *PRIOR, *DEPTH, "--set", wrong).exit_code == 0
     assert load_calibration(tmp_path / "c.yaml") == load_calibration(calibrated)
@@ -147,7 +147,7 @@ def test_a_std_declared_5_times_too_small_is_found_out(calibrated: Path, tmp_pat
     assert metrics["before"]["nll_heavy"] > metrics["after"]["nll_heavy"] + 0.5
 
 
-def test_normals(tmp_path: Path) -> None:
+def test_calibrate_normals(tmp_path: Path) -> None:
     """The README of the scene: rms of angle over declared std 0.96."""
     arguments = ["--kind", "normals", "--ground-truth", SCENE / "gt_normals"]
     arguments += ["--set", f"options.directory={SCENE / 'priors' / 'normals'}"]
@@ -161,7 +161,7 @@ def test_normals(tmp_path: Path) -> None:
     assert 0.6 < after["coverage"][0] < 0.76
 
 
-def test_masked_pixels_and_images_without_truth_are_left_out(tmp_path: Path) -> None:
+def test_calibrate_skips_masked_pixels_and_missing_truth(tmp_path: Path) -> None:
     shutil.copytree(SCENE / "gt_depth", tmp_path / "gt")
     (tmp_path / "masks").mkdir()
     for path in (tmp_path / "gt").iterdir():
@@ -197,7 +197,7 @@ def test_masked_pixels_and_images_without_truth_are_left_out(tmp_path: Path) -> 
         ([*PRIOR, "--ground-truth", SCENE / "gt"], "has no file for any of the images"),
     ],
 )
-def test_wrong_use_is_explained_in_a_line(
+def test_calibrate_command_wrong_arguments_fail(
     tmp_path: Path, arguments: Sequence[object], message: str
 ) -> None:
     result = run(tmp_path / "c.yaml", *arguments)
@@ -206,13 +206,13 @@ def test_wrong_use_is_explained_in_a_line(
     assert not (tmp_path / "c.yaml").exists()
 
 
-def test_the_name_of_the_file_says_its_format(tmp_path: Path) -> None:
+def test_calibrate_command_suffix_selects_format(tmp_path: Path) -> None:
     result = run(tmp_path / "calibration", *PRIOR, *DEPTH)
     assert result.exit_code == 2
     assert "ends in .yaml or .json" in result.output
 
 
-def test_points_of_a_model(calibrated: Path, tmp_path: Path) -> None:
+def test_calibrate_with_model_points(calibrated: Path, tmp_path: Path) -> None:
     """Points that two views see lead to about the same std as true maps, in any unit."""
     write_model(SCENE, tmp_path / "model", scale=7.0)
     result = run(tmp_path / "points.yaml", *PRIOR, "--model", tmp_path / "model")
@@ -227,7 +227,7 @@ def test_points_of_a_model(calibrated: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_nothing_but_photos(calibrated: Path, tmp_path: Path) -> None:
+def test_self_calibration_with_images_only(calibrated: Path, tmp_path: Path) -> None:
     """The points of our own reconstruction lead to about the same std as true depth."""
     result = run(tmp_path / "own.yaml", *PRIOR, "--config", "demo", *_normals())
     assert result.exit_code == 0, result.output

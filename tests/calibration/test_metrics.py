@@ -30,7 +30,7 @@ def residuals_of(error: Float64, images: int = 1) -> Residuals:
     )
 
 
-def test_normal_errors_of_the_declared_size() -> None:
+def test_metrics_of_calibrated_std_are_ideal() -> None:
     rng = np.random.default_rng(0)
     std = np.exp(rng.normal(-2, 0.5, 100_000))
     metrics = compute_metrics(residuals_of(std * rng.normal(size=len(std))), std)
@@ -43,7 +43,7 @@ def test_normal_errors_of_the_declared_size() -> None:
     assert all(b["coverage"][0] == pytest.approx(0.683, abs=0.015) for b in metrics["by_range"])
 
 
-def test_five_times_too_small_a_std_shows_everywhere() -> None:
+def test_metrics_of_underestimated_std_are_bad() -> None:
     rng = np.random.default_rng(0)
     error = rng.normal(size=20_000)
     right, wrong = (compute_metrics(residuals_of(error), np.full(20_000, s)) for s in (1.0, 0.2))
@@ -53,14 +53,14 @@ def test_five_times_too_small_a_std_shows_everywhere() -> None:
     assert wrong["nll_heavy"] > right["nll_heavy"]
 
 
-def test_noise_of_the_truth_is_part_of_what_is_expected() -> None:
+def test_metrics_include_noise_of_truth() -> None:
     rng = np.random.default_rng(0)
     error = 0.5 * rng.normal(size=50_000)
     noisy = replace(residuals_of(error), noise=np.full(50_000, 0.4))
     assert compute_metrics(noisy, np.full(50_000, 0.3))["z_mad"] == pytest.approx(1, abs=0.02)
 
 
-def test_ause_is_0_for_the_true_order_and_large_for_the_opposite() -> None:
+def test_ause_is_zero_for_true_order() -> None:
     error = np.random.default_rng(0).normal(size=5_000)
     residuals = residuals_of(error)
     perfect = compute_metrics(residuals, np.abs(error) + 1e-9)["ause"]
@@ -70,7 +70,7 @@ def test_ause_is_0_for_the_true_order_and_large_for_the_opposite() -> None:
     assert 0.2 < ignorant < opposite
 
 
-def test_the_sensitivity_curve_by_hand() -> None:
+def test_sensitivity_curve_matches_hand_computed_values() -> None:
     curve = sensitivity_curve(np.array([3.0, 0.0, 4.0, 0.0]), np.array([0.1, 0.2, 0.3, 0.4]))
     total = np.sqrt(25 / 4)
     assert curve["recall"] == [0.25, 0.5, 0.75, 1.0]
@@ -80,13 +80,13 @@ def test_the_sensitivity_curve_by_hand() -> None:
     assert curve["ideal"] == pytest.approx([value / total for value in ideal])
 
 
-def test_equal_stds_do_not_keep_the_order_of_the_images() -> None:
+def test_sensitivity_curve_shuffles_equal_stds() -> None:
     error = np.concatenate([np.zeros(500), np.ones(500)])
     curve = sensitivity_curve(error, np.ones(1000))
     assert curve["predicted"][len(curve["predicted"]) // 2] == pytest.approx(1, abs=0.1)
 
 
-def test_every_image_has_the_same_weight() -> None:
+def test_metrics_weight_images_equally() -> None:
     good, bad = np.full(900, 0.1), np.full(100, 10.0)
     residuals = replace(
         residuals_of(np.concatenate([good, bad]), images=2), image=np.repeat([0, 1], [900, 100])

@@ -77,14 +77,14 @@ def errors(truth: dict[str, DepthTruth], points: Float64, images: ImageSet) -> F
     return np.concatenate(found)
 
 
-def test_depth_has_errors_of_the_declared_size(points: Float64, images: ImageSet) -> None:
+def test_model_depth_std_is_calibrated(points: Float64, images: ImageSet) -> None:
     z = np.abs(errors(depth_truth_from_model(make_model(points, points), images), points, images))
     assert len(z) > POINTS
     # Noisy keypoints are sometimes nearest to another point, so the middle is looked at.
     assert 1.4826 * np.median(z) == pytest.approx(1, abs=0.2)
 
 
-def test_where_the_model_puts_the_points_does_not_matter(points: Float64, images: ImageSet) -> None:
+def test_model_depth_is_independent_of_model_points(points: Float64, images: ImageSet) -> None:
     """A prior that pulled points along their rays must not be compared with itself."""
     center = -arc_poses(5, 8.0)[2][:, :3].T @ arc_poses(5, 8.0)[2][:, 3]
     pulled = center + 1.15 * (points - center)
@@ -94,9 +94,7 @@ def test_where_the_model_puts_the_points_does_not_matter(points: Float64, images
     assert np.abs(np.median(errors(again, points, images))) < 0.2
 
 
-def test_points_of_small_angle_and_wrong_matches_are_no_truth(
-    points: Float64, images: ImageSet
-) -> None:
+def test_model_depth_excludes_small_angles_and_outliers(points: Float64, images: ImageSet) -> None:
     near = points.copy()
     near[:100] = points[:100] * 0.1 + [0, 60.0, 0]  # so far away that the rays are parallel
     truth = depth_truth_from_model(make_model(near, near), images)
@@ -113,10 +111,10 @@ def test_points_of_small_angle_and_wrong_matches_are_no_truth(
     )
 
 
-def test_images_that_only_the_model_has_are_left_out(points: Float64, images: ImageSet) -> None:
+def test_model_depth_skips_unknown_images(points: Float64, images: ImageSet) -> None:
     some = ImageSet(images.images[:2], images._options)
     assert set(depth_truth_from_model(make_model(points, points), some)) == {"1.png", "2.png"}
 
 
-def test_a_model_without_points_has_no_truth(images: ImageSet) -> None:
+def test_model_depth_without_points_is_empty(images: ImageSet) -> None:
     assert depth_truth_from_model(make_model(np.zeros((0, 3)), np.zeros((0, 3))), images) == {}

@@ -87,7 +87,7 @@ def assert_near(
     assert np.median(std_of(other, data.residuals(other)) / stds[1]) < 0.3
 
 
-def test_one_std_covers_held_out_images(by_sensor: CalibrationResult) -> None:
+def test_std_covers_test_images(by_sensor: CalibrationResult) -> None:
     before, after = (by_sensor.report["metrics"][when] for when in ("before", "after"))
     assert len(by_sensor.report["images"]) == 123
     assert 0.60 < after["coverage"][0] < 0.76
@@ -95,7 +95,7 @@ def test_one_std_covers_held_out_images(by_sensor: CalibrationResult) -> None:
     assert after["nll_heavy"] < before["nll_heavy"]
 
 
-def test_nothing_but_photos_leads_to_nearly_the_same(
+def test_self_calibration_is_close_to_sensor_calibration(
     room: Room, by_sensor: CalibrationResult
 ) -> None:
     own = calibrate(room.frames, room.config)
@@ -103,7 +103,7 @@ def test_nothing_but_photos_leads_to_nearly_the_same(
     assert_near(own, by_sensor, room, 0.25)
 
 
-def test_so_do_the_points_of_a_model_by_colmap(
+def test_colmap_points_are_close_to_sensor_calibration(
     room: Room, by_sensor: CalibrationResult, tmp_path: Path
 ) -> None:
     photos, registry = room.frames, Registry.discover()

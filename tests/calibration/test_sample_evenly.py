@@ -19,7 +19,7 @@ def truth_at(xy: Float64, depth: Float64 | None = None) -> DepthTruth:
     return DepthTruth(xy, depth, depth / 1000)
 
 
-def test_a_crowd_counts_no_more_than_a_point_alone() -> None:
+def test_sample_evenly_weights_by_area() -> None:
     rng = np.random.default_rng(0)
     crowd = rng.normal((50, 75), 0.1, (99, 2))
     even = sample_evenly(truth_at(np.vstack([crowd, [[150.0, 75.0]]])), SIZE, 40_000, rng)
@@ -29,7 +29,7 @@ def test_a_crowd_counts_no_more_than_a_point_alone() -> None:
     np.testing.assert_array_equal(even.std, even.depth / 1000)
 
 
-def test_pixels_far_from_all_points_are_left_out() -> None:
+def test_sample_evenly_skips_distant_pixels() -> None:
     rng = np.random.default_rng(0)
     even = sample_evenly(truth_at(np.array([[100.0, 75.0]])), SIZE, 20_000, rng)
     disc = np.pi * (REACH * WIDTH) ** 2 / (WIDTH * HEIGHT)
@@ -57,7 +57,7 @@ def photos(*, texture_only: bool) -> DepthData:
     return DepthData(tuple(samples), in_meters=False)
 
 
-def test_the_std_is_that_of_the_picture_and_not_of_its_texture() -> None:
+def test_sample_evenly_removes_texture_bias() -> None:
     """Half of the pixels err with a std of 5 %, half with 15 %: 68.27 % are within 8.8 %."""
     stds = []
     for texture_only in (True, False):

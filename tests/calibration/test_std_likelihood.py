@@ -30,7 +30,7 @@ def fitted(samples: tuple[DepthSamples, ...], *alignments: str) -> DepthCalibrat
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_all_three_terms_within_5_percent_from_20_images(seed: int) -> None:
+def test_fit_recovers_three_terms_within_5_percent(seed: int) -> None:
     found = fitted(simulate(PLAIN, 20, seed))
     assert found.use_network_variance
     assert found.std_scale == pytest.approx(PLAIN.std_scale, rel=0.05)
@@ -39,27 +39,27 @@ def test_all_three_terms_within_5_percent_from_20_images(seed: int) -> None:
     assert found.edge_ratio is None
 
 
-def test_without_network_variance() -> None:
+def test_fit_without_network_variance() -> None:
     found = fitted(simulate(replace(PLAIN, network=False, relative_std=0.2), 20))
     assert not found.use_network_variance
     assert found.relative_std == pytest.approx(0.2, rel=0.05)
 
 
-def test_truth_that_is_noisy_itself_is_accounted_for() -> None:
+def test_fit_subtracts_noise_of_truth() -> None:
     noisy = replace(PLAIN, truth_std=0.05)
     found = fitted(simulate(noisy, 20))
     assert found.std_scale == pytest.approx(PLAIN.std_scale, rel=0.05)
     assert found.relative_std == pytest.approx(PLAIN.relative_std, rel=0.07)
 
 
-def test_more_variance_at_edges() -> None:
+def test_fit_recovers_edge_scale() -> None:
     found = fitted(simulate(replace(PLAIN, edge_std_scale=3.0), 20))
     assert found.edge_ratio in (1.05, 1.1)
     assert found.edge_std_scale == pytest.approx(3.0, rel=0.05)
     assert found.relative_std == pytest.approx(PLAIN.relative_std, rel=0.05)
 
 
-def test_a_network_that_knows_nothing_is_not_believed() -> None:
+def test_fit_ignores_uninformative_network_std() -> None:
     samples = simulate(replace(PLAIN, network=False, gross=0.02), 12)
     rng = np.random.default_rng(5)
     pretending = tuple(
@@ -68,7 +68,7 @@ def test_a_network_that_knows_nothing_is_not_believed() -> None:
     assert not fitted(pretending).use_network_variance
 
 
-def test_a_floor_that_never_counts_is_the_usual_one_or_what_hides() -> None:
+def test_fit_undetermined_floor_has_default() -> None:
     coarse = simulate(replace(PLAIN, network=False, relative_std=0.3, std_floor=0), 10)
     assert fitted(coarse).std_floor == pytest.approx(0.02)
     fine = simulate(replace(PLAIN, network=False, relative_std=0.003, std_floor=0, gross=0.01), 10)
@@ -78,7 +78,7 @@ def test_a_floor_that_never_counts_is_the_usual_one_or_what_hides() -> None:
 
 
 @pytest.mark.parametrize("alignment", ["scale-shift", "disparity"])
-def test_the_shift_of_relative_networks(alignment: str) -> None:
+def test_fit_recovers_shift_of_relative_network(alignment: str) -> None:
     parameters = Simulated(network=False, metric=False, relative_std=0.05, gross=0.02)
     shifted = tuple(_unshift(s, alignment, 0.4) for s in simulate(parameters, 20))
     found = fitted(shifted, "scale", "scale-shift", "disparity")
@@ -88,18 +88,18 @@ def test_the_shift_of_relative_networks(alignment: str) -> None:
     assert found.relative_std == pytest.approx(0.05, rel=0.05)
 
 
-def test_relative_depth_without_a_shift_is_left_alone() -> None:
+def test_fit_without_shift_selects_scale() -> None:
     samples = simulate(replace(PLAIN, metric=False, network=False), 20)
     assert abs(fitted(samples, "scale", "scale-shift", "disparity").shift) < 0.02
 
 
-def test_gross_errors_are_counted() -> None:
+def test_fit_estimates_gross_ratio() -> None:
     assert fit_std(depth_residuals(simulate(PLAIN, 10), DepthCalibration())).gross > 0.02
     clean = replace(PLAIN, gross=0.0)
     assert fit_std(depth_residuals(simulate(clean, 10), DepthCalibration())).gross < 0.005
 
 
-def test_heavy_tails_get_the_std_that_covers() -> None:
+def test_fit_heavy_tails_matches_coverage() -> None:
     samples = simulate(replace(PLAIN, gross=0.0, network=False), 10)
     rng = np.random.default_rng(0)
     heavy = tuple(
@@ -111,7 +111,7 @@ def test_heavy_tails_get_the_std_that_covers() -> None:
     assert within.mean() == pytest.approx(0.683, abs=0.02)
 
 
-def test_intervals_hold_the_truth_and_narrow_with_more_images() -> None:
+def test_bootstrap_intervals_cover_truth_and_shrink() -> None:
     widths = []
     for images in (5, 30):
         residuals = depth_residuals(simulate(PLAIN, images, seed=7, pixels=300), DepthCalibration())
@@ -124,7 +124,7 @@ def test_intervals_hold_the_truth_and_narrow_with_more_images() -> None:
     assert widths[1] < 0.6 * widths[0]
 
 
-def test_every_image_counts_the_same() -> None:
+def test_fit_weights_images_equally() -> None:
     good = simulate(replace(PLAIN, network=False, relative_std=0.05, std_floor=0), 6, pixels=200)
     many = simulate(replace(PLAIN, network=False, relative_std=0.2, std_floor=0), 6, pixels=4000)
     few = simulate(replace(PLAIN, network=False, relative_std=0.2, std_floor=0), 6, pixels=200)
@@ -134,7 +134,7 @@ def test_every_image_counts_the_same() -> None:
 
 
 @pytest.mark.parametrize("network", [True, False])
-def test_normals_within_5_percent_from_20_images(network: bool) -> None:
+def test_fit_recovers_normal_std_within_5_percent(network: bool) -> None:
     rng = np.random.default_rng(0)
     samples = tuple(_normal_samples(rng, 2.0, np.radians(4.0), network) for _ in range(20))
     found = select_candidate(NormalData(samples).fit()).calibration
@@ -155,7 +155,7 @@ def test_tangent_errors_are_angles() -> None:
     assert length == pytest.approx(np.arccos((prior * truth).sum(axis=1)), abs=1e-9)
 
 
-def test_std_of_is_what_apply_declares() -> None:
+def test_std_of_matches_apply() -> None:
     """The fit and the extraction must mean the same by a calibration."""
     samples = simulate(PLAIN, 1)
     calibration = DepthCalibration(
@@ -168,7 +168,7 @@ def test_std_of_is_what_apply_declares() -> None:
     assert std_of(calibration, residuals) == pytest.approx(by_hand, rel=1e-12)
 
 
-def test_residuals_of_normals_have_both_directions() -> None:
+def test_normal_residuals_have_two_directions() -> None:
     samples = _normal_samples(np.random.default_rng(0), 1.0, 0.1, True)
     residuals = normal_residuals([samples])
     assert len(residuals) == 2 * len(samples.prior)

@@ -82,8 +82,8 @@ def test_scale_std_of_single_pair_is_zero() -> None:
 def test_scale_std_of_separate_pairs_is_declared_std() -> None:
     exact, std = 1e9, 0.2
     groups = {view: end_constraint(view ^ 1, exact, std) for view in range(4)}  # pairs 0-1 and 2-3
-    # The scale std of a map is sqrt(1.5) std, because the correlation in a pair is 0.5. A pair has the
-    # mean scale of its maps, at half the distance between both pairs from their mean.
+    # The scale std of a map is sqrt(1.5) std, because the correlation in a pair is 0.5. A pair has
+    # the mean scale of its maps, at half the distance between both pairs from their mean.
     expected = std * (1.5 / 2 / 2) ** 0.5
     assert list(estimate_scale_stds(groups).values()) == pytest.approx([expected] * 4, rel=1e-3)
     alone = estimate_scale_stds(

@@ -22,7 +22,7 @@ TRUTH = np.array([[2, 2, 4, 0]], dtype=np.float32).repeat(3, axis=0)
 VALID = np.ones(TRUTH.shape, dtype=np.bool_)
 
 
-def test_depth_errors_computed_by_hand() -> None:
+def test_depth_accuracy_matches_hand_computed_errors() -> None:
     depth = np.array([[1, 3, 4, 9]], dtype=np.float32).repeat(3, axis=0)
     found = depth_accuracy(depth, VALID, TRUTH, scale=1.0)
     assert found is not None
@@ -33,7 +33,7 @@ def test_depth_errors_computed_by_hand() -> None:
     assert (found.pixels, found.coverage, found.scale) == (9, 1.0, 1.0)
 
 
-def test_median_scaling_takes_out_the_scale() -> None:
+def test_depth_accuracy_median_scaling_removes_scale() -> None:
     depth = np.where(TRUTH > 0, 0.25 * TRUTH, 1).astype(np.float32)
     raw = depth_accuracy(depth, VALID, TRUTH, scale=1.0)
     scaled = depth_accuracy(depth, VALID, TRUTH, scale=None)
@@ -44,7 +44,7 @@ def test_median_scaling_takes_out_the_scale() -> None:
     assert both["abs_rel"] == pytest.approx(0.375) and both["pixels"] == 18
 
 
-def test_only_pixels_known_to_both_count() -> None:
+def test_depth_accuracy_uses_common_pixels() -> None:
     valid = VALID.copy()
     valid[:, 0] = False
     found = depth_accuracy(TRUTH + np.float32(0), valid, TRUTH, scale=1.0)
@@ -53,7 +53,7 @@ def test_only_pixels_known_to_both_count() -> None:
     assert depth_accuracy(TRUTH, ~VALID, TRUTH, scale=None) is None
 
 
-def test_a_map_on_a_smaller_grid_is_interpolated() -> None:
+def test_depth_accuracy_interpolates_smaller_map() -> None:
     rows, columns = np.mgrid[0:40, 0:80] + 0.5
     truth = (2 + columns / 80 + rows / 40).astype(np.float32)
     small = truth.reshape(20, 2, 40, 2).mean(axis=(1, 3))
@@ -61,7 +61,7 @@ def test_a_map_on_a_smaller_grid_is_interpolated() -> None:
     assert found is not None and found.abs_rel < 1e-3
 
 
-def test_accuracy_and_completeness_of_a_plane() -> None:
+def test_cloud_accuracy_of_plane() -> None:
     x, y = np.meshgrid(np.arange(0, 1, 0.01), np.arange(0, 1, 0.01))
     scan = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
     half = scan[scan[:, 0] < 0.5] + [0, 0, 0.03]
@@ -78,7 +78,7 @@ def test_accuracy_and_completeness_of_a_plane() -> None:
         cloud_accuracy(scan[:0], scan)
 
 
-def test_a_cloud_that_is_nowhere_near_has_a_median_distance_all_the_same() -> None:
+def test_cloud_accuracy_distant_cloud_has_finite_median() -> None:
     rng = np.random.default_rng(0)
     scan = rng.random((5000, 3)) * [1, 1, 0]
     found = cloud_accuracy(scan + np.array([0, 0, 3]), scan, (0.01, 0.02))
@@ -87,14 +87,14 @@ def test_a_cloud_that_is_nowhere_near_has_a_median_distance_all_the_same() -> No
     assert found["f1"] == {"0.01": 0, "0.02": 0}
 
 
-def test_points_of_one_place_count_once() -> None:
+def test_cloud_accuracy_counts_dense_regions_once() -> None:
     scan = np.array([[0.0, 0, 0], [1, 0, 0]])
     crowded = np.concatenate([np.full((1000, 3), 0.001), [[1.0, 0, 3]]])
     assert cloud_accuracy(crowded, scan, (0.1,))["accuracy"]["0.1"] == 0.5
 
 
 @pytest.mark.parametrize("kind", ["ours", "ascii", "big"])
-def test_ply_files_of_all_kinds(kind: str, tmp_path: Path) -> None:
+def test_read_ply_supports_all_formats(kind: str, tmp_path: Path) -> None:
     points = np.array([[1.5, -2, 3], [0.25, 5, -6]])
     path = tmp_path / "cloud.ply"
     if kind == "ours":
@@ -122,13 +122,15 @@ def test_ply_files_of_all_kinds(kind: str, tmp_path: Path) -> None:
         b"ply\nformat ascii 1.0\nelement face 1\nend_header\n",
     ],
 )
-def test_what_is_no_cloud_is_explained(content: bytes, tmp_path: Path) -> None:
+def test_read_ply_invalid_file_raises(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "x.ply").write_bytes(content)
-    with pytest.raises(InputError, match=r"x\.ply: (is no PLY file|its points have no x, y and z)"):
+    with pytest.raises(
+        InputError, match=r"x\.ply( is not a PLY file|: the vertices need x, y and z)"
+    ):
         read_ply(tmp_path / "x.ply")
 
 
-def test_the_command_compares_depth_and_cloud(scene_folder: Path, tmp_path: Path) -> None:
+def test_evaluate_command_reports_depth_and_cloud(scene_folder: Path, tmp_path: Path) -> None:
     gt, depth = scene_folder / "gt", scene_folder / "gt_depth"
     (tmp_path / "depth").mkdir()
     (tmp_path / "sparse").symlink_to(gt)
@@ -148,14 +150,14 @@ def test_the_command_compares_depth_and_cloud(scene_folder: Path, tmp_path: Path
     assert report["trajectory"]["rpe_rmse"] == pytest.approx(0, abs=1e-9)
     write_ply(tmp_path / "dense.ply", cloud[:0], np.zeros((0, 3), dtype=np.uint8))
     result = CliRunner().invoke(build_app(), arguments)
-    assert result.exit_code == 2 and "dense.ply has no points" in result.stderr
+    assert result.exit_code == 2 and "dense.ply: has no points" in result.stderr
     write_depth(tmp_path / "other" / "x.png", flat)
     arguments[4] = str(tmp_path / "other")
     result = CliRunner().invoke(build_app(), arguments)
     assert result.exit_code == 2 and "no depth map has a true one" in result.stderr
 
 
-def test_true_depth_is_the_scan_where_there_is_none(scene_folder: Path, tmp_path: Path) -> None:
+def test_evaluate_command_without_scan_uses_true_depth(scene_folder: Path, tmp_path: Path) -> None:
     gt, depth = scene_folder / "gt", scene_folder / "gt_depth"
     (tmp_path / "depth").mkdir()
     (tmp_path / "sparse").symlink_to(gt)

@@ -66,7 +66,7 @@ def arguments(scene: Path, config: Path, folder: Path) -> list[str]:
     return ["benchmark", str(scene), *settings.split()]
 
 
-def test_the_report_has_all_methods_and_names_its_convention(output) -> None:
+def test_report_lists_methods_and_convention(output) -> None:
     folder, out, _ = output
     report = json.loads((folder / "report.json").read_text())["conventions"]
     assert set(report) == {"paper", "models", "colmap", "vggt"}
@@ -82,7 +82,7 @@ def test_the_report_has_all_methods_and_names_its_convention(output) -> None:
     assert "ordered pairs" in (folder / "report.html").read_text()
 
 
-def test_dense_columns_are_of_ours_where_there_is_true_depth(output) -> None:
+def test_report_dense_columns_need_true_depth(output) -> None:
     folder, out, _ = output
     report = json.loads((folder / "report.json").read_text())["conventions"]["paper"]
     rows = {row["method"]: row["dense"] for row in report["rows"]}
@@ -103,7 +103,7 @@ def test_dense_columns_are_of_ours_where_there_is_true_depth(output) -> None:
     assert "<th>AbsRel</th><th>0.02 m</th>" in page and f"<td>{shares}</td>" in page
 
 
-def test_the_recall_curves_are_labelled_and_those_of_the_errors(output) -> None:
+def test_report_recall_curves_match_errors(output) -> None:
     folder, _, _ = output
     page = (folder / "report.html").read_text()
     drawing = ElementTree.fromstring(
@@ -122,7 +122,7 @@ def test_the_recall_curves_are_labelled_and_those_of_the_errors(output) -> None:
     assert len(first) == 2 + 2 * (errors <= 20).sum()
 
 
-def test_records_hold_the_poses(output) -> None:
+def test_records_contain_poses(output) -> None:
     folder, _, _ = output
     record = read_record(folder / "runs" / "room" / "sift" / "all-00" / "ours-sensor.json")
     assert set(record.estimated) == set(record.truth)
@@ -132,7 +132,7 @@ def test_records_hold_the_poses(output) -> None:
     assert record.pairs >= 4 and not record.error
 
 
-def test_a_second_run_computes_nothing(output, scene_folder: Path, config: Path) -> None:
+def test_run_benchmark_second_run_uses_records(output, scene_folder: Path, config: Path) -> None:
     folder, out, _ = output
     times = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*/*/*/*.json")}
     assert len(times) == 3
@@ -142,7 +142,9 @@ def test_a_second_run_computes_nothing(output, scene_folder: Path, config: Path)
     assert {path: path.stat().st_mtime_ns for path in times} == times
 
 
-def test_what_changed_or_broke_is_computed_again(output, scene_folder: Path, config: Path) -> None:
+def test_run_benchmark_repeats_changed_or_damaged_runs(
+    output, scene_folder: Path, config: Path
+) -> None:
     folder, _, _ = output
     damaged = folder / "runs" / "room" / "sift" / "all-00" / "colmap.json"
     damaged.write_text(damaged.read_text()[:100])
@@ -163,7 +165,7 @@ def test_what_changed_or_broke_is_computed_again(output, scene_folder: Path, con
     assert known == {"ours-sensor": True, "colmap": True}
 
 
-def test_two_workers_give_the_same_poses(
+def test_run_benchmark_is_independent_of_workers(
     output, scene_folder: Path, config: Path, tmp_path
 ) -> None:
     plan = BenchmarkPlan((scene_folder,), (str(config),), None, ("sensor",), ("colmap",), workers=2)
@@ -186,13 +188,15 @@ def test_two_workers_give_the_same_poses(
         ({"buckets": ("leq5",)}, "no bucket 'leq5'"),
     ],
 )
-def test_wrong_names_are_explained(scene_folder: Path, config: Path, tmp_path, change, message):
+def test_run_benchmark_unknown_name_raises(
+    scene_folder: Path, config: Path, tmp_path, change, message
+):
     plan = BenchmarkPlan((scene_folder,), (str(config),), **change)
     with pytest.raises(InputError, match=message):
         run_benchmark(plan, tmp_path)
 
 
-def test_two_scenes_of_one_name_are_refused(scene_folder: Path, tmp_path: Path) -> None:
+def test_run_benchmark_equal_scene_names_raise(scene_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="same name"):
         run_benchmark(BenchmarkPlan((scene_folder, scene_folder)), tmp_path)
 
@@ -202,7 +206,7 @@ def small_task(method: str = "ours") -> MethodRun:
     return MethodRun(method, method, problem, MapperOptions())
 
 
-def test_what_a_method_raises_is_its_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_method_exception_becomes_error(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*arguments: object) -> None:
         raise RuntimeError("no memory")
 
@@ -212,7 +216,7 @@ def test_what_a_method_raises_is_its_outcome(monkeypatch: pytest.MonkeyPatch) ->
     assert outcome.error == "RuntimeError: no memory" and not outcome.models
 
 
-def test_a_method_that_kills_its_process_is_recorded_and_the_rest_goes_on() -> None:
+def test_run_methods_survives_crash() -> None:
     dies = MethodRun("dies", "ours", Deadly(), MapperOptions())  # type: ignore[arg-type]
     outcomes = {
         task.label: outcome for task, outcome in run_methods([dies, small_task("colmap")], 1)

@@ -20,13 +20,13 @@ def problem(links: list[tuple[int, int]]) -> MappingProblem:
     return make_mapping_problem(room_scene(), CAMERA, POSES, links=links)
 
 
-def test_a_chain_carries_poses_from_pair_to_pair_in_either_direction() -> None:
+def test_chained_poses_follow_pairs_in_both_directions() -> None:
     (model,) = estimate_chained_poses(problem([(0, 2), (1, 2), (1, 4), (3, 4)]))
     assert set(model) == set(TRUTH)
     assert pose_errors_deg(model, TRUTH, CONVENTIONS["paper"]).max() < 0.5
 
 
-def test_groups_are_models_of_their_own_and_lone_images_none() -> None:
+def test_chained_poses_of_components_are_separate_models() -> None:
     models = estimate_chained_poses(problem([(0, 1), (2, 3), (3, 4), (2, 4)]))
     assert [sorted(model) for model in models] == [
         ["view_2.png", "view_3.png", "view_4.png"],
@@ -36,7 +36,7 @@ def test_groups_are_models_of_their_own_and_lone_images_none() -> None:
     assert estimate_chained_poses(problem([])) == []
 
 
-def test_every_model_counts_by_the_convention_of_that_name() -> None:
+def test_models_convention_counts_all_models() -> None:
     largest, other = estimate_chained_poses(problem([(0, 1), (2, 3), (3, 4), (2, 4)]))
     record = BenchmarkRecord(
         "s", "c", "b", "b-00", "m", "", largest, TRUTH, 4, 0.0, 0.0, others=[other]

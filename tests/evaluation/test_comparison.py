@@ -40,7 +40,7 @@ def difference(a: list[BenchmarkRecord], b: list[BenchmarkRecord], resamples: in
     return found
 
 
-def test_a_large_difference_is_significant() -> None:
+def test_compare_benchmarks_large_difference_is_significant() -> None:
     found = difference(records(3.0), records(0.5, seed=1))
     before, after = found.auc[5]
     low, high = found.interval[5]
@@ -49,12 +49,12 @@ def test_a_large_difference_is_significant() -> None:
     assert found.unit == "sets" and found.sets == 8
 
 
-def test_no_difference_is_not() -> None:
+def test_compare_benchmarks_equal_sides_are_not_significant() -> None:
     same = difference(records(1.0), records(1.0))
     assert same.interval[5] == (0.0, 0.0) and same.p_value[5] == 1.0
 
 
-def test_false_alarms_are_as_rare_as_declared() -> None:
+def test_compare_benchmarks_false_positive_rate() -> None:
     # Seeds far from those of the other tests; p-values of swaps are uniform for equal sides.
     p = [
         difference(records(1.0, seed=k), records(1.0, seed=k + 1), resamples=150).p_value[5]
@@ -64,20 +64,20 @@ def test_false_alarms_are_as_rare_as_declared() -> None:
     assert 0.3 < np.mean(np.array(p) < 0.5) < 0.7
 
 
-def test_few_sets_are_compared_by_pairs() -> None:
+def test_compare_benchmarks_few_sets_resamples_pairs() -> None:
     found = difference(records(3.0, sets=2), records(0.5, sets=2, seed=1))
     assert found.unit == "pairs" and found.sets == 2
     assert found.interval[20][0] > 0
 
 
-def test_only_sets_of_both_sides_count() -> None:
+def test_compare_benchmarks_uses_common_sets() -> None:
     found = difference(records(1.0, sets=8), records(1.0, sets=6, seed=1)[1:])
     assert found.sets == 5
     with pytest.raises(InputError, match="no set and method in common"):
         compare_benchmarks({"ours": records(1.0)}, {"colmap": records(1.0)})
 
 
-def test_the_command_compares_folders_and_methods(tmp_path: Path) -> None:
+def test_benchmark_command_compares_folders_and_methods(tmp_path: Path) -> None:
     for record in records(3.0) + records(0.5, seed=1, label="colmap"):
         write_record(tmp_path / "a", record)
     for record in records(0.3, seed=2):
@@ -96,7 +96,7 @@ def test_the_command_compares_folders_and_methods(tmp_path: Path) -> None:
         read_benchmark(str(tmp_path))
 
 
-def test_rows_pool_errors_and_several_scenes() -> None:
+def test_build_rows_pools_errors_and_scenes() -> None:
     first = records(1.0, sets=3)
     lost = BenchmarkRecord(**{**vars(first[0]), "estimated": {}, "error": "RuntimeError: no"})
     rows = build_rows([lost, *first[1:], *records(1.0, sets=2, scene="hall")])
@@ -112,7 +112,7 @@ def test_rows_pool_errors_and_several_scenes() -> None:
     assert "### all scenes, configuration `c`" in text and "| 67% | 1.00 | 1 |" in text
 
 
-def test_what_failed_is_listed_with_its_reason(tmp_path: Path) -> None:
+def test_report_lists_failures(tmp_path: Path) -> None:
     good, other = records(1.0, sets=2)
     lost = BenchmarkRecord(
         **{**vars(other), "estimated": {}, "error": "RuntimeError: 3 < 5 points"}

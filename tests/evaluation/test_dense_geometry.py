@@ -47,7 +47,7 @@ def cloud_of(scene: SceneFolder) -> Float64:
     return SCALE * build_true_surface(scene.depth, NAMES, CAMERAS, scene.truth, 0.01)
 
 
-def test_what_is_right_but_for_the_unit_is_right(scene: SceneFolder) -> None:
+def test_dense_geometry_is_invariant_to_unit(scene: SceneFolder) -> None:
     found = evaluate_dense_geometry(model(scene), cloud_of(scene), scene, CAMERAS, (0.02, 0.05))
     assert found is not None
     assert found["depth"]["abs_rel"] < 1e-4 and found["depth"]["images"] == len(NAMES)
@@ -55,12 +55,12 @@ def test_what_is_right_but_for_the_unit_is_right(scene: SceneFolder) -> None:
     assert found["cloud"]["f1"] == {"0.02": 1.0, "0.05": 1.0}
 
 
-def test_depth_off_by_a_tenth_is_not_scaled_away(scene: SceneFolder) -> None:
+def test_dense_geometry_measures_depth_scale_error(scene: SceneFolder) -> None:
     found = evaluate_dense_geometry(model(scene, 1.1), cloud_of(scene), scene, CAMERAS, (0.02,))
     assert found is not None and found["depth"]["abs_rel"] == pytest.approx(0.1, abs=1e-3)
 
 
-def test_without_true_depth_or_scale_there_is_nothing_to_say(scene: SceneFolder, tmp_path) -> None:
+def test_dense_geometry_without_truth_returns_none(scene: SceneFolder, tmp_path) -> None:
     cloud = cloud_of(scene)
     (tmp_path / "gt_depth").mkdir()
     for other in (replace(scene, path=tmp_path / "nowhere"), replace(scene, path=tmp_path)):
@@ -68,7 +68,7 @@ def test_without_true_depth_or_scale_there_is_nothing_to_say(scene: SceneFolder,
     assert evaluate_dense_geometry(model(scene, images=2), cloud, scene, CAMERAS, (0.02,)) is None
 
 
-def test_a_row_has_the_mean_of_the_sets_that_were_compared(scene: SceneFolder) -> None:
+def test_build_rows_averages_dense_sets(scene: SceneFolder) -> None:
     found = evaluate_dense_geometry(model(scene), cloud_of(scene), scene, CAMERAS, (0.02,))
     other = evaluate_dense_geometry(model(scene, 1.1), cloud_of(scene)[:1], scene, CAMERAS, (0.02,))
     records = [

@@ -39,7 +39,9 @@ def write_text(model: pycolmap.Reconstruction, folder: Path) -> None:
     model.write_text(str(folder))
 
 
-def test_a_colmap_model_of_each_set(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
+def test_external_records_read_colmap_models(
+    model: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
     scene = scene_of(model, tmp_path)
     for item in scene.sets:
         write_text(moved(model), tmp_path / "theirs" / "room" / item.name / "sparse" / "0")
@@ -51,7 +53,9 @@ def test_a_colmap_model_of_each_set(model: pycolmap.Reconstruction, tmp_path: Pa
         assert read_record(tmp_path / "out" / record.file).label == "theirs"
 
 
-def test_several_models_count_as_ours_do(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
+def test_external_records_keep_several_models(
+    model: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
     scene = scene_of(model, tmp_path)
     small = pycolmap.Reconstruction(model)
     for image in sorted(small.images)[2:]:
@@ -64,7 +68,7 @@ def test_several_models_count_as_ours_do(model: pycolmap.Reconstruction, tmp_pat
     assert (len(record.estimated), [len(other) for other in record.others]) == (5, [2])
 
 
-def test_transforms_of_a_single_set(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
+def test_external_records_read_transforms(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
     scene = scene_of(model, tmp_path)
     (tmp_path / "theirs").mkdir()
     files = {image.name: f"images/{image.name}" for image in model.images.values()}
@@ -76,7 +80,7 @@ def test_transforms_of_a_single_set(model: pycolmap.Reconstruction, tmp_path: Pa
     assert record.errors_deg(CONVENTIONS["paper"]).max() < 1e-4
 
 
-def test_a_set_without_a_model_counts_as_failed(
+def test_external_records_missing_model_is_failed(
     model: pycolmap.Reconstruction, tmp_path: Path
 ) -> None:
     scene = scene_of(model, tmp_path)
@@ -92,7 +96,7 @@ def test_a_set_without_a_model_counts_as_failed(
 
 
 @pytest.mark.parametrize("text", ["theirs", "a/b=.", "theirs=nowhere", "ours-sensor=.", "colmap=."])
-def test_a_wrong_result_is_said(text: str, tmp_path: Path) -> None:
+def test_benchmark_command_wrong_result_fails(text: str, tmp_path: Path) -> None:
     arguments = ["benchmark", "scene", "-o", str(tmp_path), "--result", text]
     ended = CliRunner().invoke(build_app(), arguments)
     assert ended.exit_code == 2

@@ -276,13 +276,13 @@ def test_scannet(tmp_path: Path) -> None:
         ("colmap", "no dataset 'colmap'"),
     ],
 )
-def test_another_layout_is_explained(tmp_path: Path, kind: str, message: str) -> None:
+def test_import_scene_wrong_layout_raises(tmp_path: Path, kind: str, message: str) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=message):
         import_scene(kind, tmp_path / "empty", tmp_path / "out")
 
 
-def test_the_command_takes_every_nth_image_and_keeps_what_is_there(tmp_path: Path) -> None:
+def test_import_command_takes_every_nth_image(tmp_path: Path) -> None:
     seven_scenes(tmp_path / "chess")
     target = tmp_path / "out"
     arguments = ["testsets", "import", "7-scenes", str(tmp_path / "chess"), str(target)]

@@ -28,7 +28,7 @@ def wall(*shifts: float, depth: float = 2.0):
     return names, poses, cameras, flat
 
 
-def test_cameras_before_a_wall() -> None:
+def test_overlap_of_cameras_in_front_of_wall() -> None:
     names, poses, cameras, flat = wall(0.0, 1.0, 2.0, 4.0)
     overlap = overlap_from_depth(names, poses, cameras, lambda _: flat)
     expected = [[1, 0.75, 0.5, 0], [0.75, 1, 0.75, 0.25], [0.5, 0.75, 1, 0.5], [0, 0.25, 0.5, 1]]
@@ -38,7 +38,7 @@ def test_cameras_before_a_wall() -> None:
     assert overlap.three_view(3, 1, 2) == pytest.approx(0.25, abs=0.02)
 
 
-def test_the_smaller_direction_counts_for_two_views_and_the_largest_view_for_three() -> None:
+def test_overlap_uses_minimum_of_pair_and_maximum_of_triplet() -> None:
     # The second camera stands twice as far from the wall: it sees all the first does, and four
     # times as much.
     names, poses, cameras, flat = wall(0.0, 0.0, 1.0)
@@ -49,7 +49,7 @@ def test_the_smaller_direction_counts_for_two_views_and_the_largest_view_for_thr
     assert overlap.three_view(0, 1, 2) == pytest.approx(0.75, abs=0.02)
 
 
-def test_hidden_surfaces_and_unknown_depth_do_not_count() -> None:
+def test_overlap_ignores_occluded_and_unknown_depth() -> None:
     names, poses, cameras, flat = wall(0.0, 0.0)
     near, holes = flat.copy(), flat.copy()
     near[:, :50] = 1.0  # something stands before the left half
@@ -61,7 +61,7 @@ def test_hidden_surfaces_and_unknown_depth_do_not_count() -> None:
     assert overlap.counts[1] == pytest.approx(overlap.counts[0] / 2, rel=0.05)
 
 
-def test_points_of_a_model() -> None:
+def test_overlap_from_model_points() -> None:
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(model="PINHOLE", width=9, height=9, params=[9, 9, 4, 4], camera_id=1)
@@ -88,7 +88,7 @@ def test_points_of_a_model() -> None:
 
 
 @pytest.mark.slow
-def test_overlaps_declared_by_a_shared_scene(shared_data: Path) -> None:
+def test_overlap_matches_declared_overlap(shared_data: Path) -> None:
     scene = read_scene(shared_data / "data" / "rendered_kitchen")
     declared = yaml.safe_load((scene.path / "testsets.yaml").read_text())
     cameras = {i.name: i.pinhole for i in load_images(scene.images, scene.intrinsics)}

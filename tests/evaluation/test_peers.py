@@ -24,7 +24,7 @@ def problem() -> MappingProblem:
     )
 
 
-def test_the_database_holds_the_problem(problem: MappingProblem, tmp_path) -> None:
+def test_write_database_contains_problem(problem: MappingProblem, tmp_path) -> None:
     write_database(problem, tmp_path / "database.db")
     with pycolmap.Database.open(tmp_path / "database.db") as database:
         assert database.num_images() == database.num_cameras() == database.num_frames() == 6
@@ -47,7 +47,7 @@ def test_the_database_holds_the_problem(problem: MappingProblem, tmp_path) -> No
 
 
 @pytest.mark.parametrize("name", PEERS)
-def test_every_peer_reconstructs_an_easy_scene(name: str, problem: MappingProblem) -> None:
+def test_run_peer_reconstructs_easy_scene(name: str, problem: MappingProblem) -> None:
     with limit_threads(1):  # the same model every time
         (estimated,) = run_peer(name, problem)
     truth = {f"view_{i}.png": (pose[:, :3], pose[:, 3]) for i, pose in enumerate(POSES)}
@@ -56,7 +56,7 @@ def test_every_peer_reconstructs_an_easy_scene(name: str, problem: MappingProble
     assert errors.max() < 1.0
 
 
-def test_without_matches_no_peer_has_a_pose(problem: MappingProblem) -> None:
+def test_run_peer_without_matches_has_no_poses(problem: MappingProblem) -> None:
     empty = MappingProblem(problem.images)
     for name in ("colmap", "colmap-global"):
         assert run_peer(name, empty) == []

@@ -106,7 +106,7 @@ def independent_histogram(errors: list[float], threshold: int) -> float:
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
-def test_agrees_with_an_independent_implementation(convention, area) -> None:
+def test_pose_auc_matches_independent_implementation(convention, area) -> None:
     rng = np.random.default_rng(7)
     for _ in range(1000):
         truth = random_poses(rng, int(rng.integers(2, 6)))
@@ -118,7 +118,7 @@ def test_agrees_with_an_independent_implementation(convention, area) -> None:
             assert value == pytest.approx(area(list(errors), threshold), abs=1e-12)
 
 
-def test_a_case_computed_by_hand() -> None:
+def test_pose_errors_match_hand_computed_case() -> None:
     # Three cameras in a row, 1 m apart, all looking along z. The third is turned by 2 degrees
     # about y around its own centre; the second is moved 1 m forward instead of 1 m to the right.
     truth = {name: rotated_y(0, (x, 0, 0)) for x, name in enumerate("abc")}
@@ -137,7 +137,7 @@ def test_a_case_computed_by_hand() -> None:
     assert auc[20] == pytest.approx((2 * (1 - 2 / 20)) / 6)
 
 
-def test_areas_of_five_errors_computed_by_hand() -> None:
+def test_areas_match_hand_computed_values() -> None:
     errors = np.array([0.5, 1.0, 1.5, 2.0, 180.0])
     assert exact_area(errors, 2) == pytest.approx((1.5 + 1.0 + 0.5 + 0.0) / 5 / 2)
     # Triangle and trapezoids: 0.05 + 0.15 + 0.25 + 0.35 = 0.8, over 2 degrees.
@@ -146,7 +146,7 @@ def test_areas_of_five_errors_computed_by_hand() -> None:
     assert histogram_area(errors, 2) == pytest.approx((0.2 + 0.8) / 2)
 
 
-def test_the_exact_area_is_the_integral_of_the_recall_curve() -> None:
+def test_exact_area_integrates_recall_curve() -> None:
     errors = np.random.default_rng(0).exponential(4, size=40)
     for threshold in (1, 5, 20):
         inside = sorted(errors[errors < threshold])
@@ -154,7 +154,7 @@ def test_the_exact_area_is_the_integral_of_the_recall_curve() -> None:
         assert exact_area(errors, threshold) == pytest.approx(integral / threshold, abs=1e-9)
 
 
-def test_perfect_poses_score_one_in_any_similarity_frame() -> None:
+def test_pose_auc_is_invariant_to_similarity() -> None:
     rng = np.random.default_rng(1)
     truth = random_poses(rng, 6)
     frame = Rotation.random(rng=rng).as_matrix()
@@ -164,14 +164,14 @@ def test_perfect_poses_score_one_in_any_similarity_frame() -> None:
         assert list(auc.values()) == pytest.approx([1, 1, 1], abs=1e-6)
 
 
-def test_a_translation_of_the_wrong_sign_is_forgiven_only_when_folded() -> None:
+def test_folded_convention_ignores_translation_sign() -> None:
     truth = {"a": rotated_y(0, (0, 0, 0)), "b": rotated_y(0, (1, 0, 0))}
     mirrored = {"a": rotated_y(0, (0, 0, 0)), "b": rotated_y(0, (-1, 0, 0))}
     assert pose_errors_deg(mirrored, truth, PAPER) == pytest.approx([0, 0])
     assert pose_errors_deg(mirrored, truth, COLMAP) == pytest.approx([180, 180])
 
 
-def test_one_unregistered_image_of_four_costs_half_of_the_pairs() -> None:
+def test_unregistered_image_fails_its_pairs() -> None:
     truth = random_poses(np.random.default_rng(2), 4)
     estimated = {name: truth[name] for name in list(truth)[:3]}
     errors = pose_errors_deg(estimated, truth, PAPER)
@@ -179,7 +179,7 @@ def test_one_unregistered_image_of_four_costs_half_of_the_pairs() -> None:
     assert pose_auc(errors, PAPER)[5] == pytest.approx(0.5, abs=1e-6)
 
 
-def test_nothing_registered_scores_zero_and_no_pairs_is_an_error() -> None:
+def test_pose_auc_without_registration_is_zero() -> None:
     truth = random_poses(np.random.default_rng(3), 3)
     errors = pose_errors_deg({}, truth, VGGT)
     assert list(errors) == [180.0] * 3

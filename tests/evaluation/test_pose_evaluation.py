@@ -13,7 +13,7 @@ from mpsfm_core.evaluation.pose_evaluation import evaluate
 from mpsfm_core.inputs.models import read_poses
 
 
-def test_the_report_is_plain_data(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
+def test_evaluate_returns_plain_data(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
     model.write_text(str(tmp_path))
     truth = read_poses(tmp_path)
     names = list(truth)
@@ -30,7 +30,7 @@ def test_the_report_is_plain_data(model: pycolmap.Reconstruction, tmp_path: Path
     assert chosen["trajectory"] is None
 
 
-def test_wrong_image_names_are_wrong_input(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
+def test_evaluate_unknown_image_raises(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
     model.write_binary(str(tmp_path))
     truth = read_poses(tmp_path)
     with pytest.raises(InputError, match=r"no image .* called nowhere\.jpg"):

@@ -21,11 +21,13 @@ from mpsfm_core.evaluation.scene_folder import read_scene
         ("degraded-", None),
     ],
 )
-def test_seeds_are_read_from_the_name(quality: str, seed: int | None) -> None:
+def test_parse_error_seed_reads_name(quality: str, seed: int | None) -> None:
     assert parse_error_seed(quality) == seed
 
 
-def test_each_seed_draws_other_errors_of_the_same_size(scene_folder: Path, tmp_path: Path) -> None:
+def test_degraded_seeds_give_different_errors_of_equal_std(
+    scene_folder: Path, tmp_path: Path
+) -> None:
     scene = read_scene(scene_folder)
     assert scene.depth is not None
     image = sorted(scene.truth)[0]

@@ -30,7 +30,7 @@ def overlap() -> Overlap:
     return overlap_from_depth(names, poses, cameras, lambda _: flat)
 
 
-def test_every_set_keeps_its_limits(overlap: Overlap) -> None:
+def test_sampled_sets_satisfy_limits(overlap: Overlap) -> None:
     buckets = sample_buckets(overlap, SamplingOptions(sets=3))
     place = {name: i for i, name in enumerate(overlap.names)}
     assert set(buckets) >= {"leq10", "leq30", "triplets", "all"}
@@ -47,7 +47,7 @@ def test_every_set_keeps_its_limits(overlap: Overlap) -> None:
     assert buckets["all"] == [{"images": list(overlap.names)}]
 
 
-def test_no_image_could_be_added(overlap: Overlap) -> None:
+def test_sampled_sets_are_maximal(overlap: Overlap) -> None:
     place = {name: i for i, name in enumerate(overlap.names)}
     for item in sample_buckets(overlap, SamplingOptions(sets=2))["leq10"]:
         members = [place[name] for name in item["images"]]
@@ -56,7 +56,7 @@ def test_no_image_could_be_added(overlap: Overlap) -> None:
             assert not (fits and overlap.two_view[other, members].max() >= 0.25)
 
 
-def test_sets_differ_by_two_images_and_repeat(overlap: Overlap) -> None:
+def test_sampled_sets_differ_and_are_deterministic(overlap: Overlap) -> None:
     options = SamplingOptions(sets=4)
     buckets = sample_buckets(overlap, options)
     assert buckets == sample_buckets(overlap, options)
@@ -67,7 +67,7 @@ def test_sets_differ_by_two_images_and_repeat(overlap: Overlap) -> None:
             assert max(len(a - b), len(b - a)) >= 2
 
 
-def test_triplets_are_in_their_group_and_connected(overlap: Overlap) -> None:
+def test_sampled_triplets_match_group(overlap: Overlap) -> None:
     place = {name: i for i, name in enumerate(overlap.names)}
     triplets = sample_buckets(overlap, SamplingOptions(sets=4))["triplets"]
     assert {"0", "20-40", "40+"} <= set(triplets)
@@ -82,12 +82,12 @@ def test_triplets_are_in_their_group_and_connected(overlap: Overlap) -> None:
             assert links >= 2
 
 
-def test_a_limit_on_the_number_of_images(overlap: Overlap) -> None:
+def test_max_images_limits_sets(overlap: Overlap) -> None:
     buckets = sample_buckets(overlap, SamplingOptions(sets=2, max_images=6))
     assert max(len(item["images"]) for item in buckets["leq30"]) == 6
 
 
-def test_the_command_writes_sets_that_can_be_read(scene_folder: Path, tmp_path: Path) -> None:
+def test_build_command_writes_readable_sets(scene_folder: Path, tmp_path: Path) -> None:
     copy = tmp_path / "room"
     shutil.copytree(scene_folder, copy)
     arguments = ["testsets", "build", str(copy), "--min-images", "3"]
@@ -100,7 +100,7 @@ def test_the_command_writes_sets_that_can_be_read(scene_folder: Path, tmp_path: 
     assert {"all"} <= {item.bucket for item in read_scene(copy).sets}
 
 
-def test_a_model_without_points_has_no_overlap(scene_folder: Path, tmp_path: Path) -> None:
+def test_build_sets_model_without_points_raises(scene_folder: Path, tmp_path: Path) -> None:
     copy = tmp_path / "room"
     shutil.copytree(scene_folder, copy)
     arguments = ["testsets", "build", str(copy), "--source", "model", "--replace"]

@@ -13,7 +13,7 @@ from mpsfm_core.evaluation.scene_folder import read_scene
 from tests.evaluation.conftest import NAMES, POSES
 
 
-def test_sets_poses_and_files(scene_folder: Path) -> None:
+def test_read_scene_returns_sets_and_poses(scene_folder: Path) -> None:
     scene = read_scene(scene_folder)
     assert [item.name for item in scene.sets] == [
         "all-00",
@@ -28,7 +28,7 @@ def test_sets_poses_and_files(scene_folder: Path) -> None:
     assert scene.intrinsics == scene_folder / "gt"  # there is no intrinsics.yaml
 
 
-def test_buckets_are_chosen_by_name_and_by_group(scene_folder: Path) -> None:
+def test_select_sets_by_bucket_and_group(scene_folder: Path) -> None:
     scene = read_scene(scene_folder)
     assert len(scene.select_sets(None)) == 3
     assert [item.bucket for item in scene.select_sets(["triplets"])] == ["triplets/20-40"] * 2
@@ -43,7 +43,7 @@ def copy(scene_folder: Path, tmp_path: Path) -> Path:
     return tmp_path / "copy"
 
 
-def test_without_sets_there_is_one_of_all_images(copy: Path) -> None:
+def test_read_scene_without_sets_has_one_set(copy: Path) -> None:
     (copy / "testsets.yaml").unlink()
     assert [item.images for item in read_scene(copy).sets] == [tuple(NAMES)]
 
@@ -57,12 +57,12 @@ def test_without_sets_there_is_one_of_all_images(copy: Path) -> None:
         ("all: [[0000, 0001]", "cannot be read"),
     ],
 )
-def test_wrong_sets_are_explained(copy: Path, text: str, message: str) -> None:
+def test_read_scene_wrong_sets_raise(copy: Path, text: str, message: str) -> None:
     (copy / "testsets.yaml").write_text(text)
     with pytest.raises(InputError, match=message):
         read_scene(copy)
 
 
-def test_a_folder_without_photos_is_explained(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="photos in images/"):
+def test_read_scene_without_images_raises(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="photos must be in images"):
         read_scene(tmp_path)

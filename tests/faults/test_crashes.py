@@ -69,24 +69,24 @@ def failed(scene: Scene, number: int, error: int, lasting: bool) -> None:
     check_next_run(scene, what)
 
 
-def test_killed_at_a_few_calls(scene: Scene) -> None:
+def test_kill_at_few_calls_leaves_readable_results(scene: Scene) -> None:
     for number in points(scene, QUICK, 0):
         killed(scene, number)
 
 
 @pytest.mark.slow
-def test_killed_at_many_calls(scene: Scene) -> None:
+def test_kill_at_many_calls_leaves_readable_results(scene: Scene) -> None:
     for number in points(scene, KILLS, 1):
         killed(scene, number)
 
 
-def test_a_few_failing_calls(scene: Scene) -> None:
+def test_few_failing_calls_are_reported(scene: Scene) -> None:
     for number, error in zip(points(scene, QUICK, 2), ERRORS * 2, strict=False):
         failed(scene, number, error, error == errno.ENOSPC)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("error", ERRORS, ids=errno.errorcode.get)
-def test_many_failing_calls(scene: Scene, error: int) -> None:
+def test_many_failing_calls_are_reported(scene: Scene, error: int) -> None:
     for turn, number in enumerate(points(scene, FAULTS // len(ERRORS), 3 + error)):
         failed(scene, number, error, turn % 2 == 0)
