@@ -8,11 +8,14 @@ from typing import Protocol
 class ExtractionEvents(Protocol):
     """Receives progress, always in the thread that called :func:`extract`."""
 
-    def stage_started(self, stage: str, total: int | None) -> None: ...
+    def stage_started(self, stage: str, total: int | None) -> None:
+        """Receive the start of a stage with ``total`` steps, None if unknown."""
 
-    def stage_progress(self, stage: str, done: int, total: int) -> None: ...
+    def stage_progress(self, stage: str, done: int, total: int) -> None:
+        """Receive the number of finished steps."""
 
-    def stage_finished(self, stage: str, seconds: float) -> None: ...
+    def stage_finished(self, stage: str, seconds: float) -> None:
+        """Receive the end of a stage."""
 
 
 class NullExtractionEvents:

@@ -97,6 +97,7 @@ class RemoteStep:
     config: Config
 
     def __call__(self, item: Any) -> None:
+        """Process an item; its result is in the cache afterwards."""
         with limit_threads(thread_count(self.config.runtime)):
             _worker_state(self).work[self.stage](item)
 
@@ -113,7 +114,8 @@ class _WorkerState:
         if context.cache.load(RUNS, content_key(step.run), np.ndarray) is None:
             raise InputError(
                 f"the worker on {socket.gethostname()} does not see the cache "
-                f"{context.cache.folder} of this run: set runtime.cache_dir to a folder that all machines share"
+                f"{context.cache.folder} of this run: set runtime.cache_dir to a folder that all "
+                "machines share"
             )
         context.load_masks()
         table = None if config.features is None else FeatureTable(context, config.features)

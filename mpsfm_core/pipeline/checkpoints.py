@@ -108,7 +108,8 @@ class MappingCheckpoints:
             return None
         placed = f"{header['registered']} of {self._total} images registered in the last component"
         self._stages.notice(
-            f"mapping continues from a checkpoint of {header['time']}: {placed} (--fresh starts again)"
+            f"mapping continues from a checkpoint of {header['time']}: {placed} "
+            "(--fresh starts again)"
         )
         return arrays
 

@@ -310,7 +310,7 @@ def _precision(results: list[PairMatches]) -> tuple[float, float]:
 
 
 def _mean_precision(depth: DepthPrior) -> float:
-    """Return the mean inverse variance of valid pixels, which ranks pairs. [reference]"""
+    """Return the mean inverse variance of valid pixels, which ranks pairs [reference]."""
     if depth.variance is None or not depth.valid.any():
         return 0.0
     return float((1.0 / depth.variance[depth.valid].astype(np.float64)).mean())

@@ -127,9 +127,9 @@ def _chance_of_inliers(inliers: int, matches: int, camera: PinholeCamera, error_
     """Return the probability that a given epipolar geometry has the inliers by chance.
 
     A random match is an inlier if it falls into the error band around its epipolar line. The line
-    is at most as long as the diagonal of the image. The Sampson error combines the distances in both
-    images, hence the factor ``sqrt(2)``. Matches of the minimal sample do not count. (A-contrario
-    test, Moisan and Stival, IJCV 2004.)
+    is at most as long as the diagonal of the image. The Sampson error combines the distances in
+    both images, hence the factor ``sqrt(2)``. Matches of the minimal sample do not count.
+    (A-contrario test, Moisan and Stival, IJCV 2004.)
     """
     area = camera.width * camera.height
     band = 2 * math.sqrt(2) * error_px * math.hypot(camera.width, camera.height) / area
