@@ -1,4 +1,4 @@
-"""A COLMAP model with points, made of a scene's true poses and depth."""
+"""COLMAP model with points from the true poses and depth of a scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Priors whose errors have exactly the distribution that a calibration declares."""
+"""Simulated priors whose errors have the distribution of a calibration."""
 
 from __future__ import annotations
 

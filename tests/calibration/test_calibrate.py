@@ -1,4 +1,4 @@
-"""``mpsfm calibrate`` on the sample scene, whose depth and normals have known errors."""
+"""Tests of ``mpsfm calibrate`` on the sample scene with known errors."""
 
 from __future__ import annotations
 

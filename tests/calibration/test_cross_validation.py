@@ -1,4 +1,4 @@
-"""What a study reports, and what it warns of."""
+"""Tests of the calibration study and its warnings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_study_improves_cross_validated_coverage(twenty: CalibrationStudy) -> No
 
 
 def test_study_folds_are_whole_scenes() -> None:
-    """Of three scenes one has twice the errors: fitted to the others, its std covers less."""
+    """One of three scenes has twice the errors, so a fit to two scenes has low coverage on it."""
     easy = simulate(PRIOR, 16, pixels=300)
     hard = simulate(replace(PRIOR, relative_std=0.2), 8, seed=1, pixels=300)
     named = [replace(image, name=f"{'ab'[n // 8]}/{image.name}") for n, image in enumerate(easy)]

@@ -1,4 +1,4 @@
-"""Metrics on errors whose coverage and order are known."""
+"""Tests of metrics on errors with known coverage and order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth at the points of a COLMAP model, against a scene that is known exactly."""
+"""Tests of true depth from COLMAP points on an exactly known scene."""
 
 from __future__ import annotations
 

@@ -72,8 +72,7 @@ def by_sensor(room: Room) -> CalibrationResult:
 def assert_near(
     found: CalibrationResult, by_sensor: CalibrationResult, room: Room, values: float
 ) -> None:
-    """The std of the pixels of all photos differs by at most 25 %, its parts by so many ``values``
-    (of a few frames they are less certain than what they make together)."""
+    """Check that the median std differs by at most 25 % and its factors by `values`."""
     own, true = found.file.calibration, by_sensor.file.calibration
     assert isinstance(own, DepthCalibration) and isinstance(true, DepthCalibration)
     assert not (own.use_network_variance or true.use_network_variance)

@@ -1,4 +1,4 @@
-"""Points stand for the pixels around them, however much they crowd elsewhere."""
+"""Tests of even sampling of points over the image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fitting finds the parameters that errors were drawn with."""
+"""Tests that the fit recovers the parameters of simulated errors."""
 
 from __future__ import annotations
 

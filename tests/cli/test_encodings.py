@@ -1,4 +1,4 @@
-"""Names that the terminal cannot print, and names that are not UTF-8."""
+"""Tests of names that the terminal cannot print and names that are not UTF-8."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``mpsfm models``."""
+"""Tests of ``mpsfm models``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scene folder of rendered photos of an analytic room, with true poses and depth."""
+"""Fixtures: a scene folder of rendered images with true poses and depth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ triplets:
 
 @pytest.fixture(scope="session")
 def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five photos on an arc; nobody may change the folder."""
+    """Write five images on an arc; tests must not change the folder."""
     folder = tmp_path_factory.mktemp("scenes") / "room"
     for name in ("images", "gt"):
         (folder / name).mkdir(parents=True)

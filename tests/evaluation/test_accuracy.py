@@ -1,4 +1,4 @@
-"""Accuracy of depth maps and point clouds."""
+"""Tests of the accuracy of depth maps and point clouds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trajectory errors after a similarity transform."""
+"""Tests of trajectory errors after a similarity transform."""
 
 from __future__ import annotations
 

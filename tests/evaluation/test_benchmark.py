@@ -1,4 +1,4 @@
-"""The whole benchmark on a small scene: runs, resumes, survives failures, reports."""
+"""Tests of the benchmark on a small scene: run, resume, failures, report."""
 
 from __future__ import annotations
 

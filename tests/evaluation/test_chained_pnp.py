@@ -1,4 +1,4 @@
-"""The reference point without a mapper, on views whose poses and depth are known."""
+"""Tests of the chained-PnP baseline on views with known poses and depth."""
 
 from __future__ import annotations
 

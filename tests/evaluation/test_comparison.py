@@ -1,4 +1,4 @@
-"""Differences between benchmarks and their significance."""
+"""Tests of the statistical comparison of benchmarks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth maps and a cloud beside true depth, in the scale of the cameras."""
+"""Tests of the evaluation of depth maps and clouds with true depth."""
 
 from __future__ import annotations
 

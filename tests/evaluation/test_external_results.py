@@ -1,4 +1,4 @@
-"""Models of other programs in the tables of a benchmark."""
+"""Tests of benchmark records from models of other programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Overlap against hand-made scenes and against what the shared scenes declare."""
+"""Tests of overlap on constructed scenes and on a shared scene."""
 
 from __future__ import annotations
 

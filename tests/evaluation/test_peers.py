@@ -1,4 +1,4 @@
-"""COLMAP's mappers on an analytic scene whose poses are known."""
+"""Tests of COLMAP's mappers on an analytic scene with known poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pose AUC against hand-computed cases and an independent implementation."""
+"""Tests of the pose AUC with hand-computed cases and an independent implementation."""
 
 from __future__ import annotations
 

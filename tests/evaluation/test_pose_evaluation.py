@@ -1,4 +1,4 @@
-"""Comparing poses by image name."""
+"""Tests of the evaluation of poses by image name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth of a stated quality, made from a scene's true depth."""
+"""Tests of depth priors of known quality."""
 
 from __future__ import annotations
 

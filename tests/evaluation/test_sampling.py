@@ -1,4 +1,4 @@
-"""Sampled sets keep the rules of their bucket."""
+"""Tests of the sampling of test sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading scene folders."""
+"""Tests of reading scene folders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small scene, and a process that reconstructs it under disturbances."""
+"""Fixtures: a small scene, and a process that reconstructs it under faults."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Scene:
         return dict(json.loads(self.process.stdout.readline()))
 
     def leftovers(self) -> list[str]:
-        """What no run should leave: scratch folders, unfinished files, checkpoints."""
+        """Return leftovers: scratch folders, unfinished files and checkpoints."""
         paths = [p for p in self.work.rglob("*") if p.name.startswith(".")]
         paths += [p for p in (self.work / "cache" / "mapping").rglob("*") if p.is_file()]
         return [str(path.relative_to(self.work)) for path in paths]

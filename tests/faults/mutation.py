@@ -1,4 +1,4 @@
-"""Hostile copies of well-formed files, and processes in which they are read."""
+"""Mutated copies of well-formed files, and processes that read them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mpsfm_core.data.errors import MpsfmError
 LIMIT_S = 10
 """A file that keeps a reader busy for longer, in time of the processor, hangs it."""
 MEMORY = 1 << 30
-"""Bytes that a reader may take for a file of some kilobytes, beside what the process had."""
+"""Maximum bytes that a reader may allocate for a file of some kilobytes."""
 
 _TOKENS = (
     *(b"0", b"-1", b"1e309", b"nan", b"99999999999999999999", b"18446744073709551615", b"1_0"),

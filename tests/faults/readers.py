@@ -1,4 +1,4 @@
-"""Readers of results, matches of others, weights and datasets, each with a well-formed file."""
+"""Readers of results, matches, weights and datasets, each with a well-formed file."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def synthetic() -> pycolmap.Reconstruction:
 
 
 def in_model(*readers: Reader) -> dict[str, Reader]:
-    """Readers of a folder for each of the files of a model, the others being as they should be."""
+    """Return readers of a folder for each file of a model; the other files are well-formed."""
 
     def in_folder(text: bool, reader: Reader) -> Reader:
         def read(path: Path) -> None:
@@ -91,7 +91,7 @@ def exported(folder: Path) -> None:
 
 
 def used(folder: Path) -> None:
-    """As the dense command, the viewers and the sampling of test sets use a model."""
+    """Read a model like the dense command, the viewers and the sampling of test sets."""
     model = read_model(folder)
     for image in model.images.values():
         _point_depths(model, image)
@@ -110,7 +110,7 @@ def model_files(*readers: Reader) -> Table:
 
 
 def models() -> Table:
-    """Files of COLMAP models, for every use beside poses and intrinsics."""
+    """Return files of COLMAP models, for every use except poses and intrinsics."""
     return model_files(exported, used)
 
 

@@ -19,7 +19,7 @@ _LIMIT_S = 120
 
 
 def disturbed(request: dict[str, Any]) -> dict[str, Any]:
-    """Run once in a fork; says how it ended: signal, or the error's class and message."""
+    """Run once in a fork; returns the signal, or the class and message of the error."""
     report = Path(request["report"])
     report.unlink(missing_ok=True)
     child = os.fork()

@@ -1,4 +1,4 @@
-"""Nothing is lost, whatever ends a run: killed, or failed by the disk, at any call that writes."""
+"""Tests that a run killed or failed at any write call loses no results."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def points(scene: Scene, count: int, seed: int) -> list[int]:
 
 
 def check_intact(scene: Scene, what: object) -> None:
-    """Earlier results or new ones, never a mixture; what is only half exchanged says so."""
+    """Check that results are old or new, never mixed, and that a partial exchange is marked."""
     found = content(scene.output)
     scratch = {name for name in found if name.startswith(".mpsfm-")}
     visible = {name: value for name, value in found.items() if name not in scratch}
@@ -36,7 +36,7 @@ def check_intact(scene: Scene, what: object) -> None:
 
 
 def is_whole(scene: Scene, visible: dict[str, str]) -> bool:
-    """All results are there; the page that is made of them may be missing, and can be made anew."""
+    """Check that all results exist; the report page may be missing and can be written again."""
     results = {name: value for name, value in scene.whole.items() if name != REPORT}
     return visible in (scene.whole, results)
 

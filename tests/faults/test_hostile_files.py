@@ -1,4 +1,4 @@
-"""No file can crash, hang or fill the memory of a reader: it is read or refused in our words."""
+"""Tests that no file can crash, hang or fill the memory of a reader."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def archive(**arrays: Any) -> bytes:
 
 
 def as_photo(path: Path) -> None:
-    """As one photo of three."""
+    """Read a file as one photo of three."""
     for name in ("a.png", "b.png"):
         (path.parent / name).write_bytes(encoded(".png"))
     found = load_images(path.parent)
@@ -94,7 +94,7 @@ def as_cache_entry(path: Path) -> None:
 
 
 def as_state(path: Path) -> None:
-    """As a checkpoint that has been found to be of this problem."""
+    """Read a file as a checkpoint of the same problem."""
     deserialize(checkpoints.read_checkpoint(path)[1])
 
 
