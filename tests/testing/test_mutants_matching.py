@@ -319,8 +319,58 @@ def test_masks(caught: Callable[..., None], factory: type, check: str, message: 
     caught("mask", factory, check, message, PAINTED)
 
 
+class NotScaledBack(Sift):
+    """Reduces views above 640 pixels and returns keypoints of the reduced image."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(SiftOptions(resize=640), context)
+
+    def extract(self, view: View) -> Features:
+        features = super().extract(view)
+        factor = min(1.0, 640 / max(view.camera.size))
+        return replace(features, keypoints=factor * features.keypoints)
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [(NotScaledBack, "features-large-view", "have to be scaled back")],
+)
+def test_features_of_large_views(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
+    caught("features", factory, check, message)
+
+
+class LimitedMatcher(MutualNearest):
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(MutualNearestOptions(), context)
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        if max(len(fa), len(fb)) > 2048:
+            raise ValueError("index 2048 is out of bounds")
+        return super().match(a, b, fa, fb)
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [(LimitedMatcher, "matcher-many-features", "out of bounds")],
+)
+def test_matchers_of_many_features(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
+    caught("matcher", factory, check, message, None, "sparse")
+
+
 def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
     kinds = ("features", "matcher", "retrieval", "mask")
     checks = {check_id(check) for kind in kinds for check in CHECKS_BY_KIND[kind]}
-    tests = (test_features, test_sparse_matchers, test_dense_matchers, test_retrieval, test_masks)
+    tests = (
+        test_features_of_large_views,
+        test_matchers_of_many_features,
+        test_features,
+        test_sparse_matchers,
+        test_dense_matchers,
+        test_retrieval,
+        test_masks,
+    )
     assert checks - named(*tests) == set()

@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpsfm_core.data import Features, Float64, Int64
+from mpsfm_core.data import Features, Float64, Int64, View
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 PIXEL_TOLERANCE = 0.25
 """Shift in pixels, or in multiples of ``std_px`` if larger than one. Integer pixel centers
 shift by 0.5; SIFT has 0.00 and XFeat at most 0.08."""
+LARGE_SIZE = (4096, 3072)
+"""Width and height of a large view: 12.6 megapixels, as phones record."""
 _SAME_KEYPOINT_PX = 2.5
 """Distance in pixels up to which keypoints of view and rotated view are the same. A half-pixel
 mistake in both directions moves them apart by 1.4."""
@@ -79,6 +81,37 @@ def check_features_pixel_convention(case: ContractCase) -> str:
     raise CheckSkipped(f"the detector is not symmetric, keypoints are {text}")
 
 
+def check_features_large_view(case: ContractCase) -> str:
+    """Require keypoints in pixels of a large view, even if the provider reduces the image.
+
+    The view has 12.6 megapixels. Only its lower right corner has texture, so that keypoints of a
+    reduced image that are not scaled back miss it.
+    """
+    case.require_truth("image")
+    import cv2  # local, because pytest loads this module when it collects tests
+
+    width, height = LARGE_SIZE
+    left, top = 3 * width // 4, 3 * height // 4
+    tile = cv2.resize(case.example.view.image, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+    num_rows, num_columns = -(-(height - top) // tile.shape[0]), -(-(width - left) // tile.shape[1])
+    texture = np.tile(tile, (num_rows, num_columns, 1))
+    image = np.full((height, width, 3), 128, np.uint8)
+    image[top:, left:] = texture[: height - top, : width - left]
+    view = View("large.png", image, case.example.camera.resized(width, height))
+    features = case.run_on_view(view, case.example)
+    _require_enough(features)
+    margin = 3 * features.std_px
+    x, y = features.keypoints.T
+    inside = float(((x >= left - margin) & (y >= top - margin)).mean())
+    if inside < _MIN_INSIDE_RATIO:
+        raise CheckFailed(
+            f"only {inside:.0%} of the keypoints of a {width} x {height} view are where there is "
+            f"texture, the largest are x = {x.max():.0f}, y = {y.max():.0f}: keypoints of a "
+            f"reduced image have to be scaled back"
+        )
+    return f"{inside:.0%} of {len(features)} keypoints are where there is texture"
+
+
 def check_features_descriptors(case: ContractCase) -> str:
     """Require that descriptors belong to their keypoints.
 
@@ -116,6 +149,7 @@ def check_features_dimension(case: ContractCase) -> str:
 CHECKS = (
     check_features_axes,
     check_features_pixel_convention,
+    check_features_large_view,
     check_features_descriptors,
     check_features_dimension,
 )

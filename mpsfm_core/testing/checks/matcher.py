@@ -23,6 +23,8 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 SHIFT_TOLERANCE = 0.2
 """Shift in multiples of ``std_px`` or pixels of the larger view; integer pixel centers give 0.5."""
+NUM_MANY_FEATURES = 4096
+"""Number of features per view that every sparse matcher has to accept."""
 _MIN_CORRECT_RATIO = 0.5
 """Ratio of correct matches of an easy pair: SIFT nearest neighbors 0.99, LighterGlue 0.96."""
 
@@ -88,6 +90,23 @@ def check_matcher_few_features(case: ContractCase) -> None:
         validation.run_matcher(case.spec, case.provider, (a.view, b.view), given)
 
 
+def check_matcher_many_features(case: ContractCase) -> str:
+    """Require a valid answer for 4096 features per view.
+
+    Images of users have as many. A fixed buffer or a limit of the network must not end a run.
+    """
+    if not case.declares("sparse"):
+        raise CheckSkipped("needs no features")
+    a, b = case.example, case.example.partner
+    features = case.extract_features(a.view, b.view)
+    if not (len(features[0]) and len(features[1])):
+        raise CheckSkipped("the detector finds no features to repeat")
+    many = _repeat(features[0], a), _repeat(features[1], b)
+    answer = validation.run_matcher(case.spec, case.provider, (a.view, b.view), many)
+    num_matches = 0 if answer.sparse is None else len(answer.sparse)
+    return f"{num_matches} matches of {NUM_MANY_FEATURES} features"
+
+
 def check_matcher_scores(case: ContractCase) -> str:
     """Require a higher mean score of correct matches than of wrong ones.
 
@@ -131,6 +150,7 @@ CHECKS = (
     check_matcher_pixel_convention,
     check_matcher_no_features,
     check_matcher_few_features,
+    check_matcher_many_features,
     check_matcher_scores,
     check_matcher_pair_depth,
 )
@@ -170,5 +190,21 @@ def _take_first(features: Features, count: int) -> Features:
         features.descriptors[:count],
         None if features.scores is None else features.scores[:count],
         None if features.scales is None else features.scales[:count],
+        features.std_px,
+    )
+
+
+def _repeat(features: Features, example: Example) -> Features:
+    """Repeat features with small random changes until there are NUM_MANY_FEATURES."""
+    rows = np.arange(NUM_MANY_FEATURES) % len(features)
+    rng = np.random.default_rng(0)
+    keypoints = features.keypoints[rows] + rng.uniform(-1, 1, (len(rows), 2))
+    descriptors = features.descriptors[rows]
+    noise = 0.01 * descriptors.std() * rng.normal(size=descriptors.shape)
+    return Features(
+        np.clip(keypoints, 0, example.camera.size),
+        (descriptors + noise).astype(np.float32),
+        None if features.scores is None else features.scores[rows],
+        None if features.scales is None else features.scales[rows],
         features.std_px,
     )
