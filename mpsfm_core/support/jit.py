@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import numba
 from numba import njit
+from numba.core.caching import IndexDataCacheFile
 from numba.extending import register_jitable
 
 from mpsfm_core.support.user_folders import user_cache_folder
@@ -38,6 +39,7 @@ def kernel(**options: Any) -> Callable[[F], F]:
 
     def decorate(function: F) -> F:
         _choose_cache_folder()
+        _discard_unreadable_indices()
         try:
             return _compiled(function, cache=True, **options)
         except RuntimeError:  # no writable cache folder
@@ -57,6 +59,24 @@ def helper(**options: Any) -> Callable[[F], F]:
 def _compiled(function: F, **options: Any) -> F:
     compiled: F = njit(**_ALWAYS, **options)(function)
     return compiled
+
+
+@cache
+def _discard_unreadable_indices() -> None:
+    """Let numba treat an index of an earlier version that it cannot unpickle as a cache miss.
+
+    numba unpickles the types in an index before it compares the index with the source. A type that
+    an upgrade renamed would raise AttributeError in the first call of the kernel.
+    """
+    load: Callable[[Any], Any] = IndexDataCacheFile._load_index
+
+    def load_or_discard(self: Any) -> Any:
+        try:
+            return load(self)
+        except (AttributeError, ImportError):
+            return {}
+
+    IndexDataCacheFile._load_index = load_or_discard
 
 
 @cache
