@@ -14,7 +14,7 @@ _LICENSE = "Apache-2.0"
 _ACCURACY: dict[Kind, str] = {
     "depth": "AbsRel 0.15 in a real room, 0.10 on a facade, after each photo's scale (measured)",
     "normals": "median 6 deg in a rendered kitchen (measured)",
-    "mask": "sky well, mirrors and glass hardly",
+    "mask": "detects sky well, mirrors and glass rarely",
 }
 """Measured in benchmarks/results/priors.md."""
 
@@ -36,7 +36,7 @@ def _spec(kind: Kind, factory: str, summary: str, *capabilities: Capability) -> 
         factory=f"mpsfm_compact.provider:Compact{factory}",
         options=CompactOptions,
         capabilities=frozenset({"intrinsics-aware", *capabilities}),
-        summary=f"small network of our own, its weights in the package: {summary}",
+        summary=f"small network, weights included: {summary}",
         requires=("onnxruntime",),
         install_hint="pip install mpsfm-compact",
         code_license=_LICENSE,

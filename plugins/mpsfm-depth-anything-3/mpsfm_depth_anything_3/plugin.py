@@ -17,10 +17,10 @@ def mpsfm_providers() -> list[ProviderSpec]:
             factory="mpsfm_depth_anything_3.provider:DepthAnything3",
             options=DepthAnything3Options,
             capabilities=frozenset({"variance", "proposes-poses", "proposes-intrinsics"}),
-            summary="Depth Anything 3: depth, poses and intrinsics of several photos at once",
+            summary="Depth Anything 3: depth, poses and intrinsics of photo groups",
             requires=("torch", "depth_anything_3"),
-            install_hint="pip install --no-deps depth-anything-3 (its code asks for much that is "
-            "not needed here)",
+            install_hint="pip install --no-deps depth-anything-3 (most of its dependencies are "
+            "not needed)",
             code_license="Apache-2.0",
             weights_license=f"{LICENSES['da3-small']} (small, base), {LICENSES['da3-large']}",
             weights=weights,

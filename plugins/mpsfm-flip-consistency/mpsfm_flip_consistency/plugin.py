@@ -14,7 +14,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             name="flip-consistency",
             factory="mpsfm_flip_consistency.wrapper:FlipConsistency",
             capabilities=frozenset({"wraps-depth", "wraps-normals"}),
-            summary="second pass on the mirrored image: mean, and variance from the disagreement",
+            summary="second pass on the mirrored image: mean, and variance from the difference",
             code_license="Apache-2.0",
         )
     ]

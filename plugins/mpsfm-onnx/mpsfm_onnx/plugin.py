@@ -107,7 +107,7 @@ def _moge(kind: Kind, factory: str, *capabilities: Capability) -> ProviderSpec:
         contract="mpsfm_onnx.contract:moge",
         options=Moge2Options,
         capabilities=frozenset({"intrinsics-aware", *capabilities}),
-        summary="MoGe-2 ViT-S: metric depth and normals of photos of anything",
+        summary="MoGe-2 ViT-S: metric depth and normals",
         requires=("onnxruntime",),
         install_hint="pip install mpsfm-onnx",
         code_license="Apache-2.0",

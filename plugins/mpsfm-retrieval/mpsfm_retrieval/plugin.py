@@ -29,7 +29,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             name="appearance",
             factory="mpsfm_retrieval.appearance:Appearance",
             options=AppearanceOptions,
-            summary="SIFT features and colours of the whole image; needs no weights",
+            summary="SIFT features and colors of the image; no weights",
             code_license="Apache-2.0",
         ),
     ]
