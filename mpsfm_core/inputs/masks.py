@@ -58,7 +58,7 @@ def find_masks(folder: Path, names: Sequence[str], images_folder: Path) -> dict[
 
     A mask is called as its image (``X.png``, ``X.jpg.png``, ``X.jpg``) or ``X_mask.png`` and the
     like, in any image format. Case is ignored. The folder has the tree of the images folder, or all
-    masks lie in it directly. It may be the images folder itself.
+    masks are in it directly. It may be the images folder itself.
 
     Returns:
         Image name -> file of its mask, for the images that have one. Warns if some have none.

@@ -1,4 +1,4 @@
-"""What a person should know of a run: whether it is good, what is wrong, and what to do."""
+"""Findings of a run for users: what is wrong or doubtful, where, and what to do."""
 
 from __future__ import annotations
 
@@ -13,30 +13,39 @@ from mpsfm_core.report.verdict import judge
 
 Level = Literal["bad", "warning", "note"]
 _ORDER: tuple[Level, ...] = ("bad", "warning", "note")
-_REFINED_FAR = 0.1
-"""A focal length that changed by more was no good guess (ours)."""
+_MAX_FOCAL_CHANGE = 0.1
+"""Relative change of a refined focal length from which it is reported."""
 
 _NETWORKLESS = {"flat", "from-depth"}
-"""Providers that stand in where no network could be had."""
+"""Depth providers that use no network."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """``title``: in a line. ``text``: what is the matter. ``remedy``: what to do, may be empty.
-    ``images``: the photos that it is about."""
+    """One finding."""
 
     level: Level
+    """Severity."""
     title: str
+    """One line."""
     text: str
+    """What happened, in sentences."""
     remedy: str = ""
+    """Next step for the user, may be empty."""
     images: tuple[str, ...] = field(default=())
+    """Names of the images that are concerned."""
 
 
 def findings(summary: Mapping[str, Any]) -> list[Finding]:
-    """The worst first. ``summary``: of ``summary.json``."""
-    found = [
+    """Collect all findings of a run, most severe first.
+
+    Args:
+        summary: content of ``summary.json``.
+    """
+    collected = [
         *_failure(summary),
         *_doubts(summary),
+        *_left_out(summary),
         *_missing(summary),
         *_unconfirmed(summary),
         *_providers(summary),
@@ -44,10 +53,11 @@ def findings(summary: Mapping[str, Any]) -> list[Finding]:
         *_focal_lengths(summary),
         *_weak(summary),
     ]
-    return sorted(found, key=lambda finding: _ORDER.index(finding.level))
+    return sorted(collected, key=lambda finding: _ORDER.index(finding.level))
 
 
 def _failure(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield the cause of a failed run."""
     if summary["status"] == "success":
         return
     pairs = summary["pairs"]
@@ -59,8 +69,8 @@ def _failure(summary: Mapping[str, Any]) -> Iterator[Finding]:
         yield Finding(
             "bad",
             "No two photos could be matched",
-            f"{_count(pairs['matched'], 'pair')} of photos compared, none shows the same place for "
-            f"certain: {causes or 'no pair was proposed'}.",
+            f"{_count(pairs['matched'], 'pair')} of photos were compared, none could be verified: "
+            f"{causes or 'no pair was proposed'}.",
             "Photos must overlap: about half of each should be in the next. Check that they are "
             "sharp and of one place, and that --intrinsics belongs to them. With little overlap "
             "try --config robust; with walls without texture --config dense.",
@@ -72,12 +82,12 @@ def _failure(summary: Mapping[str, Any]) -> Iterator[Finding]:
     usual, count = Counter(start.text for start in starts).most_common(1)[0] if starts else ("", 0)
     yield Finding(
         "bad",
-        "Photos match, but no two of them can be the start",
+        "Photos match, but no pair can start the reconstruction",
         f"{pairs['verified']} of {_count(pairs['matched'], 'pair')} of photos could be verified, "
-        f"but a reconstruction could start from none. In {_count(count, 'pair')}: {usual}",
+        f"but none can start a reconstruction. In {_count(count, 'pair')}: {usual}",
         "Look at the matches and at the prior depth of these photos below. Depth that is wrong "
         "(glass, mirrors, a weak network) or a wrong focal length does this: try another depth "
-        "network (mpsfm config show default says which are to be had), or give --intrinsics. More "
+        "network (mpsfm config show default lists them), or give --intrinsics. More "
         "photos of the same place help in any case.",
     )
 
@@ -90,12 +100,28 @@ def _doubts(summary: Mapping[str, Any]) -> Iterator[Finding]:
         yield Finding("warning", title, explained.text, explained.remedy, doubt.images)
 
 
+def _left_out(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield the images that were left out before the reconstruction."""
+    faults = summary["images"].get("left_out", {})
+    if faults:
+        first, fault = next(iter(faults.items()))
+        example = fault if len(faults) == 1 else f"For example {first}: {fault}"
+        yield Finding(
+            "warning",
+            f"{_count(len(faults), 'photo')} could not be used",
+            f"{example[:1].upper()}{example[1:]}.",
+            "Replace or remove the photo or its mask.",
+            tuple(faults),
+        )
+
+
 def _missing(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield one finding for each reason of unregistered images."""
     by_title = defaultdict(list)
     for name, reason in summary["images"]["unregistered"].items():
         by_title[explain_image(reason).title].append((name, explain_image(reason)))
     failed = summary["status"] != "success"
-    if failed:  # of course
+    if failed:  # the cause of the failure implies these reasons
         implied = {ImageReason.NO_REGISTERED_NEIGHBOR}
         if not summary["pairs"]["verified"]:
             implied.add(ImageReason.NO_VERIFIED_MATCHES)
@@ -112,6 +138,7 @@ def _missing(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _unconfirmed(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield the images that are registered tentatively."""
     names = tuple(summary["images"]["unconfirmed"])
     if names:
         yield Finding(
@@ -124,13 +151,14 @@ def _unconfirmed(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _providers(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield the fallbacks that replaced configured providers."""
     for provider in summary["providers"]:
         passed = provider["passed_over"]
         if provider["name"] in _NETWORKLESS and provider["block"] == "depth":
             yield Finding(
                 "warning",
                 "No depth network was used",
-                "Depth was taken as flat, so photos must overlap as for any other program.",
+                "Constant depth was used, so photos must overlap as much as for other programs.",
                 "pip install mpsfm-compact, or see mpsfm doctor.",
             )
         elif passed:
@@ -139,34 +167,36 @@ def _providers(summary: Mapping[str, Any]) -> Iterator[Finding]:
             )
             yield Finding(
                 "note",
-                f"{provider['block']}: {provider['name']} stood in for {', '.join(passed)}",
-                f"What is preferred could not be had. {reasons}.",
-                "mpsfm doctor says what is missing and how to get it.",
+                f"{provider['block']}: {provider['name']} replaced {', '.join(passed)}",
+                f"Preferred providers were not available: {reasons}.",
+                "mpsfm doctor lists what is missing and how to install it.",
             )
 
 
 def _scale(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield that the metric scale is unknown or uncertain."""
     for reconstruction in summary["reconstructions"][:1]:
         metric = reconstruction["metric_scale"]
         if metric is None:
             yield Finding(
                 "note",
                 "The scale is unknown",
-                "No depth in metres was used: distances are right only relative to each other.",
-                "Use a depth provider that is metric (mpsfm plugins list).",
+                "No depth in meters was used: only ratios of distances are right.",
+                "Use a metric depth provider (mpsfm plugins list).",
             )
         elif not metric["trusted"]:
             yield Finding(
                 "warning",
                 "The scale is uncertain",
                 f"The depth maps of {_count(metric['num_images'], 'photo')} disagree by "
-                f"{metric['spread']:.0%} on how large a metre is; one unit is about "
+                f"{metric['spread']:.0%} on the scale; one unit is about "
                 f"{metric['metres_per_unit']:.3g} m.",
                 "Measure one distance, or use a better metric depth network.",
             )
 
 
 def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield estimated focal lengths, and those that refinement changed by much."""
     details = summary["images"]["details"]
     refined = {
         name: (image["focal_length_px"], image.get("refined_focal_length_px"))
@@ -190,7 +220,7 @@ def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
     far = [
         name
         for name, (before, after) in refined.items()
-        if name not in guessed and after and abs(after / before - 1) > _REFINED_FAR
+        if name not in guessed and after and abs(after / before - 1) > _MAX_FOCAL_CHANGE
     ]
     if far:
         before, after = refined[far[0]]
@@ -205,31 +235,33 @@ def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _weak(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Photos that hang on one other photo."""
+    """Yield the images with verified matches to only one other image."""
     partners = partner_counts(summary)
     weak = tuple(name for name in summary["images"]["registered"] if partners[name] == 1)
     if weak and len(summary["images"]["registered"]) > 2:
         yield Finding(
             "note",
-            f"{_count(len(weak), 'photo')} held by one other photo only",
+            f"{_count(len(weak), 'photo')} connected to only one other photo",
             "Nothing else confirms their poses.",
-            "Look at them first if something seems off; a further photo nearby makes them safe.",
+            "Check them first if something looks wrong; add a photo from nearby.",
             weak,
         )
 
 
-def weakest(summary: Mapping[str, Any], most: int = 3) -> list[tuple[str, int]]:
-    """The registered photos with fewest verified matches with others of them, and how many."""
+def weakest(summary: Mapping[str, Any], max_images: int = 3) -> list[tuple[str, int]]:
+    """Return the registered images with the fewest verified matches, with the numbers."""
     registered = set(summary["images"]["registered"])
     matches = Counter(dict.fromkeys(summary["images"]["registered"], 0))
     for pair in summary["pairs"]["all"]:
         if "inliers" in pair and registered.issuperset(pair["images"]):
             matches.update(dict.fromkeys(pair["images"], pair["inliers"]))
-    return sorted(matches.items(), key=lambda item: item[1])[: min(most, len(registered) // 2)]
+    return sorted(matches.items(), key=lambda item: item[1])[
+        : min(max_images, len(registered) // 2)
+    ]
 
 
 def partner_counts(summary: Mapping[str, Any]) -> Counter[str]:
-    """For each registered image how many others of them it has verified matches with."""
+    """Count the registered images with which each registered image has verified matches."""
     registered = set(summary["images"]["registered"])
     return Counter(
         name

@@ -45,7 +45,7 @@ class Explanation:
     title: str
     """A phrase without numbers; photos with the same title are reported together."""
     text: str
-    """One sentence that says what happened."""
+    """One sentence about what happened."""
     remedy: str
     """The next step for the user; empty if there is none."""
 

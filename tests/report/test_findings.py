@@ -211,3 +211,11 @@ def test_verdict_doubts_guessed_focal_lengths_that_were_not_refined() -> None:
     report["images"]["details"]["b"]["focal_length_from"] = "default"
     (doubt,) = judge(report).doubts
     assert doubt.images == ("b",)
+
+
+def test_images_that_were_left_out_are_a_finding() -> None:
+    report = summary()
+    report["images"]["left_out"] = {"c": "mask c.png is all black: it excludes every pixel"}
+    (finding,) = [item for item in findings(report) if item.images == ("c",)]
+    assert (finding.level, finding.title) == ("warning", "1 photo could not be used")
+    assert finding.text == "Mask c.png is all black: it excludes every pixel."
