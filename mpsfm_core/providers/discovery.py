@@ -1,4 +1,4 @@
-"""Discovery: load the installed plugins so that a broken one becomes a reason, never an exception.
+"""Discovery: load installed plugins; a broken one becomes a reason, never an exception.
 
 Importing a plugin and calling its hooks runs foreign code. Both happen in a thread with a time
 limit. A thread cannot be killed: a plugin that hangs stays behind as a daemon thread, and the

@@ -1,4 +1,4 @@
-"""Choice of one provider in a configuration: name, options, wrappers, calibration, fallbacks."""
+"""Configuration of one provider: name, options, wrappers, calibration and fallbacks."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ProviderConfig(Options):
 
     @property
     def is_unresolved(self) -> bool:
-        """Whether provider resolution has yet to choose between several providers.
+        """True until provider resolution has chosen between several providers.
 
         See :mod:`mpsfm_core.pipeline.provider_resolution`.
         """

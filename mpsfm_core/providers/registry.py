@@ -1,4 +1,4 @@
-"""Registry of providers: discovery, availability, options, weights, calibration and construction.
+"""Registry of providers: availability, options, weights, calibration and construction.
 
 A :class:`Registry` is an ordinary object. The pipeline creates one with :meth:`Registry.discover`
 and passes it on.

@@ -384,7 +384,7 @@ def _find_exported_file(uri: str) -> Path:
     manifest = exports_folder() / f"{name}.json"
     if Path(name).name != name or not manifest.is_file():
         raise WeightsError(
-            f"{uri} is not on this machine, and nobody publishes it: 'mpsfm models export {name} "
+            f"{uri} is not on this machine and is not published: 'mpsfm models export {name} "
             f"--code CHECKOUT --checkpoint FILE' makes it from the authors' code and weights"
         )
     try:

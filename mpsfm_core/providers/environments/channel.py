@@ -124,7 +124,7 @@ class _Block:
 
     @property
     def in_use(self) -> bool:
-        """Whether an array that views the block is alive."""
+        """True while an array that views the block is alive."""
         return self._read is not None and self._read() is not None
 
     def for_writing(self, size: int) -> memoryview:

@@ -1,4 +1,4 @@
-"""Providers of another environment as specifications for the registry and as callable objects."""
+"""Providers of another environment: specifications for the registry, and clients."""
 
 from __future__ import annotations
 

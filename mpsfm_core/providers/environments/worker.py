@@ -1,4 +1,4 @@
-"""Worker process: serves the providers of its environment to a client, one request at a time.
+"""Worker process: serves the providers of its environment, one request at a time.
 
 Started as ``python -m mpsfm_core.providers.environments.worker FOLDER``.
 """

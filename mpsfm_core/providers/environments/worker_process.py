@@ -28,7 +28,7 @@ _START_TIMEOUT_S = 120.0
 _NEEDED_BYTES = 256 << 20
 """Free memory that the messages of a worker need; with less they use the temporary folder."""
 _NUM_LENT_BLOCKS = 2
-"""Number of answers whose arrays may be alive at once: one is requested while one is stored."""
+"""Number of answers whose arrays may be alive in parallel: one is requested while one is stored."""
 _EXIT_TIMEOUT_S = 5.0
 _MPSFM_ERRORS: Mapping[str, type[MpsfmError]] = MappingProxyType(
     {
@@ -90,13 +90,13 @@ class Worker:
             self.close()
             raise ProviderError(
                 f"{label} has mpsfm-core {greeting['core']}, whose protocols are of another "
-                f"version ({versions} there, {(PROTOCOL, API_VERSION)} here): make it anew with "
+                f"version ({versions} there, {(PROTOCOL, API_VERSION)} here): create it again with "
                 f"'mpsfm env create'"
             )
 
     @property
     def alive(self) -> bool:
-        """Whether the process is running."""
+        """True while the process is running."""
         return self._process.poll() is None
 
     def ask(
