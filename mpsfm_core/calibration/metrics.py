@@ -30,7 +30,7 @@ def compute_metrics(residuals: Residuals, std: Float64) -> dict[str, Any]:
     ``|error / std|``, 1 when right. ``nll``: mean negative log density if errors were normal,
     ``nll_heavy``: if they had the fit's heavy tails and the same coverage of 1 std. ``ause``: area
     between the sensitivity curve and that of the true order of errors, as a share of the total
-    RMSE; 0 is a perfect order. ``rmse``: in metres or rad. Then the curves behind them.
+    RMSE; 0 is a perfect order. ``rmse``: in meters or rad. Then the curves behind them.
     """
     total, weights = np.hypot(std, residuals.noise), residuals.weights()
     heavy_scale = total / STD_OF_T

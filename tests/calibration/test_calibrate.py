@@ -100,10 +100,10 @@ def test_plots_are_labeled(calibrated: Path) -> None:
     groups = {g.get("id"): g for g in root.iter("{http://www.w3.org/2000/svg}g") if g.get("id")}
     plots = [groups[f"axes_{number}"] for number in (1, 2, 3, 4)]
     labels = [
-        {"Sensitivity", "share of pixels, most certain first", "RMSE / RMSE of all"},
+        {"Sensitivity", "ratio of pixels, most certain first", "RMSE / RMSE of all"},
         {"declared std (log depth)", "actual spread (log depth)", "ideal"},
-        {"Coverage on held-out images", "standard deviations", "share of errors within"},
-        {"Coverage by range", "depth (m)", "share within 1 std"},
+        {"Coverage on held-out images", "standard deviations", "ratio of errors within"},
+        {"Coverage by range", "depth (m)", "ratio within 1 std"},
     ]
     for plot, expected in zip(plots, labels, strict=True):
         texts = {"".join(t.itertext()) for t in plot.iter("{http://www.w3.org/2000/svg}text")}
@@ -188,12 +188,12 @@ def test_calibrate_skips_masked_pixels_and_missing_truth(tmp_path: Path) -> None
         ([*PRIOR, "--ground-truth", "nowhere"], "nowhere does not exist"),
         ([*PRIOR, "--model", SCENE / "images"], "has no COLMAP model"),
         ([*PRIOR, "--model", SCENE / "gt"], "the model has no points"),
-        ([*PRIOR, *DEPTH, "--model", SCENE / "gt"], "true maps or a model, not both"),
+        ([*PRIOR, *DEPTH, "--model", SCENE / "gt"], "true maps or a model for the calibration, not both"),
         ([*PRIOR, *DEPTH, "--kind", "depht"], "did you mean 'depth'"),
         ([*PRIOR, *DEPTH, "--alignment", "shift"], "unknown 'shift'"),
         ([*PRIOR, *DEPTH, "--set", "ground_truth.scael=1"], "ground_truth.scael"),
         ([*PRIOR, *DEPTH, "--set", "options.scael=1"], "did you mean 'scale'"),
-        (["--kind", "normals", "--model", SCENE / "gt"], "only be calibrated with true normal"),
+        (["--kind", "normals", "--model", SCENE / "gt"], "need true normal maps"),
         ([*PRIOR, "--ground-truth", SCENE / "gt"], "has no file for any of the images"),
     ],
 )
@@ -209,7 +209,7 @@ def test_calibrate_command_wrong_arguments_fail(
 def test_calibrate_command_suffix_selects_format(tmp_path: Path) -> None:
     result = run(tmp_path / "calibration", *PRIOR, *DEPTH)
     assert result.exit_code == 2
-    assert "ends in .yaml or .json" in result.output
+    assert "must end in .yaml or .json" in result.output
 
 
 def test_calibrate_with_model_points(calibrated: Path, tmp_path: Path) -> None:

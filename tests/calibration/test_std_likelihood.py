@@ -190,7 +190,7 @@ def _unshift(samples: DepthSamples, alignment: str, share: float) -> DepthSample
         step=samples.step[keep],
         truth=samples.truth[keep],
         truth_std=samples.truth_std[keep],
-        medians=(medians[0], medians[1]),
+        depth_medians=(medians[0], medians[1]),
     )
 
 
