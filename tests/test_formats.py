@@ -1,7 +1,7 @@
 """Files that an earlier version wrote are read; those of a later one are refused, or made anew.
 
 ``tests/golden/VERSION`` has a file of each format as that version wrote it
-(``python tests/golden/make.py``).
+(``python -m tests.golden.make``).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def results(folder: Path) -> Any:
     maps = [(found.refined(n), found.prior(n), found.picture(n)) for n in found.names]
     assert all(part is not None for parts in maps for part in parts)
     assert "dense: {enabled" not in render(found)
-    lines = [(line.image_a, line.image_b, len(line.points_a)) for line in found.lines()]
+    lines = [(line.image_a, line.image_b, len(line.points_a)) for line in found.matches()]
     return found.summary["reconstructions"], lines
 
 
@@ -237,7 +237,7 @@ def test_a_checkpoint_is_read_as_it_was_written(golden: Path) -> None:
 
 
 def test_files_of_this_version_are_kept() -> None:
-    assert core_version() in VERSIONS, "python tests/golden/make.py writes them"
+    assert core_version() in VERSIONS, "python -m tests.golden.make writes them"
 
 
 def declared() -> dict[str, int]:

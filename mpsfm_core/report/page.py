@@ -22,7 +22,7 @@ from mpsfm_core.report import pictures
 from mpsfm_core.report.findings import findings, partner_counts
 from mpsfm_core.report.points import PointSet, dense_points, sparse_points
 from mpsfm_core.report.reasons import explain_image, explain_pair
-from mpsfm_core.report.result_folder import PairMatches, PriorMaps, RefinedMap, ResultFolder
+from mpsfm_core.report.result_folder import MatchLines, PriorMaps, RefinedMap, ResultFolder
 from mpsfm_core.report.verdict import judge
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.threads import parallel_map
@@ -182,7 +182,7 @@ class _ImageEntries:
             "pictures": self._pictures(name, prior, refined),
         }
 
-    def lines(self, pair: PairMatches) -> str:
+    def lines(self, pair: MatchLines) -> str:
         """Encode matches as (ax, ay, bx, by) uint16, relative to the sizes of both views."""
         sides = []
         for name, points in ((pair.image_a, pair.points_a), (pair.image_b, pair.points_b)):

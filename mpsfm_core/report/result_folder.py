@@ -60,7 +60,7 @@ class PriorMaps:
 
 
 @dataclass(frozen=True, eq=False)
-class PairMatches:
+class MatchLines:
     """Sample of the verified matches of two images, (m, 2) float32 each, pixels of the views."""
 
     image_a: str
@@ -155,7 +155,7 @@ class ResultFolder:
             raise InputError(f"{file} is damaged")
         return np.asarray(picture, np.uint8)
 
-    def matches(self) -> list[PairMatches]:
+    def matches(self) -> list[MatchLines]:
         """Read the sampled verified matches of all pairs, empty if they were not written."""
         file = self.path / VIEWS / MATCHES
         if not file.is_file():
@@ -164,7 +164,7 @@ class ResultFolder:
         try:
             starts: Int64 = data["starts"]
             return [
-                PairMatches(
+                MatchLines(
                     str(data["names"][a]),
                     str(data["names"][b]),
                     data["points_a"][starts[row] : starts[row + 1]],

@@ -1,4 +1,4 @@
-"""Writes a file of each of our formats, as this version writes it: ``python tests/golden/make.py``.
+"""Writes a file of each of our formats, as this version writes it: ``python -m tests.golden.make``.
 
 They go into a folder named after the version, where the tests find them from then on: what was
 written once is read for ever, or refused in words. What is there is not touched; a new folder is
@@ -94,7 +94,7 @@ def entries() -> dict[str, Any]:
         "normals": faces,
         "joint": JointPrior(depth, faces),
         "two-view": TwoViewGeometry(
-            "", "calibrated", np.arange(4), np.eye(3), np.array([0.6, 0, 0.8])
+            "", "calibrated", 4, np.arange(4), np.eye(3), np.array([0.6, 0, 0.8])
         ),
         "mask": np.array([[0, 255]], np.uint8),
     }
