@@ -178,10 +178,10 @@ def walk_files(folder: Path) -> Iterator[str]:
             continue
         visited.add((status.st_dev, status.st_ino))
         # Real folders first: images keep the names that they have without links.
-        folders[:] = sorted(
-            (name for name in folders if not name.startswith(".")),
-            key=lambda name, parent=parent: (Path(parent, name).is_symlink(), name),
-        )
+        visible = [name for name in folders if not name.startswith(".")]
+        folders[:] = [
+            name for _, name in sorted((Path(parent, n).is_symlink(), n) for n in visible)
+        ]
         for name in sorted(files):
             path = Path(parent, name)
             if not name.startswith(".") and path.is_file():
