@@ -2,7 +2,7 @@
 
 Both sides are compared on their common sets. Confidence intervals come from a paired bootstrap over
 sets. P-values come from a randomization test that swaps the sides of each set, which is exact even
-for few sets. If a bucket has too few sets, image pairs are resampled instead (both orders together).
+for few sets. If a bucket has too few sets, image pairs are resampled instead, in both orders.
 Pairs of a set share images, so these intervals are too narrow; the table names the resampled unit.
 """
 
