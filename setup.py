@@ -1,6 +1,8 @@
-"""What pyproject.toml cannot say: the top-level configs/ and the photos of the sample scene are
-installed inside of the package, and the templates of new plugins are data although they look like
-code."""
+"""Install the data that pyproject.toml cannot describe.
+
+The top-level configs/ and the photos of the sample scene are installed inside the package. The
+templates of new plugins are data although they look like code.
+"""
 
 from setuptools import find_packages, setup
 

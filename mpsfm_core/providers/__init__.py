@@ -56,8 +56,8 @@ __all__ = [
     "ProviderSpec",
     "RetrievalProvider",
     "WeightsFile",
-    "weights_from_option",
     "hookimpl",
     "hookspec",
     "require_features",
+    "weights_from_option",
 ]

@@ -116,7 +116,8 @@ def test_checking_leaves_nothing_behind(tmp_path: Path, output: Path) -> None:
 def test_a_file_in_the_way_is_wrong_input(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(InputError, match="cannot be the output folder"), lock_output_folder(folder):
+        refused = pytest.raises(InputError, match="cannot be the output folder")
+        with refused, lock_output_folder(folder):
             pass
 
 
