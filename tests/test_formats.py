@@ -201,7 +201,8 @@ def test_a_file_of_a_later_version_is_refused_or_made_anew(name: str, golden: Pa
     if FILES[name].anew is not None:
         assert FILES[name].read(golden) == FILES[name].anew
         return
-    with pytest.raises(InputError, match=r"is of format 999, written by a newer mpsfm-core") as caught:
+    newer = r"is of format 999, written by a newer mpsfm-core"
+    with pytest.raises(InputError, match=newer) as caught:
         FILES[name].read(golden)
     assert Path(FILES[name].path).name in str(caught.value)
 

@@ -59,7 +59,8 @@ def test_plugins_bring_formats(result: Path, tmp_path: Path, install_plugin) -> 
 
         @hookimpl
         def mpsfm_export_formats():
-            count = ExportFormat("count", "how many", ("n.txt",), f"{__name__}:write", align_gravity=True)
+            write = f"{__name__}:write"
+            count = ExportFormat("count", "how many", ("n.txt",), write, align_gravity=True)
             return [count, ExportFormat("broken", "", (), f"{__name__}:nothing")]
 
         def write(source, folder):
