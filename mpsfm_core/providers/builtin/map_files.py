@@ -42,24 +42,23 @@ def find_file(options: FileOptions, view: View, what: str) -> Path:
     suffixes = _SUFFIXES if options.suffix is None else (options.suffix,)
     full = options.directory / view.name
     bases = [full, full.with_suffix("")]
-    for base in bases:
-        for suffix in suffixes:
-            path = _find_ignoring_case(base.with_name(base.name + suffix))
-            if path is not None:
-                return path
+    candidates = [base.with_name(base.name + suffix) for base in bases for suffix in suffixes]
+    path = next((path for path in candidates if path.is_file()), None)
+    path = path or _find_ignoring_case(candidates)
+    if path is not None:
+        return path
     wanted = f"{bases[1]}{suffixes[0] if len(suffixes) == 1 else '{' + ','.join(suffixes) + '}'}"
     raise InputError(f"{what} of image {view.name!r}: there is no file {wanted}")
 
 
-def _find_ignoring_case(path: Path) -> Path | None:
-    """Return the file of this name, else the one whose name differs only in case."""
-    if path.is_file():
-        return path
-    if not path.parent.is_dir():
+def _find_ignoring_case(candidates: list[Path]) -> Path | None:
+    """Return the first file whose name differs only in case; all candidates are in one folder."""
+    folder = candidates[0].parent
+    if not folder.is_dir():
         return None
-    name = path.name.casefold()
-    similar = (other for other in path.parent.iterdir() if other.name.casefold() == name)
-    return next((other for other in sorted(similar) if other.is_file()), None)
+    files = {path.name.casefold(): path for path in sorted(folder.iterdir(), reverse=True)}
+    names = (path.name.casefold() for path in candidates)
+    return next((files[name] for name in names if name in files), None)
 
 
 def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
