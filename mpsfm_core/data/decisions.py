@@ -1,7 +1,7 @@
 """Typed reasons of the decisions that a run makes about images, pairs and providers.
 
-A reason is a code with the fields that its code declares. It is created where the decision is made
-and stored in ``summary.json`` as ``{"code": ..., field: ...}``. Only
+A reason is a code with the fields that its code declares. The code that decides
+creates the reason, and ``summary.json`` stores it as ``{"code": ..., field: ...}``. Only
 :mod:`mpsfm_core.report.reasons` renders a reason into words and a remedy.
 """
 
@@ -36,7 +36,7 @@ class ReasonCode(Enum):
 
 
 class ImageReason(ReasonCode):
-    """Why an image is not registered, or why a pair cannot initialize a component."""
+    """Reasons why an image is not registered, or why a pair cannot initialize a component."""
 
     NO_VERIFIED_MATCHES = ("no-verified-matches",)
     NO_REGISTERED_NEIGHBOR = ("no-registered-neighbor",)
@@ -53,10 +53,13 @@ class ImageReason(ReasonCode):
     CONTRADICTS_IMAGE = ("contradicts-image", "violation_ratio", "other_image")
     """The depth of another image contradicts the pose: share of contradicting pixels."""
     CONTRADICTS_DEPTH = ("contradicts-depth", "violation_ratio", "step")
-    """The same in a check of all images: after global-initialization, or in the final-check."""
+    """Share of pixels that contradict the depth of other images, in a check of all images.
+
+    ``step``: global-initialization or final-check.
+    """
     CONTRADICTED_BY_IMAGES = ("contradicted-by-images", "num_images")
     MISREGISTERED = ("misregistered", "num_matches")
-    """So many more matches contradict the pose than support it."""
+    """Number of matches that contradict the pose in excess of those that support it."""
     CONNECTED_BY_DROPPED_IMAGE = ("connected-by-dropped-image", "step")
     COMPONENT_TOO_SMALL = ("component-too-small", "num_images", "min_images")
     COMPONENT_LIMIT = ("component-limit", "max_components")
@@ -68,7 +71,7 @@ class ImageReason(ReasonCode):
 
 
 class PairReason(ReasonCode):
-    """Why geometric verification drops an image pair."""
+    """Reasons why geometric verification drops an image pair."""
 
     TOO_FEW_MATCHES = ("too-few-matches", "num_matches", "min_matches")
     TOO_FEW_INLIERS = ("too-few-inliers", "num_inliers", "num_matches")
@@ -80,7 +83,7 @@ class PairReason(ReasonCode):
 
 
 class ProviderReason(ReasonCode):
-    """Why a preferred provider is passed over for its fallback."""
+    """Reasons why the configuration uses a fallback instead of a preferred provider."""
 
     UNAVAILABLE = ("unavailable", "detail")
     """The plugin is missing or broken, or the options do not fit it."""
@@ -90,7 +93,7 @@ class ProviderReason(ReasonCode):
 
 
 class ChoiceReason(ReasonCode):
-    """Why a block of the configuration uses its provider."""
+    """Reasons why a block of the configuration uses its provider."""
 
     CONFIGURED = ("configured",)
     FIRST_CHOICE = ("first-choice",)
@@ -98,17 +101,17 @@ class ChoiceReason(ReasonCode):
 
 
 class CameraReason(ReasonCode):
-    """Why the guessed focal length of a camera is not refined."""
+    """Reasons why bundle adjustment does not refine the guessed focal length of a camera."""
 
     TOO_FEW_IMAGES = ("too-few-images", "num_images", "min_images")
     NOT_OBSERVABLE = ("not-observable", "focal_length_std_ratio")
-    """The images do not constrain the focal length; its relative std after adjustment."""
+    """Relative std of a focal length that the images do not constrain."""
     OUT_OF_RANGE = ("out-of-range", "focal_length_px")
     """The refined value is no plausible focal length."""
 
 
 class GpsReason(ReasonCode):
-    """Why a reconstruction is not aligned with the GPS positions of its images."""
+    """Reasons why a reconstruction is not aligned with the GPS positions of its images."""
 
     TOO_FEW_POSITIONS = ("too-few-positions", "num_positions", "min_positions")
     TOO_LITTLE_SPREAD = ("too-little-spread", "spread_m", "std_m")
@@ -118,7 +121,7 @@ class GpsReason(ReasonCode):
 
 
 class DoubtReason(ReasonCode):
-    """Why a reconstruction may be wrong although its images are registered."""
+    """Reasons to doubt a reconstruction although its images are registered."""
 
     UNEXPLAINED_PAIRS = ("unexplained-pairs", "num_pairs", "image_a", "image_b", "num_matches")
     """Verified pairs whose images share hardly any point in the model."""

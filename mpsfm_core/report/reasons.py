@@ -1,7 +1,7 @@
 """Render the typed reasons of a run into words and a remedy for users.
 
-The reasons are defined in :mod:`mpsfm_core.data.decisions`. This module is the only place that
-knows words for them: terminal, report page and exceptions all call :func:`explain`.
+:mod:`mpsfm_core.data.decisions` defines the reasons. Terminal, report page and exceptions all call
+:func:`explain`, so the words for each reason exist once.
 """
 
 from __future__ import annotations
