@@ -240,11 +240,11 @@ def test_what_was_found_in_further_files(tmp_path: Path) -> None:
         database.execute("UPDATE other SET pair_id = NULL")
         database.execute("DROP TABLE matches")
         database.execute("ALTER TABLE other RENAME TO matches")
-    with pytest.raises(InputError, match=r"a\.db, matches: None is no pair of images"):
+    with pytest.raises(InputError, match=r"a\.db, matches: None is not a pair id"):
         table["intrinsics/a.db"][1](path)
     out = Path(shutil.copytree(GOLDEN / "out", tmp_path / "out"))
     (out / "sparse" / "points3D.bin").write_bytes(bytes(8))
-    with pytest.raises(InputError, match="out: its results are damaged"):
+    with pytest.raises(InputError, match="out: the results are damaged"):
         write_report(out)
     used(out)
     images = out / "sparse" / "images.bin"
@@ -256,12 +256,12 @@ def test_what_was_found_in_further_files(tmp_path: Path) -> None:
     summary = json.loads((out / "summary.json").read_text())
     summary["stages"] = {"mapping": {}}
     (out / "summary.json").write_text(json.dumps(summary))
-    with pytest.raises(InputError, match="out: its results are damaged"):
+    with pytest.raises(InputError, match="out: the results are damaged"):
         write_report(out)
 
 
 def test_compressed_file_size_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(npz, "MOST_BYTES", 1_000_000)
+    monkeypatch.setattr(npz, "MAX_BYTES", 1_000_000)
     path = tmp_path / "depth.npz"
     np.savez_compressed(path, depth=np.zeros((1000, 1000), np.float32))
     with pytest.raises(InputError, match="unpacks to 4 MB, 1 at most"):
