@@ -1,4 +1,7 @@
-"""Plugin providers: protocols, hooks and specifications. See :mod:`registry` for discovery."""
+"""Plugin interface of providers: protocols, hooks and specifications.
+
+The module :mod:`registry` finds the installed plugins.
+"""
 
 from mpsfm_core.providers.protocols import (
     API_VERSION,

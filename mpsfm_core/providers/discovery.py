@@ -1,8 +1,8 @@
-"""Discovery: load installed plugins; a broken one becomes a reason, never an exception.
+"""Discovery of installed plugins; a plugin that fails to load is listed with the reason.
 
-Importing a plugin and calling its hooks runs foreign code. Both happen in a thread with a time
-limit. A thread cannot be killed: a plugin that hangs stays behind as a daemon thread, and the
-process continues without it.
+Importing a plugin and calling its hooks runs foreign code. Both run in a thread with a time limit.
+A thread cannot be killed: a plugin that hangs remains as a daemon thread, and the process
+continues.
 """
 
 from __future__ import annotations
@@ -42,25 +42,25 @@ _REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 @dataclass(frozen=True)
 class LoadedPlugin:
-    """Result of loading one entry point: its module and providers, or the fault."""
+    """Result of loading one plugin entry point: its module and providers, or the fault."""
 
     name: str
     distribution: str
     version: str
     module: object = None
-    """Imported object, None if loading failed."""
+    """Imported plugin module, None if loading failed."""
     specs: tuple[object, ...] = ()
     """What ``mpsfm_providers`` returned."""
     hooks: tuple[str, ...] = ()
-    """Names of the implemented hooks, without the prefix ``mpsfm_``."""
+    """Names of the hooks that the plugin implements, without the prefix ``mpsfm_``."""
     fault: str = ""
     """Reason why the plugin cannot be used, else empty."""
     hint: str = ""
-    """Remedy for the fault."""
+    """Text for the user that explains how to repair the fault."""
 
 
 def create_plugin_manager() -> pluggy.PluginManager:
-    """Create a pluggy manager with the hooks of MP-SfM and no plugins."""
+    """Create a pluggy plugin manager that has the MP-SfM hooks and no plugins."""
     manager = pluggy.PluginManager("mpsfm")
     manager.add_hookspecs(Hooks)
     return manager
@@ -92,14 +92,15 @@ def installed_plugins(
 def crashing_plugins(timeout_s: float) -> set[tuple[str, str]]:
     """Find the plugins that crash the process in which they are loaded.
 
-    A child process prints each entry point before it loads it. If the process crashes, the last
-    printed one is the cause; the search continues without it.
+    A child process prints the name of each entry point before loading the plugin. If the child
+    process crashes, the last printed entry point is the cause. The search continues without this
+    plugin.
 
     Args:
-        timeout_s: Time limit for each plugin.
+        timeout_s: Time limit for loading each plugin.
 
     Returns:
-        (name, module) of the entry points.
+        Pairs (name, module) of the entry points.
     """
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
     remaining = {(entry.name, entry.value) for entry in entries}
@@ -141,25 +142,25 @@ os._exit(0)
 
 
 def subprocess_environment() -> dict[str, str]:
-    """Return environment variables with which a child finds the modules of this process."""
+    """Return environment variables with which a child process finds the modules of this process."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
 def inspect_plugin(module: object, name: str, distribution: str, version: str) -> LoadedPlugin:
-    """Collect the providers and hooks of an imported plugin.
+    """Collect the providers and hooks of an imported plugin module.
 
     Args:
         module: Module or object with hook implementations.
-        name: Name of the entry point.
-        distribution: Name of the distribution.
-        version: Version of the distribution.
+        name: Name of the plugin's entry point.
+        distribution: Name of the plugin's distribution package.
+        version: Version of the plugin's distribution package.
 
     Returns:
-        The plugin, with a ``fault`` if it implements an unknown hook.
+        The loaded plugin, with a ``fault`` if the plugin implements an unknown hook.
 
     Raises:
         TypeError: The object implements no hook, or ``mpsfm_providers`` does not return a list.
-        Exception: Whatever the plugin raises.
+        Exception: Any exception of the plugin's ``mpsfm_providers``.
     """
     manager = create_plugin_manager()
     manager.register(module, name)
@@ -181,7 +182,7 @@ def inspect_plugin(module: object, name: str, distribution: str, version: str) -
 
 
 def find_spec_fault(spec: ProviderSpec) -> tuple[str, str]:
-    """Return why a specification cannot be used and the remedy, or two empty texts."""
+    """Return why a provider specification is unusable and the repair, or two empty texts."""
     if not isinstance(spec.api_version, int) or spec.api_version > API_VERSION:
         return (
             f"is made for plugin API {spec.api_version}, this core has {API_VERSION}",
@@ -189,7 +190,7 @@ def find_spec_fault(spec: ProviderSpec) -> tuple[str, str]:
         )
     try:
         fault = _malformed(spec)
-    except Exception as error:  # fields of unexpected types
+    except Exception as error:  # Fields of the specification have unexpected types.
         fault = str(error)
     if fault:
         return f"has a wrong specification: {fault}", "tell the plugin's author"
@@ -201,9 +202,9 @@ def find_spec_fault(spec: ProviderSpec) -> tuple[str, str]:
 
 
 def _distribution(entry: metadata.EntryPoint) -> tuple[str, str]:
-    """Return name and version of the distribution of an entry point.
+    """Return the distribution name and version of a plugin's entry point.
 
-    Damaged metadata must not hide the plugin from lists.
+    A plugin with damaged package metadata must still appear in lists.
     """
     try:
         if entry.dist is not None:
@@ -216,17 +217,19 @@ def _distribution(entry: metadata.EntryPoint) -> tuple[str, str]:
 def _load(
     entry: metadata.EntryPoint, distribution: str, version: str, timeout_s: float
 ) -> LoadedPlugin:
-    """Load an entry point in a thread with a time limit."""
+    """Load a plugin's entry point in a thread with a time limit."""
     outcome: list[LoadedPlugin | BaseException] = []
 
     def work() -> None:
         try:
             outcome.append(inspect_plugin(entry.load(), entry.name, distribution, version))
-        except BaseException as error:  # SystemExit of a plugin must not end the program
+        except BaseException as error:  # A SystemExit raised by a plugin must not end the program.
             outcome.append(error)
 
     thread = threading.Thread(target=work, name=f"mpsfm plugin {entry.name}", daemon=True)
-    with redirect_stdout(sys.stderr):  # keep the standard output of commands clean
+    with redirect_stdout(
+        sys.stderr
+    ):  # Keep the plugin's output away from the standard output of commands.
         thread.start()
         thread.join(timeout_s)
     if not outcome:
@@ -243,24 +246,23 @@ def _load(
 
 
 def _hint(error: BaseException, distribution: str) -> str:
-    """Return the remedy for a plugin whose loading raised an error."""
+    """Return advice for the user about a plugin whose loading raised an error."""
     absent = (error.name or "") if isinstance(error, ImportError) else ""
     if absent.partition(".")[0] == "mpsfm_core" or "ProviderSpec.__init__()" in str(error):
-        return (
-            f"pip install --upgrade mpsfm-core, or uninstall {distribution}"  # made for a newer API
-        )
+        # The plugin was made for a newer API.
+        return f"pip install --upgrade mpsfm-core, or uninstall {distribution}"
     if absent and isinstance(error, ModuleNotFoundError):
         return f"pip install the package of module {absent!r}, or uninstall {distribution}"
     return f"reinstall or uninstall {distribution}"
 
 
 def _malformed(spec: ProviderSpec) -> str:
-    """Return the first rule that a specification violates, or an empty text."""
+    """Return the first rule that a provider specification violates, or an empty text."""
     if spec.kind not in KINDS:
         return f"unknown kind {spec.kind!r}{did_you_mean(str(spec.kind), KINDS)}"
     name = spec.name
     if isinstance(name, str) and callable(spec.factory):
-        name = name.partition("@")[0]  # the rest is the name of an environment
+        name = name.partition("@")[0]  # The text after the separator is the name of an environment.
     if not (isinstance(name, str) and _NAME.fullmatch(name)):
         return f"name {spec.name!r} is not made of lower-case letters, digits and - . _"
     if not (callable(spec.factory) or _is_reference(spec.factory)):
@@ -288,7 +290,7 @@ def _is_reference(value: Any) -> bool:
 
 
 def _installed(name: str) -> bool:
-    """Return whether a package exists. Looks up the top level only, which imports nothing."""
+    """Return whether a Python package is installed, looking up its top level without an import."""
     try:
         return importlib.util.find_spec(name.partition(".")[0]) is not None
     except (ImportError, ValueError):

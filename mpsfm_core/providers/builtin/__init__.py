@@ -1,1 +1,1 @@
-"""Providers that need no download."""
+"""Built-in providers, which need no download."""

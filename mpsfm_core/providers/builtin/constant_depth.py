@@ -9,19 +9,19 @@ from mpsfm_core.data.options import Options
 from mpsfm_core.providers import ProviderContext
 
 _GRID = (24, 32)
-"""Rows and columns of the map; normals from depth need some pixels."""
+"""Rows and columns of the constant depth map; normals from depth need several pixels."""
 
 
 class ConstantDepth:
-    """Depth provider that returns a plane parallel to the image at distance 1, not metric.
+    """Depth provider that returns the plane z = 1 parallel to the image, without a metric unit.
 
-    With the large std that its specification declares, the mapper can lift keypoints for a first
-    pose. Images with much overlap are then reconstructed nearly as without priors.
+    The specification declares a large std, with which the mapper can still lift keypoints to 3D.
+    Images with much overlap are reconstructed almost as if there were no depth prior.
     """
 
     def __init__(self, options: Options | None, context: ProviderContext) -> None:
         pass
 
     def predict(self, view: View) -> DepthPrior:
-        """Return depth 1 everywhere."""
+        """Return z-depth 1 at every pixel."""
         return DepthPrior.from_arrays(np.ones(_GRID), metric=False)

@@ -1,4 +1,4 @@
-"""Placeholders for depth that another block of the configuration predicts."""
+"""Placeholder providers for depth that a matcher or a multi-view network predicts."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from mpsfm_core.providers import ProviderContext
 class MatcherDepth:
     """Placeholder for ``depth: {use: matcher}``: depth predicted by the matcher.
 
-    The extraction takes the depth of each image from its most certain pair, as the MASt3R
-    configuration of the paper does. A single view has no pair, so that :meth:`predict` always
-    fails.
+    Feature extraction takes the depth of each image from its pair with the most certain depth, as
+    the MASt3R configuration of the paper does. A single view has no pair, so :meth:`predict` always
+    raises an error.
     """
 
     source = "the pairs of a matcher that predicts depth"
@@ -22,7 +22,7 @@ class MatcherDepth:
         pass
 
     def predict(self, view: View) -> DepthPrior:
-        """Raise an error: one view has no matches.
+        """Raise an error, because a single view has no matches.
 
         Raises:
             ProviderError: Always.
@@ -34,9 +34,10 @@ class MatcherDepth:
 
 
 class MultiViewDepth(MatcherDepth):
-    """Placeholder for ``depth: {use: multiview}``: depth of the multi-view network.
+    """Placeholder for ``depth: {use: multiview}``: depth predicted by the multi-view network.
 
-    The extraction takes the depth from the groups of images that the network received.
+    Feature extraction takes the depth from the groups of images that the multi-view network
+    received.
     """
 
     source = "a multi-view network"

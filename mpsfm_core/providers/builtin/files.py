@@ -20,7 +20,8 @@ from mpsfm_core.providers.builtin.options import (
 )
 
 _MIN_ENCODED_LENGTH = 0.5
-"""Smallest length of a decoded normal. Mid-gray, which means unknown, has a length near zero."""
+"""Smallest length of a normal decoded from an image file; shorter vectors are invalid. Mid-gray,
+which encodes an unknown normal, has a length near zero."""
 
 
 class DepthFiles:
@@ -30,7 +31,7 @@ class DepthFiles:
         self._options = options
 
     def predict(self, view: View) -> DepthPrior:
-        """Read the depth of a view on the grid of its file.
+        """Read the depth map of a view from its file, in the resolution of the file.
 
         Args:
             view: View whose name selects the file.
@@ -39,8 +40,8 @@ class DepthFiles:
             Depth with variance.
 
         Raises:
-            InputError: The file is missing, unreadable or does not cover the view, or it has no
-                variance and the options declare none.
+            InputError: The file is missing, unreadable or does not cover the view. Also raised if
+                neither the file nor the options declare a variance.
         """
         path = find_file(self._options, view, "depth")
         arrays = read_arrays(path, "depth")
@@ -83,14 +84,14 @@ class NormalFiles:
         self._options = options
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """Read the normals of a view on the grid of their file.
+        """Read the normal map of a view from its file, in the resolution of the file.
 
         Args:
             view: View whose name selects the file.
             depth: Not used.
 
         Returns:
-            Normals in the camera frame.
+            Unit normals in the camera frame.
 
         Raises:
             InputError: The file is missing, unreadable or does not cover the view.
@@ -119,7 +120,7 @@ class MaskFiles:
         self._options = options
 
     def mask(self, view: View) -> Bool:
-        """Read the mask of a view and resize it to the view by nearest neighbor.
+        """Read the mask of a view and resize the mask to the view by nearest neighbor.
 
         Args:
             view: View whose name selects the file.
@@ -146,7 +147,7 @@ class MaskFiles:
 
 
 def _grayscale(path: Path, stored: NDArray[Any]) -> NDArray[Any]:
-    """Return one channel of a depth map stored as gray RGB; colors are an error."""
+    """Return one channel of a depth map stored as gray RGB; raise an error for a color image."""
     if stored.ndim == 3 and stored.shape[2] == 3:
         if (stored == stored[..., :1]).all():
             return np.asarray(stored[..., 0])
@@ -165,7 +166,7 @@ def _optional(
 
 
 def _decoded(stored: NDArray[Any]) -> NDArray[Any]:
-    """Decode normals from unsigned integers; floating-point values are not encoded."""
+    """Decode normals from unsigned integers; leave floating-point normals unchanged."""
     if np.issubdtype(stored.dtype, np.unsignedinteger):
         return stored.astype(np.float64) / np.iinfo(stored.dtype).max * 2 - 1
     return stored.astype(np.float64)

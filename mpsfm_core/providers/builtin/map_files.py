@@ -1,4 +1,4 @@
-"""Maps in files of several formats, found by the name of their image."""
+"""Files of depth, normal and mask maps in several formats, named after their image."""
 
 from __future__ import annotations
 
@@ -22,22 +22,23 @@ _SUFFIXES = (".npz", ".npy", ".exr", ".png", ".tif", ".tiff")
 _SINGLE_CHANNELS = ("Z", "Y", "depth.Z", "Depth.Z", "R", "V")
 _VECTOR_CHANNELS = (("X", "Y", "Z"), ("R", "G", "B"))
 _MAX_ASPECT_DIFFERENCE = 0.02
-"""Largest relative difference of aspect ratios. Rounding of a reduced size stays below."""
+"""Largest relative difference between the aspect ratios of a map file and its view. Rounding the
+size of a reduced map stays below this difference."""
 
 
 def find_file(options: FileOptions, view: View, what: str) -> Path:
-    """Find the file of a view.
+    """Find the map file of a view.
 
     Args:
         options: Folder and suffix.
         view: View whose name selects the file.
-        what: Name of the quantity for messages.
+        what: Name of the quantity for messages, such as "depth".
 
     Returns:
         Path of the file.
 
     Raises:
-        InputError: There is no file; the message has the expected path.
+        InputError: There is no file for the view; the message has the expected path.
     """
     suffixes = _SUFFIXES if options.suffix is None else (options.suffix,)
     full = options.directory / view.name
@@ -52,7 +53,7 @@ def find_file(options: FileOptions, view: View, what: str) -> Path:
 
 
 def _find_ignoring_case(candidates: list[Path]) -> Path | None:
-    """Return the first file whose name differs only in case; all candidates are in one folder."""
+    """Return the first candidate file whose name differs from the expected name only in case."""
     folder = candidates[0].parent
     if not folder.is_dir():
         return None
@@ -62,11 +63,12 @@ def _find_ignoring_case(candidates: list[Path]) -> Path | None:
 
 
 def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
-    """Read the arrays of a file by name.
+    """Read the named arrays of a map file.
 
     Args:
         path: File in NPZ, NPY, EXR or an image format; colors are returned as RGB.
-        main: Name of the required array, and of the only array of formats other than NPZ.
+        main: Name of the required array. Formats other than NPZ have one array, which gets this
+            name.
 
     Returns:
         Arrays by name.
@@ -83,7 +85,7 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
             arrays = {main: _read_image(path)}
     except InputError:
         raise
-    except Exception as error:  # parsers raise any exception for a damaged file
+    except Exception as error:  # Parsers raise exceptions of any type for a damaged file.
         raise InputError(f"{path} cannot be read: {type(error).__name__}: {error}") from error
     if main not in arrays:
         raise InputError(f"{path} has no array {main!r}, it has {', '.join(arrays) or 'none'}")
@@ -91,7 +93,7 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
 
 
 def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> None:
-    """Require that a map has the right number of channels and covers the view.
+    """Require that a map has the expected number of channels and covers the view.
 
     Args:
         path: File of the map, for messages.
@@ -100,7 +102,8 @@ def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> No
         channels: Expected number of channels.
 
     Raises:
-        InputError: The shape is wrong, or the aspect ratio differs from that of the view.
+        InputError: The shape is wrong, or the aspect ratio of the map differs from that of the
+            view.
     """
     expected = 2 if channels == 1 else 3
     if values.ndim != expected or (channels > 1 and values.shape[2] != channels):
@@ -118,7 +121,7 @@ def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> No
 def _read_numpy(path: Path, main: str) -> dict[str, NDArray[Any]]:
     if path.suffix == ".npz":
         return read_npz(path)
-    # From memory, because numpy does not close a damaged file.
+    # Load the file into memory first, because numpy does not close a damaged file.
     return {main: np.lib.format.read_array(io.BytesIO(path.read_bytes()), allow_pickle=False)}
 
 
@@ -150,7 +153,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
 
 
 def _choose_channels(channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return (h, w, 3) for channels X, Y, Z or R, G, B, else the depth channel (h, w)."""
+    """Return EXR channels X, Y, Z or R, G, B as (h, w, 3), else the depth channel as (h, w)."""
     if len(channels) == 1:
         return next(iter(channels.values()))
     for names in _VECTOR_CHANNELS:

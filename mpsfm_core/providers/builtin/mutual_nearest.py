@@ -1,4 +1,4 @@
-"""Matching of mutual nearest descriptors."""
+"""Brute-force matching of mutual nearest descriptors."""
 
 # mypy: allow-untyped-decorators
 
@@ -15,17 +15,19 @@ from mpsfm_core.providers.builtin.options import MutualNearestOptions
 from mpsfm_core.support.jit import kernel
 
 _BLOCK = 128
-"""Number of rows per block: 4 MB for 8192 features on the other side, which fits into caches."""
+"""Number of descriptors per block of the distance matrix: 4 MB for 8192 descriptors in the second
+image, which fits into CPU caches."""
 _ROUNDING = np.float32(1e-5)
-"""Squared distances are equal up to this ratio of the squared descriptor length. The order of
-float32 sums depends on the processor."""
+"""Largest difference of two squared distances that count as equal, relative to the squared
+descriptor length. The summation order of float32, and thus the rounding error, depends on the
+processor."""
 
 
 class MutualNearest:
-    """Matcher of mutual nearest descriptors of any kind by Euclidean distance.
+    """Matcher of mutual nearest descriptors by Euclidean distance, for any kind of features.
 
-    The score of a match is ``1 - nearest / second nearest distance``, with the larger ratio of both
-    directions.
+    The score of a match is ``1 - nearest / second nearest distance``, taking the larger distance
+    ratio of the two directions.
     """
 
     def __init__(self, options: MutualNearestOptions, context: ProviderContext) -> None:
@@ -38,11 +40,11 @@ class MutualNearest:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match the features of two views; each feature has at most one match.
+        """Match the features of two views one to one.
 
         Args:
-            view_a: First view, used for messages.
-            view_b: Second view, used for messages.
+            view_a: Undistorted image, used for messages.
+            view_b: Undistorted image, used for messages.
             features_a: Features of the first view.
             features_b: Features of the second view.
 
@@ -50,7 +52,8 @@ class MutualNearest:
             Sparse matches.
 
         Raises:
-            ProviderError: There are no features, or their descriptors differ in length.
+            ProviderError: Features are missing, or the descriptors of the two views differ in
+                length.
         """
         features_a, features_b = require_features(
             "mutual-nearest matches features", features_a, features_b
@@ -69,15 +72,15 @@ class MutualNearest:
 
 
 def mutual_nearest(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
-    """Find mutual nearest neighbors.
+    """Find the mutual nearest neighbors of two descriptor sets.
 
     Args:
         a: Descriptors (n, d).
         b: Descriptors (m, d).
 
     Returns:
-        Rows (k, 2) of a and b, their distances (k,), and the ratio (k,) of nearest to second
-        nearest distance, the larger one of both directions.
+        Row indices (k, 2) of descriptors in a and b, their distances (k,), and the ratio (k,) of
+        nearest to second nearest distance. The ratio is the larger of the two directions.
     """
     if not (len(a) and len(b)):
         empty = np.empty(0, dtype=np.float32)
@@ -94,13 +97,15 @@ def mutual_nearest(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
     in_a, in_b = pairs.T
     nearest = np.maximum(from_a.nearest[in_a], 0)
     limit = np.maximum(np.minimum(from_a.second[in_a], from_b.second[in_b]), 0)
-    rounding = _ROUNDING * norms_a[in_a]  # equal distances have a ratio of 1
+    rounding = (
+        _ROUNDING * norms_a[in_a]
+    )  # If the nearest and second nearest distances are equal, their ratio is 1.
     ratio = np.sqrt((nearest + rounding) / (limit + rounding))
     return pairs, np.sqrt(nearest), ratio
 
 
 class _Nearest(NamedTuple):
-    """Nearest row of the other side per row, its squared distance and the second nearest one."""
+    """Nearest descriptor of the second image per descriptor of the first."""
 
     best: Int64
     nearest: Float32
@@ -112,7 +117,7 @@ class _Nearest(NamedTuple):
         return cls(np.zeros(count, np.int64), far, far.copy())
 
     def select(self, rows: slice) -> _Nearest:
-        """Return array views of some rows."""
+        """Return the nearest-neighbor arrays restricted to some descriptors, as array views."""
         return _Nearest(self.best[rows], self.nearest[rows], self.second[rows])
 
 
@@ -129,7 +134,7 @@ def _compare(
     nearest_of_b: Float32,
     second_of_b: Float32,
 ) -> None:
-    """Update the nearest neighbors by a block of products ``-2 a b`` (n, m) of rows from start."""
+    """Update the nearest neighbors by products ``-2 a b`` (n, m) of the rows from ``start``."""
     for i in range(len(norms_a)):
         best, nearest, second = 0, np.float32(np.inf), np.float32(np.inf)
         for j in range(len(norms_b)):

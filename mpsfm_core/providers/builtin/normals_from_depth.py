@@ -1,4 +1,4 @@
-"""Normals of planes fitted to the depth prior."""
+"""Normals of planes that are fitted to the depth prior."""
 
 from __future__ import annotations
 
@@ -14,38 +14,39 @@ from mpsfm_core.providers import ProviderContext
 from mpsfm_core.providers.builtin.options import NormalsFromDepthOptions
 
 _MIN_SUPPORT = 0.5
-"""Smallest ratio of valid pixels in a window."""
+"""Smallest ratio of pixels with valid depth in the window of a plane fit."""
 _MIN_SPREAD = 1e-3
-"""Smallest determinant over squared trace of the pixel covariance: 1/4 for a square, 0 on a
+"""Smallest ``det / trace^2`` of the covariance of pixel positions: 1/4 for a square, 0 on a
 line."""
 _NOISE_MARGIN = 6.0
-"""Edge threshold in multiples of the std of the map's roughness."""
+"""Depth-edge threshold in multiples of the std of the depth map's roughness."""
 _VARIANCE_RANGE = (1e-12, np.pi**2)
 _MEDIAN_BEND = 1.052
-"""Median of the larger of two independent absolute errors of std 1."""
+"""Median of ``max(|e1|, |e2|)`` for independent Gaussian errors of std 1."""
 _BEND_NOISE = np.sqrt(1.5)
 """Std of ``w1 - (w0 + w2) / 2`` for independent errors of std 1."""
 
 
 class NormalsFromDepth:
-    """Normals of least-squares planes in a window around each pixel of the depth map.
+    """Normals provider that fits least-squares planes in a window around each depth pixel.
 
     A plane ``g . X = 1`` has the inverse depth ``1 / z = g . (x, y, 1)`` along the ray ``(x, y,
-    1)``. The inverse depth is linear in ``g``, so that ``g`` follows from a linear fit, and the
-    normal is ``-g / |g|``. Windows shrink until they contain no depth edge.
+    1)``. The inverse depth is linear in ``g``, so a linear least-squares fit gives ``g``, and the
+    normal is ``-g / |g|``. The provider shrinks windows until they contain no depth edge.
 
-    Uncertainty: errors of depth maps are smooth over many pixels, because a network bends a wall
-        instead of roughening it. Differences of neighbors are therefore more accurate than
-        independent errors of the declared size would imply. An error of relative std ``s`` that
-        varies over an angle of ``a`` radians tilts a surface by about ``s / a``; ``slope_std`` is
-        ``1 / a``. The residuals of the fit add the roughness, with one independent error per pixel.
+    Errors of depth maps are smooth over many pixels, because a network bends a wall instead of
+    roughening the surface. Depth differences of neighboring pixels are therefore more
+        accurate than independent errors of the declared std would be. A depth error of relative std
+        ``s`` that varies over an angle of ``a`` radians tilts a surface by about ``s / a``; the
+        option ``slope_std`` is ``1 / a``. The fit residuals add the variance of the roughness,
+        assuming one independent error per pixel.
     """
 
     def __init__(self, options: NormalsFromDepthOptions, context: ProviderContext) -> None:
         self._options = options
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """Return normals with variance; invalid at depth edges, holes and the border of the map."""
+        """Return normals with variance, invalid at depth edges, holes and the border of the map."""
         if depth is None:
             raise ProviderError("from-depth needs a depth prior with its variance")
         return fit_normals(view.camera, depth, self._options)
@@ -54,18 +55,18 @@ class NormalsFromDepth:
 def fit_normals(
     camera: PinholeCamera, depth: DepthPrior, options: NormalsFromDepthOptions
 ) -> NormalPrior:
-    """Fit normals to a depth map that covers the view of a camera.
+    """Fit normals to a depth map.
 
     Args:
-        camera: Camera of the view.
+        camera: Camera of the view that the depth map covers.
         depth: Depth with variance.
-        options: Options of the fit.
+        options: Options of the plane fit.
 
     Returns:
-        Normals with variance on the grid of the depth map.
+        Unit normals with variance, on the grid of the depth map.
 
     Raises:
-        ProviderError: The depth has no variance.
+        ProviderError: The depth prior has no variance.
     """
     if depth.variance is None:
         raise ProviderError("from-depth needs a depth prior with its variance")
@@ -80,7 +81,7 @@ def fit_normals(
     fit = _fit_without_edges(xy, inverse, noise, depth.valid & ~edges, edges, radius)
     squared_length = np.maximum((fit.plane**2).sum(axis=-1), 1e-300)
     relative = depth.variance / np.maximum(depth.depth.astype(np.float64), 1e-12) ** 2
-    # The same error along the ray tilts a surface less at a grazing angle.
+    # At a grazing angle the same depth error along the ray tilts a surface less.
     tilt = options.slope_std**2 * relative * inverse**2
     return NormalPrior.from_arrays(
         -fit.plane / np.sqrt(squared_length)[..., None],
@@ -91,7 +92,7 @@ def fit_normals(
 
 
 class _Fit(NamedTuple):
-    """Planes (h, w, 3), the variance (h, w) of their vectors across themselves, and validity."""
+    """Planes g (h, w, 3), variance (h, w) of g perpendicular to itself, validity (h, w)."""
 
     plane: Float64
     variance: Float64
@@ -99,9 +100,10 @@ class _Fit(NamedTuple):
 
 
 def _relative_bends(inverse: Float64, valid: Bool) -> Float64:
-    """Return the relative deviation of inverse depth from the mean of its neighbors.
+    """Return the relative deviation of inverse depth from the mean of the neighboring pixels.
 
-    The deviation along rows and columns is 0 on any plane, and set to 0 if a neighbor is missing.
+    The deviation is computed along rows and columns: it is 0 on any plane, and set to 0 if a
+    neighbor is missing.
     """
     largest = np.zeros(valid.shape)
     for axis in (0, 1):
@@ -115,7 +117,7 @@ def _relative_bends(inverse: Float64, valid: Bool) -> Float64:
 def _fit_without_edges(
     xy: Float64, inverse: Float64, noise: Float64, usable: Bool, edges: Bool, radius: int
 ) -> _Fit:
-    """Fit each pixel with the largest window, radius halved repeatedly, without an edge."""
+    """Fit a plane to each pixel, halving the window radius until the window has no edge."""
     best = _fit_planes(xy, inverse, noise, usable, edges, radius)
     while radius > 1:
         radius //= 2
@@ -133,7 +135,7 @@ def _fit_planes(
 ) -> _Fit:
     """Fit planes ``g`` with ``inverse = g . (x, y, 1)`` to the usable pixels of windows.
 
-    ``noise`` (h, w) is the smallest variance of the inverse depth of one pixel.
+    ``noise`` (h, w) is a lower bound for the variance of the inverse depth of a pixel.
     """
     x, y = xy[..., 0], xy[..., 1]
     weight = usable.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Built-in providers, which need no weights. Imports nothing heavy."""
+"""Plugin of the built-in providers, which need no weights. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LICENSE = "Apache-2.0"
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Return the built-in providers."""
+    """Return the specifications of the built-in providers."""
     return [*_matching(), *_depth(), *_normals(), *_masks()]
 
 
@@ -56,7 +56,7 @@ def _depth() -> list[ProviderSpec]:
             summary="depth maps of a sensor or any network, read from files",
             code_license=_LICENSE,
             contract="mpsfm_core.testing.builtin_contracts:depth_files",
-            # The files declare their uncertainty, which is used unchanged.
+            # The map files declare their uncertainty, which is used unchanged.
             calibration=DepthCalibration(std_scale=1.0, relative_std=0.0, std_floor=0.0),
         ),
         ProviderSpec(
@@ -66,7 +66,7 @@ def _depth() -> list[ProviderSpec]:
             summary="a plane parallel to the image: no prior at all, for photos with much overlap",
             code_license=_LICENSE,
             accuracy="none: it does not look at the photo (a network: pip install mpsfm-compact)",
-            # [tuned: sample scene] 0.3 to 0.5 give the same poses, 1.0 is worse.
+            # [tuned: sample scene] relative_std from 0.3 to 0.5 gives the same poses, 1.0 is worse.
             calibration=DepthCalibration(relative_std=0.5),
         ),
         ProviderSpec(
@@ -77,7 +77,7 @@ def _depth() -> list[ProviderSpec]:
             summary="the depth that the matcher predicts for its pairs (pair-depth)",
             code_license=_LICENSE,
             contract="mpsfm_core.testing.builtin_contracts:depth_of_matcher",
-            # [reference] Scale of MASt3R's confidence, without a std proportional to depth.
+            # [reference] scale of MASt3R's confidence, without a std proportional to depth
             calibration=DepthCalibration(std_scale=0.862, relative_std=0.0),
         ),
         ProviderSpec(

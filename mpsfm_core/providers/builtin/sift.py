@@ -1,4 +1,4 @@
-"""SIFT features of COLMAP's CPU extractor."""
+"""SIFT features from COLMAP's CPU extractor."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mpsfm_core.providers import ProviderContext
 from mpsfm_core.providers.builtin.options import SiftOptions
 
 _WARNING = 1
-"""Log level of COLMAP that hides its report on each image."""
+"""glog level that hides COLMAP's output for each image."""
 
 
 class Sift:
-    """Features provider with COLMAP's CPU extractor (VLFeat); deterministic."""
+    """Deterministic SIFT features provider with COLMAP's CPU extractor (VLFeat)."""
 
     def __init__(self, options: SiftOptions, context: ProviderContext) -> None:
         self._resize = options.resize
@@ -38,7 +38,7 @@ class Sift:
         sift.normalization = (
             pycolmap.Normalization.L1_ROOT if options.root else pycolmap.Normalization.L2
         )
-        if "GLOG_minloglevel" not in os.environ:  # COLMAP reports every image on stderr
+        if "GLOG_minloglevel" not in os.environ:  # COLMAP prints a line for every image on stderr.
             pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, _WARNING)
 
     def extract(self, view: View) -> Features:
@@ -47,12 +47,13 @@ class Sift:
         keypoints, descriptors = _run_colmap(gray, self._settings)
         size = gray.shape[1], gray.shape[0]
         factor = view.camera.width / size[0]
-        # COLMAP stores x, y and the affine shape a11, a12, a21, a22, whose columns are the axes.
+        # COLMAP stores a keypoint as x, y and the affine shape a11, a12, a21, a22, whose columns
+        # are the axes.
         axes = np.hypot(keypoints[:, 2:4], keypoints[:, 4:6])
         xy = scale_pixels(keypoints[:, :2].astype(np.float64), size, view.camera.size)
         norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
         return Features(
-            # The sub-pixel fit of the detector may leave the image by a fraction of a pixel.
+            # The sub-pixel fit of the SIFT detector may leave the image by a fraction of a pixel.
             np.clip(xy, 0, view.camera.size),
             descriptors / np.maximum(norms, np.float32(1e-6)),
             scales=axes.mean(axis=1) * np.float32(factor),
@@ -73,10 +74,10 @@ class Sift:
 def _run_colmap(
     gray: UInt8, settings: pycolmap.FeatureExtractionOptions
 ) -> tuple[Float32, Float32]:
-    """Extract keypoints (n, 6) and descriptors (n, 128) of an image.
+    """Extract SIFT keypoints (n, 6) and descriptors (n, 128) of an image.
 
-    The extractor object of pycolmap holds the GIL while it computes, so that threads would wait for
-    each other. The extraction command does not, but works on files.
+    ``pycolmap.Sift`` holds the GIL while it computes, so threads would wait for each other.
+    COLMAP's feature extraction command releases the GIL, but only works on files.
     """
     with tempfile.TemporaryDirectory(prefix="mpsfm-sift-") as folder:
         images, database = Path(folder, "images"), Path(folder, "database.db")

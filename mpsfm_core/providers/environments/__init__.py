@@ -1,6 +1,6 @@
-"""Providers in other Python environments, used through a worker process.
+"""Providers in other Python environments, called through a worker process.
 
-A worker in the other environment (:mod:`mpsfm_core.providers.environments.worker`) constructs the
-provider and answers requests. :mod:`remote_provider` is the client in this process. Arrays pass
-through memory that both processes map.
+A worker process in the other environment (:mod:`mpsfm_core.providers.environments.worker`)
+constructs the provider and runs its methods. The client in this process is :mod:`remote_provider`.
+Arrays are transferred through shared memory.
 """

@@ -1,7 +1,7 @@
-"""Messages between two processes: text through a pipe, arrays through memory that both map.
+"""Message channel between two processes: text through a pipe, arrays through shared memory.
 
-A block is a file, in memory if the system has a file system there. It grows as needed and is
-reused, because fresh memory costs more than the copy into it.
+A block of shared memory is a mapped file, on an in-memory file system if there is one. A block
+grows as needed and is reused, because allocating memory costs more than copying into it.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ from mpsfm_core.providers.environments.codec import EncodedMessage, decode_messa
 
 _IN_MEMORY = Path("/dev/shm")
 _HEADER = struct.Struct("<IIQ")
-"""Bytes of text, number of the block for the answer, bytes of arrays. All versions of the protocol
-start with this header, so that both sides can read the version in the greeting."""
+"""Message header: bytes of text, number of the shared block for the reply, bytes of arrays. All
+versions of the protocol start with this header, so both processes can read the version in the first
+message."""
 _LARGEST_TEXT = 1 << 28
 _EMPTY = np.empty(0, dtype=np.uint8)
 
 
 class ChannelClosed(Exception):
-    """The other process has ended or closed its pipe."""
+    """The process at the other end of the channel has ended or closed its pipe."""
 
 
 class Channel:
-    """One end of the connection between two processes.
+    """One end of the message channel between two processes.
 
-    Each message announces into which block of the receiver the next message has to be written.
+    Each message names the shared block that the next message in the other direction has to use.
     """
 
     def __init__(
@@ -46,17 +47,17 @@ class Channel:
         other: str,
         lent: int | None = None,
     ) -> None:
-        """Open one end on a pair of pipes.
+        """Open one end of the channel on a pair of pipes.
 
         Args:
             reader: Pipe to read from.
             writer: Pipe to write to.
-            folder: Folder of the block files.
-            own: Prefix of the block files that this end writes.
-            other: Prefix of the block files that the other end writes.
+            folder: Folder of the shared memory files.
+            own: File name prefix of the blocks that this end of the channel writes.
+            other: File name prefix of the blocks that the other end of the channel writes.
             lent: Number of messages whose arrays may be alive at the same time. Received arrays are
-                views of their block; if all blocks are in use, they are copies. None: arrays are
-                valid until the next message arrives.
+                views of their shared block; if all blocks are in use, the arrays are copies. With
+                None, arrays are valid until the next message arrives.
         """
         self._reader, self._writer = reader, writer
         self._own, self._other = folder / own, folder / other
@@ -76,7 +77,7 @@ class Channel:
             block = self._written.get(self._target) or _Block(Path(f"{self._own}{self._target}"))
             self._written[self._target] = block
             packed.write(block.for_writing(packed.size))
-        # the last block, whose content is copied, if all others are in use
+        # If all blocks are in use, the last one receives the arrays and is copied.
         free = (i for i, block in enumerate(self._inbox) if not block.in_use)
         self._announced = next(free, len(self._inbox) - 1)
         try:
@@ -87,14 +88,14 @@ class Channel:
             raise ChannelClosed from error
 
     def receive(self) -> Any:
-        """Receive the next value.
+        """Receive the next message.
 
         Raises:
             ChannelClosed: The other process has ended.
         """
         length, self._target, size = _HEADER.unpack(self._read(_HEADER.size))
         if length > _LARGEST_TEXT:
-            raise ChannelClosed  # foreign output in the pipe
+            raise ChannelClosed  # The pipe contains foreign output instead of a message.
         text = self._read(length)
         block = self._inbox[self._announced].for_reading(size) if size else _EMPTY
         return decode_message(
@@ -102,7 +103,7 @@ class Channel:
         )
 
     def close(self) -> None:
-        """Unmap the blocks; their files are removed with their folder."""
+        """Unmap the shared blocks; their files are removed together with their folder."""
         for block in (*self._written.values(), *self._inbox):
             block.close()
 
@@ -114,7 +115,7 @@ class Channel:
 
 
 class _Block:
-    """File of bytes that both processes map."""
+    """Block of shared memory: a file that both processes map."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -124,11 +125,11 @@ class _Block:
 
     @property
     def in_use(self) -> bool:
-        """True while an array that views the block is alive."""
+        """True while an array that views the shared block is alive."""
         return self._read is not None and self._read() is not None
 
     def for_writing(self, size: int) -> memoryview:
-        """Return ``size`` bytes to write to, growing the file if necessary; may raise OSError."""
+        """Return a buffer of ``size`` bytes for writing, growing the shared file if necessary."""
         if size > self._size:
             self.close()
             with self._path.open("a+b") as file:
@@ -138,17 +139,17 @@ class _Block:
         return memoryview(self._map)[:size]
 
     def for_reading(self, size: int) -> UInt8:
-        """Return what the other process wrote."""
+        """Return the bytes that the other process wrote to the shared block."""
         if size > self._size:
             self.close()
             self._open(self._path.stat().st_size)
         assert self._map is not None
         content = np.frombuffer(self._map, dtype=np.uint8, count=size)
-        self._read = weakref.ref(content)  # views of the array keep it alive
+        self._read = weakref.ref(content)  # Views of the array keep the memory map alive.
         return content
 
     def close(self) -> None:
-        """Forget the map; it lives as long as arrays that look into it."""
+        """Drop the reference to the memory map, which lives as long as arrays that view it."""
         self._map, self._size = None, 0
 
     def _open(self, size: int) -> None:
@@ -158,7 +159,7 @@ class _Block:
 
 
 def reserve_space(descriptor: int, size: int) -> None:
-    """Reserve disk space for a file of this size.
+    """Reserve disk space for a shared memory file of the given size.
 
     Writing to a mapped page without disk space would kill the process.
     """
@@ -169,7 +170,7 @@ def reserve_space(descriptor: int, size: int) -> None:
 
 
 def create_shared_folder(needed: int) -> tempfile.TemporaryDirectory[str]:
-    """Create a folder for block files, in memory if ``needed`` bytes are free there."""
+    """Create a folder for shared memory files, in memory if ``needed`` bytes are free."""
     place = None
     if _IN_MEMORY.is_dir() and os.access(_IN_MEMORY, os.W_OK):
         status = os.statvfs(_IN_MEMORY)

@@ -13,11 +13,11 @@ class $Class:
         self._network = Network(context.resolve_weights(options.weights, options.sha256))
 
     def predict(self, view):
-        depth = self._network(view.image / np.float32(255))  # metres along z
+        depth = self._network(view.image / np.float32(255))  # z-depth in meters
         return DepthPrior.from_arrays(depth)
 
 
-class Network:  # put yours here: this one is an affine function of each pixel's colour
+class Network:  # replace by your network; this example is an affine function of a pixel's color
     def __init__(self, path):
         with np.load(path) as weights:
             self._weights, self._bias = weights["weights"], weights["bias"]

@@ -6,11 +6,11 @@ from mpsfm_core import Features, Options
 
 class ${Class}Options(Options):
     max_keypoints: int = 1000
-    radius: int = 7  # of the patch around a keypoint, in pixels
+    radius: int = 7  # half the patch size around a keypoint, in pixels
 
 
 class $Class:
-    """Corners, described by the patches around them: put your detector here."""
+    """Detect corners and describe each by its image patch: put your detector here."""
 
     def __init__(self, options, context):
         self._options = options
@@ -20,7 +20,7 @@ class $Class:
         corners = cv2.goodFeaturesToTrack(gray, self._options.max_keypoints, 0.01, 3)
         columns, rows = _none(corners).reshape(-1, 2).astype(np.int64).T
         return Features(
-            keypoints=np.stack([columns, rows], axis=1) + 0.5,  # a pixel's centre is at 0.5
+            keypoints=np.stack([columns, rows], axis=1) + 0.5,  # COLMAP convention: the first pixel's center is at 0.5
             descriptors=self._describe(gray, columns, rows),
         )
 

@@ -8,7 +8,7 @@ class ${Class}Options(Options):
 
 
 class $Class:
-    """Mutual nearest neighbours: put your matcher here."""
+    """Match mutual nearest neighbors by cosine similarity: put your matcher here."""
 
     def __init__(self, options, context):
         self._options = options

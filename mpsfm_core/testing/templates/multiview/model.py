@@ -14,15 +14,15 @@ class $Class:
 
     def predict_group(self, views):
         depth = self._network([view.image / np.float32(255) for view in views])
-        # If the network says how the views lie to each other: poses=, (n, 3, 4) cam_from_group,
-        # and the capability proposes-poses; if it says their intrinsics: intrinsics=, (n, 4).
+        # A network that predicts relative poses passes poses=cam_from_group (n, 3, 4) and declares
+        # the capability proposes-poses; predicted intrinsics are passed as intrinsics= (n, 4).
         return MultiViewPrior(tuple(DepthPrior.from_arrays(map) for map in depth))
 
 
-class Network:  # put yours here: this one is an affine function of each pixel's colour
+class Network:  # replace by your network; this example is an affine function of a pixel's color
     def __init__(self, path):
         with np.load(path) as weights:
             self._weights, self._bias = weights["weights"], weights["bias"]
 
-    def __call__(self, images):  # metres along the axis of each view, all in one unit
+    def __call__(self, images):  # z-depth of each view, all in the same unit (meters)
         return [rgb @ self._weights + self._bias for rgb in images]

@@ -17,7 +17,7 @@ class $Class:
         return NormalPrior.from_arrays(normals, camera=view.camera)
 
 
-class Network:  # put yours here: this one is an affine function of each pixel's colour
+class Network:  # replace by your network; this example is an affine function of a pixel's color
     def __init__(self, path):
         with np.load(path) as weights:
             self._weights, self._bias = weights["weights"], weights["bias"]

@@ -5,11 +5,11 @@ from mpsfm_core import Options
 
 
 class ${Class}Options(Options):
-    size: int = 8  # of the thumbnail, in pixels
+    size: int = 8  # width and height of the thumbnail, in pixels
 
 
 class $Class:
-    """Describes a view by a thumbnail: put your global descriptor here."""
+    """Describe a view by a thumbnail: put your global descriptor here."""
 
     def __init__(self, options, context):
         self._size = options.size
@@ -18,4 +18,4 @@ class $Class:
         size = (self._size, self._size)
         small = cv2.resize(view.image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         vector = small.ravel() - small.mean()
-        return vector / max(np.linalg.norm(vector), np.float32(1))  # similarity: dot product
+        return vector / max(np.linalg.norm(vector), np.float32(1))  # unit length: dot product = similarity

@@ -10,7 +10,7 @@ class ${Class}Options(Options):
 
 
 class $Class:
-    """Multiplies the std of a provider: put your second pass, tiling or ensemble here."""
+    """Scale the std of a provider: put your second pass, tiling or ensemble here."""
 
     def __init__(self, inner, options, context):
         self._inner = inner
