@@ -1,4 +1,4 @@
-"""A provider in use: its identity for the cache, and one instance per thread."""
+"""Providers of a run: one instance per thread, and the identity of a provider in cache keys."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from mpsfm_core.support.threads import count_cores
 T = TypeVar("T")
 
 _MAX_WORKERS = 4
-"""Largest automatic number of workers. Each worker loads its own copy of a network, so further
-cores become threads of the workers."""
+"""Default limit for ``runtime.workers``. Each worker loads its own copy of a network, so further
+CPU cores become threads of the workers."""
 _MAX_URI_LENGTH = 1000
 
 
 @dataclass
 class Usage:
-    """Usage statistics of a provider."""
+    """Number of results and computing time of a provider in a run."""
 
     computed: int = 0
-    """Results that the provider computed."""
+    """Number of results that the provider computed."""
     cached: int = 0
-    """Results from the cache."""
+    """Number of results from the cache."""
     seconds: float = 0.0
-    """Computing time of all workers."""
+    """Computing time in seconds, summed over all workers."""
 
 
 class ActiveProvider:
-    """A configured provider.
+    """Runs a configured provider and counts its results.
 
-    Constructs the provider when a thread computes its first result, so a run with a complete cache
-    loads no network.
+    A thread creates its provider instance when it computes its first result. A run whose results
+    are all in the cache therefore loads no network.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class ActiveProvider:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Everything except the input that the output depends on, as plain data."""
+        """Names, versions, options, seed and file hashes of the provider and its wrappers."""
         with self._lock:
             if self._identity is None:
                 self._identity = self._identify()
@@ -83,16 +83,16 @@ class ActiveProvider:
 
     @property
     def workers(self) -> int:
-        """Number of threads that may use the provider; one on a GPU."""
+        """Number of threads that run the provider in parallel; 1 on a GPU."""
         return 1 if _device(self._runtime, self.spec) == "cuda" else worker_count(self._runtime)
 
     def compute_timed(
         self, key: str, compute: Callable[[Any], T], timeout_s: float | None = None
     ) -> T:
-        """Compute a result with the instance of this thread, and measure its time.
+        """Compute a result with the provider instance of this thread, and measure the time.
 
-        A thread that exceeds the timeout cannot be killed. It keeps its instance, and a new
-        instance computes further results.
+        A thread that exceeds the timeout cannot be killed. The thread keeps its provider instance,
+        and a new instance computes further results.
 
         Args:
             key: Key of the result in the cache.
@@ -153,9 +153,9 @@ class ActiveProvider:
         return {"api": API_VERSION, "seed": self._runtime.seed, "providers": described}
 
     def _hashes(self, kind: Kind, name: str, values: dict[str, Any]) -> dict[str, str]:
-        """Return the SHA-256 of the files that options name, and of the weights.
+        """Return the SHA-256 of the weight files and of the files named in options.
 
-        Constructing the provider downloads missing weights first.
+        Missing weights are downloaded first, by creating the provider.
         """
         named = [uri for uri in _texts(values) if is_remote(uri) or self._store.locate(uri)]
         weights = [file.uri for file in self._registry.weights(kind, name, values)]
@@ -167,7 +167,7 @@ class ActiveProvider:
 
 
 def run_with_timeout(seconds: float | None, compute: Callable[[], T]) -> T:
-    """Run a computation; raises TimeoutError if it takes longer than ``seconds``."""
+    """Run a computation; raise TimeoutError if the computation takes longer than ``seconds``."""
     if seconds is None:
         return compute()
     outcome: list[Any] = []
@@ -218,7 +218,7 @@ def _device(runtime: RuntimeOptions, spec: ProviderSpec) -> str:
 
 
 def _may_have_gpu() -> bool:
-    """Look for NVIDIA's driver, which is faster than importing a GPU library."""
+    """Check for NVIDIA's driver, which is faster than importing a GPU library."""
     return Path("/dev/nvidiactl").exists() or shutil.which("nvidia-smi") is not None
 
 

@@ -1,8 +1,8 @@
 """Content-addressed cache of provider results on disk.
 
-The key of an entry is the hash of everything that its content depends on: options, weights and
-images. An entry is therefore never out of date. Entries are written to a temporary file and moved
-when complete. A damaged entry is computed again.
+The key of a cache entry is the hash of all inputs of the result: options, weights and images. A
+cache entry is therefore never out of date. Each entry is written to a temporary file and renamed
+when complete. A damaged cache entry is computed again.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ T = TypeVar("T")
 Arrays = Mapping[str, NDArray[Any]]
 
 FORMAT = 1
-"""Format version of entries; raising it invalidates all entries."""
+"""Version of the file format of cache entries; raising the number invalidates all entries."""
 
 
 class Cache:
-    """A folder of entries, shared by threads and processes.
+    """Folder of cache entries, shared by threads and processes.
 
     Args:
-        folder: default ``$MPSFM_CACHE`` or the platform's user cache; entries go into
-            ``extraction/`` below it.
+        folder: Cache folder, default ``$MPSFM_CACHE`` or the platform's user cache. Entries go into
+            its subfolder ``extraction/``.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -49,7 +49,7 @@ class Cache:
         remove_temporary_files(self._unfinished)
 
     def load(self, kind: str, key: str, cls: type[T]) -> T | None:
-        """Load an entry as an object of ``cls``; None if it is missing or unreadable."""
+        """Load a cache entry as an object of ``cls``; None without a readable entry."""
         path = self._path(kind, key)
         try:
             return unpack(cls, read_npz(path))
@@ -58,12 +58,12 @@ class Cache:
         except OSError as error:
             _log.warning("cache entry %s cannot be read (%s): computing it again", path, error)
             return None
-        except Exception as error:  # the checks of a data class raise errors of any kind
+        except Exception as error:  # constructors of data classes raise errors of any kind
             _log.warning("cache entry %s is damaged (%s): computing it again", path, error)
             return None
 
     def store(self, kind: str, key: str, value: object) -> None:
-        """Store an object.
+        """Store an object as a cache entry.
 
         Raises:
             OutputError: the disk is full or fails.
@@ -79,7 +79,7 @@ class Cache:
             ) from error
 
     def forget(self, kind: str, key: str) -> None:
-        """Delete an entry if it exists."""
+        """Delete a cache entry if it exists."""
         with suppress(OSError):
             self._path(kind, key).unlink()
 
@@ -88,7 +88,7 @@ class Cache:
 
 
 def cache_folder(folder: Path | None = None) -> Path:
-    """Return the given folder, or ``$MPSFM_CACHE``, or the user cache of the platform."""
+    """Return ``folder`` if given, else ``$MPSFM_CACHE``, else the platform's user cache."""
     return user_cache_folder() if folder is None else Path(folder).expanduser()
 
 
@@ -108,7 +108,7 @@ def digest(value: object) -> str:
 
 
 def pack(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """Return the arrays of a data object by path, without fields that are None."""
+    """Flatten a data object to arrays by field path; fields that are None are omitted."""
     if isinstance(value, tuple) and value and is_dataclass(value[0]):
         return {
             name: array
@@ -151,10 +151,10 @@ def _unpack_tuple(cls: type[T], arrays: Arrays, path: str) -> tuple[T, ...]:
     return tuple(unpack(cls, arrays, f"{path}/{index}") for index in range(count))
 
 
-_hints = functools.cache(get_type_hints)  # slower than reading a small entry
+_hints = functools.cache(get_type_hints)  # get_type_hints takes longer than reading a small entry
 
 
 def _data_class(hint: object) -> type | None:
-    """Return the data class in an annotation: alone, ``| None`` or in a tuple."""
+    """Return the data class ``C`` of an annotation ``C``, ``C | None`` or ``tuple[C, ...]``."""
     kinds = (hint, *get_args(hint))
     return next((k for k in kinds if isinstance(k, type) and is_dataclass(k)), None)

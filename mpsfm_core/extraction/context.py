@@ -25,7 +25,7 @@ from mpsfm_core.providers.registry import Registry
 _log = logging.getLogger(__name__)
 
 RUNS = "run"
-"""Kind of the cache entries with which the workers of one run share failures."""
+"""Cache subfolder in which the workers of one run share provider failures."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -43,12 +43,12 @@ class ExtractionContext:
         self.cache = Cache(config.runtime.cache_dir)
         self.providers: list[ActiveProvider] = []
         self.failures: dict[int, str] = {}
-        """Error message of each image that the run skips."""
+        """Error message of each skipped image, by image index."""
         self._events = events
         self.run_remotely: Callable[[str, Sequence[Any]], Generator[None, None, None]] | None = None
-        """Runs a stage on the workers of an executor; None without an executor."""
+        """Function that runs a stage on remote workers; None without an executor."""
         self.shared_run = ""
-        """Identifies the run for the workers of an executor, which share failures."""
+        """Identifier of the run, under which remote workers share provider failures."""
         self._mask_providers: list[ActiveProvider] = []
         self._masks: dict[int, tuple[UInt8, str]] = {}
 
@@ -66,14 +66,14 @@ class ExtractionContext:
         *providers: ActiveProvider,
         local: bool = False,
     ) -> list[Result]:
-        """Run a stage on all items in parallel; return the results in order.
+        """Run an extraction stage on all items in parallel; return the results in order.
 
         Args:
-            stage: Name of the stage, for progress.
-            items: Input of each step.
-            work: Computes one step.
-            providers: Providers that the stage uses; they limit the number of workers.
-            local: True runs on this machine even if there is an executor.
+            stage: Name of the stage, for progress messages.
+            items: Input of each call of ``work``.
+            work: Function that computes the result of one item.
+            providers: Providers that the stage uses; each limits the number of threads.
+            local: If true, run on this machine even if an executor is configured.
         """
         workers = min((p.workers for p in providers), default=worker_count(self.config.runtime))
         is_cached = providers and not any(provider.can("uncached") for provider in providers)
@@ -92,20 +92,21 @@ class ExtractionContext:
         compute: Callable[[Any], Result],
         images: Sequence[int] = (),
     ) -> Result:
-        """Return the result of a provider from the cache, or compute and cache it.
+        """Return a provider's result from the cache, or compute and cache the result.
 
-        If ``runtime.on_error`` is ``skip``, a failure gives an empty result, which is not cached.
+        If ``runtime.on_error`` is ``skip``, a provider failure gives an empty result, which is not
+        cached.
 
         Args:
-            provider: The provider.
+            provider: Provider to run.
             cls: Class of the result.
             inputs: Plain data that identifies the input.
-            compute: Computes the result with a provider instance.
+            compute: Function that computes the result with a provider instance.
             images: Indices of the images that the input shows.
 
         Raises:
             ProviderRunError: the provider failed, or too many images failed.
-            ProviderOutputError: the provider broke its contract.
+            ProviderOutputError: the provider's output violates the provider contract.
         """
         key = self.key(provider, inputs)
         uncached = provider.can("uncached")
@@ -130,7 +131,7 @@ class ExtractionContext:
         return value
 
     def _check_known_failure(self, key: str) -> None:
-        """Raise the error of another worker of this run for the same result."""
+        """Raise ProviderRunError if another worker of this run failed on the same result."""
         if self.shared_run:
             known = self.cache.load(RUNS, content_key(self.shared_run, key), np.ndarray)
             if known is not None:
@@ -141,7 +142,7 @@ class ExtractionContext:
         return any(index in self.failures for index in images)
 
     def _record_failure(self, images: Sequence[int], error: MpsfmError) -> None:
-        """Record a failure; raises ProviderRunError once more than half of the images failed."""
+        """Record a provider failure; raise ProviderRunError if over half of the images failed."""
         names = " and ".join(self.images[index].name for index in images)
         _log.warning("%s is skipped: %s", names, error)
         if len(images) == 1:
@@ -155,12 +156,12 @@ class ExtractionContext:
         return content_key(provider.identity, list(inputs))
 
     def view(self, index: int) -> View:
-        """Return the view of an image with the masks of the mask providers."""
+        """Return the undistorted view of an image, masked by the mask providers."""
         view = self.images.view(index)
         return replace(view, mask=self.mask(index)) if self._mask_providers else view
 
     def mask(self, index: int) -> Bool | None:
-        """Return which pixels of a view may be used; None means all."""
+        """Return the mask (H, W) of usable pixels of a view; None if all pixels are usable."""
         mask = self.images.mask(index)
         if not self._mask_providers:
             return mask
@@ -170,7 +171,7 @@ class ExtractionContext:
         return is_usable if mask is None else is_usable & mask
 
     def view_inputs(self, index: int, provider: ActiveProvider) -> list[object]:
-        """Return what identifies a view for a provider: pixels, masks, used intrinsics."""
+        """Return the cache-key parts of a view: pixels, masks and, if used, intrinsics."""
         pixels, *intrinsics = self._unmasked_inputs(index, provider)
         masks = [self._combined_mask(index)[1]] if self._mask_providers else []
         return [pixels, *masks, *intrinsics]
@@ -182,7 +183,7 @@ class ExtractionContext:
         return inputs
 
     def load_masks(self) -> None:
-        """Create the mask providers; views have masks from now on."""
+        """Create the mask providers; later calls of ``view`` apply their masks."""
         self._mask_providers = [self.provider("mask", backend) for backend in self.config.masks]
 
     def run_masks(self) -> None:

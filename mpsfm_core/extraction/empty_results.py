@@ -1,4 +1,4 @@
-"""Empty results, which replace those of a provider that failed on an image."""
+"""Empty provider results, used for images on which a provider failed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mpsfm_core.data import (
 
 @dataclass(frozen=True, eq=False)
 class JointPrior:
-    """Depth and normals of one pass of a network."""
+    """Depth and normals from one forward pass of a network."""
 
     depth: DepthPrior
     normals: NormalPrior

@@ -6,20 +6,20 @@ from typing import Protocol
 
 
 class ExtractionEvents(Protocol):
-    """Receives progress, always in the thread that called :func:`extract`."""
+    """Receiver of extraction progress; called in the thread that called ``extract``."""
 
     def stage_started(self, stage: str, total: int | None) -> None:
-        """Receive the start of a stage with ``total`` steps, None if unknown."""
+        """Report the start of a stage with ``total`` steps; None if the number is unknown."""
 
     def stage_progress(self, stage: str, done: int, total: int) -> None:
-        """Receive the number of finished steps."""
+        """Report the number of finished steps of a stage."""
 
     def stage_finished(self, stage: str, seconds: float) -> None:
-        """Receive the end of a stage."""
+        """Report the end of a stage and its duration in seconds."""
 
 
 class NullExtractionEvents:
-    """Ignores all events."""
+    """Receiver that ignores all extraction progress."""
 
     def stage_started(self, stage: str, total: int | None) -> None:
         """Ignore the event."""

@@ -1,4 +1,4 @@
-"""Features of the images, without those in masked areas."""
+"""Feature extraction; features in masked areas are removed."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.support.lru_cache import LruCache
 
 CACHED_BYTES = 512 << 20
-"""Size limit of the features in memory; 8192 SIFT features have 4 MB."""
+"""Size limit of the in-memory feature cache, bytes; 8192 SIFT features take 4 MB."""
 
 
 class FeatureTable:
-    """Features of each image without masked areas; an LRU cache in front of the disk cache."""
+    """Features of each image outside of masks; an LRU cache in front of the disk cache."""
 
     def __init__(self, context: ExtractionContext, backend: ProviderConfig) -> None:
         self._context = context
@@ -29,7 +29,7 @@ class FeatureTable:
         )
 
     def extract(self) -> list[Features]:
-        """Compute the features of all images; return them without descriptors, to limit memory."""
+        """Compute features of all images; the result has no descriptors, to limit memory."""
         images = range(len(self._context.images))
         return self._context.each("features", images, self._without_descriptors, self._provider)
 

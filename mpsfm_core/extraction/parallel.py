@@ -1,4 +1,4 @@
-"""Parallel steps of a stage with progress; results do not depend on the number of threads."""
+"""Parallel extraction stages with progress; results do not depend on the thread count."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ def run_stage(
 ) -> list[Result]:
     """Compute ``[work(item) for item in items]`` in parallel threads.
 
-    The first exception, or Ctrl-C, stops the stage after the running steps. Threads suffice,
-    because providers compute in native code that releases the interpreter lock, and a process
-    would load its own copy of every library and network.
+    The first exception, or Ctrl-C, stops the stage after the running calls. Threads suffice,
+    because providers compute in native code that releases Python's global interpreter lock.
+    Processes would each load a copy of every library and network.
 
     Args:
-        events: Receives progress in the calling thread.
+        events: Receiver of progress; called in the calling thread.
         stage: Name of the stage.
-        items: Input of each step.
-        work: Computes one step.
+        items: Input of each call of ``work``.
+        work: Function that computes the result of one item.
         workers: Number of threads.
-        remote: Yields after each item that remote workers computed into the cache; runs before
-            the steps on this machine.
+        remote: Generator that yields whenever a remote worker has written an item's result to the
+            cache. It is exhausted before this machine processes the items.
 
     Returns:
         The results in the order of the items.

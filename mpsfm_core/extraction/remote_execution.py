@@ -1,8 +1,7 @@
-"""Extraction stages on the workers of an executor, with results in the shared cache.
+"""Extraction stages on the workers of an executor, such as Ray or Dask, and a shared cache.
 
-A worker creates its own providers from the configuration and from the plugins on its machine. It
-processes an item as a thread of this process would. This process then loads the result from the
-cache.
+A remote worker creates its own providers from the configuration and from the plugins on its
+machine. The worker writes results to the shared cache, from which the main process loads them.
 """
 
 from __future__ import annotations
@@ -82,28 +81,28 @@ class _RemoteStages:
         context.cache.store(RUNS, content_key(self._step.run), np.array(True))
 
     def __call__(self, stage: str, items: Sequence[Any]) -> Generator[None, None, None]:
-        """Run a stage; yield after each item."""
+        """Run a stage on the executor; yield after each finished item."""
         return self._executor.run(replace(self._step, stage=stage), items)
 
 
 @dataclass(frozen=True)
 class RemoteStep:
-    """One stage that can process an item on any machine."""
+    """Pickled function that processes an item of a stage on any machine."""
 
     run: str
-    """Identifies the run; a worker keeps the providers of its latest run."""
+    """Identifier of the run; a worker caches the providers of its latest run only."""
     stage: str
     images: ImageSet
     config: Config
 
     def __call__(self, item: Any) -> None:
-        """Process an item; its result is in the cache afterwards."""
+        """Process an item and write the result to the shared cache."""
         with limit_threads(thread_count(self.config.runtime)):
             _worker_state(self).work[self.stage](item)
 
 
 class _WorkerState:
-    """State of a worker: the function of each stage for one run."""
+    """Providers of a remote worker, and the function that runs each stage."""
 
     def __init__(self, step: RemoteStep) -> None:
         config = step.config
@@ -139,7 +138,7 @@ _WORKER_STATES: dict[str, _WorkerState] = {}
 
 
 def _worker_state(step: RemoteStep) -> _WorkerState:
-    """Return the state of this process for a run; drops that of earlier runs."""
+    """Return the worker state of a run; states of earlier runs are dropped."""
     with _LOCK:
         if step.run not in _WORKER_STATES:
             _WORKER_STATES.clear()

@@ -1,4 +1,4 @@
-"""Report of extraction, as plain data for ``summary.json``."""
+"""Extraction section of ``summary.json``: pairs, images and providers, as plain data."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def describe(
 
     Args:
         context: Images, failures and providers of the run.
-        problem: The mapper's problem.
-        proposed: Number of selected pairs before the filters of plugins.
+        problem: Input of the mapper.
+        proposed: Number of selected pairs before plugins filter the pairs.
         candidates: Candidate matches of all matched pairs.
         outcomes: Two-view geometry of each candidate.
     """
@@ -47,7 +47,7 @@ def describe(
 
 
 def merge_reports(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge the report of a second pass into that of the first pass."""
+    """Merge the reports of the first and second extraction pass."""
     pairs = {tuple(pair["images"]): pair for pair in first["pairs"]}
     for pair in second["pairs"]:
         images = tuple(pair["images"])
@@ -69,7 +69,7 @@ def merge_reports(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[s
 
 
 def _merge_pair(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
-    """Merge two reports of a pair; a verified result precedes a dropped one."""
+    """Merge two reports of an image pair; a verified result replaces a dropped one."""
     if first is second or "dropped" in first:
         return second
     if "dropped" in second:

@@ -1,4 +1,4 @@
-"""Conversion of dense matches to keypoints: snapped to features, or sampled between them."""
+"""Conversion of dense matches to keypoint matches, by snapping to features or sampling."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from mpsfm_core.data import Bool, DenseMatches, Float32, Float64, Int64, SparseM
 _MIN_SCORE = 0.1
 """Minimum score of a sampled dense match. [reference RoMa]"""
 _MIN_KEYPOINT_DISTANCE_PX = 6.0
-"""Minimum distance of a sampled match to keypoints. [reference sparse_nms_radius]"""
+"""Minimum distance between a sampled dense match and keypoints, pixels. [reference
+sparse_nms_radius]"""
 _NMS_RADIUS_PX = 8.0
-"""Radius of non-maximum suppression between sampled matches. [reference]"""
+"""Radius of non-maximum suppression among sampled dense matches, pixels. [reference]"""
 
 
 @dataclass(frozen=True, eq=False)
 class PointMatches:
-    """Matches of a pair with keypoints of their own."""
+    """Point correspondences of an image pair that are not tied to detected keypoints."""
 
     xy_a: Float64
-    """(m, 2) points of the first view, pixels."""
+    """(m, 2) matched points in the first view, pixels."""
     xy_b: Float64
-    """(m, 2) points of the second view, pixels."""
+    """(m, 2) matched points in the second view, pixels."""
     scores: Float32
     """(m,) scores of the matches."""
 
@@ -35,15 +36,15 @@ NO_POINTS = PointMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, dtype=n
 def snap_to_keypoints(
     dense: DenseMatches, keypoints_a: Float64, keypoints_b: Float64, radius_px: float
 ) -> SparseMatches:
-    """Assign dense matches to the nearest keypoints in both views.
+    """Assign dense matches to the nearest keypoints of both views.
 
-    Of several dense matches for one keypoint, the one with the best score is used.
+    If several dense matches are nearest to a keypoint, the match with the best score is used.
 
     Args:
         dense: Dense matches of the pair.
         keypoints_a: (n, 2) keypoints of the first view, pixels.
         keypoints_b: (k, 2) keypoints of the second view, pixels.
-        radius_px: Maximum distance between match and keypoint.
+        radius_px: Maximum distance between dense match and keypoint, pixels.
     """
     distance_a, row_a = _nearest(keypoints_a, dense.points_a)
     distance_b, row_b = _nearest(keypoints_b, dense.points_b)
@@ -55,9 +56,9 @@ def snap_to_keypoints(
 def sample_dense_matches(
     dense: DenseMatches, keypoints_a: Float64, keypoints_b: Float64
 ) -> PointMatches:
-    """Select dense matches that are certain, apart from keypoints and apart from each other.
+    """Select confident dense matches that keep a distance to keypoints and each other.
 
-    See the paper's appendix "two-view correspondences".
+    See the MP-SfM paper, appendix "two-view correspondences".
 
     Args:
         dense: Dense matches of the pair.
@@ -75,7 +76,7 @@ def sample_dense_matches(
 
 
 def _suppress_neighbors(points: Float64) -> Bool:
-    """Return which points (n, 2), best first, survive greedy non-maximum suppression."""
+    """Apply greedy non-maximum suppression to points (n, 2), sorted best first."""
     survives = np.ones(len(points), dtype=np.bool_)
     if not len(points):
         return survives
@@ -90,7 +91,7 @@ def _suppress_neighbors(points: Float64) -> Bool:
 
 
 def _nearest(keypoints: Float64, points: Float64) -> tuple[Float64, Int64]:
-    """Return distance and row of the nearest keypoint of each point; infinite without keypoints."""
+    """Return distance and row of each point's nearest keypoint; infinite without keypoints."""
     if not len(keypoints):
         return np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)
     distance, row = cKDTree(keypoints).query(points)

@@ -1,7 +1,7 @@
 """Keypoint adjustment: refine keypoints to a fraction of a pixel by aligning image patches.
 
 Detectors localize a scene point differently in each image, and many networks return whole pixels of
-a reduced image. Two steps correct this, as in Lindenberger et al., Pixel-Perfect
+a downscaled image. Two steps correct the keypoints, as in Lindenberger et al., Pixel-Perfect
 Structure-from-Motion, ICCV 2021, with gray values instead of learned features:
 
 1. Align the patches around each verified match. The first warp assumes a fronto-parallel plane at
@@ -27,30 +27,31 @@ from mpsfm_core.geometry.patch_alignment import align_patches
 from mpsfm_core.support.lru_cache import LruCache
 
 CACHED_BYTES = 256 << 20
-"""Size limit of the cache of gray images."""
+"""Size limit of the in-memory cache of gray images, bytes."""
 BLUR_PX = 0.8
-"""Standard deviation of the Gaussian blur before interpolation."""
+"""Standard deviation of the Gaussian blur of gray images, pixels."""
 MAX_ALIGNMENTS = 4
-"""Number of best matches of a keypoint that are aligned."""
+"""Maximum number of matches per keypoint whose patches are aligned, best scores first."""
 RADIUS_STD = 9
-"""Radius of the round patches in standard deviations of a keypoint. Cost grows with its square, and
-a larger patch is less often planar."""
+"""Radius of the round patches in keypoint standard deviations. Cost grows with the square, and a
+larger patch is less often planar."""
 MIN_CORRELATION = 0.8
-"""Minimum normalized correlation of aligned patches."""
+"""Minimum normalized cross-correlation of aligned patches."""
 MAX_SHIFT_STD = 3.0
-"""Maximum shift of a keypoint in its standard deviations."""
+"""Maximum shift of a keypoint, in keypoint standard deviations."""
 ADJUSTED_STD_RATIO = 0.25
-"""Standard deviation of an adjusted keypoint over that of the detected keypoint."""
+"""Ratio of keypoint standard deviations after and before adjustment."""
 _NOISE_CORRELATION_PX = float(2 * np.sqrt(np.pi) * BLUR_PX)
-"""Correlation length of image noise after the blur."""
+"""Correlation length of image noise after the Gaussian blur, pixels."""
 _MIN_ALIGNMENT_STD = 0.05
-"""Minimum std of an alignment in stds of a keypoint: interpolation and non-planar surfaces."""
+"""Minimum standard deviation of a patch alignment, in keypoint standard deviations. Accounts for
+interpolation and non-planar surfaces."""
 _CAUCHY_SCALE = 0.3
-"""Scale of the Cauchy loss on residuals of alignments, in standard deviations of a keypoint."""
+"""Scale of the Cauchy loss on alignment residuals, in keypoint standard deviations."""
 _NUM_REWEIGHTINGS = 3
-"""Iterations of IRLS."""
+"""Number of IRLS iterations that solve for the keypoint shifts."""
 _MIN_DETERMINANT = 0.05
-"""Ratio of areas from which a warp counts as degenerate."""
+"""Minimum determinant of an affine warp; warps that shrink area further are rejected."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +59,13 @@ class AlignedPair:
     """Linear equations of one pair: ``shift_b - warp @ shift_a = offset``."""
 
     rows: Int64
-    """(m,) rows of the matches whose patches correlate."""
+    """(m,) rows of the matches whose patches were aligned."""
     warp: Float64
     """(m, 2, 2) affine warp from view a to view b."""
     offset: Float64
     """(m, 2) offset in pixels of view b."""
     information: Float64
-    """(m, 2, 2) inverse covariance of the offset, pixels^-2."""
+    """(m, 2, 2) inverse covariance of the offset, pixels^-2 of view b."""
 
 
 _EQUATION = ("warp", "offset", "information")
@@ -74,21 +75,22 @@ class AdjustedKeypoints(NamedTuple):
     """Keypoints of one image after adjustment."""
 
     keypoints: Float64
-    """(n, 2) pixels."""
+    """(n, 2) adjusted keypoints, pixels."""
     measured: Bool
-    """(n,) whether alignments determine the keypoint; if not, its position is unchanged."""
+    """(n,) true for keypoints moved by patch alignments; the positions of the others are
+    unchanged."""
 
 
 class PairSide(NamedTuple):
-    """One view of a pair, with the matched keypoints."""
+    """One view of an image pair, with the matched keypoints."""
 
     camera: PinholeCamera
     image: Float32
-    """Result of :func:`smooth_gray_image`."""
+    """(h, w) blurred gray image, the result of :func:`smooth_gray_image`."""
     xy: Float64
-    """(m, 2) matched keypoints, pixels of the camera."""
+    """(m, 2) matched keypoints, pixels of the view."""
     std_px: float
-    """Standard deviation of the keypoints."""
+    """Standard deviation of the keypoints, pixels of the view."""
 
     @property
     def step(self) -> Float64:
@@ -142,7 +144,7 @@ class KeypointAdjuster:
 def select_best_matches(
     pairs: Sequence[VerifiedPair], counts: Sequence[int], max_matches: int
 ) -> list[VerifiedPair]:
-    """Keep the matches that are among the best of one of their two keypoints.
+    """Select the matches that are among the best of one of their two keypoints.
 
     Args:
         pairs: Verified pairs.
@@ -171,7 +173,7 @@ def select_best_matches(
 
 
 def _number_keypoints(pairs: Sequence[VerifiedPair], counts: Sequence[int]) -> tuple[Int64, Int64]:
-    """Return the global keypoint indices (m,) of all matches, of view a and of view b."""
+    """Return the indices (m,) of matched keypoints in the concatenated keypoints of all images."""
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     a = [offsets[pair.image_a] + pair.matches[:, 0] for pair in pairs]
     b = [offsets[pair.image_b] + pair.matches[:, 1] for pair in pairs]
@@ -179,7 +181,7 @@ def _number_keypoints(pairs: Sequence[VerifiedPair], counts: Sequence[int]) -> t
 
 
 def smooth_gray_image(rgb: UInt8, std_px: float) -> Float32:
-    """Convert a view (h, w, 3) to a blurred gray image whose keypoints have a std of one pixel."""
+    """Convert an RGB view (h, w, 3) to a blurred gray image with a keypoint std of one pixel."""
     image: Any = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     if std_px > 1:
         size = [max(1, round(length / std_px)) for length in image.shape[::-1]]
@@ -189,9 +191,9 @@ def smooth_gray_image(rgb: UInt8, std_px: float) -> Float32:
 
 
 def align_pair(a: PairSide, b: PairSide, rotation: Float64, translation: Float64) -> AlignedPair:
-    """Align the patches of the matches of a pair by affine least-squares alignment.
+    """Align the patches around the matches of an image pair by affine least squares.
 
-    The view with more detail provides the templates.
+    Template patches come from the view of higher resolution.
 
     Args:
         a: First view.
@@ -228,8 +230,8 @@ def fronto_parallel_warp(
 ) -> Float64:
     """Return the warps (m, 2, 2) of planes that are parallel to image a, from view a to view b.
 
-    Each plane passes through the triangulated point of a match. If the rays do not meet in front of
-    both cameras, the plane is at infinity.
+    Each plane passes through the triangulated point of a match. If the point is not in front of
+    both cameras, the plane at infinity is used.
     """
     ray_a, ray_b = rays(a.camera, a.xy) @ rotation.T, rays(b.camera, b.xy)
     # Least-squares depth z of ray_b x (z ray_a + translation) = 0.
@@ -256,14 +258,15 @@ def adjust_keypoints(
 ) -> list[AdjustedKeypoints]:
     """Move the keypoints of all images to fit the alignments of all pairs.
 
-    The detected position is a Gaussian prior.
+    The detected keypoint position has a Gaussian prior.
 
     Args:
         keypoints: (n, 2) keypoints of each image, pixels.
         std_px: Standard deviation of the keypoints of each image.
         pairs: Pairs that were aligned.
         aligned: Alignment of each pair.
-        max_shift_std: Shift in standard deviations above which a keypoint keeps its position.
+        max_shift_std: Maximum shift in keypoint standard deviations; keypoints with larger shifts
+        are not moved.
     """
     counts = [len(xy) for xy in keypoints]
     std = np.repeat(np.asarray(std_px, dtype=np.float64), counts)
@@ -324,7 +327,7 @@ def solve_shifts(
 
 
 def _block_matrix(blocks: list[tuple[Int64, Int64, Float64]], count: int) -> Any:
-    """Return the sparse sum of 2 x 2 blocks, each given as (rows, columns, values (m, 2, 2))."""
+    """Sum 2 x 2 blocks (block rows, block columns, values (m, 2, 2)) into a sparse matrix."""
     two = np.arange(2)
     rows = [np.broadcast_to(2 * r[:, None, None] + two[:, None], m.shape) for r, _, m in blocks]
     columns = [np.broadcast_to(2 * c[:, None, None] + two, m.shape) for _, c, m in blocks]
@@ -334,7 +337,7 @@ def _block_matrix(blocks: list[tuple[Int64, Int64, Float64]], count: int) -> Any
 
 
 def _invert(matrices: Float64) -> Float64:
-    """Invert matrices (m, 2, 2); singular ones give the identity."""
+    """Invert matrices (m, 2, 2); singular matrices give the identity."""
     is_regular = np.abs(np.linalg.det(matrices)) > 1e-12
     inverse: Float64 = np.linalg.inv(np.where(is_regular[:, None, None], matrices, np.eye(2)))
     return inverse

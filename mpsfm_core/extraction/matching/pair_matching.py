@@ -42,17 +42,17 @@ from mpsfm_core.providers import validation
 
 @dataclass(frozen=True, eq=False)
 class CandidateMatches:
-    """Matches of a pair before verification."""
+    """Matches of an image pair before two-view verification."""
 
     pair: Pair
     sparse: SparseMatches
     """Matches between detected features."""
     points: PointMatches
-    """Dense matches with keypoints of their own; their rows follow those of ``sparse``."""
+    """Matches sampled from dense matches; their rows follow those of ``sparse``."""
     std_px: float
-    """Standard deviation of ``points``."""
+    """Standard deviation of the sampled ``points``, pixels."""
     precision: tuple[float, float] = (0.0, 0.0)
-    """Mean inverse variance of the pair depth of both images, 0 without pair depth."""
+    """Mean inverse variance of the depth that the matcher predicts for each image, or 0."""
 
     def __len__(self) -> int:
         return len(self.sparse) + len(self.points.scores)
@@ -70,7 +70,7 @@ class PairMatcher:
         self._snaps = config.matcher is None and table is not None
 
     def match(self, pairs: list[Pair], located: list[Features]) -> list[CandidateMatches]:
-        """Match pairs; ``located`` are the features of all images, descriptors are not needed."""
+        """Match image pairs, given the features of all images; descriptors may be empty."""
 
         def work(pair: Pair) -> CandidateMatches:
             return self._match_pair(pair, located[pair[0]], located[pair[1]])
@@ -78,7 +78,7 @@ class PairMatcher:
         return self._context.each("matching", pairs, work, *self._providers)
 
     def results(self, pair: Pair) -> list[PairMatches]:
-        """Return the cached results of all matchers for a pair."""
+        """Return the results of all matchers for an image pair; cached."""
         return [self._run(provider, pair) for provider in self._providers]
 
     def pair_depth(self, pair: Pair, side: int) -> DepthPrior:
@@ -123,7 +123,7 @@ class PairMatcher:
         return context.result(provider, PairMatches, inputs, compute, pair)
 
     def _unmasked(self, pair: Pair, dense: DenseMatches) -> DenseMatches:
-        """Return the matches whose points no mask excludes."""
+        """Remove dense matches with a point in a masked area."""
         keep = np.ones(len(dense), dtype=np.bool_)
         for index, points in zip(pair, (dense.points_a, dense.points_b), strict=True):
             mask = self._context.mask(index)
@@ -135,7 +135,7 @@ class PairMatcher:
 
 
 class PairVerifier:
-    """Verifies candidate matches by two-view geometry; cached."""
+    """Estimates the two-view geometry of candidate matches; cached."""
 
     def __init__(self, context: ExtractionContext, located: list[Features]) -> None:
         self._context = context
@@ -173,21 +173,21 @@ class PairVerifier:
 
 @dataclass(frozen=True, eq=False)
 class AssembledMatches:
-    """Verified pairs with the keypoints of all images."""
+    """Verified image pairs, and the keypoints of all images."""
 
     pairs: tuple[VerifiedPair, ...]
     keypoints: list[Float64]
     """(n, 2) keypoints of each image, pixels."""
     std_px: list[float]
-    """Standard deviation of the detected keypoints of each image."""
+    """Median standard deviation of the detected keypoints of each image, pixels."""
     std_factor: list[Float64]
-    """(n,) ratio of each keypoint's std after adjustment to ``std_px``."""
+    """(n,) ratio of each keypoint's standard deviation to ``std_px``, less than 1 if adjusted."""
 
 
 def assemble_matches(
     candidates: list[CandidateMatches], outcomes: list[TwoViewGeometry], located: list[Features]
 ) -> AssembledMatches:
-    """Number the keypoints of each image: its features, then the points of its verified pairs."""
+    """Collect the keypoints of each image: features, then sampled points of verified pairs."""
     keypoints = [[features.keypoints] for features in located]
     counts = [len(features) for features in located]
     noise = [[(len(features), features.std_px)] for features in located]
@@ -224,7 +224,7 @@ def assemble_matches(
 
 
 def adjust_assembled(context: ExtractionContext, assembled: AssembledMatches) -> AssembledMatches:
-    """Return the matches with adjusted keypoints, if adjustment is enabled."""
+    """Adjust the keypoints of assembled matches, if adjustment is enabled."""
     options = context.config.adjustment
     if not (options.enabled and assembled.pairs):
         return assembled
@@ -238,7 +238,7 @@ def adjust_assembled(context: ExtractionContext, assembled: AssembledMatches) ->
 
 
 def adjust_problem_keypoints(context: ExtractionContext, problem: MappingProblem) -> MappingProblem:
-    """Return a problem without adjustment with adjusted keypoints."""
+    """Adjust the keypoints of a mapping problem that has detected keypoints."""
     images = problem.images
     found = adjust_assembled(
         context,
@@ -257,7 +257,7 @@ def adjust_problem_keypoints(context: ExtractionContext, problem: MappingProblem
 
 
 def merge_matches(problem: MappingProblem, more: AssembledMatches) -> MappingProblem:
-    """Add matches to a problem; their keypoints are appended to those of the problem."""
+    """Add matches to a mapping problem; new keypoints follow those of the problem."""
     offsets = [len(image.keypoints) for image in problem.images]
     images = tuple(
         replace(
@@ -286,7 +286,7 @@ def _std_factor(image: MappingImage) -> Float64:
 
 
 def _merge_pair(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:
-    """Concatenate the matches of a pair; keep the geometry with more inliers."""
+    """Concatenate two match lists of a pair; use the geometry with more inliers."""
     if a is None:
         return b
     return replace(
@@ -297,7 +297,7 @@ def _merge_pair(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:
 
 
 def _median_std(parts: list[tuple[int, float]]) -> float:
-    """Return the median std of keypoints, given as groups of (number, std)."""
+    """Return the median standard deviation of keypoints, given as groups (number, std)."""
     values = np.repeat([std for _, std in parts], [count for count, _ in parts])
     return float(np.median(values)) if len(values) else 1.0
 
@@ -310,7 +310,7 @@ def _precision(results: list[PairMatches]) -> tuple[float, float]:
 
 
 def _mean_precision(depth: DepthPrior) -> float:
-    """Return the mean inverse variance of valid pixels, which ranks pairs [reference]."""
+    """Return the mean inverse variance of valid depths, which ranks pairs [reference]."""
     if depth.variance is None or not depth.valid.any():
         return 0.0
     return float((1.0 / depth.variance[depth.valid].astype(np.float64)).mean())

@@ -24,40 +24,40 @@ _USABLE = {
     _Configuration.PLANAR_OR_PANORAMIC: "planar or panoramic",
 }
 _MIN_INLIER_RATIO = 0.1
-"""Inlier ratio that the number of RANSAC trials is computed for. [reference]"""
+"""Assumed minimum inlier ratio, which limits the number of RANSAC trials. [reference]"""
 _MAX_TRIALS = 20_000
 """Maximum number of RANSAC trials. [reference]"""
 _CONFIDENCE = 0.999
 """Probability that RANSAC draws an outlier-free sample. [COLMAP confidence]"""
 _MIN_E_F_RATIO = 0.95
-"""Inliers of the essential over those of the fundamental matrix, for a calibrated pair.
+"""Minimum ratio of essential-matrix inliers to fundamental-matrix inliers of a calibrated pair.
 [COLMAP min_E_F_inlier_ratio]"""
 _SAMPLE_SIZE = 5
-"""Matches that determine an essential matrix."""
+"""Number of matches in a minimal sample for an essential matrix."""
 _MAX_H_RATIO = 0.8
-"""Inliers of a homography over those of the epipolar model, from which a pair is planar or
-panoramic. [COLMAP max_H_inlier_ratio]"""
+"""Ratio of homography inliers to epipolar inliers above which a pair is planar or panoramic.
+[COLMAP max_H_inlier_ratio]"""
 
 
 @dataclass(frozen=True, eq=False)
 class TwoViewGeometry:
-    """Two-view geometry of an image pair, or the code of the reason why the pair is dropped."""
+    """Two-view geometry of an image pair, or the reason why the pair is dropped."""
 
     dropped: str
     """Value of a :class:`~mpsfm_core.data.decisions.PairReason`; empty for a verified pair."""
     configuration: str
-    """COLMAP's configuration of the two-view geometry, in words."""
+    """COLMAP's two-view configuration in words, for example "planar"."""
     num_inliers: int
-    """Inliers of the estimated geometry, also of a dropped pair."""
+    """Number of inliers of the estimated geometry, also for a dropped pair."""
     inliers: Int64
-    """(k,) rows of the inlier matches; none of a dropped pair."""
+    """(k,) rows of the inlier matches; empty for a dropped pair."""
     rotation: Float64
     """(3, 3) rotation of ``cam_b_from_cam_a``."""
     translation: Float64
     """(3,) translation of ``cam_b_from_cam_a``, of unit or zero length."""
 
     def drop_reason(self, num_matches: int, min_matches: int) -> Reason:
-        """Return the reason why the pair is dropped, with its numbers."""
+        """Return the reason why the pair is dropped, with numbers of matches and inliers."""
         code = PairReason(self.dropped)
         values: dict[str, str | int] = {
             "num_matches": num_matches,
@@ -84,10 +84,10 @@ def verify_matches(
         camera_a: Camera of the first view.
         camera_b: Camera of the second view.
         xy_a: (m, 2) matched keypoints of the first view, pixels.
-        xy_b: (m, 2) matched keypoints of the second view, row by row.
+        xy_b: (m, 2) matched keypoints of the second view, pixels; row i matches row i of ``xy_a``.
         options: Thresholds of inliers and of accepted pairs.
-        std_px: Standard deviation of the keypoints; scales the inlier threshold.
-        seed: Seed of RANSAC. Same input and seed give the same result.
+        std_px: Standard deviation of the keypoints, pixels; scales the inlier threshold.
+        seed: Seed of RANSAC; the same input and seed give the same result.
 
     Returns:
         The geometry, or the reason why the pair is dropped.
@@ -126,10 +126,10 @@ def verify_matches(
 def _chance_of_inliers(inliers: int, matches: int, camera: PinholeCamera, error_px: float) -> float:
     """Return the probability that a given epipolar geometry has the inliers by chance.
 
-    A random match is an inlier if it falls into the error band around its epipolar line. The line
-    is at most as long as the diagonal of the image. The Sampson error combines the distances in
-    both images, hence the factor ``sqrt(2)``. Matches of the minimal sample do not count.
-    (A-contrario test, Moisan and Stival, IJCV 2004.)
+    A random match is an inlier if its second point falls into the error band around the epipolar
+    line. The epipolar line is at most as long as the image diagonal. The Sampson error combines the
+    distances in both images, hence the factor ``sqrt(2)``. Matches of the minimal sample do not
+    count (a-contrario test, Moisan and Stival, IJCV 2004).
     """
     area = camera.width * camera.height
     band = 2 * math.sqrt(2) * error_px * math.hypot(camera.width, camera.height) / area
@@ -150,7 +150,7 @@ def _colmap_options(
     colmap.min_E_F_inlier_ratio = _MIN_E_F_RATIO
     colmap.max_H_inlier_ratio = _MAX_H_RATIO
     colmap.compute_relative_pose = True
-    colmap.detect_watermark = False  # photos of this pipeline are the user's own
+    colmap.detect_watermark = False  # watermarks occur in internet photo collections only
     ransac = colmap.ransac
     ransac.max_error = options.max_error_px * max(1.0, std_px)
     ransac.min_inlier_ratio = _MIN_INLIER_RATIO

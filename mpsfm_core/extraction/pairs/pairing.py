@@ -1,4 +1,4 @@
-"""Generation of image pairs: exhaustive, sequential, by similarity or by numbered names."""
+"""Generation of image pairs: exhaustive, sequential, by similarity or by file numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mpsfm_core.data import Float32, Float64
 from mpsfm_core.extraction.options import PairOptions
 
 Pair = tuple[int, int]
-"""Indices of two images, the smaller first."""
+"""Indices of the two images of a pair, the smaller index first."""
 
 _NUMBERED = re.compile(r"(.*?)(\d+)(\D*)")
 _SMALLEST_POSITIVE = float(np.finfo(np.float64).tiny)
@@ -23,14 +23,14 @@ def exhaustive_pairs(count: int) -> list[Pair]:
 
 
 def sequential_pairs(count: int, options: PairOptions) -> list[Pair]:
-    """Pair each image with the following ones, or with those at distance 1, 2, 4, 8 ..."""
+    """Pair each image with the following images, or with those 1, 2, 4, 8 ... positions later."""
     steps = range(options.overlap)
     offsets = [2**step if options.quadratic else step + 1 for step in steps]
     return _sort_pairs((a, a + d) for a in range(count) for d in offsets if a + d < count)
 
 
 def retrieval_pairs(descriptors: Sequence[Float32], options: PairOptions) -> list[Pair]:
-    """Pair each image with the most similar ones, by dot product of descriptors (d,)."""
+    """Pair each image with the images of largest dot product of global descriptors (d,)."""
     matrix = np.stack(descriptors).astype(np.float64)
     min_similarity = max(options.min_similarity, -np.finfo(np.float64).max)
     return most_similar_pairs(matrix @ matrix.T, options.top_k, min_similarity)
@@ -60,7 +60,7 @@ def most_similar_pairs(
 
 
 def numbered_neighbor_pairs(names: Sequence[str], options: PairOptions) -> list[Pair]:
-    """Pair each image with the following ones of its sequence.
+    """Pair each image with the following images of its numbered sequence.
 
     Images form a sequence if their names differ only in the last number, which gives the order.
     """
@@ -80,12 +80,12 @@ def numbered_neighbor_pairs(names: Sequence[str], options: PairOptions) -> list[
 def filter_pairs(
     pairs: Sequence[Pair], names: Sequence[str], answers: Iterable[Iterable[tuple[str, str]]]
 ) -> list[Pair]:
-    """Keep the pairs that every plugin's filter returned.
+    """Select the image pairs that the filters of all plugins accept.
 
     Args:
         pairs: Pairs of image indices.
         names: Names of all images.
-        answers: Pairs of image names of each filter, in any order.
+        answers: Pairs of image names that each filter accepts, in any order.
     """
     accepted = [frozenset(frozenset(pair) for pair in answer) for answer in answers]
     return [
@@ -96,5 +96,5 @@ def filter_pairs(
 
 
 def _sort_pairs(pairs: Iterable[Pair]) -> list[Pair]:
-    """Order the images of each pair, and the pairs; drop duplicates."""
+    """Sort the image pairs and the two images of each pair; drop duplicates."""
     return sorted({(min(pair), max(pair)) for pair in pairs})

@@ -23,13 +23,13 @@ from mpsfm_core.providers import validation
 
 
 class PairSelection:
-    """Selects pairs for the matcher.
+    """Selects the image pairs that are matched.
 
     Args:
         context: Options, cache and progress of the run.
         table: Features of the images, None without a feature provider.
-        unconstrained: Images that are matched again: one of them must be in each pair. None allows
-            all pairs.
+        unconstrained: Images to match again after the fast pass; each pair has at least one of
+            these images. None allows all pairs.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class PairSelection:
         unconstrained: Collection[int] | None = None,
     ) -> None:
         self.proposed = 0
-        """Number of selected pairs before the filters of plugins."""
+        """Number of selected image pairs before plugins filter the pairs."""
         self._unconstrained = unconstrained
         self._context = context
         self._table = table
@@ -47,10 +47,10 @@ class PairSelection:
         self._selected: set[Pair] = set()
 
     def choose(self) -> list[Pair]:
-        """Select the pairs of the first round.
+        """Select the image pairs that are matched first.
 
         Raises:
-            ConfigError: ``pairs.mode`` is retrieval, and there is no retrieval provider.
+            ConfigError: ``pairs.mode`` is ``retrieval``, but no retrieval provider is configured.
         """
         options, count = self._context.config.pairs, len(self._context.images)
         if options.mode == "sequential":
@@ -70,10 +70,10 @@ class PairSelection:
         )
 
     def choose_again(self, verified: Sequence[Pair]) -> list[Pair]:
-        """Select further pairs between the components of the verified pairs.
+        """Select further image pairs between the components of the match graph.
 
-        Each component except the largest gets its most similar untried pairs with other images.
-        Only mode ``auto`` selects further pairs.
+        Each component except the largest gets its most similar unmatched pairs with images of other
+        components. Only ``pairs.mode: auto`` selects further pairs.
         """
         if self._similarity is None:
             return []
@@ -97,7 +97,7 @@ class PairSelection:
 
     @property
     def _partners(self) -> int:
-        """Number of partners of an image."""
+        """Number of images that each image is matched with."""
         config = self._context.config
         if self._unconstrained is None or config.fast_pass is None:
             return config.pairs.partners
@@ -107,7 +107,7 @@ class PairSelection:
         return 0.0 if self._similarity is None else float(self._similarity[pair])
 
     def _select(self, chosen: Sequence[Pair]) -> list[Pair]:
-        """Sort pairs, record them, and apply the filters of plugins."""
+        """Sort and record image pairs, and apply the pair filters of plugins."""
         images = self._unconstrained
         unique = sorted({(a, b) for a, b in chosen if images is None or a in images or b in images})
         self._selected.update(unique)
@@ -118,9 +118,9 @@ class PairSelection:
         return pairs.filter_pairs(unique, names, answers)
 
     def _compute_similarity(self) -> Float64 | None:
-        """Return the similarity (n, n) of all images by retrieval, or else by features.
+        """Compute the similarity (n, n) of all images by retrieval, or else by local features.
 
-        None if neither is configured.
+        Returns None if neither a retrieval provider nor a feature provider is configured.
         """
         backend = self._context.config.retrieval
         if backend is not None:
@@ -154,10 +154,10 @@ class PairSelection:
         return scores
 
     def describe(self, index: int) -> Any:
-        """Return the global descriptor (d,) of an image; cached.
+        """Compute the global descriptor (d,) of an image; cached.
 
         Raises:
-            ConfigError: there is no retrieval provider.
+            ConfigError: no retrieval provider is configured.
         """
         context, provider = self._context, self._retrieval
         return context.result(

@@ -1,11 +1,11 @@
-"""Image similarity from a few local features, to select pairs without retrieval.
+"""Image similarity from a few local features, to select image pairs without retrieval.
 
-1. Match score: mutual nearest neighbors among the strongest descriptors, weighted by their ratio
-   to the second nearest neighbor.
-2. Excess: subtract the score that two images reach by chance, because images with repetitive
-   texture match everything.
-3. Diffusion: two images that are similar to a third are similar to each other. This finds pairs
-   of small overlap (Zhou et al., Ranking on Data Manifolds, NIPS 2003).
+1. Match score: mutual nearest neighbors among the strongest descriptors, weighted by the ratio of
+   nearest to second nearest distance.
+2. Excess: subtract the match score that two images reach by chance, because images with repetitive
+   texture match many images.
+3. Diffusion: two images that are similar to a third image are similar to each other. Diffusion
+   finds pairs of small overlap (Zhou et al., Ranking on Data Manifolds, NIPS 2003).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from mpsfm_core.data import Features, Float32, Float64
 
 NUM_DESCRIPTORS = 512
-"""Descriptors of an image that are compared. Cost grows with the square.
+"""Number of descriptors per image that are compared. Cost grows with the square.
 [tuned: benchmarks.pairs]"""
 DIFFUSION_RATIO = 0.8
 """Diffusion weight ``alpha`` of manifold ranking. [tuned: benchmarks.pairs]"""
@@ -23,7 +23,7 @@ _TINY = np.float32(1e-12)
 
 
 def strongest_descriptors(features: Features) -> Float32:
-    """Return the descriptors (k, d) with the largest scores; without scores, the first ones."""
+    """Return the descriptors (k, d) with the largest scores, or the first k without scores."""
     if features.scores is None:
         return features.descriptors[:NUM_DESCRIPTORS]
     order = np.argsort(-features.scores, kind="stable")[:NUM_DESCRIPTORS]

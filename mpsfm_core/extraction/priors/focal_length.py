@@ -1,4 +1,4 @@
-"""Focal lengths of images without EXIF, estimated by the depth provider."""
+"""Focal length estimation by the depth provider, for images without EXIF focal length."""
 
 from __future__ import annotations
 
@@ -26,19 +26,20 @@ def estimate_focal_lengths(
 ) -> ImageSet:
     """Replace default focal lengths by estimates of the depth provider.
 
-    Images of one camera get the median of their estimates, which the mapper refines. Without
-    default focal lengths, or without the capability ``estimates-focal``, nothing changes.
+    Images of one camera get the median of their estimates, which the mapper refines. The images are
+    returned unchanged if no focal length is a default, or if the depth provider lacks the
+    capability ``estimates-focal``.
 
     Args:
-        images: The images.
+        images: All input images.
         config: Configuration with resolved providers.
-        registry: The installed providers.
-        events: Receives progress.
+        registry: Installed providers.
+        events: Receiver of progress.
 
     Raises:
-        InputError: the provider or its weights are missing.
-        ProviderRunError: the provider failed.
-        ProviderOutputError: the provider broke its contract.
+        InputError: the depth provider or its weights are missing.
+        ProviderRunError: the depth provider failed.
+        ProviderOutputError: the provider's output violates the provider contract.
     """
     unknown = [index for index, image in enumerate(images) if image.focal_source == "default"]
     if not unknown:

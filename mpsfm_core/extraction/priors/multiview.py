@@ -1,4 +1,4 @@
-"""Depth and poses from a multi-view network that sees groups of images."""
+"""Depth and poses from a multi-view network that processes groups of images."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.providers import validation
 
 Group = tuple[int, ...]
-"""Indices of the images of a group, its first image first."""
+"""Image indices of a group that the multi-view network processes together."""
 
 
 def choose_groups(count: int, matches: dict[Pair, int], size: int) -> list[tuple[Group, int]]:
     """Partition the images into groups that share verified matches.
 
-    A group starts with the image with most matches and grows greedily by the image that shares
-    most matches with it. A group without further new images is filled with images of other
+    A group starts with the ungrouped image that has most matches. The group grows greedily by the
+    image that shares most matches with the group. Remaining space is filled with images of other
     groups, because more images improve the prediction.
 
     Args:
@@ -30,8 +30,8 @@ def choose_groups(count: int, matches: dict[Pair, int], size: int) -> list[tuple
         size: Maximum size of a group.
 
     Returns:
-        Each group with the number of its own images, which come first. Each image is an own image
-        of exactly one group.
+        Each group with its number of core images, which come first. Each image is a core image of
+        exactly one group.
     """
     shared = np.zeros((count, count), dtype=np.int64)
     for (a, b), number in matches.items():
@@ -48,7 +48,7 @@ def choose_groups(count: int, matches: dict[Pair, int], size: int) -> list[tuple
 
 
 def _grow_group(group: list[int], shared: Int64, allowed: Any, size: int) -> list[int]:
-    """Add the allowed images with most shared matches, one after the other."""
+    """Add the allowed images that share most matches with a group, one after the other."""
     grown = list(group)
     while len(grown) < size:
         num_shared = np.where(allowed, shared[:, grown].sum(axis=1), 0)
@@ -71,7 +71,7 @@ class GroupPriors:
         self._poses: list[Float64 | None] = []
 
     def run(self, matches: dict[Pair, int]) -> None:
-        """Choose the groups by verified matches, and run the network on all groups."""
+        """Choose image groups by verified matches, and run the multi-view network on each."""
         size = self._context.config.extraction.group_size
         self.groups = choose_groups(len(self._context.images), matches, size)
         for number, (group, num_own) in enumerate(self.groups):
@@ -80,7 +80,7 @@ class GroupPriors:
         self._poses = self._context.each("multiview", shown, self._predict_poses, self.provider)
 
     def predict(self, group: Group) -> MultiViewPrior:
-        """Return the prediction of the network for a group."""
+        """Predict depth and poses of an image group with the multi-view network; cached."""
         context, provider = self._context, self.provider
 
         def compute(instance: Any) -> MultiViewPrior:
@@ -91,7 +91,7 @@ class GroupPriors:
         return context.result(provider, MultiViewPrior, inputs, compute, group)
 
     def depth(self, image: int) -> DepthPrior:
-        """Return the depth of an image, predicted with its group."""
+        """Return the depth prior of an image from the prediction for its group."""
         number, row = self._position[image]
         prior = self.predict(self.groups[number][0])
         if not prior.depth:  # the provider failed, and the run skips failures
@@ -100,7 +100,7 @@ class GroupPriors:
         return prior.depth[row]
 
     def place(self, image: int) -> tuple[int, Pose | None]:
-        """Return the number of an image's group, and the pose that the network predicts."""
+        """Return an image's group number, and the pose that the multi-view network predicts."""
         number, row = self._position[image]
         poses = self._poses[number]
         if poses is None or not len(poses):
@@ -108,15 +108,15 @@ class GroupPriors:
         return number, (poses[row, :, :3].copy(), poses[row, :, 3].copy())
 
     def described(self) -> list[list[str]]:
-        """Return the image names of each group, for the report."""
+        """Return the image names of each multi-view group, for the report."""
         names = self._context.images.names
         return [[names[image] for image in group] for group, _ in self.groups]
 
     def _predict_poses(self, group: Group) -> Float64 | None:
-        """Return the poses of a group; its maps stay in the cache, to limit memory."""
+        """Predict the poses of a group; depth maps stay in the disk cache, to limit memory."""
         return self.predict(group).poses
 
 
 def consecutive_groups(images: Sequence[int], size: int) -> list[Group]:
-    """Group images in their order, before matches are known."""
+    """Split the image sequence into groups of ``size``, for use before matching."""
     return [tuple(images[start : start + size]) for start in range(0, len(images), size)]

@@ -11,11 +11,11 @@ from mpsfm_core.geometry import log_depth_steps, resize_map
 EDGE_VARIANCE = 1e6
 """Variance of normals at depth edges, rad^2. [reference]"""
 _ALL_VALID = 1 - 1e-5
-"""Threshold of a resized mask: 1 up to float32 rounding if all contributing pixels are valid."""
+"""Threshold of an interpolated mask: a pixel is valid if all contributing pixels are valid."""
 
 
 def integration_grid(size: tuple[int, int], longer_side: int) -> tuple[int, int]:
-    """Return (width, height) of the maps for an image of ``size``, with its aspect ratio."""
+    """Return (width, height) of the prior maps of an image, with the image's aspect ratio."""
     factor = longer_side / max(size)
     return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
 
@@ -23,9 +23,10 @@ def integration_grid(size: tuple[int, int], longer_side: int) -> tuple[int, int]
 def resize_depth(prior: DepthPrior, grid: tuple[int, int]) -> DepthPrior:
     """Resize a depth prior to a grid (width, height).
 
-    Interpolates inverse depth, which is linear on planes, and relative variance bilinearly, and
-    averages them when shrinking. Averaging does not reduce the variance, because errors of
-    neighbors are correlated. A pixel is valid if all contributing pixels are valid.
+    Inverse depth, which is linear on planes, and relative variance are interpolated bilinearly, and
+    averaged when shrinking. The variance is not divided by the number of averaged pixels, because
+    errors of neighboring pixels are correlated. A pixel is valid if all contributing pixels are
+    valid.
     """
     if (prior.shape[1], prior.shape[0]) == grid:
         return prior
@@ -55,18 +56,18 @@ def resize_normals(prior: NormalPrior, grid: tuple[int, int]) -> NormalPrior:
 
 
 def resize_mask(mask: Bool, grid: tuple[int, int]) -> Bool:
-    """Resize a mask (H, W) to a grid (width, height) by the nearest pixel."""
+    """Resize a mask (H, W) to a grid (width, height) by nearest-neighbor interpolation."""
     resized = cv2.resize(mask.astype(np.uint8), grid, interpolation=cv2.INTER_NEAREST_EXACT)
     return np.asarray(resized > 0)
 
 
 def mask_depth(prior: DepthPrior, allowed: Bool) -> DepthPrior:
-    """Invalidate depth where the mask is False."""
+    """Mark depth as invalid where the mask ``allowed`` is false."""
     return DepthPrior(prior.depth, prior.variance, prior.valid & allowed, prior.metric)
 
 
 def mask_normals(prior: NormalPrior, allowed: Bool) -> NormalPrior:
-    """Invalidate normals where the mask is False."""
+    """Mark normals as invalid where the mask ``allowed`` is false."""
     return NormalPrior(prior.normals, prior.variance, prior.valid & allowed)
 
 
@@ -74,9 +75,9 @@ def inflate_edge_variance(normals: NormalPrior, depth: DepthPrior, ratio: float)
     """Set the variance of normals on both sides of depth edges to :data:`EDGE_VARIANCE`.
 
     Args:
-        normals: Normals with variance.
-        depth: Depth on the same grid. Steps to invalid pixels are not edges.
-        ratio: Ratio of neighboring depths that defines an edge.
+        normals: Normal prior with variance.
+        depth: Depth prior on the same grid; steps to invalid pixels are not edges.
+        ratio: Ratio of neighboring depths above which there is a depth edge.
     """
     edges = log_depth_steps(depth.depth, depth.valid) > np.log(ratio)
     variance = np.where(edges & normals.valid, np.float32(EDGE_VARIANCE), _variance(normals))

@@ -1,4 +1,4 @@
-"""Prior maps of the mapper: predicted, calibrated, resized and masked."""
+"""Prediction of the mapper's prior maps: predict, calibrate, resize and mask."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ class PriorPredictor:
 
     Args:
         context: Views, options and progress of the run.
-        matcher: Matcher that predicts pair depth, if depth comes from the matcher.
-        candidates: Candidate matches, to choose the best pair of each image.
-        groups: Predictions of the multi-view network, if there is one.
+        matcher: Matcher that predicts depth, for ``depth.use: matcher``.
+        candidates: Candidate matches, from which the pair with the best depth of each image is
+        chosen.
+        groups: Predictions of the multi-view network, for ``depth.use: multiview``.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class PriorPredictor:
         self._best = _best_pairs(candidates) if config.depth.use == FROM_MATCHER else None
 
     def run(self) -> list[tuple[DepthPrior, NormalPrior]]:
-        """Return depth and normals of each image on the grid of the mapper, with variances."""
+        """Compute depth and normals of each image on the mapper's grid, with variances."""
         images = range(len(self._context.images))
         depth = self._raw.depth
         if not depth.can("uncached"):
@@ -58,7 +59,7 @@ class PriorPredictor:
         return self._context.each("normals", images, self._prepare_maps, slowest, local=local)
 
     def _predict_only(self, index: int) -> None:
-        """Predict into the cache, because full-size maps of all images may exceed memory."""
+        """Predict depth into the disk cache; full-size maps of all images may exceed memory."""
         self.predicted(index)
 
     def _prepare_maps(self, index: int) -> tuple[DepthPrior, NormalPrior]:
@@ -66,13 +67,13 @@ class PriorPredictor:
         return self._on_grid(index, depth, self._normal_calibration.apply(normals))
 
     def full_size(self, index: int) -> tuple[DepthPrior, NormalPrior]:
-        """Return calibrated depth and uncalibrated normals of an image, in full size; cached."""
+        """Return full-size calibrated depth and uncalibrated normals of an image; cached."""
         raw_depth, normals = self.predicted(index)
         depth = self._depth_calibration.apply(raw_depth)
         return depth, self._raw.predict_normals(index, depth) if normals is None else normals
 
     def predicted(self, index: int) -> tuple[DepthPrior, NormalPrior | None]:
-        """Return uncalibrated depth, and normals if the same pass predicts them; cached."""
+        """Return uncalibrated depth, and normals if the depth network predicts both; cached."""
         if self._groups is not None:
             return self._groups.depth(index), None
         if self._best is not None:
@@ -80,7 +81,7 @@ class PriorPredictor:
         return self._raw.predict(index)
 
     def _from_matcher(self, index: int) -> DepthPrior:
-        """Return the pair depth of highest precision; an empty prior without a pair."""
+        """Return the matcher's most precise depth of an image; an empty prior without a pair."""
         assert self._best is not None and self._matcher is not None
         if index not in self._best:
             empty = np.zeros((1, 1), dtype=np.float32)
@@ -107,7 +108,7 @@ class PriorPredictor:
 
 
 def _depth_calibration(config: Config, registry: Registry) -> DepthCalibration:
-    """Return the configured calibration of depth, or that of the predicting network."""
+    """Return the depth calibration of the configuration, or of the network that predicts depth."""
     kind: Kind = "depth"
     backend = config.depth
     if backend.use == FROM_MULTIVIEW and config.multiview and backend.calibration is None:
@@ -118,7 +119,7 @@ def _depth_calibration(config: Config, registry: Registry) -> DepthCalibration:
 
 
 def check_depth_source(config: Config, registry: Registry) -> None:
-    """Raise ConfigError if depth should come from a matcher without pair depth."""
+    """Raise ConfigError if ``depth.use`` is ``matcher`` and no matcher predicts depth."""
     chosen = [b for b in (config.matcher, config.dense_matcher) if b is not None]
     specs = [registry.spec("matcher", backend.use) for backend in chosen]
     predicts_depth = any("pair-depth" in spec.capabilities for spec in specs)
@@ -128,7 +129,7 @@ def check_depth_source(config: Config, registry: Registry) -> None:
 
 
 def _best_pairs(candidates: list[CandidateMatches]) -> dict[int, tuple[CandidateMatches, int]]:
-    """Return for each image its pair of highest precision, and its side in the pair."""
+    """Return each image's pair with the most precise depth, and the image's side (0 or 1)."""
     best: dict[int, tuple[float, CandidateMatches, int]] = {}
     for matches in candidates:
         for side, image in enumerate(matches.pair):

@@ -1,4 +1,4 @@
-"""Depth and normals as the providers predict them, before calibration; cached."""
+"""Uncalibrated depth and normals from the providers; cached."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class RawPriors:
     """Runs the depth and normals providers of a configuration.
 
     Attributes:
-        depth: The depth provider.
-        normals: The normals provider; None if one pass of the depth provider predicts both.
+        depth: Provider of depth.
+        normals: Provider of normals; None if one forward pass of the depth provider predicts both.
     """
 
     def __init__(self, context: ExtractionContext) -> None:
@@ -27,7 +27,7 @@ class RawPriors:
         self.normals = None if joint else context.provider("normals", context.config.normals)
 
     def predict(self, index: int) -> tuple[DepthPrior, NormalPrior | None]:
-        """Return depth of an image, and normals if the same pass predicts them."""
+        """Predict depth of an image, and normals if the depth provider predicts both."""
         provider, context = self.depth, self._context
         inputs = context.view_inputs(index, provider)
         if self.normals is None:
@@ -46,10 +46,10 @@ class RawPriors:
         return context.result(provider, DepthPrior, inputs, compute, [index]), None
 
     def predict_normals(self, index: int, depth: DepthPrior | None) -> NormalPrior:
-        """Return normals of an image by the normals provider.
+        """Predict normals of an image with the normals provider.
 
         Args:
-            index: The image.
+            index: Index of the image.
             depth: Calibrated depth, for providers with the capability ``needs-depth``.
         """
         provider, context = self.normals, self._context
@@ -65,7 +65,7 @@ class RawPriors:
 
 
 def _is_joint(context: ExtractionContext, depth: ActiveProvider) -> bool:
-    """Check whether one pass of the depth provider predicts the normals too."""
+    """Check whether one forward pass of the depth provider predicts depth and normals."""
     depth_config, normals = context.config.depth, context.config.normals
     same = (depth_config.use, depth_config.options) == (normals.use, normals.options)
     return depth.can("joint-normals") and same and not depth_config.wrap and not normals.wrap
