@@ -52,6 +52,10 @@ from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredIm
 from mpsfm_core.support.threads import thread_limit
 
 _T = TypeVar("_T", bound=np.generic)
+_NUM_SOURCES = 5
+"""Maximum number of source views per view; higher is more complete and slower [ours]."""
+_MATCH_STD_PX = 0.5
+"""Nominal std of a match in pixels, for the tolerance of the consistency check [ours]."""
 _MAX_COST = 0.9
 """Maximum matching cost of a measured pixel; textureless images match anything [ours]."""
 _MAX_SPLAT_STDS = 1.5
@@ -139,8 +143,8 @@ def densify(
     """
     image_rows = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
     images = [reconstruction.images[row] for row in image_rows]
-    neighbors = select_source_views(images, max(options.num_sources, _MAX_SPLAT_VIEWS))
-    sources = [views[: options.num_sources] for views in neighbors]
+    neighbors = select_source_views(images, max(_NUM_SOURCES, _MAX_SPLAT_VIEWS))
+    sources = [views[:_NUM_SOURCES] for views in neighbors]
     compared_views = _symmetric_neighbors(sources)
     views = _ViewCache(images, view_of, options)
 
@@ -148,7 +152,7 @@ def densify(
         view, name = views[row], images[row].name
         stereo = checkpoints.load(name) if checkpoints else None
         if stereo is None:
-            stereo = match_stereo_depth(view, [views[source] for source in sources[row]], options)
+            stereo = match_stereo_depth(view, [views[source] for source in sources[row]])
             if checkpoints:
                 checkpoints.save(name, stereo)
         supported = view.usable & (stereo.cost < _MAX_COST)
@@ -158,7 +162,7 @@ def densify(
 
     def check_image(row: int) -> tuple[GeometricConsistency, ScaleConstraints | None]:
         image = matched[row]
-        differences = _compare_with_views(row, matched, compared_views[row], options)
+        differences = _compare_with_views(row, matched, compared_views[row])
         patches = {
             source: measure_patch_offsets(
                 views[row], image.log_depth, views[source], difference.agree
@@ -182,7 +186,7 @@ def densify(
     def fuse_image(row: int) -> tuple[RegisteredImage, Bool]:
         view = views[row]
         known = LogDepthMap(view.log_depth, view.log_std)
-        stereo = _merge_stereo_depth(row, view, matched, consistency, neighbors[row], options)
+        stereo = _merge_stereo_depth(row, view, matched, consistency, neighbors[row])
         measured = fuse_known_depth(stereo, known)
         posterior = compute_depth_posterior(known, measured, options.correlation_px)
         scale_std = scale_stds.get(row, 0.0)
@@ -226,9 +230,7 @@ class _ViewCache:
         options: DenseOptions,
     ) -> None:
         self._images, self._view_of, self._options = images, view_of, options
-        self._cached_load = lru_cache(_NUM_CACHED_NEIGHBORHOODS * (1 + options.num_sources))(
-            self._load
-        )
+        self._cached_load = lru_cache(_NUM_CACHED_NEIGHBORHOODS * (1 + _NUM_SOURCES))(self._load)
 
     def __getitem__(self, row: int) -> DenseView:
         return self._cached_load(row)
@@ -259,9 +261,9 @@ class _MatchedImage(NamedTuple):
         """(h, w) pixels that a point moves per unit of log depth."""
         return resize_map(self.parallax, *self.grid.camera.size)
 
-    def posed_depth(self, options: DenseOptions) -> PosedDepth:
+    def posed_depth(self) -> PosedDepth:
         """Return the depth map with its pose and nominal std."""
-        return PosedDepth(self.grid, self.log_depth, self.log_std(options.match_std_px))
+        return PosedDepth(self.grid, self.log_depth, self.log_std(_MATCH_STD_PX))
 
 
 def _symmetric_neighbors(sources: Sequence[Sequence[int]]) -> list[list[int]]:
@@ -274,14 +276,12 @@ def _symmetric_neighbors(sources: Sequence[Sequence[int]]) -> list[list[int]]:
 
 
 def _compare_with_views(
-    row: int, matched: Mapping[int, _MatchedImage], views: Sequence[int], options: DenseOptions
+    row: int, matched: Mapping[int, _MatchedImage], views: Sequence[int]
 ) -> dict[int, DepthDifferences]:
     """Compare the supported depth of an image with the depth maps of other views."""
-    depth = matched[row].posed_depth(options)
+    depth = matched[row].posed_depth()
     return {
-        view: compare_depths(depth, matched[view].posed_depth(options)).where(
-            matched[row].supported
-        )
+        view: compare_depths(depth, matched[view].posed_depth()).where(matched[row].supported)
         for view in views
         if view in matched
     }
@@ -313,7 +313,6 @@ def _merge_stereo_depth(
     matched: Mapping[int, _MatchedImage],
     consistency: Mapping[int, GeometricConsistency],
     neighbors: Sequence[int],
-    options: DenseOptions,
 ) -> LogDepthMap:
     """Merge the consistent depth of an image with depth splatted from its neighbors.
 
@@ -322,7 +321,7 @@ def _merge_stereo_depth(
     """
     image, confirmed = matched[row], consistency[row].confirmed
     log_depth = image.log_depth + consistency[row].mean_change
-    std = image.log_std(consistency[row].std_px if confirmed.any() else options.match_std_px)
+    std = image.log_std(consistency[row].std_px if confirmed.any() else _MATCH_STD_PX)
     std = np.maximum(std, np.float32(MIN_STD))
     neighbor_depths = (
         (matched[j].grid, matched[j].log_depth, consistency[j].confirmed)

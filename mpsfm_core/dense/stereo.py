@@ -17,7 +17,6 @@ import numpy as np
 from mpsfm_core.data import Float32, Float64
 from mpsfm_core.dense.dense_view import DenseView
 from mpsfm_core.dense.depth_posterior import UNKNOWN_LOG_STD
-from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stereo_kernels import (
     aggregate_costs,
     compute_ncc_costs,
@@ -26,6 +25,24 @@ from mpsfm_core.dense.stereo_kernels import (
 )
 from mpsfm_core.geometry import resize_map
 
+_RANGE_STDS = 2.0
+"""Half width of the depth search range in stds of the known depth [ours]."""
+_MAX_LABELS = 96
+"""Maximum number of depth hypotheses per pixel on the coarse level; bounds the memory [ours]."""
+_WINDOW_RADIUS = 3
+"""Radius of the NCC window in pixels of the pyramid level [ours]."""
+_GRAY_NOISE = 2.0
+"""Std of image noise in gray levels of 255; higher treats more texture as noise [ours]."""
+_MERGED_VIEW_RATIO = 0.5
+"""Ratio of the views that see a point whose costs are averaged, the lowest costs first [ours].
+
+The views with the highest costs count as occluded. A higher ratio is less robust to occlusion."""
+_PRIOR_WEIGHT = 0.02
+"""Weight of the squared deviation from the known depth in stds; costs are in [0, 1] [ours]."""
+_SMALL_STEP_PENALTY = 0.04
+"""Penalty P1 of semi-global matching for neighboring pixels one label apart [ours]."""
+_LARGE_STEP_PENALTY = 1.6
+"""Penalty P2 of semi-global matching for larger steps; image edges reduce the penalty [ours]."""
 _LEVELS = (2, 1)
 """Downsampling factors of the pyramid levels, coarse to fine."""
 _FINE_LABELS = 5
@@ -54,9 +71,7 @@ class StereoDepth:
     """(8, 8) pixels that a point moves in the source views per unit of log depth."""
 
 
-def match_stereo_depth(
-    view: DenseView, sources: Sequence[DenseView], options: DenseOptions
-) -> StereoDepth:
+def match_stereo_depth(view: DenseView, sources: Sequence[DenseView]) -> StereoDepth:
     """Estimate the depth of a view from one or more source views."""
     log_depth = np.zeros((0, 0), np.float32)
     for factor in _LEVELS:
@@ -66,13 +81,13 @@ def match_stereo_depth(
         step = 1 / max(float(np.median(parallax)), 1e-6)
         if factor == _LEVELS[0]:
             log_depth = level_view.log_depth
-            reach = options.range_stds * float(np.median(level_view.log_std))
-            count = int(np.clip(np.ceil(2 * reach / step), 2, options.max_labels - 1))
+            reach = _RANGE_STDS * float(np.median(level_view.log_std))
+            count = int(np.clip(np.ceil(2 * reach / step), 2, _MAX_LABELS - 1))
             offsets: Float64 = np.linspace(-reach, reach, count + 1)
         else:
             log_depth = resize_map(cv2.medianBlur(log_depth, 3), *level_view.camera.size)
             offsets = (np.arange(-_FINE_LABELS, _FINE_LABELS + 1) * step).astype(np.float64)
-        log_depth, cost = _sweep(level_view, level_sources, log_depth, offsets, options)
+        log_depth, cost = _sweep(level_view, level_sources, log_depth, offsets)
     return StereoDepth(log_depth, cost, parallax)
 
 
@@ -81,7 +96,6 @@ def _sweep(
     sources: Sequence[DenseView],
     surface: Float32,
     offsets: Float64,
-    options: DenseOptions,
 ) -> tuple[Float32, Float32]:
     """Search the best offset from a surface at each pixel.
 
@@ -90,14 +104,13 @@ def _sweep(
         sources: Source views on the same level.
         surface: (h, w) log depth of the base surface.
         offsets: (k,) labels, evenly spaced offsets of log depth.
-        options: Options of stereo.
 
     Returns:
         Log depth and matching cost, both (h, w).
     """
     base = np.where(view.usable, np.exp(surface), np.float32(0))
     costs = np.empty((len(sources), len(offsets), *base.shape), np.uint8)
-    noise_variance = (options.grey_noise / 255) ** 2
+    noise_variance = (_GRAY_NOISE / 255) ** 2
     for source, source_costs in zip(sources, costs, strict=True):
         compute_ncc_costs(
             view.gray,
@@ -105,35 +118,33 @@ def _sweep(
             offsets,
             source.gray,
             *source.pixels_from(view),
-            options.window_radius,
+            _WINDOW_RADIUS,
             noise_variance,
             source_costs,
         )
     merged = np.empty((*base.shape, len(offsets)), np.float32)
-    merge_view_costs(costs, options.view_share, _UNSEEN_COST, merged)
+    merge_view_costs(costs, _MERGED_VIEW_RATIO, _UNSEEN_COST, merged)
     change = (surface - view.log_depth)[..., None] + offsets.astype(np.float32)
     deviation = change / view.log_std[..., None]
-    unary = merged + np.float32(options.prior_weight) * np.minimum(deviation**2, _MAX_PRIOR)
-    reach = _search_range(view, options)[..., None] + (offsets[1] - offsets[0])
+    unary = merged + np.float32(_PRIOR_WEIGHT) * np.minimum(deviation**2, _MAX_PRIOR)
+    reach = _search_range(view)[..., None] + (offsets[1] - offsets[0])
     unary[np.abs(change) > reach] = _OUT_OF_RANGE_COST
     total = np.zeros_like(merged)
-    penalties = options.small_step, options.large_step
+    penalties = _SMALL_STEP_PENALTY, _LARGE_STEP_PENALTY
     aggregate_costs(unary.astype(np.float32), view.gray, *penalties, _GRAY_EDGE, total)
     offset, cost = np.empty_like(base), np.empty_like(base)
     select_labels(total, merged, offsets, offset, cost)
     return surface + offset, cost
 
 
-def _search_range(view: DenseView, options: DenseOptions) -> Float32:
+def _search_range(view: DenseView) -> Float32:
     """Compute the half width (h, w) of the search range in log depth.
 
     Pixels with a lower std than the median use the median. Holes reach all labels.
     """
     known = view.log_std[view.log_std < UNKNOWN_LOG_STD]
     median_std = np.median(known) if len(known) else UNKNOWN_LOG_STD
-    reach: Float32 = np.float32(options.range_stds) * np.maximum(
-        view.log_std, np.float32(median_std)
-    )
+    reach: Float32 = np.float32(_RANGE_STDS) * np.maximum(view.log_std, np.float32(median_std))
     return reach
 
 
