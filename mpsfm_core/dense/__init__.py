@@ -1,1 +1,1 @@
-"""Dense geometry of a reconstruction: stereo depth with variance, fusion, mesh."""
+"""Dense geometry of a reconstruction: multi-view stereo, depth map fusion and meshing."""

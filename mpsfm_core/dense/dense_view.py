@@ -14,7 +14,7 @@ from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 
 
 def dense_grid_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
-    """Return (width, height) of the grid for an image; `max_size` limits the longer side."""
+    """Compute (width, height) of the stereo grid of an image, at most `max_size` long."""
     factor = min(1.0, max_size / max(size))
     return max(2, round(size[0] * factor)), max(2, round(size[1] * factor))
 
@@ -24,11 +24,11 @@ class PosedGrid:
     """Pixel grid with intrinsics and pose."""
 
     camera: PinholeCamera
-    """Intrinsics of the grid."""
+    """Intrinsics on the stereo grid."""
     rotation: Float64
-    """(3, 3) rotation of ``cam_from_world``."""
+    """(3, 3) rotation of the pose ``cam_from_world``."""
     translation: Float64
-    """(3,) translation of ``cam_from_world``, world units."""
+    """(3,) translation of the pose ``cam_from_world``, world units."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -36,13 +36,14 @@ class PosedGrid:
         return self.camera.height, self.camera.width
 
     def pixels_from(self, source: PosedGrid) -> tuple[Float64, Float64]:
-        """Return the projection of another grid's pixels, ``d * matrix @ (x, y, 1) + offset``.
+        """Compute the matrix and offset that project pixels with depth from another grid.
 
         Args:
-            source: Grid with the pixel (x, y) at depth d.
+            source: Grid of the pixels (x, y) with z-depth d.
 
         Returns:
-            Matrix (3, 3) and offset (3,). The sum is a homogeneous pixel of this grid.
+            Matrix (3, 3) and offset (3,); ``d * matrix @ (x, y, 1) + offset`` is a homogeneous
+            pixel of this grid.
         """
         rotation = self.rotation @ source.rotation.T
         translation = self.translation - rotation @ source.translation
@@ -52,14 +53,14 @@ class PosedGrid:
 
 @dataclass(frozen=True, eq=False)
 class DenseView(PosedGrid):
-    """Undistorted view with its known depth on one grid."""
+    """Undistorted view and its refined depth, resampled to the stereo grid."""
 
     gray: Float32
-    """(h, w) gray values in [0, 1]."""
+    """(h, w) gray values of the view in [0, 1]."""
     usable: Bool
-    """(h, w) mask, False at masked pixels."""
+    """(h, w) mask of pixels that neither the user nor the undistortion masks."""
     log_depth: Float32
-    """(h, w) natural logarithm of the known depth in world units; holes are filled from around."""
+    """(h, w) natural log of the known depth in world units; neighboring pixels fill holes."""
     log_std: Float32
     """(h, w) std of ``log_depth``; ``UNKNOWN_LOG_STD`` in holes."""
 
@@ -70,7 +71,7 @@ class DenseView(PosedGrid):
         Args:
             image: Registered image with pose and depth map.
             view: Undistorted view of the image.
-            max_size: Maximum of the longer side in pixels.
+            max_size: Maximum length of the grid's longer side in pixels.
         """
         rows, columns = view.image.shape[:2]
         width, height = dense_grid_size((columns, rows), max_size)
@@ -90,7 +91,7 @@ class DenseView(PosedGrid):
         )
 
     def downsample(self, factor: int) -> DenseView:
-        """Return the view on a grid with `factor` times fewer rows and columns."""
+        """Downsample the view to `factor` times fewer rows and columns."""
         if factor == 1:
             return self
         width, height = (max(2, size // factor) for size in self.camera.size)
@@ -106,7 +107,7 @@ class DenseView(PosedGrid):
 
     @property
     def grid(self) -> PosedGrid:
-        """Intrinsics and pose without pixel data."""
+        """Intrinsics and pose of the grid without pixel data."""
         return PosedGrid(self.camera, self.rotation, self.translation)
 
 
@@ -114,15 +115,15 @@ def resample_known_depth(depth: DepthPrior, width: int, height: int) -> tuple[Fl
     """Resample a depth map and its std in log depth to a grid.
 
     Linear interpolation across a depth edge would give a depth on neither surface. The nearest
-    sample replaces the interpolated value if both differ by more than the std, and next to holes.
+    sample replaces an interpolated value next to holes, or if both differ by more than the std.
 
     Args:
         depth: Refined depth map with variance.
-        width: Columns of the grid.
-        height: Rows of the grid.
+        width: Number of columns of the grid.
+        height: Number of rows of the grid.
 
     Returns:
-        Log depth and its std, both (h, w).
+        Natural log of depth and its std, both (h, w).
     """
     log_depth, log_std = _log_depth_and_std(depth)
     smooth, smooth_std = (resize_map(map_, width, height) for map_ in (log_depth, log_std))
@@ -136,7 +137,7 @@ def resample_known_depth(depth: DepthPrior, width: int, height: int) -> tuple[Fl
 
 def _log_depth_and_std(depth: DepthPrior) -> tuple[Float32, Float32]:
     """Return log depth without holes and its std, both (h, w)."""
-    assert depth.variance is not None  # a refined map always has a variance
+    assert depth.variance is not None  # The mapper sets this variance.
     valid = depth.valid
     if not valid.any():
         zero = np.zeros(depth.shape, np.float32)

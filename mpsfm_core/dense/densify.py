@@ -59,48 +59,48 @@ _MATCH_STD_PX = 0.5
 _MAX_COST = 0.9
 """Maximum matching cost of a measured pixel; textureless images match anything [ours]."""
 _MAX_SPLAT_STDS = 1.5
-"""Largest deviation of splatted depth from the known depth, in stds of the latter.
+"""Maximum difference of splatted and known depth, in stds of the known depth [ours].
 
-Splatted depth beyond may belong to a surface past an edge [ours]."""
+A larger difference may mean that the splatted depth belongs to a surface past an edge."""
 _MAX_SPLAT_VIEWS = 16
 """Maximum number of views whose depth is splatted into a view; bounds the run time."""
 _NUM_CACHED_NEIGHBORHOODS = 4
-"""Neighborhoods (a view and its sources) in the view cache; neighboring views share sources."""
+"""Capacity of the view cache, as number of views with their source views."""
 _SPLAT_STD_FACTOR = 3.0
 """Std of splatted depth relative to the std of matched depth [ours]."""
 
 
 @dataclass(frozen=True)
 class DenseReport:
-    """Result of densification per image."""
+    """Source views, confirmed ratios and stereo masks of all densified images."""
 
     sources: dict[str, list[str]]
-    """Image name -> names of its source images."""
+    """Image name -> names of the source images of its stereo depth."""
     confirmed: dict[str, float]
-    """Image name -> ratio of pixels whose depth another view confirms, in [0, 1]."""
+    """Image name -> ratio of pixels whose stereo depth another view confirms, in [0, 1]."""
     measured: dict[str, Bool]
     """Image name -> (h, w) mask of pixels whose depth comes from stereo."""
 
     def describe(self) -> dict[str, Any]:
-        """Return the entries of `summary.json`."""
+        """Return the densification entries of `summary.json`."""
         return {"sources": self.sources, "confirmed": self.confirmed}
 
 
 class ArrayStore(Protocol):
-    """Storage of large arrays, in memory or on disk."""
+    """Function that stores large arrays in memory or on disk."""
 
     def __call__(self, array: NDArray[_T]) -> NDArray[_T]:
-        """Store an array and return an array of equal values."""
+        """Store an array in memory or on disk and return an array of equal values."""
         ...
 
 
 def store_in_memory(array: NDArray[_T]) -> NDArray[_T]:
-    """Return the array itself."""
+    """Return the array itself, which stays in memory."""
     return array
 
 
 class StereoCheckpoints(Protocol):
-    """Storage of stereo depth per image, so that an interrupted run can resume."""
+    """Storage of the stereo depth of each image, so that an interrupted run can resume."""
 
     def load(self, name: str) -> StereoDepth | None:
         """Return the stereo depth of an image, or None.
@@ -131,10 +131,10 @@ def densify(
         reconstruction: Posed images with refined depth maps.
         view_of: Returns the undistorted view of an image name.
         options: Options of stereo and fusion.
-        workers: Number of threads; None uses the limit of the run.
-        progress: Called with the number of matched images and the total.
-        checkpoints: Stores stereo depth for an interrupted run.
-        store_array: Stores large maps, including those of the result. Several threads call it.
+        workers: Number of threads; None uses the thread limit of the process.
+        progress: Called with the number of images with stereo depth and the number of all images.
+        checkpoints: Stores stereo depth, so that an interrupted run can resume.
+        store_array: Stores large maps, including the depth maps of the result; must be thread-safe.
         poses_use_depth: True if depth priors of these images constrained the poses. The scales of
             image pairs may then depend on the priors alone, which adds a scale variance.
 
@@ -221,7 +221,7 @@ def _confirmed_ratio(consistency: GeometricConsistency | None) -> float:
 
 
 class _ViewCache:
-    """Loads views on the grid of densification on demand and caches the latest."""
+    """Cache that loads views on the stereo grid on demand."""
 
     def __init__(
         self,
@@ -241,33 +241,33 @@ class _ViewCache:
 
 
 class _MatchedImage(NamedTuple):
-    """Stereo depth of an image as the later stages need it."""
+    """Stereo depth of an image for the consistency check and the fusion."""
 
     grid: PosedGrid
     log_depth: Float32
-    """(h, w) log depth."""
+    """(h, w) natural log of the stereo depth in world units."""
     parallax: Float32
     """:attr:`StereoDepth.parallax`."""
     supported: Bool
     """(h, w) mask of unmasked pixels with a low matching cost."""
 
     def log_std(self, std_px: float | Float32) -> Float32:
-        """Convert the std of a match in pixels to the std of log depth, (h, w)."""
+        """Convert the std of a match in pixels to the std of log depth (h, w)."""
         std: Float32 = np.float32(std_px) / self.parallax_px
         return std
 
     @property
     def parallax_px(self) -> Float32:
-        """(h, w) pixels that a point moves per unit of log depth."""
+        """(h, w) pixels that a projection in the source views moves per unit of log depth."""
         return resize_map(self.parallax, *self.grid.camera.size)
 
     def posed_depth(self) -> PosedDepth:
-        """Return the depth map with its pose and nominal std."""
+        """Return the stereo depth map with its pose and nominal std."""
         return PosedDepth(self.grid, self.log_depth, self.log_std(_MATCH_STD_PX))
 
 
 def _symmetric_neighbors(sources: Sequence[Sequence[int]]) -> list[list[int]]:
-    """Return for each view its sources and the views that have it as a source, sorted."""
+    """Return for each view the source views, and the views that use the view as source."""
     neighbors = [set(views) for views in sources]
     for row, views in enumerate(sources):
         for view in views:
@@ -278,7 +278,7 @@ def _symmetric_neighbors(sources: Sequence[Sequence[int]]) -> list[list[int]]:
 def _compare_with_views(
     row: int, matched: Mapping[int, _MatchedImage], views: Sequence[int]
 ) -> dict[int, DepthDifferences]:
-    """Compare the supported depth of an image with the depth maps of other views."""
+    """Compare the low-cost stereo depth of an image with the depth maps of other views."""
     depth = matched[row].posed_depth()
     return {
         view: compare_depths(depth, matched[view].posed_depth()).where(matched[row].supported)
@@ -314,10 +314,10 @@ def _merge_stereo_depth(
     consistency: Mapping[int, GeometricConsistency],
     neighbors: Sequence[int],
 ) -> LogDepthMap:
-    """Merge the consistent depth of an image with depth splatted from its neighbors.
+    """Merge the consistent stereo depth of an image with depth projected from neighbors.
 
-    Pixels that other views confirm use their own depth. The other pixels use confirmed depth of
-    neighbors if it is close to the known depth.
+    Pixels that another view confirms use the stereo depth of the image. Unconfirmed pixels use the
+    confirmed depth of neighbors if this depth is close to the known depth.
     """
     image, confirmed = matched[row], consistency[row].confirmed
     log_depth = image.log_depth + consistency[row].mean_change
@@ -345,7 +345,7 @@ def _replace_depth(
     scale_std: float,
     store_array: ArrayStore,
 ) -> RegisteredImage:
-    """Return the image with a new depth map; `scale_std` is the std of its log scale."""
+    """Replace the depth map of an image; `scale_std` is the std of the map's log scale."""
     depth = np.exp(posterior.log_depth)
     variance = (posterior.log_std**2 + np.float32(scale_std**2)) * depth**2
     prior = DepthPrior.from_arrays(depth, variance, view.usable, metric=image.depth.metric)

@@ -1,9 +1,9 @@
-"""Depth completion: correct known depth where stereo measured nothing.
+"""Depth completion: correct known depth at pixels without stereo measurement.
 
 Two assumptions constrain a pixel without measurement. The ratio of known to true depth is smooth
 and close to 1. Surfaces are planar, and inverse depth of a plane is linear in the image. Measured
-pixels estimate the variance of both assumptions. Both are linear in the ratio, and so are the
-measurements: completion is one sparse linear least-squares problem.
+pixels estimate the variance of both assumptions. Both assumptions and the measurements are linear
+in the ratio, so completion is one sparse linear least-squares problem.
 """
 
 from __future__ import annotations
@@ -18,40 +18,40 @@ from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.geometry.statistics import ONE_SIGMA
 
 _MAX_CORRECTION = 1.0
-"""Largest correction of log depth; extrapolated planes reach beyond infinity [ours]."""
+"""Maximum correction of log depth; extrapolated planes can reach infinite depth [ours]."""
 
 
 class MeasuredCorrection(NamedTuple):
     """Measured corrections of the known depth on a coarse grid."""
 
     change: Float32
-    """(h, w) from known to measured log depth."""
+    """(h, w) measured minus known log depth."""
     precision: Float32
-    """(h, w) inverse variance of the change, 0 where nothing was measured."""
+    """(h, w) inverse variance of ``change``, 0 at pixels without measurement."""
 
 
 class PlanarityPrior(NamedTuple):
     """Gaussian prior on second differences of inverse depth, relative to inverse depth."""
 
     bends: csr_array
-    """(m, n) maps the n ratios of known to true depth to m relative second differences."""
+    """(m, n) matrix from the n ratios of known to true depth to m relative second differences."""
     weight: Float64
-    """(m,) inverse variance of each second difference."""
+    """(m,) inverse variance of each relative second difference of inverse depth."""
 
 
 def estimate_planarity(
     log_depth: Float32, hole: Bool, correction: MeasuredCorrection, min_std: float
 ) -> PlanarityPrior:
-    """Estimate how planar the surfaces of an image are.
+    """Estimate the weights of the planarity prior from the measured depth of an image.
 
-    The std is that of measured second differences. If the known map bends as much, there may be an
-    edge, and the weight is halved. The rim of a hole shows no edges, so its weight is 0. Without
-    measurements all weights are 0.
+    The std of a second difference is the std of measured second differences. If the known depth has
+    an equally large second difference, an edge is likely and the weight is halved. Edges at the rim
+    of a hole cannot be detected, so the weight there is 0. Without measurements all weights are 0.
 
     Args:
-        log_depth: (h, w) known log depth; holes are filled from around.
+        log_depth: (h, w) known log depth; neighboring pixels fill holes.
         hole: (h, w) mask of pixels without known depth.
-        correction: Measured corrections on the same grid.
+        correction: Measured corrections on the grid of the known depth.
         min_std: Minimum std of log depth.
     """
     second = _second_differences(*log_depth.shape)
@@ -76,13 +76,13 @@ def solve_depth_correction(
     """Solve for the correction of the known log depth at every pixel.
 
     Args:
-        field: Gaussian Markov random field of the ratio of known to true depth: couplings with the
-            east and south neighbor and with 1, each (h, w).
+        field: Precisions of the Gaussian Markov random field of the ratio of known to true depth,
+            each (h, w): coupling with the east neighbor, with the south neighbor, and with 1.
         planarity: Planarity prior of the image.
         measured: Measured corrections.
 
     Returns:
-        (h, w) change of log depth.
+        (h, w) correction of the known log depth.
     """
     height, width = measured.change.shape
     east, south, mass = (each.astype(np.float64) for each in field)
@@ -109,15 +109,15 @@ def solve_depth_correction(
 
 
 def _differences(n: int) -> csr_array:
-    """Build the operator of forward differences, (n - 1, n)."""
+    """Build the matrix (n - 1, n) of forward differences of n values."""
     return csr_array(eye_array(n - 1, n, k=1) - eye_array(n - 1, n))
 
 
 def _second_differences(height: int, width: int) -> csr_array:
-    """Build the operator of all second differences, (m, n) for n pixels.
+    """Build the matrix (m, n) of all second differences of a map with n pixels.
 
-    Rows, columns and mixed differences are weighted so that the sum of squares is invariant to
-    rotation (the Frobenius norm of the Hessian).
+    The weights of row, column and mixed differences make the sum of squares invariant to rotation
+    (Frobenius norm of the Hessian).
     """
     down, across = _differences(height), _differences(width)
     rows = kron(eye_array(height), _differences(width - 1) @ across)

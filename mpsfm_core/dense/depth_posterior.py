@@ -1,9 +1,10 @@
 """Gaussian fusion of stereo depth with known depth, and the posterior std.
 
-:mod:`mpsfm_core.dense.depth_completion` corrects known depth where stereo measured nothing. The
-error of known log depth is a Gaussian Markov random field (Lindgren et al., 2011) on the pixels.
-Its posterior std is the declared std far from measurements and lower near them. Planarity does not
-lower the std, because unmeasured surfaces often start behind an edge.
+:mod:`mpsfm_core.dense.depth_completion` corrects known depth at pixels without stereo measurement.
+The error of known log depth is a Gaussian Markov random field (Lindgren et al., 2011) on the
+pixels. The posterior std of known depth is the declared std far from stereo measurements and lower
+near measurements. Planarity does not lower the std, because unmeasured surfaces often start behind
+an edge.
 """
 
 from __future__ import annotations
@@ -25,37 +26,37 @@ from mpsfm_core.optimize.depth_variance import compute_inverse_diagonal
 _DOWNSAMPLING = 8
 """Downsampling factor of the grid of the random field."""
 _MIN_MEASURED_RATIO = 0.3
-"""Minimum ratio of measured pixels in a block; single pixels may be coincidental [ours]."""
+"""Minimum ratio of stereo pixels in a block; single pixels may match by chance [ours]."""
 _MIN_KNOWN_ERROR_RATIO = 0.5
-"""Minimum ratio of the known depth's error to its distance from measured depth.
+"""Minimum ratio of the known depth's std to its distance from measured depth [ours].
 
-The std of the measured depth is not exact to better than an eighth [ours]."""
+The relative accuracy of the measured depth's std is about 1/8."""
 MIN_STD = 1e-4
-"""Minimum std of log depth; no sensor is more exact."""
+"""Minimum std of log depth, more accurate than any sensor."""
 UNKNOWN_LOG_STD = 1.0
-"""Std of log depth in holes, where the value comes from the surroundings."""
+"""Std of log depth in holes, whose depth is filled from neighboring pixels."""
 
 
 class LogDepthMap(NamedTuple):
-    """Log depth with std."""
+    """Map of log depth with std."""
 
     log_depth: Float32
-    """(h, w) log depth."""
+    """(h, w) natural log of z-depth in world units."""
     log_std: Float32
-    """(h, w) std of the log depth, infinite where nothing was measured."""
+    """(h, w) std of the log depth, infinite at pixels without depth."""
 
     @property
     def known(self) -> Bool:
-        """(h, w) mask of pixels with a finite std."""
+        """(h, w) mask of pixels whose std is finite."""
         return np.isfinite(self.log_std)
 
 
 def fuse_known_depth(measured: LogDepthMap, known: LogDepthMap) -> LogDepthMap:
     """Fuse measured depth with known depth at the same pixels.
 
-    The variance of the known depth is estimated from its distance to the measured depth, minus the
-    variance of the latter. The estimate may be far below the declared variance, so that depth of a
-    sensor keeps its accuracy. Holes of the known depth are ignored.
+    The variance of the known depth is estimated as its mean squared distance to the measured depth
+    minus the variance of the measured depth. The estimate may be far below the declared variance,
+    so that depth of a sensor keeps its accuracy. Holes of the known depth are ignored.
     """
     compared = measured.known & (known.log_std < UNKNOWN_LOG_STD)
     if not compared.any():
@@ -83,8 +84,8 @@ def compute_depth_posterior(
     """Compute log depth and std at every pixel from known and measured depth.
 
     Args:
-        known: Known depth before stereo, without holes.
-        measured: Stereo depth, fused with known depth.
+        known: Depth before stereo; neighboring pixels fill holes.
+        measured: Stereo depth after :func:`fuse_known_depth`.
         correlation_px: Correlation length of the error of known depth in pixels.
     """
     height, width = known.log_depth.shape
@@ -116,7 +117,7 @@ def compute_depth_posterior(
 
 
 def _calibrated_std(known: LogDepthMap, measured: LogDepthMap, std: Float32) -> Float32:
-    """Scale a declared std, on any grid, to the distances between known and measured depth.
+    """Scale a declared std so that it fits the distances between known and measured depth.
 
     Holes stay unknown.
     """
@@ -129,9 +130,9 @@ def _calibrated_std(known: LogDepthMap, measured: LogDepthMap, std: Float32) -> 
 
 
 def _error_correlation(pixel_std: Float32, block_std: Float32) -> Float32:
-    """Return the assumed error correlation of a pixel with its block, in [0, 1].
+    """Return the assumed correlation of a pixel's error with its block, in [0, 1].
 
-    The correlation is low if the stds differ much.
+    The correlation is low if the stds of pixel and block differ much.
     """
     correlation: Float32 = np.minimum(pixel_std / block_std, block_std / pixel_std) ** 2
     return correlation

@@ -1,4 +1,4 @@
-"""Depth prior from sparse points, for models without depth maps."""
+"""Depth prior from the sparse points of an image, for COLMAP models without depth maps."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import numpy as np
 from mpsfm_core.data import DepthPrior, Float64
 
 _GRID = (8, 8)
-"""Shape of the map. The map is constant, so the shape has no influence."""
+"""Shape of the prior's depth map; the map is constant, so the shape has no influence."""
 _RANGE_PERCENTILES = (2.0, 98.0)
-"""Percentiles of the point depths that bound the range; points outside may be outliers."""
+"""Percentiles of the point depths that bound the depth range; points outside may be outliers."""
 _RANGE_STDS = 1.5
-"""Half width of the range in stds. Stereo searches slightly further."""
+"""Half width of the depth range in stds; the search range of stereo is slightly wider."""
 _MIN_LOG_STD = 0.1
-"""Minimum std of log depth."""
+"""Minimum std of the prior's log depth."""
 
 
 def depth_prior_from_points(depths: Float64) -> DepthPrior | None:
@@ -23,7 +23,7 @@ def depth_prior_from_points(depths: Float64) -> DepthPrior | None:
         depths: (n,) depths of the points in the camera frame, world units.
 
     Returns:
-        The prior, or None without points in front of the camera.
+        The depth prior, or None without points in front of the camera.
     """
     positive = depths[depths > 0]
     if not len(positive):

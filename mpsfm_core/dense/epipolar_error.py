@@ -1,9 +1,9 @@
-"""Pose errors of image pairs, measured as patch offsets from epipolar lines.
+"""Pose errors of image pairs, measured as offsets of matched patches from epipolar lines.
 
 The depth of a pixel moves its projection along the epipolar line only. The offset of a matched
-patch perpendicular to the line is therefore a pose error. Pose errors along the line are invisible,
-because the matched depth absorbs them. If few patches match at all, both images hardly show the
-same surface.
+patch perpendicular to the epipolar line is therefore a pose error. Pose errors along the epipolar
+line are not observable, because the stereo depth absorbs them. If few patches match, the two images
+hardly show the same surface.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from mpsfm_core.geometry.statistics import ONE_SIGMA
 MAX_PATCHES = 100
 """Maximum number of patches per image pair [ours]."""
 PATCH_RADIUS_PX = 7
-"""Radius of a patch and largest offset of a match, in pixels of the depth map [ours]."""
+"""Patch radius and maximum offset of a match, in pixels of the depth map [ours]."""
 MIN_CORRELATION = 0.8
-"""Minimum NCC of a matched patch [ours]."""
+"""Minimum normalized cross-correlation (NCC) of a matched patch [ours]."""
 _NOISE_CORRELATION_PX = 1.5
-"""Correlation length of the noise of a downsampled image, in pixels."""
+"""Correlation length of the image noise after downsampling, in pixels."""
 _LOG_DEPTH_STEP = 1e-2
 """Step of log depth for the numeric direction of the epipolar line."""
 
@@ -34,13 +34,13 @@ class PatchOffsets(NamedTuple):
     """Offsets of matched patches from their epipolar lines."""
 
     epipolar_px: Float64
-    """(n,) signed distance of each matched patch from its line, pixels of the source view."""
+    """(n,) signed distances of matched patches to epipolar lines, pixels of the source view."""
     matched_ratio: float
-    """Ratio of patches that match, in [0, 1]."""
+    """Ratio of the sampled patches that match, in [0, 1]."""
 
 
 def estimate_pose_error_px(pairs: Iterable[PatchOffsets]) -> float:
-    """Return the std of the epipolar offsets of an image's pairs in pixels; 0 without matches."""
+    """Estimate the std of epipolar offsets over image pairs in pixels; 0 without matches."""
     offsets = np.abs(np.concatenate([np.zeros(0), *(pair.epipolar_px for pair in pairs)]))
     return float(np.quantile(offsets, ONE_SIGMA)) if len(offsets) else 0.0
 
@@ -48,7 +48,7 @@ def estimate_pose_error_px(pairs: Iterable[PatchOffsets]) -> float:
 def measure_patch_offsets(
     view: DenseView, log_depth: Float32, source: DenseView, mask: Bool
 ) -> PatchOffsets:
-    """Match patches of a view near their projections in a source view.
+    """Match patches of a reference view near their projections in a source view.
 
     Args:
         view: Reference view.

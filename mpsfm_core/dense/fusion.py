@@ -21,12 +21,13 @@ from mpsfm_core.support.threads import parallel_map
 _MAX_NEIGHBORS = 8
 """Maximum number of images that vote on the points of one image, by overlap."""
 _MIN_PIXEL_RATIO = 0.25
-"""Ratio of the most certain pixels that always pass; networks may declare large stds [ours]."""
+"""Ratio of the pixels with the lowest std that always pass; networks may declare large stds
+[ours]."""
 _DUPLICATE_DISTANCE = 0.02
-"""Relative distance up to which consistent points are duplicates, whatever their std [ours]."""
+"""Relative distance below which consistent points are duplicates at any std [ours]."""
 _DOMINANT_STD_RATIO = 0.5
-"""Std ratio below which the more certain of two consistent points replaces the other at any
-distance [ours]."""
+"""Ratio of two stds below which the more certain of two consistent points is used at any distance
+[ours]."""
 
 _T = TypeVar("_T")
 
@@ -35,26 +36,26 @@ class _ConsistencyVotes(NamedTuple):
     """Votes of neighboring images on n points of one image."""
 
     consistent: Bool
-    """(n,) mask of points that at least as many images confirm as see through."""
+    """(n,) mask of points that as many images confirm as contradict, or more."""
     duplicate: Bool
-    """(n,) mask of points that a more certain image shows too."""
+    """(n,) mask of points that an image with lower depth std also contains."""
     views: UInt8
-    """(n,) number of images that agree, including the point's own."""
+    """(n,) number of images with consistent depth, including the image of the point."""
 
 
 class FusedPointCloud(NamedTuple):
-    """Point cloud with n points."""
+    """Fused point cloud with n points."""
 
     points: Float64
-    """(n, 3) float64 positions, world frame."""
+    """(n, 3) float64 positions of the points, world frame."""
     colors: UInt8
-    """(n, 3) uint8 RGB."""
+    """(n, 3) uint8 RGB colors of the points."""
     normals: Float32
     """(n, 3) float32 unit normals facing the camera of the point, world frame; 0 if undefined."""
     std: Float32
-    """(n,) float32 std of the depth, world units."""
+    """(n,) float32 std of each point's depth, world units."""
     views: UInt8
-    """(n,) uint8 number of images whose depth agrees, including the point's own (>= 1)."""
+    """(n,) uint8 number of images with consistent depth, including the image of the point."""
 
 
 def fuse_depth_maps(
@@ -63,7 +64,7 @@ def fuse_depth_maps(
     options: ResultOptions,
     seed: int = 0,
 ) -> FusedPointCloud:
-    """Fuse depth maps into one cloud; duplicates are taken from the most certain image.
+    """Fuse depth maps into one point cloud; the point with the lowest std replaces duplicates.
 
     Uncertain pixels, inconsistent pixels and images without confirmed pose are left out. If the
     cloud exceeds `options.dense_max_points`, each map is subsampled randomly.
@@ -72,7 +73,7 @@ def fuse_depth_maps(
         reconstruction: Posed images with depth maps.
         view_of: Returns the undistorted view of an image name, for the colors.
         options: Options of the results.
-        seed: Seed of the subsampling.
+        seed: Seed of the random subsampling.
     """
     images = reconstruction.confirmed_images
 
@@ -122,7 +123,8 @@ def _vote_on_images(
     Args:
         images: Images with confirmed poses.
         options: Options of the results.
-        select: Called with the image's row, its certain pixels (flat indices) and their votes.
+        select: Called with the image's index, the flat indices of its certain pixels, and their
+            votes.
     """
     max_relative_std = max(options.dense_max_relative_std, _relative_std_of_best_pixels(images))
     usable = [_certain_pixels(image, max_relative_std) for image in images]
@@ -148,7 +150,7 @@ _EMPTY = FusedPointCloud(
 
 
 def _relative_std_of_best_pixels(images: Sequence[RegisteredImage]) -> float:
-    """Return the relative std at the `_MIN_PIXEL_RATIO` quantile, median over the images."""
+    """Compute the median over images of the `_MIN_PIXEL_RATIO` quantile of relative depth std."""
     quantiles = [
         np.quantile(np.sqrt(_variance(image)[valid]) / image.depth.depth[valid], _MIN_PIXEL_RATIO)
         for image in images
@@ -158,18 +160,18 @@ def _relative_std_of_best_pixels(images: Sequence[RegisteredImage]) -> float:
 
 
 def _certain_pixels(image: RegisteredImage, max_relative_std: float) -> Bool:
-    """Return the mask (h, w) of valid pixels with a low relative std."""
+    """Return the mask (h, w) of valid depth pixels with a low relative std."""
     certain: Bool = _variance(image) <= (max_relative_std * image.depth.depth) ** 2
     return certain & image.depth.valid
 
 
 def _variance(image: RegisteredImage) -> Float32:
-    assert image.depth.variance is not None  # a refined map always has a variance
+    assert image.depth.variance is not None  # The mapper sets this variance.
     return image.depth.variance
 
 
 def _unproject_pixels(image: RegisteredImage, pixels: Int64) -> tuple[Float64, Float64]:
-    """Return world points (n, 3) and depth variances (n,) of flat pixel indices."""
+    """Unproject flat pixel indices to world points (n, 3) with depth variances (n,)."""
     height, width = image.depth.shape
     camera = image.camera.resized(width, height)
     xy = pixel_centers(width, height).reshape(-1, 2)[pixels]
@@ -184,12 +186,13 @@ def _vote_on_points(
     voters: Sequence[tuple[RegisteredImage, Bool, bool]],
     sigmas: float,
 ) -> _ConsistencyVotes:
-    """Count which images confirm, see through or duplicate the points of one image.
+    """Count the images that confirm, contradict or duplicate the points of one image.
 
     Args:
         points: (n, 3) world points.
-        variance: (n,) variance of their depth.
-        voters: Other images, masks of their certain pixels, and whether they win ties of variance.
+        variance: (n,) variance of the points' depth.
+        voters: Neighboring images, masks of their certain pixels, and True if the image wins at
+            equal variance.
         sigmas: Largest difference of consistent depths in stds.
     """
     votes = np.zeros(len(points), np.int64)

@@ -19,15 +19,16 @@ from mpsfm_core.support.jit import kernel
 _MAX_DIFFERENCE_STDS = 3.0
 """Largest difference of consistent depths in stds."""
 _MIN_TOLERANCE, _MAX_TOLERANCE = 0.005, 0.05
-"""Bounds of the tolerance in log depth, for inexact poses and large stds [ours]."""
+"""Minimum and maximum tolerance of log depth differences, for inexact poses and large stds
+[ours]."""
 _ERROR_CORRELATION = 0.3
 """Correlation of the errors of consistent depth maps [tuned: benchmarks.dense]."""
 _COINCIDENCE_RATIO = 0.5
-"""Ratio of near misses to agreements above which all agreements may be coincidental [ours]."""
+"""Ratio of near misses to consistent pixels above which the consistency may be chance [ours]."""
 _MIN_PATCH_RATIO = 0.25
-"""Minimum ratio of matched patches that proves a pair with many near misses.
+"""Minimum ratio of matched patches that confirms an image pair with many near misses [ours].
 
-Pairs with correct poses reach 0.2 to 0.8 on hololens_room [ours]."""
+Pairs with correct poses reach 0.2 to 0.8 on the scene hololens_room."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,24 +36,27 @@ class GeometricConsistency:
     """Consistency of one depth map with the depth maps of other views."""
 
     views: NDArray[np.uint16]
-    """(h, w) number of views that agree. One suffices: two wrong depths rarely agree."""
+    """(h, w) number of views with consistent depth. A single consistent view confirms a pixel,
+    because two wrong depths are rarely equal."""
     mean_change: Float32
-    """(h, w) from this map's log depth to the mean of all consistent log depths."""
+    """(h, w) mean of all consistent log depths minus the log depth of the map."""
     match_std_px: float
-    """Std of a match in pixels, estimated from the differences; NaN without agreement."""
+    """Std of a stereo match in pixels, estimated from depth differences; NaN without consistent
+    pixels."""
     pose_std_px: float = 0.0
-    """Std that pose errors add, in pixels. The differences do not contain this error."""
+    """Std of a match from pose errors in pixels; depth differences do not contain this error."""
 
     @property
     def confirmed(self) -> Bool:
-        """(h, w) mask of pixels that at least one other view confirms."""
+        """(h, w) mask of pixels whose depth at least one other view confirms."""
         return self.views > 0
 
     @property
     def std_px(self) -> Float32:
         """(h, w) std of the mean of consistent depths in pixels.
 
-        Errors of the maps are correlated: their differences underestimate the error of the mean.
+        The errors of depth maps are correlated, so depth differences underestimate the error of the
+        mean.
         """
         views = self.views.astype(np.float32)
         correlation = _ERROR_CORRELATION
@@ -62,11 +66,11 @@ class GeometricConsistency:
 
 
 class PosedDepth(NamedTuple):
-    """Depth map with its pose."""
+    """Depth map of a view with pose and std."""
 
     grid: PosedGrid
     log_depth: Float32
-    """(h, w) log depth."""
+    """(h, w) natural log of z-depth in world units."""
     log_std: Float32
     """(h, w) std of the log depth."""
 
@@ -75,28 +79,28 @@ class DepthDifferences(NamedTuple):
     """Differences from a depth map to the depth map of another view."""
 
     log_depth: Float32
-    """(h, w) difference of log depth; NaN where both disagree or the other view sees no point."""
+    """(h, w) difference of log depth; NaN at inconsistent pixels and outside of the other view."""
     near_miss: Bool
-    """(h, w) mask of pixels that differ by one to two times the tolerance."""
+    """(h, w) mask of near misses, whose depths differ by one to two times the tolerance."""
 
     @property
     def agree(self) -> Bool:
-        """(h, w) mask of consistent pixels."""
+        """(h, w) mask of pixels whose depths are consistent."""
         return np.isfinite(self.log_depth)
 
     def where(self, usable: Bool) -> DepthDifferences:
-        """Return the differences of the usable pixels, mask (h, w)."""
+        """Return the depth differences within a mask (h, w)."""
         return DepthDifferences(
             np.where(usable, self.log_depth, np.float32(np.nan)), self.near_miss & usable
         )
 
     def is_coincidental(self, matched_patch_ratio: float) -> bool:
-        """Return True if the agreement may be coincidental.
+        """Return True if the consistency of two depth maps may be chance.
 
-        Coincidental agreement has as many near misses as agreements.
+        Consistency by chance has as many near misses as consistent pixels.
 
         Args:
-            matched_patch_ratio: Ratio of the agreeing patches whose appearance also matches.
+            matched_patch_ratio: Ratio of patches at consistent pixels whose gray values match.
         """
         near_miss, agree = int(self.near_miss.sum()), int(self.agree.sum())
         return near_miss > _COINCIDENCE_RATIO * agree and matched_patch_ratio < _MIN_PATCH_RATIO
@@ -114,12 +118,12 @@ def compare_depths(reference: PosedDepth, source: PosedDepth) -> DepthDifference
 def evaluate_consistency(
     parallax: Float32, differences: Iterable[Float32], pose_std_px: float = 0.0
 ) -> GeometricConsistency:
-    """Merge the differences to several views and estimate the std of a match.
+    """Merge the depth differences to several views and estimate the std of a match.
 
-    A difference contains the errors of two matches.
+    A depth difference contains the errors of two matches.
 
     Args:
-        parallax: (h, w) pixels that a point moves per unit of log depth.
+        parallax: (h, w) pixels that a projection moves per unit of log depth.
         differences: :attr:`DepthDifferences.log_depth` of each view, (h, w).
         pose_std_px: :attr:`GeometricConsistency.pose_std_px`.
     """
@@ -135,7 +139,7 @@ def evaluate_consistency(
 
 
 def splat_depth(grid: PosedGrid, sources: Iterable[tuple[PosedGrid, Float32, Bool]]) -> Float32:
-    """Project masked pixels of other views into a grid and keep the nearest depth per pixel.
+    """Project masked pixels of other views into a grid with a z-buffer (nearest depth wins).
 
     Args:
         grid: Target grid.
@@ -162,7 +166,7 @@ def _compare(
     differences: Float32,
     near_miss: Bool,
 ) -> None:
-    """Write differences and near misses; see :func:`compare_depths`."""
+    """Write log depth differences and near misses for :func:`compare_depths`."""
     height, width = log_depth.shape
     rows, columns = source.shape
     for i in range(height):
@@ -189,7 +193,7 @@ def _compare(
 
 @kernel()
 def _splat(depth: Float32, mask: Bool, matrix: Float64, offset: Float64, splatted: Float32) -> None:
-    """Project the masked log depths of one view; see :func:`splat_depth`."""
+    """Project the masked log depths of one view for :func:`splat_depth`."""
     height, width = depth.shape
     rows, columns = splatted.shape
     for i in range(height):

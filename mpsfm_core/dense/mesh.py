@@ -1,9 +1,8 @@
 """Triangle mesh from the depth maps of all images.
 
-The maps are integrated into a truncated signed distance field (TSDF; Curless and Levoy, SIGGRAPH
-1996), where the inverse variance weights each pixel. Blocks of the field exist only around
-surfaces, so that memory does not grow with the volume. Marching cubes of scikit-image extracts the
-triangles.
+Depth maps are integrated into a truncated signed distance field (TSDF) with inverse-variance
+weights [Curless and Levoy, SIGGRAPH 1996]. TSDF blocks exist only around surfaces, so that memory
+does not grow with the volume. Marching cubes of scikit-image extracts the triangles.
 """
 # mypy: allow-untyped-decorators
 
@@ -36,13 +35,14 @@ from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.support.jit import kernel
 
 _BLOCK_SIZE = 64
-"""Voxels along a side of a block."""
+"""Number of voxels along each side of a TSDF block."""
 _TRUNCATION_VOXELS = 3.0
-"""Minimum truncation distance in voxels: a cell and its neighbors."""
+"""Minimum truncation distance of the TSDF in voxels, a cell and its neighbors."""
 _TRUNCATION_STDS = 3.0
-"""Minimum truncation distance in stds of depth, so that noise does not split a surface."""
+"""Minimum truncation distance of the TSDF in depth stds, so that noise does not split a surface."""
 _MERGE_DISTANCE = 1e-3
-"""Distance in voxels below which vertices of neighboring blocks merge, above float32 rounding."""
+"""Distance in voxels below which vertices of neighboring TSDF blocks merge, above float32
+rounding."""
 _CORNERS = np.array(list(product((0.0, 1.0), repeat=3)))
 
 
@@ -50,11 +50,11 @@ class TriangleMesh(NamedTuple):
     """Triangle mesh with vertex colors."""
 
     vertices: Float64
-    """(n, 3) float64 positions, world frame."""
+    """(n, 3) float64 positions of the vertices, world frame."""
     triangles: Int64
-    """(m, 3) int64 vertex indices, counterclockwise as the cameras see them."""
+    """(m, 3) int64 vertex indices of the triangles, counterclockwise as seen by the cameras."""
     colors: UInt8
-    """(n, 3) uint8 RGB."""
+    """(n, 3) uint8 RGB colors of the vertices."""
 
 
 class _WeightedDepth(NamedTuple):
@@ -62,15 +62,15 @@ class _WeightedDepth(NamedTuple):
 
     image: RegisteredImage
     intrinsics: Float64
-    """(4,) fx, fy, cx, cy on the grid of the map."""
+    """(4,) intrinsics fx, fy, cx, cy in pixels of the depth map."""
     depth: Float32
-    """(h, w) depth, 0 at holes."""
+    """(h, w) z-depth in world units, 0 at holes."""
     weight: Float32
-    """(h, w) inverse variance, 0 at holes."""
+    """(h, w) inverse variance of depth, 0 at holes."""
 
     @property
     def points(self) -> Float64:
-        """World points of all pixels with depth, (n, 3)."""
+        """(n, 3) world points of all pixels with depth."""
         height, width = self.depth.shape
         valid = self.depth > 0
         xy = pixel_centers(width, height)[valid]
@@ -81,17 +81,18 @@ class _WeightedDepth(NamedTuple):
         return points
 
     def find_visible(self, vertices: Float64, tolerance: float) -> tuple[Int64, Float64]:
-        """Find the vertices on the surface of this depth map.
+        """Find the mesh vertices on the surface of the depth map.
 
-        Behind an object's edge the TSDF ends in a false wall: some images see past the edge, others
-        have no depth there. No depth map shows this wall.
+        Behind the edge of an object the TSDF has a false surface, because only some images have
+        depth there. No depth map contains this false surface, so its vertices are rejected.
 
         Args:
-            vertices: (n, 3) world positions.
-            tolerance: Minimum tolerance of depth, world units; the std may allow more.
+            vertices: (n, 3) positions of the vertices, world frame.
+            tolerance: Minimum depth tolerance in world units; the depth std may raise the
+                tolerance.
 
         Returns:
-            Vertex indices (k,) and their pixels (k, 2).
+            Indices (k,) of the vertices on the surface, and their pixels (k, 2).
         """
         height, width = self.depth.shape
         local = transform(self.image.rotation, self.image.translation, vertices)
@@ -104,7 +105,7 @@ class _WeightedDepth(NamedTuple):
         return rows, xy[rows]
 
     def may_see(self, low: Float64, high: Float64) -> bool:
-        """Return False only if the box between two world corners is certainly not in the image."""
+        """Return False if a box between two world corners certainly projects outside the image."""
         corners = low + _CORNERS * (high - low)
         local = transform(self.image.rotation, self.image.translation, corners)
         if (local[:, 2] <= 0).any():
@@ -171,7 +172,7 @@ def mesh_depth_maps(
 
 
 def _import_libraries() -> tuple[Any, Any]:
-    """Import `marching_cubes` and `simplify` of the optional dependencies."""
+    """Import `marching_cubes` (scikit-image) and `simplify` (fast-simplification)."""
     try:
         from fast_simplification import simplify
         from skimage.measure import marching_cubes
@@ -186,7 +187,7 @@ def _import_libraries() -> tuple[Any, Any]:
 def _weight_depth(image: RegisteredImage, mask: Bool) -> _WeightedDepth:
     height, width = image.depth.shape
     variance = image.depth.variance
-    assert variance is not None  # a refined map always has a variance
+    assert variance is not None  # The mapper sets this variance.
     min_variance = np.finfo(np.float32).tiny
     weight = np.where(mask, 1 / np.maximum(variance, min_variance), 0).astype(np.float32)
     depth = np.where(mask, image.depth.depth, 0).astype(np.float32)
@@ -194,10 +195,11 @@ def _weight_depth(image: RegisteredImage, mask: Bool) -> _WeightedDepth:
 
 
 def _find_surface_blocks(maps: Sequence[_WeightedDepth], voxel: float) -> Int64:
-    """Return the integer coordinates (b, 3) of the blocks with points, in a fixed order."""
+    """Return the sorted integer coordinates (b, 3) of the TSDF blocks that contain points."""
     blocks_per_map = [np.zeros((0, 3), np.int64)]
     for map_ in maps:
-        # A point at a face counts for both blocks, because the surface may pass on either side.
+        # A point at a block face counts for both blocks, because the surface may pass on either
+        # side.
         points = map_.points / (voxel * _BLOCK_SIZE)
         shifted = [np.floor(points + (corner - 0.5) / _BLOCK_SIZE) for corner in _CORNERS]
         blocks_per_map.append(np.unique(np.concatenate(shifted).astype(np.int64), axis=0))
@@ -231,9 +233,9 @@ def _extract_block_surface(
     if not (field[observed] < 0).any() or not (field[observed] > 0).any():
         return None
     try:
-        # Counterclockwise as seen from positive distances, the side of the cameras.
+        # Triangles are counterclockwise as seen from positive distances, the side of the cameras.
         vertices, triangles, *_ = marching_cubes(field, 0.0, mask=observed)
-    except (ValueError, RuntimeError):  # no fully observed cell contains a surface
+    except (ValueError, RuntimeError):  # There is no complete surface cell.
         return None
     return origin + voxel * vertices.astype(np.float64), triangles.astype(np.int64)
 
@@ -256,14 +258,14 @@ def _integrate(
     Args:
         origin: (3,) world position of the first voxel.
         voxel: Voxel size, world units.
-        rotation: (3, 3) of ``cam_from_world``.
+        rotation: (3, 3) rotation of ``cam_from_world``.
         translation: (3,) of ``cam_from_world``.
-        camera: (4,) fx, fy, cx, cy on the grid of the map.
-        depth: (h, w) depth, 0 at holes.
+        camera: (4,) intrinsics fx, fy, cx, cy in pixels of the depth map.
+        depth: (h, w) z-depth in world units, 0 at holes.
         pixel_weight: (h, w) weights.
-        truncation: Truncation distance, world units.
-        total: (n, n, n) weighted sum of signed distances, updated.
-        weight: (n, n, n) sum of weights, updated.
+        truncation: Truncation distance of the TSDF in world units.
+        total: (n, n, n) weighted sum of signed distances, updated in the call.
+        weight: (n, n, n) sum of weights, updated in the call.
     """
     height, width = depth.shape
     a, b, c = total.shape
@@ -295,7 +297,7 @@ def _integrate(
 def _merge_surfaces(
     surfaces: Sequence[tuple[Float64, Int64]], voxel: float
 ) -> tuple[Float64, Int64]:
-    """Merge the surfaces of blocks at the vertices on their common faces."""
+    """Merge the triangles of all TSDF blocks at the vertices on their common faces."""
     if not surfaces:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces[:-1])])
@@ -322,7 +324,7 @@ def _remove_islands(vertices: Float64, triangles: Int64, truncation: float) -> I
 
 
 def _remove_unused_vertices(vertices: Float64, triangles: Int64) -> tuple[Float64, Int64]:
-    """Remove the vertices without triangles."""
+    """Remove the vertices that no triangle uses."""
     rows, vertex_ids = np.unique(triangles, return_inverse=True)
     return vertices[rows], vertex_ids.reshape(triangles.shape)
 

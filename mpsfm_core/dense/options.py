@@ -1,6 +1,6 @@
 """Options of densification and meshing.
 
-Defaults without a source tag are ours; `benchmarks.dense` measures them.
+Defaults without a source tag are values of this project; `benchmarks.dense` evaluates the defaults.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from mpsfm_core.data.options import Options, expert
 
 
 class DenseOptions(Options):
-    """Multi-view stereo after mapping."""
+    """Options of multi-view stereo after mapping."""
 
     enabled: bool = True
-    """Run multi-view stereo; if off, the depth maps stay as the mapper refined them."""
+    """Run multi-view stereo; if False, the results contain the refined depth maps of the mapper."""
     max_size: int = Field(640, ge=64)
     """Maximum of the longer side of the depth maps in pixels; higher is finer and slower."""
     correlation_px: float = expert(40.0, gt=0)
@@ -22,11 +22,11 @@ class DenseOptions(Options):
 
 
 class MeshOptions(Options):
-    """Triangle mesh from the depth maps."""
+    """Options of the triangle mesh from depth maps."""
 
     voxel_px: float = Field(2.0, gt=0)
     """Voxel size in pixels of the depth maps at their median depth.
 
-    Lower resolves noise rather than surface, and memory grows with the third power."""
+    Smaller voxels resolve noise instead of surface, and memory grows with the third power."""
     max_triangles: int = Field(500_000, ge=4)
-    """Maximum number of triangles; a larger mesh is simplified (about 20 bytes each on disk)."""
+    """Maximum number of triangles (about 20 bytes each on disk); a larger mesh is simplified."""

@@ -1,11 +1,11 @@
 """Scale uncertainty of stereo depth between image pairs.
 
-The depth of an image pair is known up to the length of its baseline. Two kinds of constraints link
-the log scales of pairs that share an image: pixels that both pairs confirm, and the known depth of
-the image. The declared std of known depth links the scale of each depth map to the world.
-The log scales of pairs, known depth maps and the world form a Gaussian network, in which a
-constraint equates two scales up to its variance. The reported std is the marginal std
-of a scale relative to the mean of all pairs.
+The depth of an image pair is known up to the length of its baseline. The log scales of pairs that
+share an image are linked by pixels that both pairs confirm, and by the known depth of the image.
+The declared std of known depth links the scale of each depth map to the world. The log scales of
+pairs, known depth maps and the world form a Gaussian network, in which a constraint equates two
+scales up to its variance. The reported std is the marginal std of a scale relative to the mean of
+all pairs.
 """
 
 from __future__ import annotations
@@ -23,28 +23,29 @@ from mpsfm_core.data import Float32, Float64, Int64
 from mpsfm_core.geometry.statistics import ONE_SIGMA
 
 _MIN_CONSTRAINT_STD = 1e-6
-"""Minimum std of a constraint in log scale; avoids infinite precision."""
+"""Minimum std of a log scale constraint; avoids infinite precision."""
 _SCALE_CORRELATION = 0.5
 """Correlation of the scale errors of known depth maps in one component.
 
-The maps come from one network and one scene; FastDepth reaches 0.1 to 0.7 on two scenes [ours]."""
+The depth maps come from one network and one scene; FastDepth reaches 0.1 to 0.7 on two scenes
+[ours]."""
 _BLOCK_COLUMNS = 256
-"""Columns of the inverse that are solved together; bounds the memory."""
+"""Number of columns of the inverse precision matrix that are solved together; bounds the memory."""
 
 
 class ScaleConstraints(NamedTuple):
     """Scale constraints that one image measures between its k pairs and its known depth."""
 
     sources: list[int]
-    """(k,) indices of the other image of each pair."""
+    """(k,) index of the second image of each pair."""
     pixels: Int64
-    """(k,) number of pixels that each pair confirms."""
+    """(k,) number of pixels whose depth each pair confirms."""
     shared: Float64
     """(k, k) symmetric precision of the log scale difference of two pairs, from shared pixels."""
     known: Float64
     """(k,) precision of the log scale difference between the known depth and each pair."""
     known_std: float
-    """Declared std of the log scale of the known depth."""
+    """Declared std of the known depth map's log scale."""
 
 
 def measure_scale_constraints(
@@ -53,20 +54,20 @@ def measure_scale_constraints(
     known_std: float,
     correlation_px: float,
 ) -> ScaleConstraints:
-    """Measure the scale constraints of one image.
+    """Measure the scale constraints between an image's pairs and its known depth.
 
-    All k pairs that confirm a pixel are equally certain, and their common error (the image's own)
-    cancels. The mean difference of shared pixels bounds the variance from below, independent of
-    their number. The known depth is as uncertain in the region of a pair as its distance to the
-    measured depth, because errors of a depth map are correlated over the region.
+    All pairs that confirm a pixel have equal variance, and the common error of the image cancels.
+    The squared mean difference of shared pixels is a lower bound of the variance. The std of the
+    known depth in the region of a pair is its distance to the measured depth, because errors of a
+    depth map are correlated over the region.
 
     Args:
         differences: Source image -> (h, w) differences from
             :func:`~mpsfm_core.dense.geometric_consistency.compare_depths`.
-        change: (h, w) from the known to the measured log depth.
+        change: (h, w) measured minus known log depth.
         known_std: Declared std of the known log depth.
-        correlation_px: Correlation length of errors in pixels; a square of this side counts as one
-            observation.
+        correlation_px: Correlation length of depth errors in pixels; a square of this side counts
+            as one observation.
     """
     confirmed = {source: np.isfinite(map_) for source, map_ in differences.items()}
     sources = [source for source, mask in confirmed.items() if mask.any()]
@@ -89,8 +90,9 @@ def measure_scale_constraints(
 def estimate_scale_stds(images: Mapping[int, ScaleConstraints]) -> dict[int, float]:
     """Estimate the std of the log scale of each image's stereo depth.
 
-    The variance of an image is the mean of its pairs, weighted by confirmed pixels. An image
-    without pairs has the variance of its known depth. Without any pair all stds are 0.
+    The scale variance of an image is the mean over its pairs, weighted by the number of confirmed
+    pixels. An image without pairs has the scale variance of its known depth. If no image has a
+    pair, all stds are 0.
 
     Args:
         images: Image index -> constraints, with the indices of :attr:`ScaleConstraints.sources`.
@@ -133,18 +135,18 @@ def estimate_scale_stds(images: Mapping[int, ScaleConstraints]) -> dict[int, flo
 
 
 def _world_precision(precision: csr_array, maps: list[int], stds: list[float]) -> Float64:
-    """Compute the precision of each unknown relative to the world.
+    """Compute the precision of each unknown log scale relative to the world.
 
-    Only known depth maps have one. Maps of one component have correlated scale errors, so their
-    precision is reduced.
+    The precision of image pairs is 0. Depth maps of one component have correlated scale errors,
+    which reduces their precision.
 
     Args:
-        precision: (n, n) precision of the constraints between unknowns.
-        maps: Unknowns that are known depth maps.
-        stds: Declared std of the log scale of each map.
+        precision: (n, n) precision of the constraints between unknown log scales.
+        maps: Indices of the unknowns that are log scales of known depth maps.
+        stds: Declared std of each known depth map's log scale.
 
     Returns:
-        (n,) precision, 0 for pairs.
+        (n,) precision relative to the world, 0 for image pairs.
     """
     components = connected_components(precision, directed=False)[1][maps]
     component_sizes = np.bincount(components)[components]
@@ -156,12 +158,12 @@ def _world_precision(precision: csr_array, maps: list[int], stds: list[float]) -
 def _variance_relative_to_mean(
     precision: csr_array, world_precision: Float64, weight: Float64
 ) -> Float64:
-    """Compute the variance of each unknown minus the weighted mean of all.
+    """Compute the variance of each log scale relative to the weighted mean of all log scales.
 
     Args:
-        precision: (n, n) precision of the differences of unknowns.
-        world_precision: (n,) precision of each unknown itself.
-        weight: (n,) weights of the mean, with sum 1.
+        precision: (n, n) precision of the differences of log scales.
+        world_precision: (n,) precision of each log scale relative to the world.
+        weight: (n,) weights of the mean log scale, with sum 1.
     """
     system = diags_array(precision.sum(axis=1) + world_precision) - precision
     solve = splu(system.tocsc()).solve

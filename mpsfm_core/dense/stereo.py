@@ -1,9 +1,9 @@
 """Multi-view stereo: plane-sweep along the known surface, coarse to fine.
 
-A label is an offset of log depth from the known surface. A sweep warps all pixels of one label into
-a source view, so that NCC windows follow the slant of the surface. Semi-global matching
-(Hirschmueller, PAMI 2008) aggregates the costs. The next finer level searches a few labels around
-the coarse result.
+A stereo label is an offset of log depth from the known surface. A sweep warps all pixels of one
+label into a source view, so that NCC windows follow the slant of the surface. Semi-global matching
+(Hirschmueller, PAMI 2008) aggregates the costs. The next finer pyramid level searches a few labels
+around the coarse result.
 """
 
 from __future__ import annotations
@@ -46,17 +46,18 @@ _LARGE_STEP_PENALTY = 1.6
 _LEVELS = (2, 1)
 """Downsampling factors of the pyramid levels, coarse to fine."""
 _FINE_LABELS = 5
-"""Labels to each side on the fine levels; a label is about a pixel of parallax [ours]."""
+"""Number of labels on each side of the coarse depth; a label is about a pixel of parallax
+[ours]."""
 _UNSEEN_COST = 0.6
-"""Cost of a depth that no view sees, about that of texture that does not match [ours]."""
+"""Matching cost of a depth outside of all source views, similar to a wrong match [ours]."""
 _GRAY_EDGE = 10 / 255
-"""Step of gray values that halves the penalty of a depth step [ours]."""
+"""Difference of gray values that halves the penalty P2 of a depth step [ours]."""
 _MAX_PRIOR = 9.0
-"""Cap of the squared deviation from the known depth, in stds."""
+"""Maximum of the squared deviation from the known depth, in squared stds."""
 _OUT_OF_RANGE_COST = 4.0
 """Cost of a depth outside the search range, several times the worst matching cost [ours]."""
 _PARALLAX_SAMPLES = 8
-"""Samples of parallax along each side."""
+"""Number of parallax samples along each side of the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +65,11 @@ class StereoDepth:
     """Depth map from multi-view stereo, before the consistency check."""
 
     log_depth: Float32
-    """(h, w) log depth."""
+    """(h, w) natural log of the stereo depth in world units."""
     cost: Float32
-    """(h, w) mean of ``1 - NCC`` over the best views, in [0, 1]."""
+    """(h, w) matching cost: mean of ``1 - NCC`` over the best views, in [0, 1]."""
     parallax: Float32
-    """(8, 8) pixels that a point moves in the source views per unit of log depth."""
+    """(8, 8) pixels that a projection in the source views moves per unit of log depth."""
 
 
 def match_stereo_depth(view: DenseView, sources: Sequence[DenseView]) -> StereoDepth:
@@ -101,12 +102,12 @@ def _sweep(
 
     Args:
         view: Reference view.
-        sources: Source views on the same level.
+        sources: Source views on the pyramid level of the reference view.
         surface: (h, w) log depth of the base surface.
         offsets: (k,) labels, evenly spaced offsets of log depth.
 
     Returns:
-        Log depth and matching cost, both (h, w).
+        Natural log of depth, and matching cost, both (h, w).
     """
     base = np.where(view.usable, np.exp(surface), np.float32(0))
     costs = np.empty((len(sources), len(offsets), *base.shape), np.uint8)
@@ -140,7 +141,7 @@ def _sweep(
 def _search_range(view: DenseView) -> Float32:
     """Compute the half width (h, w) of the search range in log depth.
 
-    Pixels with a lower std than the median use the median. Holes reach all labels.
+    The median std is a lower bound of each pixel's std. At holes all labels are in range.
     """
     known = view.log_std[view.log_std < UNKNOWN_LOG_STD]
     median_std = np.median(known) if len(known) else UNKNOWN_LOG_STD

@@ -1,6 +1,7 @@
-"""Compiled loops of multi-view stereo: NCC costs along a surface, semi-global matching.
+"""Compiled loops of multi-view stereo: NCC costs along a surface, and semi-global matching.
 
-Images and maps are float32 grids of one size. Labels are offsets of log depth from a base surface.
+Images and depth maps are float32 grids of one size. Stereo labels are offsets of log depth from a
+base surface.
 """
 # mypy: allow-untyped-decorators
 
@@ -14,12 +15,12 @@ from mpsfm_core.data import Float32, Float64, UInt8
 from mpsfm_core.support.jit import kernel
 
 _FASTMATH = {"contract", "reassoc", "arcp"}
-"""LLVM flags that allow reordered sums but keep NaN and infinity."""
+"""LLVM fast-math flags that allow reordered sums but preserve NaN and infinity."""
 
 UNSEEN = 255
-"""Cost of a label whose projection is outside of the source view."""
+"""Matching cost of a label whose projection is outside of the source view."""
 MAX_COST = 250
-"""Cost of a label with an NCC of 0 or less; costs are stored in units of 1 / 250."""
+"""Matching cost of a label with an NCC of 0 or less; the unit of costs is 1 / 250."""
 
 
 @kernel(fastmath=_FASTMATH)
@@ -48,7 +49,7 @@ def compute_ncc_costs(
         offset: (3,) offset of the projection.
         radius: Radius of the window in pixels.
         noise: Variance of gray values that counts as noise.
-        costs: (k, h, w) uint8, written.
+        costs: (k, h, w) uint8 output, the cost of each label.
     """
     height, width = reference.shape
     rows, columns = source.shape
@@ -122,8 +123,8 @@ def merge_view_costs(costs: UInt8, ratio: float, unseen: float, merged: Float32)
     Args:
         costs: (v, k, h, w) costs of v views.
         ratio: Ratio of the views that see a pixel to average, rounded up.
-        unseen: Cost in [0, 1] if no view sees a pixel.
-        merged: (h, w, k) float32 in [0, 1], written.
+        unseen: Cost in [0, 1] of a pixel that is outside of all source views.
+        merged: (h, w, k) float32 output, the merged costs in [0, 1].
     """
     views, labels, height, width = costs.shape
     sorted_costs = np.empty(views, np.int64)
@@ -213,7 +214,7 @@ def aggregate_costs(
         small: Penalty P1 of a step of one label.
         large: Penalty P2 of a larger step.
         edge: Difference of gray values that halves P2.
-        total: (h, w, k) float32, the sum over the directions is added.
+        total: (h, w, k) float32 output, to which the sum over the directions is added.
     """
     for row_step in (-1, 0, 1):
         for column_step in (-1, 0, 1):
@@ -231,8 +232,8 @@ def select_labels(
         total: (h, w, k) aggregated costs.
         costs: (h, w, k) costs before aggregation.
         offsets: (k,) offsets of log depth of the labels, evenly spaced.
-        offset: (h, w) float32, offset of the selected label, written.
-        cost: (h, w) float32, cost of the selected label before aggregation, written.
+        offset: (h, w) float32 output, offset of the selected label in log depth.
+        cost: (h, w) float32 output, cost of the selected label before aggregation.
     """
     height, width, labels = total.shape
     step = offsets[1] - offsets[0]

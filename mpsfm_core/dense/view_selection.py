@@ -1,4 +1,4 @@
-"""View selection by common surface and triangulation angle."""
+"""Selection of source views for stereo by common surface and triangulation angle."""
 
 # mypy: allow-untyped-decorators
 
@@ -16,24 +16,24 @@ from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 from mpsfm_core.support.jit import kernel
 
 _GRID_ROWS = 16
-"""Rows of the pixel grid on which overlap is measured."""
+"""Number of rows of the pixel grid on which the overlap of views is measured."""
 _FULL_SCORE_DEG, _WIDE_DEG = 8.0, 15.0
-"""Triangulation angle of full score, and angle above which the score falls.
+"""Minimum and maximum triangulation angle in degrees of the full score [ours].
 
-The score of MVSNet has its maximum at 5 degrees, with spreads of 1 below and 10 above [ours]."""
+The view selection score of MVSNet has its maximum at 5 degrees."""
 _MIN_GAIN = 0.02
-"""Minimum mean gain per pixel of a useful view [ours]."""
+"""Minimum mean gain per pixel of a source view [ours]."""
 _OCCLUSION_STDS = 1.5
 """Distance behind the visible surface, in stds of log depth, of an occluded point [ours]."""
 
 
 class _SampledViews(NamedTuple):
-    """Pixel grids of m views; a grid has ``_GRID_ROWS`` rows."""
+    """Poses and depth of m views, sampled on pixel grids with ``_GRID_ROWS`` rows."""
 
     params: Float64
     """(m, 4) intrinsics (fx, fy, cx, cy) of the grids."""
     columns: Int64
-    """(m,) columns of the grids."""
+    """(m,) number of columns of the grids."""
     rotations: Float64
     """(m, 3, 3) rotations of ``cam_from_world``."""
     translations: Float64
@@ -41,9 +41,9 @@ class _SampledViews(NamedTuple):
     centers: Float64
     """(m, 3) camera centers, world frame."""
     log_depth: Float64
-    """(m, rows, max columns) log depth."""
+    """(m, rows, max columns) natural log of depth at the pixels of the grids."""
     log_std: Float64
-    """(m,) median std of log depth."""
+    """(m,) median std of log depth of each view."""
     points: list[Float64]
     """(n, 3) world points of each view's grid."""
 
@@ -51,7 +51,7 @@ class _SampledViews(NamedTuple):
 def select_source_views(images: Sequence[RegisteredImage], max_sources: int) -> list[list[int]]:
     """Select up to `max_sources` source views for each image, the most useful first.
 
-    Greedy selection: each step adds the view with the largest gain, where pixels that selected
+    Each step of the greedy selection adds the view with the largest gain. Pixels that selected
     views already cover count less.
     """
     if not images:
@@ -81,7 +81,7 @@ def _sample_views(images: Sequence[RegisteredImage]) -> _SampledViews:
         valid = sample_nearest(image.depth.valid, map_xy)
         depth = np.where(valid, depth, np.median(depth[valid]) if valid.any() else 1.0)
         variance = image.depth.variance
-        assert variance is not None  # a refined map always has a variance
+        assert variance is not None  # The mapper sets this variance.
         if valid.any():
             relative_std = np.sqrt(sample_nearest(variance, map_xy)) / depth
             log_std[row] = np.median(relative_std[valid])
@@ -128,8 +128,8 @@ def _score_points(
     The score is the product of terms for triangulation angle and relative distance, and 0 for
     occluded points.
 
-    The arrays from `params` to `log_std` are those of :class:`_SampledViews`. `points` are the (n,
-    3) world points of the view `reference`. `scores` (m, n) is written.
+    The arrays from `params` to `log_std` are the fields of :class:`_SampledViews`. `points` are the
+    (n, 3) world points of the view `reference`. `scores` (m, n) is the output.
     """
     rows = log_depth.shape[1]
     for source in range(len(params)):
@@ -153,7 +153,8 @@ def _score_points(
             column, row = min(int(u), columns[source] - 1), min(int(v), rows - 1)
             if math.log(z) - log_depth[source, row, column] >= max_behind:
                 continue
-            d1, d2, dot = 0.0, 0.0, 0.0  # squared distances to both centers, dot product of rays
+            # Squared distances to both camera centers, and the dot product of both rays.
+            d1, d2, dot = 0.0, 0.0, 0.0
             for axis in range(3):
                 a, b = point[axis] - centers[reference, axis], point[axis] - centers[source, axis]
                 d1, d2, dot = d1 + a * a, d2 + b * b, dot + a * b
