@@ -1,4 +1,4 @@
-"""Fixtures of the tests of all first-party plugins."""
+"""Fixtures for the tests of all plugins in this repository."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _DEFAULT = Path(__file__).resolve().parents[2] / "shared"
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Return the folder with real scenes and models: $MPSFM_SHARED or ../shared."""
+    """Return the folder of real scenes and models: ``$MPSFM_SHARED`` or ``../shared``."""
     folder = Path(os.environ.get("MPSFM_SHARED", _DEFAULT))
     if not folder.is_dir():
         pytest.skip("no shared scenes and models here (set MPSFM_SHARED)")
@@ -26,14 +26,14 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def context(tmp_path_factory: pytest.TempPathFactory) -> ProviderContext:
-    """Return a context with one thread and no network."""
+    """Return a provider context with one thread and without Internet access."""
     store = WeightStore(tmp_path_factory.mktemp("cache"), offline=True)
     return ProviderContext(resolve_weights=store.resolve, threads=1)
 
 
 @pytest.fixture
 def write_onnx(tmp_path: Path) -> Callable[..., Path]:
-    """Return ``mpsfm_onnx.stand_in.save_model`` for the folder of the test."""
+    """Return a function that writes an ONNX model to the temporary folder of the test."""
     stand_in = pytest.importorskip("mpsfm_onnx.stand_in")
 
     def write(text: str, name: str = "tiny.onnx", **arrays: Any) -> Path:

@@ -1,1 +1,1 @@
-"""Small network with weights in the package: metric depth, normals, their variance and a mask."""
+"""Small network with weights in the package for metric depth, normals, variance and a mask."""

@@ -1,4 +1,4 @@
-"""Contract setup: a stand-in network that decodes painted views."""
+"""Small ONNX network that replaces the trained one in the provider contract tests."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ from mpsfm_core.testing import ContractSetup
 
 
 def setup(folder: Path) -> ContractSetup:
-    """Write a stand-in with the tensors of the network that decodes painted views."""
+    """Write a network of the same interface that decodes depth from the colors of test images."""
     model = stand_in(describe(CompactOptions()), folder)
     return ContractSetup(options={"weights": str(model)}, truth_source="painted")

@@ -1,4 +1,4 @@
-"""Options of the providers; imports nothing heavy."""
+"""Options of the compact network, importable without onnxruntime."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ WEIGHTS = "package:mpsfm_compact/compact.onnx"
 
 
 class CompactOptions(Options):
-    """Options of the network."""
+    """Options of the compact network."""
 
     weights: str = WEIGHTS
     """Path or URI of the ONNX file; the default file is part of this package."""
     sha256: str | None = None
-    """Expected hash of ``weights``."""
+    """Expected SHA-256 hash of the file ``weights``."""
     size: int = Field(256, ge=32, multiple_of=32)
-    """Longer side of the network input in pixels; the network is trained at 256. Larger values keep
-    thinner structures and are less accurate on average.
+    """Longer side of the network input in pixels. The network is trained at 256. Larger inputs
+    resolve thinner structures, but their depth is less accurate on average.
     """

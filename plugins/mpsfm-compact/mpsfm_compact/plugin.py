@@ -1,4 +1,4 @@
-"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
+"""Registration of the compact depth, normals and mask providers, without heavy imports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ACCURACY: dict[Kind, str] = {
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register depth (with normals of the same pass), normals and a mask."""
+    """Register the providers of depth (with normals of the same pass), normals and a mask."""
     return [
         _spec("depth", "Depth", "metric depth and normals", "metric", "variance", "joint-normals"),
         _spec("normals", "Normals", "normals", "variance"),

@@ -1,4 +1,4 @@
-"""Depth, normals and mask providers of the network."""
+"""Providers of depth, normals and a mask that run the compact network."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from mpsfm_core.geometry import resize_map
 
 
 class CompactDepth(DescribedJoint):
-    """Provider of metric depth and, in the same pass, normals."""
+    """Provider of metric depth and of normals from the same forward pass."""
 
     def __init__(self, options: CompactOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context)
 
 
 class CompactNormals(DescribedNormals):
-    """Provider of normals with angular variance."""
+    """Provider of normals with their angular variance."""
 
     def __init__(self, options: CompactOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context)
 
 
 class CompactMask:
-    """Provider of a mask of measurable surfaces."""
+    """Provider of a mask that excludes sky, mirrors and glass."""
 
     def __init__(self, options: CompactOptions, context: ProviderContext) -> None:
         self._network = Network(describe(options), context)
 
     def mask(self, view: View) -> Bool:
-        """Predict a mask that is False on sky, mirrors and glass."""
+        """Predict a mask of the image size that is False on sky, mirrors and glass."""
         rule, answer = self._network.description.outputs.mask, self._network.run(view)
         assert rule is not None
         probability = resize_map(answer.maps[rule.name][..., 0], *view.camera.size)
@@ -44,7 +44,7 @@ class CompactMask:
 
 
 def describe(options: CompactOptions) -> Description:
-    """Return the description of the network with the weights and size of the options."""
+    """Return the network description with the weights and the input size of ``options``."""
     general = load_description(str(Path(__file__).with_name("description.yaml")))
     size = general.input.size.model_copy(update={"side": options.size})
     update = {

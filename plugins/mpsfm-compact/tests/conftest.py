@@ -1,4 +1,4 @@
-"""Import path of the training code, which is not part of the package."""
+"""Import path of the training code, which is not part of the installed package."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ PLUGIN = Path(__file__).parents[1]
 
 @pytest.fixture
 def training(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make ``training`` importable; skip if its packages are missing."""
+    """Make the package ``training`` importable, or skip the test if torch is missing."""
     pytest.importorskip("torch")
     monkeypatch.syspath_prepend(str(PLUGIN))

@@ -1,4 +1,4 @@
-"""Tests of the shipped network on the sample scene, which is not part of its training data."""
+"""Accuracy of the shipped network on the sample scene, which is not in its training data."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_weights_are_small() -> None:
 
 
 def test_depth_normals_and_their_std(views: list[View], context: ProviderContext) -> None:
-    """Check accuracy and coverage of depth and normals."""
+    """Check the accuracy and the coverage of predicted depth and normals."""
     provider = CompactDepth(CompactOptions(), context)
     registry = Registry.discover()
     calibrations = {k: registry.spec(k, "compact").calibration for k in ("depth", "normals")}
@@ -73,11 +73,11 @@ def test_depth_normals_and_their_std(views: list[View], context: ProviderContext
     assert np.mean(np.concatenate(errors)) < 0.2
     assert np.median(np.concatenate(angles)) < 25
     assert 0.5 < np.mean(inside) < 0.95
-    assert np.std(np.concatenate(stds)) > 0.01  # learned, not a constant
+    assert np.std(np.concatenate(stds)) > 0.01  # the predicted std varies between pixels
 
 
 def test_kinds_agree(views: list[View], context: ProviderContext) -> None:
-    """Check that normals equal those of the joint pass, and that the mask equals valid depth."""
+    """Check that the separate normals and mask providers agree with the joint depth provider."""
     options = CompactOptions()
     depth, normals = CompactDepth(options, context).predict_joint(views[0])
     alone = CompactNormals(options, context).predict(views[0])
@@ -89,7 +89,7 @@ def test_kinds_agree(views: list[View], context: ProviderContext) -> None:
 
 
 def test_depth_follows_the_focal_length(views: list[View], context: ProviderContext) -> None:
-    """Check that depth of the same image grows with the focal length."""
+    """Check that the predicted depth of an image grows with the focal length of its camera."""
     view = views[0]
     camera = replace(view.camera, fx=1.5 * view.camera.fx, fy=1.5 * view.camera.fy)
     provider = CompactDepth(CompactOptions(), context)
@@ -99,7 +99,7 @@ def test_depth_follows_the_focal_length(views: list[View], context: ProviderCont
 
 
 def test_sky_is_no_surface(context: ProviderContext) -> None:
-    """Check that a blue gradient above textured ground has no depth."""
+    """Check that the mask excludes a blue gradient above textured ground."""
     rng = np.random.default_rng(0)
     image = np.empty((480, 640, 3), np.uint8)
     image[:220] = (np.array([120, 170, 240]) + np.arange(220)[:, None, None] // 4).astype(np.uint8)
@@ -112,6 +112,6 @@ def test_sky_is_no_surface(context: ProviderContext) -> None:
 
 
 def load_view(image: np.ndarray) -> View:
-    """Load a view with a common focal length."""
+    """Create a view of an image with a focal length of 560 pixels."""
     height, width = image.shape[:2]
     return View("made", image, PinholeCamera(width, height, 560.0, 560.0, width / 2, height / 2))

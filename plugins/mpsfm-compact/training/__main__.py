@@ -1,4 +1,4 @@
-"""Commands of ``python -m training``: make data, train, export, evaluate."""
+"""Commands of ``python -m training`` that make data, train, export and evaluate."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def draw(
     workers: int = 2,
     photos: Annotated[Path | None, typer.Option(help="pictures for textures")] = None,
 ) -> None:
-    """Draw samples of random rooms, streets and table tops."""
+    """Render training samples of random rooms, streets and table tops."""
     from training.make_data import make_drawn
 
     make_drawn(data, shards, seed, workers, photos)
@@ -27,7 +27,7 @@ def draw(
 
 @app.command("convert")
 def convert(data: Data, source: Path) -> None:
-    """Convert folders of RGB-D frames."""
+    """Convert folders of RGB-D frames to training samples."""
     from training.make_data import make_real
 
     make_real(data, source)
@@ -35,7 +35,7 @@ def convert(data: Data, source: Path) -> None:
 
 @app.command("label")
 def label(data: Data, photos: Path, teacher: Path, names: list[str]) -> None:
-    """Label the depth of photos of rooms by another network."""
+    """Label the depth of indoor images with another depth network."""
     from training.make_data import make_labelled
 
     make_labelled(data, photos, teacher, names)
@@ -43,7 +43,7 @@ def label(data: Data, photos: Path, teacher: Path, names: list[str]) -> None:
 
 @app.command("sky")
 def sky(data: Data, photos: Path, teacher: Path, names: list[str]) -> None:
-    """Label the sky of photos by another network."""
+    """Label the sky in images with a segmentation network."""
     from training.make_data import make_sky
 
     make_sky(data, photos, teacher, names)
@@ -51,7 +51,7 @@ def sky(data: Data, photos: Path, teacher: Path, names: list[str]) -> None:
 
 @app.command("triangulated")
 def triangulated(data: Data, images: Path, model: Path, name: str) -> None:
-    """Write photos with the points of their COLMAP reconstruction, for validation."""
+    """Convert images and their COLMAP points to samples for validation."""
     from training.make_data import make_triangulated
 
     make_triangulated(data, images, model, name)
@@ -59,7 +59,7 @@ def triangulated(data: Data, images: Path, model: Path, name: str) -> None:
 
 @app.command("views")
 def views(data: Data, panoramas: Path, teacher: Path) -> None:
-    """Cut views from panoramas on tripods, whose height gives the scale."""
+    """Cut perspective images from panoramas, scaled by the known height of the tripod."""
     from training.make_data import make_views
 
     make_views(data, panoramas, teacher)
@@ -77,7 +77,7 @@ def train(
     seed: int = 0,
     rate: float = 1e-3,
 ) -> None:
-    """Train, or resume a run."""
+    """Train the network, or resume its training from the last checkpoint."""
     from training.train import Schedule
     from training.train import train as run_training
 
@@ -87,7 +87,7 @@ def train(
 
 @app.command("average")
 def average(checkpoints: list[Path], output: Path) -> None:
-    """Write the mean of the weights of checkpoints as a checkpoint for ``export``."""
+    """Average the weights of checkpoints, and write a checkpoint for ``export``."""
     from training.export import average as run_average
 
     run_average(checkpoints, output)
@@ -99,7 +99,7 @@ def export(
     output: Path,
     weights: Annotated[Path | None, typer.Option(help="also the weights alone, here")] = None,
 ) -> None:
-    """Write the network of a checkpoint as ONNX, and print its differences from torch."""
+    """Export a checkpoint to ONNX, and print how its outputs differ from those of torch."""
     from training.export import export as run_export
     from training.export import keep
 
@@ -113,7 +113,7 @@ def export(
 def unpack(
     data: Data, output: Path, shards: list[str], most: Annotated[int, typer.Option()] = 40
 ) -> None:
-    """Write samples of the named shards as a scene folder for ``mpsfm calibrate``."""
+    """Convert the samples of the named shards to a scene folder for ``mpsfm calibrate``."""
     from training.samples import find_shards
     from training.unpack import unpack as run_unpack
 

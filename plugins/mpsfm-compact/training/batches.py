@@ -1,7 +1,7 @@
-"""Batches of augmented samples.
+"""Batches of augmented training samples.
 
-Labels and intrinsics follow the augmentation: crops move the principal point, zooms change the
-focal length, a roll rotates the normals, a mirror flips them.
+Labels and intrinsics follow the augmentation of the image. Crops move the principal point, zooms
+change the focal length, a roll rotates the normals, and mirroring flips them.
 """
 
 from __future__ import annotations
@@ -23,19 +23,25 @@ from training.network import CANONICAL_FOCAL
 from training.samples import HEIGHT, ROUGH, SURFACE, WIDTH, Shard
 
 _SIZES = ((256, 192), (256, 192), (256, 192), (192, 256), (224, 224))
-"""Width and height of the network input, drawn for each batch; about 49 000 pixels."""
+"""Width and height of the network input, drawn per batch. Every size has about 49 000 pixels."""
 _ZOOM = 1.6
-"""Maximum zoom; most samples keep nearly the whole image, as at inference."""
+"""Maximum zoom of the augmentation. Small zooms are more frequent, because inference uses none.
+Small zooms are more frequent, as inference uses whole images."""
 _ROLL_DEG = 6.0
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Input and labels; label maps have half the size of the input.
+    """Network input and labels of one batch. Label maps have half the size of the input.
 
-    ``image`` (n, 3, h, w) of 0 to 255; ``rays`` (n, 2, h / 32, w / 32); ``log_depth`` (n, 1, ...),
-    canonical; ``known`` bool; ``normals`` (n, 3, ...), 0 if unknown; ``kind``; ``log_focal`` (n, 1)
-    relative to the diagonal; ``metric`` (n,) bool.
+    * ``image`` (n, 3, h, w) is RGB from 0 to 255.
+    * ``rays`` (n, 2, h / 32, w / 32) are ray slopes x / z and y / z at the centers of pixel blocks.
+    * ``log_depth`` (n, 1, h / 2, w / 2) is the log of depth at the canonical focal length.
+    * ``known`` (n, 1, h / 2, w / 2) is True where depth is known.
+    * ``normals`` (n, 3, h / 2, w / 2) are in the camera frame, 0 if unknown.
+    * ``kind`` (n, 1, h / 2, w / 2) has the values of ``Sample.kind``.
+    * ``log_focal`` (n, 1) is the log of the focal length relative to the image diagonal.
+    * ``metric`` (n,) is True if depth has metric scale.
     """
 
     image: Tensor
@@ -49,9 +55,10 @@ class Batch:
 
 
 class Sampler:
-    """Sampler of stored samples.
+    """Random sampler of training samples from shards on disk.
 
-    Each source has its share; scenes of a source are drawn by the square root of their size.
+    Each source (rendered, real, panoramas, sky) has a fixed share. A scene within a source is drawn
+    with a probability proportional to the square root of its number of samples.
     """
 
     def __init__(self, sources: Sequence[tuple[Sequence[Path], float]]) -> None:
@@ -65,13 +72,13 @@ class Sampler:
         self._weights = np.array(weights) / np.sum(weights)
 
     def draw(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Draw a stored sample."""
+        """Draw a random stored sample."""
         shard = self._shards[rng.choice(len(self._shards), p=self._weights)]
         return shard[int(rng.integers(len(shard)))]
 
 
 def batches(sampler: Sampler, size: int, seed: int, first: int) -> Iterator[Batch]:
-    """Yield batches from number ``first`` on, prepared in a thread."""
+    """Yield augmented batches, beginning with batch number ``first``, from a background thread."""
 
     def make(number: int) -> Batch:
         rng = np.random.default_rng((seed, number))
@@ -90,7 +97,7 @@ def augmented(
     size: tuple[int, int],
     rng: np.random.Generator | None = None,
 ) -> Batch:
-    """Augment stored samples to a batch of ``size``; without ``rng``, no augmentation."""
+    """Combine stored samples to a batch of ``size``, augmented if ``rng`` is given."""
     width, height = size
     n = len(drawn)
     image = torch.from_numpy(np.stack([_developed(d["image"], rng) for d in drawn]))
@@ -113,7 +120,8 @@ def augmented(
         mirror = rng.choice([-1.0, 1.0], n)
         slack = rng.random((n, 2))
     corner = slack * (np.array([WIDTH, HEIGHT]) - np.array(size) / zoom[:, None])
-    # out = c_out + mirror * R(-roll) * zoom * (stored - c): a rotation about the principal point
+    # Output pixel = c_out + mirror * R(-roll) * zoom * (stored pixel - c), a rotation about the
+    # principal point c.
     center_out = (camera[:, 2:] - corner) * zoom[:, None]
     center_out[:, 0] = np.where(mirror < 0, width - center_out[:, 0], center_out[:, 0])
     cos, sin = np.cos(roll), np.sin(roll)
@@ -159,9 +167,9 @@ def augmented(
 
 
 def rays(width: int, height: int, focal: np.ndarray, center: np.ndarray) -> Tensor:
-    """Compute slopes (n, 2, h / 32, w / 32) of the rays through the centers of blocks of 32 pixels.
+    """Compute ray slopes x / z and y / z, (n, 2, h / 32, w / 32), at the centers of pixel blocks.
 
-    ``focal`` (n, 2) and ``center`` (n, 2) are in pixels.
+    Blocks have 32 x 32 pixels. ``focal`` (n, 2) and ``center`` (n, 2) are in pixels.
     """
     x, y = np.meshgrid(np.arange(width // 32) * 32 + 16.0, np.arange(height // 32) * 32 + 16.0)
     slopes = (np.stack([x, y]) - center[:, :, None, None]) / focal[:, :, None, None]
@@ -169,7 +177,7 @@ def rays(width: int, height: int, focal: np.ndarray, center: np.ndarray) -> Tens
 
 
 def _developed(image: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
-    """Apply tone, color and JPEG compression of another camera, with uint8 tables."""
+    """Apply the tone curve, colors and JPEG compression of a random camera to an image."""
     if rng is None:
         return image
     if rng.random() < 0.8:
@@ -197,7 +205,7 @@ def _developed(image: np.ndarray, rng: np.random.Generator | None) -> np.ndarray
 
 
 def _spoiled(image: Tensor, rng: np.random.Generator) -> Tensor:
-    """Apply defocus, motion blur, low resolution and noise."""
+    """Apply random defocus, motion blur, downsampling and noise to images."""
     out = []
     for picture in image:
         kind = rng.random()

@@ -1,4 +1,4 @@
-"""Export of the trained network to the ONNX file of the plugin."""
+"""Export of the trained compact network to the ONNX file of the plugin."""
 
 from __future__ import annotations
 
@@ -17,16 +17,21 @@ from training.network import CompactNetwork
 
 _OPSET = 18
 _SMALL = 1024
-"""Arrays with fewer values stay float32."""
+"""Weight arrays with fewer values than this are stored as float32 instead of float16."""
 
 
 class Exported(nn.Module):
-    """Network with the inputs and outputs of the plugin.
+    """Network with the input and output tensors of the exported ONNX file.
 
-    Input: ``image`` (1, 3, h, w) RGB of 0 to 255, ``intrinsics`` (1, 3, 3) in its pixels. Output,
-    (1, c, h / 2, w / 2): ``depth`` and ``std`` in meters for the canonical focal length,
-    ``normals``, ``angle`` (std about each axis in rad), ``validity`` in 0..1; ``focal`` (1, 1) in
-    input pixels.
+    The input ``image`` (1, 3, h, w) is RGB from 0 to 255. The input ``intrinsics`` (1, 3, 3) is the
+    calibration matrix K in pixels of ``image``. Output maps have the shape (1, c, h / 2, w / 2):
+
+    * ``depth`` and its ``std`` are in meters for the canonical focal length.
+    * ``normals`` are unit vectors in the camera frame.
+    * ``angle`` is the std of normals about each axis in rad.
+    * ``validity`` is the probability in 0..1 that a pixel shows a surface.
+
+    The output ``focal`` (1, 1) is the estimated focal length in input pixels.
     """
 
     def __init__(self, network: CompactNetwork) -> None:
@@ -34,7 +39,7 @@ class Exported(nn.Module):
         self.network = network
 
     def forward(self, image: Tensor, intrinsics: Tensor) -> tuple[Tensor, ...]:
-        """Predict all maps and the focal length."""
+        """Predict depth, std, normals, angle, validity and the focal length."""
         height, width = image.shape[2:]
         focal, center = intrinsics[:, [0, 1], [0, 1]], intrinsics[:, :2, 2]
         x = torch.arange(width // 32, device=image.device) * 32.0 + 16.0
@@ -60,10 +65,10 @@ _OUTPUTS = ("depth", "std", "normals", "angle", "validity", "focal")
 
 
 def export(checkpoint: Path, output: Path) -> dict[str, float]:
-    """Write the averaged weights of a checkpoint as ONNX with float16 weights; compare with torch.
+    """Export the averaged weights of a checkpoint to ONNX as float16, and compare with torch.
 
     Returns:
-        The largest relative difference of each output for a random image.
+        The largest relative difference between ONNX and torch for each output, on a random image.
     """
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     network = CompactNetwork()
@@ -72,7 +77,7 @@ def export(checkpoint: Path, output: Path) -> dict[str, float]:
     image, intrinsics = torch.rand(1, 3, 192, 256) * 255, torch.eye(3)[None] * 220
     intrinsics[0, :2, 2] = torch.tensor([128.0, 96.0])
     with warnings.catch_warnings():
-        # The TorchScript exporter needs no further package; it warns about dynamic shapes.
+        # The TorchScript exporter needs no further package, but warns about dynamic shapes.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             module,
@@ -96,17 +101,17 @@ def export(checkpoint: Path, output: Path) -> dict[str, float]:
 
 
 def keep(checkpoint: Path, output: Path) -> None:
-    """Write the averaged weights only, as float16, for ``train --start``."""
+    """Write only the averaged weights of a checkpoint, as float16, for ``train --start``."""
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     weights = averaged(state)
     torch.save({k: v.half() if v.is_floating_point() else v for k, v in weights.items()}, output)
 
 
 def average(checkpoints: Sequence[Path], output: Path) -> None:
-    """Write the mean of the weights of checkpoints, with the largest number of samples.
+    """Write the mean weights of several checkpoints, with the largest of their sample counts.
 
-    The mean of checkpoints of one run is often better than each (Wortsman et al., Model soups,
-    2022). Verify it on validation data.
+    The mean of checkpoints of one run is often more accurate than each of them (Wortsman et al.,
+    Model soups, 2022). Verify the accuracy of the mean on validation data.
     """
     states = [torch.load(path, map_location="cpu", weights_only=True) for path in checkpoints]
     stages = [averaged(state) for state in states]
@@ -119,7 +124,7 @@ def average(checkpoints: Sequence[Path], output: Path) -> None:
 
 
 def averaged(state: dict) -> dict[str, Tensor]:
-    """Return the running mean of the weights of a checkpoint, else its weights."""
+    """Return the moving average of the weights in a checkpoint, or its plain weights."""
     mean = state.get("mean")
     if mean is None:
         return state
@@ -127,7 +132,7 @@ def averaged(state: dict) -> dict[str, Tensor]:
 
 
 def _halve(model: onnx.ModelProto) -> None:
-    """Store large arrays as float16, each followed by a Cast to float32."""
+    """Store large weight arrays as float16, each followed by a Cast node to float32."""
     graph = model.graph
     casts = []
     for array in list(graph.initializer):

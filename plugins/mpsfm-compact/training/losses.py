@@ -21,17 +21,19 @@ _WEIGHTS = {
     "validity": 0.1,
     "focal": 0.1,
 }
-"""Weights of the terms, balanced by their gradients in the shared layers at the start."""
+"""Weight of each loss term, set such that the gradients of all terms in shared layers start
+similar.
+"""
 _EMPTY_WEIGHT = 3.0
-"""Weight of pixels without a surface, which are rare."""
+"""Loss weight of pixels without a surface, which are rare."""
 
 
 def losses(out: Mapping[str, Tensor], batch: Batch) -> dict[str, Tensor]:
-    """Compute the weighted terms of the loss.
+    """Compute the weighted terms of the training loss.
 
-    Depth: absolute difference of logs after scaling each image, the scale for metric samples, and
-    gradients at four pixel distances for measured depth. The std is that of a Laplace distribution
-    of the residuals of measured depth; its gradient does not reach the depth.
+    The depth terms are the absolute log difference after scaling each image, the scale of metric
+    samples, and depth gradients at four pixel distances where depth is measured. The std term is
+    the Laplace likelihood of the residuals of measured depth, without a gradient to the depth.
     """
     known = batch.known
     measured = known & (batch.kind == SURFACE)

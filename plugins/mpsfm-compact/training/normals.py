@@ -1,4 +1,4 @@
-"""Normals of measured depth on smooth surfaces."""
+"""Surface normals computed from measured depth on smooth surfaces."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 
 _RADIUS = 4
 _FLAT = 0.03
-"""Maximum relative rms deviation of inverse depth from a plane; sensor noise at 3 m is 0.01.
-"""
+"""Maximum rms deviation of inverse depth from a plane, relative to inverse depth."""
 _ENOUGH = 0.7
 
 
 def normals_of_depth(
     depth: NDArray[np.float32], camera: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Compute unit normals (h, w, 3) in the camera frame that face the camera; 0 if not smooth.
+    """Compute unit normals (h, w, 3) in the camera frame from depth, 0 where it is not smooth.
 
-    A plane is linear in inverse depth: ``1 / z = (n . ray) / d``. It is fitted by least squares in
-    windows of 9 x 9 pixels. ``depth`` (h, w) in meters, 0 if unknown; ``camera``: fx, fy, cx, cy.
+    A plane is linear in inverse depth, ``1 / z = (n . ray) / d``, and is fitted by least squares in
+    windows of 9 x 9 pixels. Normals face the camera. ``depth`` (h, w) is in meters, 0 if unknown,
+    and ``camera`` is (fx, fy, cx, cy) in pixels.
     """
     height, width = depth.shape
     known = depth > 0

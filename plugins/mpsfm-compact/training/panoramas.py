@@ -1,8 +1,9 @@
-"""Views cut from panoramas, with metric scale from the height of the tripod.
+"""Perspective images cut from panoramas, with metric scale from the height of the tripod.
 
-A panorama is upright and at a known height above the floor. Pixels below the horizon whose
-predicted normal points up are floor; their depth is height divided by the slope of the ray. The
-ratio to the predicted depth of the floor scales the rest of the view.
+A panorama is upright, and the height of its camera above the floor is known. A pixel below the
+horizon is floor if its predicted normal points up. The depth of a floor pixel is the camera height
+divided by the downward slope of its ray. The ratio of true to predicted floor depth scales the
+predicted depth of all other pixels.
 """
 
 from __future__ import annotations
@@ -18,33 +19,34 @@ from numpy.typing import NDArray
 from training.samples import EMPTY, HEIGHT, ROUGH, UNKNOWN, WIDTH, Sample
 
 VIEWS = 24
-"""Number of views per panorama."""
+"""Number of perspective images cut from each panorama."""
 _TRIPOD = 1.45
-"""Height of the tripod in meters; doors of 2.05 m in four rooms of Poly Haven give 1.3, 1.3, 1.5
-and 1.6.
+"""Assumed tripod height in meters. Doors of 2.05 m in four rooms of Poly Haven panoramas imply 1.3,
+1.3, 1.5 and 1.6 m.
 """
 _UPWARDS = 0.95
-"""Minimum cosine between the normal of the floor and up."""
+"""Minimum cosine between the predicted normal of a floor pixel and the up direction."""
 _BELOW = 0.12
-"""Minimum sine of the angle below the horizon, which limits the distance to 12 m."""
+"""Minimum sine of the angle of floor rays below the horizon. It limits floor distance to 12 m."""
 _SAME = 0.35
-"""Maximum difference of log height among floor pixels; tables differ by more."""
+"""Maximum difference of the log camera height among floor pixels. Table tops differ by more."""
 _ENOUGH = 0.04
-"""Minimum share of floor pixels in a view."""
+"""Minimum share of floor pixels in a perspective image that yield a camera height."""
 _USUAL = 0.3
-"""Maximum difference of the log height of a view from that of its panorama. Otherwise the surface
-is a table or bed, and the height of the panorama is used.
+"""Maximum difference of the log camera height of one image from the median of its panorama. Beyond
+this difference the surface is a table or bed, and the median height is used.
 """
 _OUTDOORS = 0.3
-"""Share of sky above the horizon from which a panorama is outdoors; then only the ground is used.
+"""Minimum share of sky above the horizon in an outdoor panorama. Outdoors, only ground pixels get
+depth labels.
 """
 
 Guess = Callable[
     [NDArray[np.uint8], float],
     tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
 ]
-"""Function from image (240, 320, 3) and focal length in pixels to depth in meters, normals (240,
-320, 3) and surface probability.
+"""Function from an image (240, 320, 3) and its focal length in pixels to depth in meters, normals
+(240, 320, 3) and surface probability.
 """
 
 
@@ -62,7 +64,7 @@ class _View:
 
 
 def views(panorama: NDArray[np.uint8], guess: Guess, rng: np.random.Generator) -> Iterator[Sample]:
-    """Cut samples from an upright equirectangular panorama (h, 2 h, 3)."""
+    """Cut training samples from an upright equirectangular panorama (h, 2 h, 3)."""
     seen = [_view(panorama, guess, rng, number) for number in range(VIEWS)]
     heights = [view.height for view in seen if view.height is not None]
     if len(heights) < VIEWS // 4:
@@ -115,7 +117,7 @@ def _view(
 
 
 def _rotation(heading: float, pitch: float, roll: float) -> NDArray[np.float64]:
-    """Compute world_from_camera; z of the world is up."""
+    """Compute the rotation world_from_camera from heading, pitch and roll in rad, with z up."""
     c, s = np.cos(pitch), np.sin(pitch)
     forward = np.array([np.cos(heading) * c, np.sin(heading) * c, s])
     right = np.array([np.sin(heading), -np.cos(heading), 0.0])
@@ -142,7 +144,7 @@ def _cut(
 
 
 def compact_guess(path: Path) -> Guess:
-    """Return a predictor from an ONNX file, averaged over image and mirror image."""
+    """Return a function that averages the network outputs of an image and its mirror image."""
     import onnxruntime
 
     from training.network import CANONICAL_FOCAL

@@ -1,6 +1,6 @@
-"""Training samples on disk: shards of memory-mapped arrays.
+"""Training samples on disk, stored in shards of memory-mapped arrays.
 
-A sample is an image of 320 x 240 pixels with its labels.
+A sample is an image of 320 x 240 pixels with its depth and normal labels.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 WIDTH, HEIGHT = 320, 240
 UNKNOWN, SURFACE, EMPTY, ROUGH = 0, 1, 2, 3
-"""Kinds of pixels: unknown; surface; no measurable surface (sky, mirrors, glass); surface with
-depth predicted by another network.
+"""Values of ``Sample.kind``: unknown, surface with measured depth, no measurable surface (sky,
+mirrors, glass), and surface whose depth was predicted by another network.
 """
 
 
@@ -24,10 +24,10 @@ depth predicted by another network.
 class Sample:
     """One training image.
 
-    ``image`` (240, 320, 3) uint8 RGB; ``depth`` (240, 320) float32, meters along z, 0 if unknown;
-    ``normals`` (240, 320, 3) in the camera frame, 0 if unknown; ``kind`` (240, 320) of UNKNOWN,
-    SURFACE, EMPTY, ROUGH; ``camera``: fx, fy, cx, cy in pixels (first pixel at (0.5, 0.5));
-    ``metric``: true if depth has metric scale.
+    ``image`` (240, 320, 3) is uint8 RGB. ``depth`` (240, 320) is float32 z-depth in meters, 0 if
+    unknown. ``normals`` (240, 320, 3) are in the camera frame, 0 if unknown. ``kind`` (240, 320) is
+    UNKNOWN, SURFACE, EMPTY or ROUGH per pixel. ``camera`` is (fx, fy, cx, cy) in pixels, with the
+    center of the first pixel at (0.5, 0.5). ``metric`` is True if depth has metric scale.
     """
 
     image: NDArray[np.uint8]
@@ -39,7 +39,7 @@ class Sample:
 
 
 def write_shard(folder: Path, samples: Iterable[Sample]) -> int:
-    """Write one shard atomically as a folder; return its number of samples."""
+    """Write samples atomically as one shard folder, and return their number."""
     stored = list(samples)
     if not stored:
         return 0
@@ -69,12 +69,12 @@ class Shard:
         return len(self._arrays["metric"])
 
     def __getitem__(self, index: int) -> dict[str, NDArray[np.generic]]:
-        """Return the stored arrays of a sample: float16 depth, normals times 127 as int8."""
+        """Return the arrays of one sample, with float16 depth and normals times 127 as int8."""
         return {name: np.asarray(array[index]) for name, array in self._arrays.items()}
 
 
 def find_shards(folder: Path) -> Iterator[Path]:
-    """Find the complete shards below a folder, in order."""
+    """Find the complete shards below a folder, sorted by path."""
     return (
         path.parent
         for path in sorted(folder.glob("**/shard.json"))

@@ -1,4 +1,4 @@
-"""Training loop; resumes from the last checkpoint."""
+"""Training loop that resumes from the last checkpoint."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from training.samples import Shard, find_shards
 
 @dataclass(frozen=True)
 class Schedule:
-    """Number of steps and learning rate.
+    """Number of training steps, learning rates, and shares of the data sources.
 
-    The rate is constant after ``warmup`` steps, and falls linearly to zero over the last
-    ``cooldown`` of ``steps``. A run can therefore be extended from its last checkpoint.
+    The learning rate is constant after ``warmup`` steps, and falls linearly to zero over the last
+    ``cooldown`` of ``steps``. Training can therefore be extended beyond ``steps`` from its last
+    checkpoint.
     """
 
     steps: int
@@ -34,13 +35,13 @@ class Schedule:
     warmup: int = 200
     decay: float = 1e-2
     average: float = 0.998
-    """Decay of the running mean of the weights, which is exported."""
+    """Decay of the exponential moving average of the weights, which is the exported network."""
     real_share: float = 0.15
-    """Share of real frames."""
+    """Share of RGB-D frames in the training samples."""
     view_share: float = 0.25
-    """Share of views of panoramas."""
+    """Share of perspective images from panoramas in the training samples."""
     sky_share: float = 0.06
-    """Share of photos with sky labels only."""
+    """Share of images with only sky labels in the training samples."""
 
 
 def train(
@@ -52,10 +53,11 @@ def train(
     start: Path | None = None,
     minutes: float | None = None,
 ) -> None:
-    """Train on the shards of ``data``, and validate on those that ``held_out`` names.
+    """Train on the shards in ``data``, and validate on the shards named in ``held_out``.
 
-    ``run``: folder of ``last.pt`` and ``log.csv``. ``start``: checkpoint with initial weights,
-    instead of ImageNet. ``minutes``: stop after this time; a later call resumes.
+    ``run`` is the folder of the checkpoint ``last.pt`` and of ``log.csv``. ``start`` is a
+    checkpoint with initial weights instead of ImageNet weights. Training stops after ``minutes``,
+    and a later call resumes from the checkpoint.
     """
     torch.manual_seed(seed)
     torch.backends.cudnn.benchmark = True
@@ -137,10 +139,10 @@ def train(
 def judge(
     network: nn.Module, shards: Sequence[Path], device: torch.device
 ) -> dict[str, dict[str, float]]:
-    """Compute the accuracy on shards, by name.
+    """Compute accuracy metrics of the network on each shard, by the name of the shard.
 
-    Metrics: AbsRel and delta < 1.25 after median scaling, median angle of normals in deg, and
-    median ratios of scale and focal length to the truth.
+    Metrics: The metrics are AbsRel and delta < 1.25 after median scaling, the median angular error
+        of normals in degrees, and the median ratios of scale and focal length to the truth.
     """
     was = network.training
     network.eval()

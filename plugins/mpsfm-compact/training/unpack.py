@@ -1,4 +1,4 @@
-"""Shards as scene folders, for ``mpsfm calibrate`` and for inspection."""
+"""Conversion of training shards to scene folders, for ``mpsfm calibrate`` and for inspection."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from training.samples import Shard
 
 
 def unpack(shards: Sequence[Path], output: Path, most: int) -> int:
-    """Write up to ``most`` evenly spaced samples of each shard as a scene folder.
+    """Write at most ``most`` evenly spaced samples of each shard to a scene folder.
 
-    The folder has ``images/``, ``gt_depth/`` (16-bit PNG, millimeters), ``gt_normals/`` and
+    The scene folder has ``images/``, ``gt_depth/`` (16-bit PNG, millimeters), ``gt_normals/`` and
     ``intrinsics.yaml``.
 
     Returns:
-        The number of samples.
+        The number of written samples.
     """
     cameras = {}
     for folder in shards:

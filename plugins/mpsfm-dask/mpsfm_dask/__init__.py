@@ -1,1 +1,1 @@
-"""Extraction on the workers of a Dask cluster."""
+"""Prior extraction on the workers of a Dask cluster."""

@@ -1,4 +1,4 @@
-"""Executor on the workers of a Dask cluster."""
+"""Executor that runs extraction steps on the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.data.options import Options, SettingsError, parse_settings
 
 MAX_TASKS = 50_000
-"""Maximum number of tasks per step; more items are grouped, because the scheduler stores all tasks
-of a step. [ours]
+"""Maximum number of Dask tasks per extraction step. Further items are grouped, because the
+scheduler keeps all tasks of a step in memory.
 """
 
 
 class DaskOptions(Options):
-    """Address and number of the workers."""
+    """Address and number of the Dask workers."""
 
     address: str | None = None
-    """Address of the scheduler, ``tcp://HOST:8786``; null starts workers on this machine."""
+    """Address of the Dask scheduler, ``tcp://HOST:8786``. null starts workers on this machine."""
     workers: int | None = Field(None, ge=1)
-    """Number of processes on this machine; null: one per core."""
+    """Number of worker processes on this machine. null starts one per core."""
     timeout_s: float = Field(30.0, gt=0)
-    """Seconds to wait for the scheduler and a first worker."""
+    """Maximum time in seconds to wait for the scheduler and a first worker."""
 
 
 class DaskExecutor:
-    """Executor that sends a step to every worker once, and the items as tasks."""
+    """Executor that sends a step to every Dask worker once, and then its items as tasks."""
 
     def __init__(self, options: Mapping[str, Any]) -> None:
-        """Connect to the scheduler, or start workers on this machine.
+        """Connect to the Dask scheduler, or start workers on this machine.
 
         Raises:
-            ConfigError: The options are wrong or the scheduler does not answer.
+            ConfigError: The options are invalid, or the scheduler does not answer.
         """
         try:
             checked = parse_settings(DaskOptions, options, ("runtime", "executor_options"))
@@ -55,7 +55,7 @@ class DaskExecutor:
             raise ConfigError(f"no Dask workers at {where}: {error}") from error
 
     def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
-        """Run a step on items; see :meth:`mpsfm_core.providers.Executor.run`."""
+        """Run a step on all items, see :meth:`mpsfm_core.providers.Executor.run`."""
         name, size = f"mpsfm-{uuid.uuid4().hex}", 1 + len(items) // MAX_TASKS
         parts = [list(items[n : n + size]) for n in range(0, len(items), size)]
         self._client.register_plugin(_StepOnWorker(step), name=name)
@@ -71,14 +71,14 @@ class DaskExecutor:
             self._client.unregister_worker_plugin(name)
 
     def close(self) -> None:
-        """Close the connection and stop the workers that were started for it."""
+        """Close the connection to the cluster, and stop workers that this executor started."""
         self._client.close()
         if self._cluster is not None:
             self._cluster.close()
 
 
 class _StepOnWorker(WorkerPlugin):  # type: ignore[misc, unused-ignore]
-    """Worker plugin that sends a step to every worker, also to workers that join later."""
+    """Dask plugin that sends a step to every worker, including workers that join later."""
 
     def __init__(self, step: Callable[[Any], None]) -> None:
         self.step = step

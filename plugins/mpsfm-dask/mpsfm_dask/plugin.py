@@ -1,4 +1,4 @@
-"""Registration of the executor ``dask``; imports Dask when it is used."""
+"""Registration of the executor ``dask``, without importing Dask."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mpsfm_core.providers import Executor
 
 @hookimpl
 def mpsfm_executor(name: str, options: Mapping[str, Any]) -> Executor | None:
-    """Return the executor, connected to its workers."""
+    """Return an executor that is connected to its Dask workers."""
     if name != "dask":
         return None
     from mpsfm_dask.executor import DaskExecutor

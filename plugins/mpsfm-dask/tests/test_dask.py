@@ -1,4 +1,4 @@
-"""Tests of the executor on a real cluster of several processes."""
+"""Tests of the Dask executor on a real cluster of several processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mpsfm_dask.executor import DaskExecutor
 from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.testing import executor_contract
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # of the cluster's own threads at its end
+pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of the cluster's own threads at shutdown
 
 
 @pytest.fixture(scope="module")

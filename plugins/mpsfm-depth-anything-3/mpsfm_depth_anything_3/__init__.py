@@ -1,1 +1,1 @@
-"""Depth Anything 3 as a multi-view provider."""
+"""Depth Anything 3 as a provider of depth, poses and intrinsics for groups of images."""

@@ -1,4 +1,4 @@
-"""Contract setup: the smallest architecture with random weights, written once per process."""
+"""Random weights of the smallest Depth Anything 3 network, for the provider contract tests."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from mpsfm_core.testing import ContractSetup
 from mpsfm_depth_anything_3.provider import as_published, network_of
 
 SIDE = 56
-"""Side of the network input in pixels."""
+"""Longer side of the network input in pixels in the contract tests."""
 _SEED = 3
 _ANGLE = 1.0
-"""Fixed angle of view in radians, because random weights can predict angles without a tangent."""
+"""Fixed angle of view in radians. Random weights could predict angles whose tangent is
+undefined."""
 
 
 def contract(folder: Path) -> ContractSetup:
-    """Write random weights; the answers are valid but not accurate."""
+    """Write a network with random weights, whose predictions are valid but not accurate."""
     path = write_weights(folder / "model.safetensors")
     return ContractSetup(options={"weights": str(path), "resize": SIDE}, truth_source="none")
 
 
 def write_weights(path: Path) -> Path:
-    """Write random weights of the smallest network in the authors' file format."""
+    """Write random weights of the smallest network in the file format of the published weights."""
     with torch.random.fork_rng():
         torch.manual_seed(_SEED)
         network = network_of("da3-small")

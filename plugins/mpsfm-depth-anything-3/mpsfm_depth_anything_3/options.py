@@ -1,4 +1,4 @@
-"""Options of the provider and its published weights; imports nothing heavy."""
+"""Options of Depth Anything 3 and its published weights, importable without torch."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ LICENSES: dict[str, str] = {
     "da3-giant": _NON_COMMERCIAL,
     "da3nested-giant-large": _NON_COMMERCIAL,
 }
-"""Licenses of the published weights, from their model cards."""
+"""License of the published weights of each network, from its model card."""
 
 
 class DepthAnything3Options(Options):
-    """Options of Depth Anything 3 (2025)."""
+    """Options of the Depth Anything 3 provider (2025)."""
 
     network: Network = "da3-small"
-    """The authors' name of the architecture."""
+    """Name of the network architecture in the Depth Anything 3 package."""
     weights: str | None = None
-    """Path or URI of a safetensors file; null: the published weights of the network."""
+    """Path or URI of a safetensors file. null selects the published weights of ``network``."""
     sha256: str | None = None
-    """Expected hash of ``weights``."""
+    """Expected SHA-256 hash of the file ``weights``."""
     resize: int = Field(504, ge=28)
-    """Longer side of the photos in pixels, rounded to multiples of 14. [authors' default]"""
+    """Longer side of the resized images in pixels, rounded to multiples of 14."""
     relative_std: float = Field(0.2, gt=0)
-    """Std of depth for a confidence of 1, relative to the mean depth of a group. The training loss
-    ``confidence * error - alpha * log(confidence)`` makes the confidence ``alpha / error``; alpha
-    is not published. [alpha of DUSt3R]
+    """Std of depth where the predicted confidence is 1, relative to the mean depth of an image
+    group. The training loss ``confidence * error - alpha * log(confidence)`` makes the confidence
+    equal to ``alpha / error``, but alpha is not published.
     """
 
     @property
     def file(self) -> str:
-        """Return the weights file of the options."""
+        """Return the path or URI of the weights that the options select."""
         return self.weights or f"hf://depth-anything/{self.network.upper()}@main/model.safetensors"
 
 
 def weights(options: Any) -> tuple[WeightsFile, ...]:
-    """Return the weights for ``ProviderSpec.weights``."""
+    """Return the weights files that the options select, with hash and license."""
     license = LICENSES[options.network] if options.weights is None else "unknown"
     return (WeightsFile(options.file, options.sha256, license),)

@@ -1,4 +1,4 @@
-"""Registration of the provider; imports nothing heavy."""
+"""Registration of the Depth Anything 3 provider, without heavy imports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mpsfm_depth_anything_3.options import LICENSES, DepthAnything3Options, weig
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register the provider of depth, poses and intrinsics of groups of photos."""
+    """Register the provider of depth, poses and intrinsics for groups of images."""
     return [
         ProviderSpec(
             kind="multiview",
@@ -24,7 +24,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             code_license="Apache-2.0",
             weights_license=f"{LICENSES['da3-small']} (small, base), {LICENSES['da3-large']}",
             weights=weights,
-            # [assumed: not measured, because the weights were not available]
+            # [assumed: the calibration was not measured, because the weights were not available]
             calibration=DepthCalibration(std_scale=1.0, relative_std=0.05),
             contract="mpsfm_depth_anything_3.contract:contract",
         )

@@ -1,4 +1,4 @@
-"""Depth Anything 3 of the authors' package on groups of views."""
+"""Provider that runs the authors' Depth Anything 3 network on groups of images."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _PATCH = 14
 _MEAN = np.float32([0.485, 0.456, 0.406])
 _STD = np.float32([0.229, 0.224, 0.225])
 _WARNINGS = 1
-"""Log level of the library without its progress messages."""
+"""Log level of the ``depth_anything_3`` package that hides its progress messages."""
 
 
 class DepthAnything3:
-    """Provider of depth of several views in one unit, with poses and intrinsics.
+    """Provider of depth in one unit for a group of images, with their poses and intrinsics.
 
-    Views keep their aspect ratio. Smaller views of a group are padded with the mean color on all
-    sides; the authors' loader crops the larger ones instead.
+    Images are resized with their aspect ratio. The smaller images of a group are padded with the
+    mean color on all sides, while the loader in the authors' package crops the larger images.
     """
 
     def __init__(self, options: DepthAnything3Options, context: ProviderContext) -> None:
@@ -48,13 +48,14 @@ class DepthAnything3:
         self._network.to(self._device)
 
     def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
-        """Predict depth of a group in one unit, its std, poses and intrinsics.
+        """Predict depth in one unit, its std, poses and intrinsics for a group of images.
 
         Args:
-            views: The views of the group.
+            views: The undistorted images of the group.
 
         Returns:
-            The prior of the group; depth is in meters for the nested network.
+            The prior of the group. Its depth is in meters for the nested network, and in an
+            arbitrary unit for other networks.
         """
         sizes = [_network_size(view, self._options.resize) for view in views]
         width, height = np.max(sizes, axis=0).tolist()
@@ -82,27 +83,29 @@ class DepthAnything3:
 
 
 def network_of(name: str) -> Any:
-    """Create the architecture from the configuration files of the library."""
+    """Create the network ``name`` from the configuration files of the ``depth_anything_3``
+    package."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # deprecation warnings of omegaconf and torch
+        warnings.simplefilter("ignore")  # hides deprecation warnings of omegaconf and torch
         from depth_anything_3.cfg import create_object, load_config
         from depth_anything_3.registry import MODEL_REGISTRY
         from depth_anything_3.utils.logger import logger
 
-        logger.level = _WARNINGS  # the library prints to the terminal
+        logger.level = _WARNINGS  # the package would print progress to the terminal
         return create_object(load_config(MODEL_REGISTRY[name])).eval()
 
 
 def as_published(network: Any) -> torch.nn.Module:
-    """Return the inner network with the tensor names of the published files.
+    """Return the network with the tensor names of the published weights files.
 
-    Tensors that several parts share are stored once.
+    A tensor that several network parts share is stored once.
     """
     return torch.nn.ModuleDict({"model": network})
 
 
 def _network_size(view: View, longest: int) -> tuple[int, int]:
-    """Compute ``(width, height)`` in whole patches, with the aspect ratio as close as possible."""
+    """Compute the network ``(width, height)`` in whole patches, close to the view's aspect
+    ratio."""
     scale = longest / max(view.camera.size)
     width, height = (max(1, round(side * scale / _PATCH)) for side in view.camera.size)
     return width * _PATCH, height * _PATCH
@@ -114,7 +117,8 @@ def _intrinsics(
     starts: Sequence[tuple[int, int]],
     sizes: Sequence[tuple[int, int]],
 ) -> Float64:
-    """Convert matrices (n, 3, 3) of the network grid to fx, fy, cx, cy of the views."""
+    """Convert calibration matrices (n, 3, 3) of the network input to (fx, fy, cx, cy) of the
+    views."""
     scale = np.array([view.camera.size for view in views]) / np.array(sizes)
     focal = matrices[:, [0, 1], [0, 1]] * scale
     center = (matrices[:, :2, 2] - np.array(starts)) * scale

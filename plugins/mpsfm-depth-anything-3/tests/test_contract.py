@@ -1,4 +1,4 @@
-"""Contract tests of the smallest network with random weights."""
+"""Provider contract tests of the smallest Depth Anything 3 network with random weights."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Comparison of the provider with the authors' inference on the same random weights."""
+"""Comparison of the provider with the authors' inference code on the same random weights."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def view(photos: list[Any]) -> Callable[..., View]:
 
 
 def of_the_authors(file: Path, views: list[View]) -> Any:
-    """Run the authors' ``DepthAnything3.inference`` in float32 on photos that need no resizing.
+    """Run the authors' ``DepthAnything3.inference`` in float32 on images that need no resizing.
 
-    Their loader needs torchvision, so its steps are repeated here.
+    The authors' image loader needs torchvision, so this function repeats its steps.
     """
     network = network_of("da3-small")
     load_model(torch.nn.ModuleDict({"model": network}), file)
@@ -83,7 +83,7 @@ def test_provider_equals_the_authors_inference(
 
 
 def test_intrinsics_are_of_the_view(provider: DepthAnything3, view: Callable[..., View]) -> None:
-    """Check that the center of a resized and padded view stays its center."""
+    """Check that the principal point at the center of a resized and padded view stays there."""
     group = provider.predict_group([view(0, 168, 112), view(1, 84, 84)])
     assert group.intrinsics is not None
     np.testing.assert_allclose(group.intrinsics[:, 2:], [[84, 56], [42, 42]], atol=1e-3)

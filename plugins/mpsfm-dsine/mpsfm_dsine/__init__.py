@@ -1,1 +1,1 @@
-"""DSINE surface normals from an ONNX file."""
+"""Surface normals from DSINE in an ONNX file."""

@@ -1,4 +1,4 @@
-"""Contract setup: a stand-in network without weights."""
+"""Small ONNX network that replaces DSINE in the provider contract tests."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ from mpsfm_dsine.provider import describe
 
 
 def setup(folder: Path) -> ContractSetup:
-    """Write a network with an intrinsics input that decodes painted views."""
+    """Write a network of DSINE's interface that decodes normals from the colors of test images."""
     model = stand_in(describe(DsineOptions(model="")), folder)
     return ContractSetup(options={"model": str(model)}, truth_source="painted")

@@ -1,6 +1,6 @@
-"""Export of DSINE with concentration to ONNX, with its authors' code.
+"""Export of DSINE, with normals and their concentration kappa, to ONNX by its authors' code.
 
-Runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+This module runs as a program, see :mod:`mpsfm_core.providers.model_export`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _SIDES = ((96, 128), (160, 96))
 
 
 class LastRefinement(torch.nn.Module):
-    """Module that returns the last refinement, as the authors' scripts do."""
+    """Module that returns only DSINE's last refinement, like the authors' test scripts."""
 
     def __init__(self, model: torch.nn.Module) -> None:
         super().__init__()
@@ -32,7 +32,8 @@ class LastRefinement(torch.nn.Module):
 
 
 class _CpuCoordinates:
-    """Context that keeps the constructor's coordinates on the CPU instead of the first GPU."""
+    """Replacement of pixel coordinates that stay on the CPU, where DSINE would use the first
+    GPU."""
 
     def __init__(self, coordinates: torch.Tensor) -> None:
         self._coordinates = coordinates
@@ -42,7 +43,7 @@ class _CpuCoordinates:
 
 
 def network(encoder: int) -> LastRefinement:
-    """Create the network of the authors' experiment exp002_kappa, with EfficientNet-B0 or -B5."""
+    """Create DSINE as in the authors' experiment exp002_kappa, with EfficientNet-B0 or -B5."""
     settings = SimpleNamespace(
         NNET_encoder_B=encoder,
         NNET_decoder_NF={0: 1280, 5: 2048}[encoder],
@@ -64,7 +65,7 @@ def network(encoder: int) -> LastRefinement:
 
 
 def export(job: ExportJob, model: LastRefinement) -> None:
-    """Export the network for images of any size in steps of 32, with their intrinsics."""
+    """Export the network for images with sides in multiples of 32 and for their intrinsics."""
     examples = []
     for height, width in _SIDES:
         intrinsics = torch.tensor([[100.0, 0, width / 2], [0, 100.0, height / 2], [0, 0, 1]])
@@ -75,7 +76,7 @@ def export(job: ExportJob, model: LastRefinement) -> None:
 
 
 def main() -> None:
-    """Export the network of the checkpoint."""
+    """Export DSINE with the weights of a checkpoint."""
     job = ExportJob.from_arguments()
     model = network(ENCODERS[job.size])
     if job.weights is not None:

@@ -1,4 +1,4 @@
-"""Options of the provider; imports nothing heavy."""
+"""Options of the DSINE provider, importable without onnxruntime."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from mpsfm_core import Options
 
 
 class DsineOptions(Options):
-    """Options of the network."""
+    """Options of the DSINE provider."""
 
     model: str = "export:dsine"
-    """Path or URI of the ONNX file; default: the output of ``mpsfm models export dsine``."""
+    """Path or URI of the ONNX file. The default is the output of ``mpsfm models export dsine``."""
     sha256: str | None = None
-    """Expected hash of ``model``."""
+    """Expected SHA-256 hash of the file ``model``."""
     size: int = Field(1200, ge=32, le=2000)
-    """Longer side of the network input in pixels; views are never enlarged. The network supports up
-    to 2000 pixels. [reference]
+    """Longer side of the network input in pixels. Smaller images are not enlarged. DSINE supports
+    up to 2000 pixels.
     """

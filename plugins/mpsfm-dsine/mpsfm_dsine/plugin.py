@@ -1,4 +1,4 @@
-"""Registration of the provider; imports neither onnxruntime nor OpenCV."""
+"""Registration of the DSINE provider, importing neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mpsfm_dsine.options import DsineOptions
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register the normals provider."""
+    """Register DSINE as a provider of normals."""
     return [
         ProviderSpec(
             kind="normals",
@@ -34,7 +34,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
 
 @hookimpl
 def mpsfm_exports() -> dict[str, ModelExport]:
-    """Register the export from the authors' code and checkpoint."""
+    """Register the ONNX export that runs the authors' code and checkpoint."""
     return {
         "dsine": ModelExport(
             script="mpsfm_dsine.export",

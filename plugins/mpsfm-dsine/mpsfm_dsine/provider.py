@@ -1,4 +1,4 @@
-"""DSINE as normals provider."""
+"""DSINE as a provider of normals."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from mpsfm_dsine.options import DsineOptions
 
 
 class Dsine(DescribedNormals):
-    """Provider of normals with a variance from their concentration."""
+    """Provider of normals, with a variance computed from the predicted concentration kappa."""
 
     def __init__(self, options: DsineOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context, options.model, options.sha256)
 
 
 def describe(options: DsineOptions) -> Description:
-    """Return the description of the network at the size of the options."""
+    """Return the description of the DSINE network with the input size of ``options``."""
     general = load_description(str(Path(__file__).with_name("description.yaml")))
     assert isinstance(general.input.size, SideSize)
     size = general.input.size.model_copy(update={"side": options.size})

@@ -1,4 +1,4 @@
-"""Contract tests with a stand-in network."""
+"""Provider contract tests with a small network that replaces DSINE."""
 
 from mpsfm_core.testing import contract_tests
 

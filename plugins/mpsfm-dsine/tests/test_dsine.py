@@ -1,4 +1,4 @@
-"""Tests of the provider with stand-ins that have DSINE's tensors."""
+"""Tests of the DSINE provider with small ONNX networks that have DSINE's tensors."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from mpsfm_core import PinholeCamera, View
 from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.geometry import pixel_centers, rays
 
-# DSINE's own rays: pixel centres at halves, principal point plus a half. The stand-in says that
-# every surface faces the camera: its normals are the rays, with concentration 12.
+# Compute rays as DSINE does, with pixel centers and the principal point shifted by half a pixel.
+# The predicted normals are the negative rays, so that every surface faces the camera, with
+# concentration 12.
 RAYS = """
 dsine (float[b,3,h,w] image, float[b,3,3] intrins) => (float[b,4,h,w] normal) {
     shape = Shape (image)
@@ -63,7 +64,8 @@ def view_of(width, height, camera=None, colour=(0, 0, 0)):
 
 @pytest.mark.parametrize("size", [1200, 64])
 def test_intrinsics_follow_resizing_and_padding(model, size, context):
-    """Check 150 x 90 padded to 160 x 96, and shrunk to 64 x 38 with padding to 64 x 64."""
+    """Check an image of 150 x 90 padded to 160 x 96, and shrunk to 64 x 38 and padded to 64 x
+    64."""
     view = view_of(150, 90, PinholeCamera(150, 90, 110.0, 120.0, 70.0, 48.0))
     prior = Dsine(DsineOptions(model=model, size=size), context).predict(view)
     height, width = prior.shape
@@ -78,7 +80,8 @@ def test_intrinsics_follow_resizing_and_padding(model, size, context):
 
 
 def test_black_padding_before_normalisation(write_onnx, context):
-    """Check the padding with a stand-in that returns a corner pixel as the x of all normals."""
+    """Check the padding color with a network that returns a corner pixel as the x of all
+    normals."""
     text = """
     dsine (float[b,3,h,w] image, float[b,3,3] intrins) => (float[b,4,h,w] normal) {
         nothing = Mul (image, none)

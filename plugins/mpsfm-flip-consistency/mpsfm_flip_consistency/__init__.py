@@ -1,1 +1,1 @@
-"""Uncertainty of depth and normals from a second pass on the mirrored image."""
+"""Variance of depth and normals from a second network pass on the mirrored image."""

@@ -1,9 +1,9 @@
-"""Mean of two passes, and its variance from their difference (paper, appendix B).
+"""Mean of the predictions for an image and its mirror image, with variance (paper, appendix B).
 
 The covariance is the sum of the outer products of both deviations from the mean, which is the
-unbiased covariance of two samples. If the network predicts a variance, the larger one is used.
-Errors of two passes are correlated, so the variance of the mean is not reduced below that of one
-pass.
+unbiased sample covariance of two predictions. If the network predicts a variance, the larger of
+both variances is used. The errors of both predictions are correlated, so the variance of the mean
+is not smaller than that of one prediction.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ from mpsfm_core import DepthPrior, NormalPrior
 from mpsfm_core.data import Bool, Float32, Float64
 
 _SMALLEST_RELATIVE_STD = 1e-4
-"""Minimum std relative to depth, because a variance must be positive if both passes agree."""
+"""Minimum std of depth relative to depth. A variance must be positive even if both predictions
+agree."""
 _SMALLEST_STD_RAD = 1e-3
 
 
 def fuse_depth(first: DepthPrior, second: DepthPrior) -> DepthPrior:
-    """Fuse two depth maps to one prior that is valid where both are.
+    """Fuse two depth maps of a view into one prior that is valid where both maps are valid.
 
-    The mean is weighted by the inverse network variances if both have one [reference], else
-    equally.
+    The mean is weighted by the inverse network variances if both maps have them [reference], else
+    both maps have the same weight.
     """
     valid = first.valid & second.valid
     depths = _stack(first.depth, second.depth, valid)
@@ -40,12 +41,12 @@ def fuse_depth(first: DepthPrior, second: DepthPrior) -> DepthPrior:
 
 
 def fuse_normals(first: NormalPrior, second: NormalPrior) -> NormalPrior:
-    """Fuse two normal maps to one prior that is valid where both are.
+    """Fuse two normal maps of a view into one prior that is valid where both maps are valid.
 
-    The mean is the normalized sum. Both normals deviate from it by half of their angle, in opposite
-    directions, so their covariance in the tangent plane has the eigenvalues ``angle**2 / 2`` and 0.
-    A :class:`NormalPrior` has one variance for both tangent directions: half of the trace,
-    ``angle**2 / 4``.
+    The mean normal is the normalized sum of both normals. Both normals deviate from the mean by
+    half of their angle, in opposite directions. Their covariance in the tangent plane therefore has
+    the eigenvalues ``angle**2 / 2`` and 0. A :class:`NormalPrior` has one variance for both tangent
+    directions, which is half of the trace, ``angle**2 / 4``.
     """
     valid = first.valid & second.valid
     total = first.normals.astype(np.float64) + second.normals
@@ -59,5 +60,5 @@ def fuse_normals(first: NormalPrior, second: NormalPrior) -> NormalPrior:
 
 
 def _stack(first: Float32, second: Float32, valid: Bool) -> Float64:
-    """Stack both maps as (2, h, w) float64, with 1 at invalid pixels."""
+    """Stack two maps as (2, h, w) float64, with 1 at invalid pixels."""
     return np.where(valid, np.stack([first, second]).astype(np.float64), 1.0)

@@ -1,4 +1,4 @@
-"""Registration of the wrapper."""
+"""Registration of the flip-consistency wrapper for depth and normals providers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from mpsfm_core import ProviderSpec, hookimpl
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register one wrapper for depth and normals."""
+    """Register one wrapper class for depth and for normals."""
     return [
         ProviderSpec(
             kind="wrapper",

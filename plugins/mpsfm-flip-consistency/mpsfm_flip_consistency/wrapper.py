@@ -1,4 +1,4 @@
-"""Wrapper around a depth or normals provider."""
+"""Wrapper around a depth or normals provider that adds a variance."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from mpsfm_flip_consistency.mirror import mirror_depth, mirror_normals, mirror_v
 
 
 class FlipConsistency:
-    """Wrapper that runs a provider on a view and its mirror image, and fuses both."""
+    """Wrapper that runs a provider on a view and on its mirror image, and fuses both priors."""
 
     def __init__(self, inner: Any, options: None, context: ProviderContext) -> None:
         self._inner = inner
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> DepthPrior | NormalPrior:
-        """Predict with the wrapped provider, and add a variance.
+        """Predict the prior of the wrapped provider, with a variance from both passes.
 
         Args:
             view: The view.
-            depth: Depth of the view, for normal providers that need it.
+            depth: Depth of the view, for normals providers that require depth.
 
         Raises:
-            DataError: The grids of both passes differ in size.
+            DataError: The priors of the view and of its mirror image have different sizes.
         """
         given, mirrored = ((), ()) if depth is None else ((depth,), (mirror_depth(depth),))
         first = self._inner.predict(view, *given)

@@ -1,4 +1,4 @@
-"""Contract tests of the wrapper around depth and normals."""
+"""Provider contract tests of the wrapper around depth and normals providers."""
 
 from mpsfm_core.testing import contract_tests
 

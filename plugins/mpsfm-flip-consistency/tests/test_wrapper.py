@@ -1,4 +1,4 @@
-"""Tests with providers whose output for a view and its mirror image is known."""
+"""Tests of the wrapper with providers whose output for a view and its mirror image is known."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ VIEW = View("a.png", RAMP, CAMERA, np.arange(1200).reshape(30, 40) % 7 > 0)
 
 
 class Plane:
-    """Provider of the exact depth of the plane ``n . X = -2``; detects mirrored images."""
+    """Provider of the exact depth of the plane ``n . X = -2``, which recognizes mirrored images."""
 
     def predict(self, view: View) -> DepthPrior:
         mirrored = view.image[0, 0, 0] > view.image[0, -1, 0]
@@ -30,7 +30,7 @@ class Plane:
 
 
 class Biased:
-    """Provider that predicts ``values`` (h, w) for every view."""
+    """Provider that predicts the depth ``values`` (h, w) for every view."""
 
     def __init__(self, values, variance=None):
         self.values, self.variance = np.asarray(values, dtype=np.float64), variance
@@ -40,7 +40,7 @@ class Biased:
 
 
 class Shading:
-    """Provider of normals along the image gradient, which needs depth."""
+    """Provider of normals along the image gradient, which requires depth."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         assert depth is not None
@@ -55,7 +55,7 @@ def flip(inner):
 
 
 def test_an_exact_provider_stays_exact():
-    """Check that the principal point and the maps are mirrored."""
+    """Check that the principal point, depth, normals and variances are mirrored."""
     exact, fused = Plane().predict(VIEW), flip(Plane()).predict(VIEW)
     np.testing.assert_allclose(fused.depth, exact.depth, rtol=1e-6)
     np.testing.assert_allclose(fused.variance, (1e-4 * exact.depth) ** 2, rtol=1e-3)
@@ -74,7 +74,8 @@ def test_disagreement_is_the_sample_variance():
 def test_fused_variance_is_the_larger_of_both():
     depth, variance = np.array([[2.0, 2.0, 3.0, 2.0]]), np.array([[0.5, 0.1, 0.1, 0.5]])
     fused = flip(Biased(depth, variance)).predict(VIEW)
-    # outer: agreement, network variance 0.5; inner: 2 and 3 at 0.1, so (0.5^2 + 0.5^2) wins
+    # Both passes agree outside, with network variance 0.5. Inside they predict 2 and 3 with
+    # variance 0.1, so (0.5^2 + 0.5^2) is the larger variance.
     np.testing.assert_allclose(fused.depth, [[2.0, 2.5, 2.5, 2.0]])
     np.testing.assert_allclose(fused.variance, [[0.5, 0.5, 0.5, 0.5]], rtol=1e-6)
 
@@ -104,7 +105,7 @@ def test_normals_come_back_into_the_frame_of_the_view():
 
 @pytest.mark.parametrize("angle_deg", [0.5, 20.0, 80.0])
 def test_covariance_of_normals_by_explicit_geometry(angle_deg):
-    """Compare with log maps at the mean, their 2 x 2 covariance, and half of its trace."""
+    """Compare with log maps on the sphere at the mean, and half the trace of their covariance."""
     rng = np.random.default_rng(3)
     middle = np.array([0.3, -0.2, -0.9]) / np.linalg.norm([0.3, -0.2, -0.9])
     basis = np.linalg.svd(middle[None])[2][1:]
@@ -125,7 +126,7 @@ def test_covariance_of_normals_by_explicit_geometry(angle_deg):
 
 
 def test_covariance_of_normals_agrees_with_the_papers_spherical_coordinates():
-    """Compare with appendix B: Jacobian at the angles, trace of the covariance in xyz."""
+    """Compare with appendix B of the paper, the trace of the covariance of normals in xyz."""
     angles = np.array([[2.3, 0.4], [2.34, 0.45]])  # polar, azimuth
 
     def cartesian(polar, azimuth):

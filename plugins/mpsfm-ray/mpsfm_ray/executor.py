@@ -1,4 +1,4 @@
-"""Executor on the workers of a Ray cluster."""
+"""Executor that runs extraction steps on the workers of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.data.options import Options, SettingsError, parse_settings
 
 MAX_TASKS = 50_000
-"""Maximum number of tasks per step; more items are grouped. [ours]"""
+"""Maximum number of Ray tasks per extraction step. Further items are grouped."""
 
 
 class RayOptions(Options):
-    """Address and number of the workers."""
+    """Address and number of the Ray workers."""
 
     address: str | None = None
-    """Address of the cluster, ``auto`` or ``ray://HOST:10001``; null starts workers on this
+    """Address of the Ray cluster, ``auto`` or ``ray://HOST:10001``. null starts workers on this
     machine.
     """
     workers: int | None = Field(None, ge=1)
-    """Number of processes on this machine; null: one per core."""
+    """Number of worker processes on this machine. null starts one per core."""
 
 
 class RayExecutor:
-    """Executor that stores a step in the object store once, and runs the items as tasks."""
+    """Executor that stores a step once in Ray's object store, and runs its items as tasks."""
 
     def __init__(self, options: Mapping[str, Any]) -> None:
-        """Connect to the cluster, or start workers on this machine.
+        """Connect to the Ray cluster, or start workers on this machine.
 
         Raises:
-            ConfigError: The options are wrong or the cluster does not answer.
+            ConfigError: The options are invalid, or the cluster does not answer.
         """
         try:
             checked = parse_settings(RayOptions, options, ("runtime", "executor_options"))
@@ -54,7 +54,7 @@ class RayExecutor:
             raise ConfigError(f"no Ray workers at {where}: {error}") from error
 
     def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
-        """Run a step on items; see :meth:`mpsfm_core.providers.Executor.run`."""
+        """Run a step on all items, see :meth:`mpsfm_core.providers.Executor.run`."""
         size = 1 + len(items) // MAX_TASKS
         parts = [list(items[n : n + size]) for n in range(0, len(items), size)]
         shared = ray.put(step)
@@ -74,7 +74,7 @@ class RayExecutor:
                 ray.cancel(reference)
 
     def close(self) -> None:
-        """Close the connection and stop the workers that were started for it."""
+        """Close the connection to the cluster, and stop workers that this executor started."""
         if self._own:
             ray.shutdown()
 

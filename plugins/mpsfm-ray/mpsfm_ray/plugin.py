@@ -1,4 +1,4 @@
-"""Registration of the executor ``ray``; imports Ray when it is used."""
+"""Registration of the executor ``ray``, without importing Ray."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mpsfm_core.providers import Executor
 
 @hookimpl
 def mpsfm_executor(name: str, options: Mapping[str, Any]) -> Executor | None:
-    """Return the executor, connected to its workers."""
+    """Return an executor that is connected to its Ray workers."""
     if name != "ray":
         return None
     from mpsfm_ray.executor import RayExecutor

@@ -1,4 +1,4 @@
-"""Tests of the executor on a real cluster of several processes."""
+"""Tests of the Ray executor on a real cluster of several processes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from mpsfm_core.testing import executor_contract
 pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
 from mpsfm_ray.executor import RayExecutor
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # of the cluster's own threads at its end
+pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of the cluster's own threads at shutdown
 
 
 class TestOneCluster:
-    """Tests that share a cluster; Ray supports one per process, so other tests run afterwards."""
+    """Tests that share one Ray cluster. Ray supports only one cluster per process, so tests that
+    start another one run later."""
 
     @pytest.fixture(scope="class")
     def executor(self) -> Iterator[RayExecutor]:

@@ -1,1 +1,1 @@
-"""Random rooms, streets and objects, rendered by ray casting."""
+"""Random rooms, streets and table tops, rendered by ray casting for training."""

@@ -1,4 +1,4 @@
-"""Scene under construction: solids with materials, lights and sky."""
+"""Builder of a synthetic scene from solids with materials, lights and a sky."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Look:
-    """Material: texture index, size in meters, tint, shine and glow."""
+    """Material: texture index, texture period in meters, tint, specular weight and emission."""
 
     texture: int
     period: float
@@ -27,9 +27,9 @@ class Look:
 
 @dataclass
 class Builder:
-    """Collector of solids; lengths in meters, z up.
+    """Collector of the solids of a scene, with lengths in meters and z up.
 
-    ``at`` is the center of the lower side of a solid.
+    In all methods, ``at`` is the center of the lower side of a solid in the world.
     """
 
     rng: np.random.Generator
@@ -45,7 +45,7 @@ class Builder:
     )
 
     def look(self, period: tuple[float, float] = (0.3, 3.0), **more: float) -> Look:
-        """Draw a random material."""
+        """Draw a material with a random texture, tint and shine."""
         rng = self.rng
         tint = np.clip(rng.uniform(0.4, 1.1) + rng.normal(0, 0.08, 3), 0.05, 1.2)
         shine = rng.uniform(0, 0.8) if rng.random() < 0.25 else 0.0
@@ -62,7 +62,8 @@ class Builder:
     def box(
         self, at: ArrayLike, size: ArrayLike, look: Look, yaw: float = 0.0, **more: Any
     ) -> None:
-        """Add a box of full ``size``, rotated by ``yaw`` (rad) about the vertical."""
+        """Add a box with side lengths ``size`` in meters, rotated by ``yaw`` (rad) about the
+        vertical."""
         half = np.asarray(size, float) / 2
         self._add(BOX, _lifted(at, half[2]), half, _turn(yaw), look, **more)
 
@@ -75,7 +76,7 @@ class Builder:
         axis: str = "z",
         yaw: float = 0.0,
     ) -> None:
-        """Add a vertical cylinder (axis z), or a horizontal one (axis x, rotated by ``yaw``)."""
+        """Add a vertical cylinder, or a horizontal one along x that is rotated by ``yaw`` (rad)."""
         half = np.array([radius, radius, height / 2])
         turn = _turn(yaw)
         lift = height / 2
@@ -84,12 +85,12 @@ class Builder:
         self._add(CYLINDER, _lifted(at, lift), half, turn, look)
 
     def ball(self, center: ArrayLike, half: ArrayLike, look: Look, yaw: float = 0.0) -> None:
-        """Add an ellipsoid with half axes around ``center``."""
+        """Add an ellipsoid with the half axes ``half`` in meters around ``center``."""
         half = np.broadcast_to(np.asarray(half, float), 3)
         self._add(BALL, np.asarray(center, float), half, _turn(yaw), look)
 
     def tumbled(self, kind: int, center: ArrayLike, half: ArrayLike, look: Look) -> None:
-        """Add a solid in any orientation."""
+        """Add a solid in a random orientation."""
         q, _ = np.linalg.qr(self.rng.normal(size=(3, 3)))
         self._add(kind, np.asarray(center, float), np.asarray(half, float), q, look)
 
@@ -109,23 +110,23 @@ class Builder:
 
     @property
     def count(self) -> int:
-        """Return the number of solids."""
+        """Return the number of solids in the scene."""
         return len(self._solids)
 
     def lamp(self, at: ArrayLike, strength: float, warmth: float) -> None:
-        """Add a point light; warmth from -1 (blue) to 1 (yellow)."""
+        """Add a point light with a color from blue (warmth -1) to yellow (warmth 1)."""
         colour = strength * np.array([1 + 0.15 * warmth, 1.0, 1 - 0.25 * warmth])
         self.lights.append([*np.asarray(at, float), *colour, 0.0])
 
     def sun(self, direction: ArrayLike, strength: float) -> None:
-        """Add a directional light from ``direction``."""
+        """Add a directional light that shines from ``direction``."""
         d = np.asarray(direction, float)
         self.lights.append(
             [*(d / np.linalg.norm(d)), *(strength * np.array([1.0, 0.95, 0.85])), 1.0]
         )
 
     def arrays(self, bank: NDArray[np.uint8]) -> tuple[Any, NDArray[Any], NDArray[Any]]:
-        """Return ``scene``, ``shows`` and ``sky`` for :func:`raycast.draw`."""
+        """Return the arguments ``scene``, ``shows`` and ``sky`` of :func:`raycast.draw`."""
         n = self.count
         kinds, shows = np.empty(n, np.int64), np.empty(n, np.int64)
         inverses, centers = np.empty((n, 3, 4)), np.empty((n, 3))
@@ -150,7 +151,7 @@ class Builder:
 
 
 def _groups(opaque: NDArray[Any], centers: NDArray[Any], radii: NDArray[Any]) -> tuple[Any, ...]:
-    """Compute bounding spheres of runs of solids, because solids of one piece are consecutive."""
+    """Compute the bounding spheres of groups of consecutive solids, which are close in space."""
     runs = [opaque[k : k + GROUP] for k in range(0, len(opaque), GROUP)]
     middles = np.array([centers[run].mean(0) for run in runs]).reshape(-1, 3)
     reach = [

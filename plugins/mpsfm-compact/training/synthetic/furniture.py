@@ -1,6 +1,7 @@
-"""Furniture: functions ``(builder, x, y, yaw)`` that draw their own sizes.
+"""Functions ``(builder, x, y, yaw)`` that add a piece of furniture of random size.
 
-The back of a piece is at ``(x, y)``, its front faces ``yaw``; sizes are those of real furniture.
+The back of a piece is at ``(x, y)`` in meters, and its front faces the direction ``yaw`` (rad).
+Sizes are those of real furniture.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ Furniture = Callable[[Builder, float, float, float], None]
 
 
 class Frame:
-    """Coordinates of a piece: ``u`` along the wall, ``v`` away from it."""
+    """Coordinate frame of a piece of furniture: ``u`` is along the wall and ``v`` away from the
+    wall, in meters."""
 
     def __init__(self, build: Builder, x: float, y: float, yaw: float) -> None:
         self.build, self.x, self.y, self.yaw = build, x, y, yaw
 
     def at(self, u: float, v: float, z: float) -> NDArray[np.float64]:
-        """Return the world position of a point."""
+        """Convert a point from furniture coordinates (u, v, z) to world coordinates."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return np.array([self.x - s * u + c * v, self.y + c * u + s * v, z])
 
@@ -38,11 +40,11 @@ class Frame:
         look: Look,
         turn: float = 0,
     ) -> None:
-        """Add a box by width along the wall, depth away from it, and height."""
+        """Add a box by its width along the wall, its depth away from the wall, and its height."""
         self.build.box(self.at(u, v, z), (d, w, h), look, self.yaw + turn)
 
     def pole(self, u: float, v: float, z: float, r: float, h: float, look: Look) -> None:
-        """Add a vertical cylinder."""
+        """Add a vertical cylinder in furniture coordinates."""
         self.build.cylinder(self.at(u, v, z), r, h, look)
 
     def ball(
@@ -57,7 +59,7 @@ def _between(b: Builder, low: float, high: float) -> float:
 
 
 def clutter(f: Frame, u: float, v: float, z: float, largest: float = 0.35) -> None:
-    """Add a small object on a surface."""
+    """Add a small object on a horizontal surface."""
     b, look = f.build, f.build.look((0.05, 0.5))
     kind = b.rng.integers(6)
     r, h = _between(b, 0.02, largest / 3), _between(b, 0.04, largest)
@@ -95,7 +97,7 @@ def _scatter(f: Frame, z: float, width: float, v0: float, v1: float, max_objects
 
 
 def table(b: Builder, x: float, y: float, yaw: float) -> None:
-    """Build a table with objects on it."""
+    """Add a table with objects on its top."""
     f, top, leg = Frame(b, x, y, yaw), b.look(), b.look()
     w, d, h = _between(b, 0.6, 2.0), _between(b, 0.5, 1.0), _between(b, 0.4, 0.78)
     f.box(0, d / 2, h - 0.04, w, d, 0.04, top)
@@ -148,7 +150,7 @@ def chair(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def office_chair(b: Builder, x: float, y: float, yaw: float) -> None:
-    """Build an office chair."""
+    """Add an office chair."""
     f, look, dark = Frame(b, x, y, yaw), b.look(), b.look()
     f.pole(0, 0.25, 0.06, 0.03, 0.38, dark)
     for turn in range(5):
@@ -208,7 +210,7 @@ def cabinet(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def shelves(b: Builder, x: float, y: float, yaw: float) -> None:
-    """Build shelves with objects."""
+    """Add shelves with objects."""
     f, look = Frame(b, x, y, yaw), b.look()
     w, d, levels = _between(b, 0.5, 1.8), _between(b, 0.22, 0.4), int(b.rng.integers(2, 7))
     gap = _between(b, 0.28, 0.42)
@@ -238,7 +240,7 @@ def shelves(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def counter(b: Builder, x: float, y: float, yaw: float) -> None:
-    """Build a kitchen counter."""
+    """Add a kitchen counter."""
     f, front, top = Frame(b, x, y, yaw), b.look(), b.look((0.2, 1.5), shine=0.3)
     units = int(b.rng.integers(2, 6))
     w = units * 0.6
@@ -270,7 +272,7 @@ def fridge(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def plant(b: Builder, x: float, y: float, yaw: float) -> None:
-    """Build a plant in a pot."""
+    """Add a plant in a pot."""
     f, leaf = Frame(b, x, y, yaw), b.look((0.05, 0.3))
     h, r = _between(b, 0.3, 1.6), _between(b, 0.1, 0.22)
     f.pole(0, 0.25, 0, r, r * 1.8, b.look())
@@ -282,7 +284,7 @@ def plant(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def floor_lamp(b: Builder, x: float, y: float, yaw: float) -> None:
-    """Build a floor lamp."""
+    """Add a floor lamp."""
     f, look = Frame(b, x, y, yaw), b.look()
     h = _between(b, 1.2, 1.8)
     f.pole(0, 0.2, 0, 0.14, 0.03, look)
@@ -291,7 +293,7 @@ def floor_lamp(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def heap(b: Builder, x: float, y: float, yaw: float) -> None:
-    """Build a heap of boxes."""
+    """Add a heap of boxes."""
     f = Frame(b, x, y, yaw)
     for _ in range(b.rng.integers(1, 6)):
         size = b.rng.uniform(0.12, 0.55, 3)
@@ -330,7 +332,7 @@ def screen(b: Builder, x: float, y: float, yaw: float) -> None:
 
 
 def odd(b: Builder, x: float, y: float, yaw: float) -> None:
-    """Add an abstract object: solids in any orientation."""
+    """Add a sculpture made of solids in random orientations."""
     f = Frame(b, x, y, yaw)
     look = b.look()
     for _ in range(b.rng.integers(1, 7)):

@@ -1,4 +1,4 @@
-"""Rendering of shards of random scenes."""
+"""Rendering of training samples of random synthetic scenes."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from training.synthetic.worlds import WORLDS, Shot
 _TEXTURES = 96
 _VIEWS = 6
 _OVERSAMPLE = 1.25
-"""Oversampling factor of colors."""
+"""Ratio of the rendered to the stored image size, for antialiasing of colors."""
 _NEAREST, _FARTHEST = 0.15, 120.0
 _DIFFERENT = 0.25
-"""Minimum log ratio of the 95th to the 5th percentile of depth; excludes bare walls."""
+"""Minimum log ratio of the 95th to the 5th percentile of depth in an image. It excludes images of
+bare walls."""
 
 
 def draw_samples(seed: Sequence[int], photos: Sequence[Path] = ()) -> Iterator[Sample]:
-    """Yield samples of random scenes."""
+    """Yield rendered training samples of random scenes, endlessly."""
     rng = np.random.default_rng(seed)
     bank = make_textures(rng, _TEXTURES, photos)
     worlds, shares = zip(*WORLDS, strict=True)

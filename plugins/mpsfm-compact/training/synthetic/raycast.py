@@ -1,8 +1,9 @@
 """Compiled ray casting of boxes, ellipsoids and cylinders.
 
-Every solid is a unit solid (cube [-1, 1]^3, unit ball, cylinder of radius 1 along z in [-1, 1])
-under an affine map, so each kind has one intersection routine. World: x and y horizontal, z up,
-meters. Camera: x right, y down, z forward.
+Every solid is a unit solid (cube [-1, 1]^3, unit ball, or cylinder of radius 1 along z in [-1, 1])
+under an affine map. Each kind of solid therefore needs one intersection routine. In world
+coordinates, x and y are horizontal and z is up, in meters. In camera coordinates, x is right, y
+down and z forward.
 """
 
 from __future__ import annotations
@@ -12,18 +13,19 @@ from numba import njit
 
 BOX, BALL, CYLINDER = 0, 1, 2
 PLAIN, MIRROR, WINDOW = 0, 1, 2
-"""Appearance of a surface: its own color, a reflection, or the sky behind it."""
+"""Appearance of a surface: its own color, a mirror reflection, or the sky seen through a window."""
 GROUP = 8
-"""Number of consecutive solids that share a bounding sphere for shadow rays."""
+"""Number of consecutive solids that share one bounding sphere for shadow rays."""
 _NEAR = 1e-4
 _TILE = 16
 _compiled = njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
-"""Compiler options; comparisons with infinity must be exact."""
+"""Options of the numba compiler. Comparisons with infinity must be exact."""
 
 
 @_compiled
 def _hit(kind, inverse, origin, direction):
-    """Compute the distance along the ray to the first surface (inf: none), and the axis hit."""
+    """Compute the distance along a ray to a unit solid (inf for a miss), and the axis of the
+    face."""
     ox = inverse[0, 0] * origin[0] + inverse[0, 1] * origin[1] + inverse[0, 2] * origin[2]
     oy = inverse[1, 0] * origin[0] + inverse[1, 1] * origin[1] + inverse[1, 2] * origin[2]
     oz = inverse[2, 0] * origin[0] + inverse[2, 1] * origin[1] + inverse[2, 2] * origin[2]
@@ -46,7 +48,7 @@ def _hit(kind, inverse, origin, direction):
             if near > enter:
                 enter, axis = near, a
             leave = min(leave, far)
-        if enter > leave or enter < _NEAR:  # surfaces are not visible from inside
+        if enter > leave or enter < _NEAR:  # faces are not visible from inside of a solid
             return np.inf, 0
         return enter, axis
     if kind == BALL:
@@ -77,7 +79,8 @@ def _hit(kind, inverse, origin, direction):
 
 @_compiled
 def _first(solids, chosen, count, origin, direction):
-    """Find distance, solid (-1: none) and axis of the first hit among chosen solids."""
+    """Find distance, solid index (-1 for a miss) and face axis of the first hit among chosen
+    solids."""
     kinds, inverses, centers, radii = solids
     best, solid, face = np.inf, -1, 0
     for k in range(count):
@@ -92,7 +95,7 @@ def _first(solids, chosen, count, origin, direction):
 
 @_compiled
 def _blocked(solids, shadows, origin, direction, reach):
-    """Return if a shadow caster is within ``reach``."""
+    """Return True if a shadow caster blocks the ray within the distance ``reach``."""
     kinds, inverses, centers, radii = solids
     opaque, group_centers, group_radii = shadows
     for g in range(len(group_radii)):
@@ -110,7 +113,7 @@ def _blocked(solids, shadows, origin, direction, reach):
 
 @_compiled
 def _near(center, radius, origin, direction, reach):
-    """Return if a ray meets a ball within ``reach``."""
+    """Return True if a ray meets a sphere within the distance ``reach``."""
     x, y, z = center[0] - origin[0], center[1] - origin[1], center[2] - origin[2]
     along = x * direction[0] + y * direction[1] + z * direction[2]
     if along + radius < 0 or along - radius > reach:
@@ -120,7 +123,7 @@ def _near(center, radius, origin, direction, reach):
 
 @_compiled
 def _surface(kinds, inverses, sizes, i, axis, point, direction, normal, uv):
-    """Compute normal and texture coordinates (meters) of a surface point."""
+    """Compute the normal and the texture coordinates (meters) of a surface point."""
     local = np.empty(3)
     for a in range(3):
         m = inverses[i, a]
@@ -159,7 +162,7 @@ def _surface(kinds, inverses, sizes, i, axis, point, direction, normal, uv):
 
 @_compiled
 def _texture(textures, number, u, v, footprint, colour):
-    """Interpolate a repeating texture at the level of the footprint (in texels)."""
+    """Interpolate a repeating texture at the mipmap level of the pixel footprint (in texels)."""
     size = textures.shape[2]
     level = 0
     while footprint > 1.5 and level < textures.shape[0] - 1:
@@ -178,7 +181,7 @@ def _texture(textures, number, u, v, footprint, colour):
 
 @_compiled
 def _sky(direction, sky, colour):
-    """Compute the sky color of a direction: horizon to zenith, and the glow of a sun."""
+    """Compute the sky color in a direction from a horizon-to-zenith gradient and a sun."""
     up = max(0.0, direction[2]) ** 0.5
     glow = direction[0] * sky[2, 0] + direction[1] * sky[2, 1] + direction[2] * sky[2, 2]
     glow = max(0.0, glow) ** 40 * 0.6
@@ -188,12 +191,13 @@ def _sky(direction, sky, colour):
 
 @_compiled
 def _shade(scene, i, axis, point, direction, distance, pixel, normal, colour):
-    """Compute the light from a surface point along the ray: texture, lighting, shadows."""
+    """Compute the light that a surface point sends along a ray, from texture, lights and
+    shadows."""
     solids, sizes, looks, textures, shadows, lights, ambient = scene
     kinds, inverses, _, _ = solids
     uv = np.empty(2)
     _surface(kinds, inverses, sizes, i, axis, point, direction, normal, uv)
-    look = looks[i]  # texture, texels' scale, tint rgb, offset uv, shine, glow
+    look = looks[i]  # Elements: texture, texels' scale, tint rgb, offset uv, shine, glow.
     slant = max(
         0.15, -(normal[0] * direction[0] + normal[1] * direction[1] + normal[2] * direction[2])
     )
@@ -213,7 +217,7 @@ def _shade(scene, i, axis, point, direction, distance, pixel, normal, colour):
         start[a] = point[a] + 2e-3 * normal[a]
     towards = np.empty(3)
     for k in range(len(lights)):
-        light = lights[k]  # position or direction, colour rgb, 1 for a sun
+        light = lights[k]  # Elements of a light: position or direction, color rgb, and 1 for a sun.
         reach = 0.0
         for a in range(3):
             towards[a] = light[a] - (0.0 if light[6] > 0 else start[a])
@@ -263,7 +267,7 @@ def draw(scene, shows, sky, origin, rotation, focal, width, height, image, depth
             length = np.sqrt(cx * cx + cy * cy + focal * focal)
             spread = (
                 0.75 * _TILE / length
-            )  # maximum angle in rad from the axis of the tile to its corner
+            )  # maximum angle in rad between the axis of an image tile and its corner rays
             for a in range(3):
                 ray[a] = (
                     rotation[a, 0] * cx + rotation[a, 1] * cy + rotation[a, 2] * focal

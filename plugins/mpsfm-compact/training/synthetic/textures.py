@@ -1,4 +1,4 @@
-"""Repeating textures: noise, wood, tiles, bricks, stripes, cloth, and parts of photos."""
+"""Repeating textures: noise, wood, tiles, bricks, stripes, cloth, and parts of real images."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _LEVELS = 6
 def make_textures(
     rng: np.random.Generator, count: int, photos: Sequence[Path] = ()
 ) -> NDArray[np.uint8]:
-    """Create textures (levels, count, s, s, 3), RGB; each level has half the detail.
+    """Create RGB mipmap textures (levels, count, s, s, 3), each level with half the detail.
 
-    With ``photos``, every second texture is a part of a photo, mirrored to repeat.
+    If ``photos`` are given, every second texture is a part of one, mirrored such that it repeats.
     """
     bank = np.empty((_LEVELS, count, SIZE, SIZE, 3), np.uint8)
     for number in range(count):
@@ -35,7 +35,7 @@ def make_textures(
 
 
 def noise(rng: np.random.Generator, decay: float, stretch: float = 1.0) -> NDArray[np.float32]:
-    """Create repeating noise (s, s) in [0, 1] with amplitude ``frequency ** -decay``."""
+    """Create repeating noise (s, s) in [0, 1] with the spectrum ``frequency ** -decay``."""
     fy, fx = np.fft.fftfreq(SIZE)[:, None] * stretch, np.fft.rfftfreq(SIZE)[None]
     frequency = np.maximum(np.hypot(fx, fy), 1 / SIZE)
     spectrum = frequency**-decay * np.exp(2j * np.pi * rng.random(frequency.shape))
@@ -46,7 +46,7 @@ def noise(rng: np.random.Generator, decay: float, stretch: float = 1.0) -> NDArr
 
 
 def _colour(rng: np.random.Generator) -> NDArray[np.float32]:
-    """Draw a color, mostly muted as walls and furniture are."""
+    """Draw a random color, mostly a muted one as of walls and furniture."""
     base = rng.uniform(0.1, 0.95) * np.ones(3)
     vivid = rng.uniform(0, 0.25) if rng.random() < 0.7 else rng.uniform(0.3, 0.9)
     return np.clip(base + vivid * rng.uniform(-1, 1, 3), 0.03, 1).astype(np.float32)
@@ -113,7 +113,7 @@ def _cloth(rng: np.random.Generator) -> NDArray[np.uint8]:
 
 
 def _patches(rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Create rectangles of many colors, like a poster or a bookshelf."""
+    """Create a texture of rectangles in many colors, like a poster or a bookshelf."""
     picture = np.empty((SIZE, SIZE, 3), np.float32)
     picture[:] = _colour(rng)
     for _ in range(rng.integers(5, 60)):

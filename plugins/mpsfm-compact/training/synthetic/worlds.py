@@ -1,4 +1,4 @@
-"""Rooms, streets and table tops, and camera positions in them."""
+"""Synthetic rooms, streets and table tops, and random camera poses in them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from training.synthetic.raycast import BALL, BOX, CYLINDER, MIRROR, WINDOW
 
 @dataclass(frozen=True)
 class Shot:
-    """Camera: position, world_from_camera (3, 3), and focal length relative to the diagonal."""
+    """Camera center, rotation world_from_camera (3, 3), and focal length relative to the
+    diagonal."""
 
     origin: NDArray[np.float64]
     rotation: NDArray[np.float64]
@@ -23,7 +24,7 @@ class Shot:
 
 
 World = Callable[[Builder], Callable[[], Shot]]
-"""Function that fills a builder and returns a function that draws shots."""
+"""Function that adds a scene to a builder, and returns a function that draws random cameras."""
 
 
 def room(b: Builder) -> Callable[[], Shot]:
@@ -84,7 +85,7 @@ def room(b: Builder) -> Callable[[], Shot]:
     def shoot() -> Shot:
         at = rng.uniform(-0.46, 0.46, 2) * (length, width)
         to = rng.uniform(-0.5, 0.5, 2) * (length, width)
-        if rng.random() < 0.5:  # photos of a room are taken from near a wall
+        if rng.random() < 0.5:  # indoor images are mostly taken from near a wall
             longer = int(width > length)
             end = rng.choice([-1.0, 1.0]) * (length, width)[longer]
             at[longer], to[longer] = rng.uniform(0.2, 0.46) * end, -rng.uniform(0, 0.5) * end
@@ -99,7 +100,8 @@ def room(b: Builder) -> Callable[[], Shot]:
 
 
 def _floor_plan(rng: np.random.Generator) -> tuple[tuple[float, float], float]:
-    """Draw length, width and height in meters: closets, ordinary rooms, halls or corridors."""
+    """Draw length, width and height in meters of a closet, an ordinary room, a hall or a
+    corridor."""
     kind = rng.choice(5, p=(0.12, 0.46, 0.22, 0.1, 0.1))
     low, high = ((1.8, 3.5), (3.0, 6.5), (4.5, 10.0), (8.0, 18.0), (5.0, 20.0))[kind]
     length, width = rng.uniform(low, high, 2)
@@ -187,11 +189,11 @@ def table_top(b: Builder) -> Callable[[], Shot]:
 
 
 WORLDS: tuple[tuple[World, float], ...] = ((room, 0.68), (street, 0.22), (table_top, 0.1))
-"""Kinds of scenes and their shares."""
+"""Functions that build a scene, and the share of each in the samples."""
 
 
 def _aimed(rng: np.random.Generator, eye: NDArray[np.float64], goal: NDArray[np.float64]) -> Shot:
-    """Create a hand-held shot towards a goal, with the focal length of a common camera."""
+    """Create a camera that is aimed at ``goal`` with hand-held errors and a random focal length."""
     forward = (goal - eye) / np.linalg.norm(goal - eye)
     forward = forward + rng.normal(0, 0.05, 3)
     forward /= np.linalg.norm(forward)
@@ -215,7 +217,7 @@ def _sky(b: Builder) -> None:
 
 
 def _wall(b: Builder, f: Frame, wide: float, height: float) -> None:
-    """Add an object on a wall, or an opening in it."""
+    """Add windows, doors, pictures, mirrors, boards or curtains to a wall."""
     rng = b.rng
     frame = b.look((1, 5))
     for _ in range(rng.integers(0, 4)):
@@ -295,7 +297,7 @@ def _house(b: Builder, f: Frame, u: float, wide: float) -> None:
                 high * 0.9,
                 trim,
             )
-    if rng.random() < 0.5:  # relief: a niche with figures
+    if rng.random() < 0.5:  # a niche with figures in relief
         for _ in range(rng.integers(2, 12)):
             at = f.at(u + rng.normal(0, wide / 6), ahead + 0.1, rng.uniform(0.3, high))
             b.tumbled(BALL, at, rng.uniform(0.1, 0.7, 3), trim)
