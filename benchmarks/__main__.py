@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def main() -> int:
-    """Run the named benchmarks; return how many failed."""
+    """Run the named benchmarks, and return the number of benchmarks that failed."""
     known = sorted(
         module.name
         for module in pkgutil.iter_modules([str(Path(__file__).parent)])

@@ -1,4 +1,4 @@
-"""Headless Chromium for screenshots of pages."""
+"""Headless Chromium browser for screenshots of HTML pages."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _ARGUMENTS = (
 
 
 def capture_png(browser: Any) -> bytes:
-    """Capture the window as PNG, without the timeout of the driver's own command."""
+    """Capture the browser window as PNG through the DevTools protocol, which has no timeout."""
     taken = browser.execute_cdp_cmd("Page.captureScreenshot", {"format": "png"})
     return base64.b64decode(taken["data"])
 
 
 @contextmanager
 def start_browser(width: int = 1280, height: int = 800) -> Iterator[Any]:
-    """Start a browser of a given size; exit if none is installed."""
+    """Start Chromium with a window size in pixels; exit if Chromium is not installed."""
     try:
         from selenium import webdriver
     except ImportError as error:
@@ -39,10 +39,10 @@ def start_browser(width: int = 1280, height: int = 800) -> Iterator[Any]:
     options.binary_location = chromium
     for argument in _ARGUMENTS:
         options.add_argument(argument)
-    options.page_load_strategy = "none"  # callers wait for the content
+    options.page_load_strategy = "none"  # the benchmarks wait until the page shows its content
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
-    browser.command_executor.client_config.timeout = 600  # seconds; rendering without a GPU is slow
+    browser.command_executor.client_config.timeout = 600  # s; slow without a GPU
     browser.set_script_timeout(600)
     screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)

@@ -1,4 +1,4 @@
-"""Scenes, result folder and helpers of the benchmarks."""
+"""Locate the scenes and the result folder of the benchmarks, and format their results."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from mpsfm_core.support.yaml_text import write_yaml
 
 RESULTS = Path(__file__).parent / "results"
 MPSFM = [sys.executable, "-m", "mpsfm_core"]
-"""The command ``mpsfm`` of this environment."""
+"""Path of the command ``mpsfm`` of the running Python environment."""
 
 
 def shared_folder() -> Path:
-    """Return the folder with real scenes: $MPSFM_SHARED or ../shared; exit if missing."""
+    """Return the folder with real scenes ($MPSFM_SHARED or ../shared); exit if it is missing."""
     default = Path(__file__).resolve().parents[2] / "shared"
     folder = Path(os.environ.get("MPSFM_SHARED", default))
     if not (folder / "data").is_dir():
@@ -30,7 +30,7 @@ def frame_names(scene: Path) -> list[str]:
 
 
 def with_sets(scene: Path, folder: Path, sets: Mapping[str, Sequence[Sequence[str]]]) -> Path:
-    """Copy a scene folder to ``folder`` with new image sets for each bucket."""
+    """Copy a scene folder to ``folder``, with new test sets (lists of images)."""
     folder.mkdir(parents=True, exist_ok=True)
     for item in scene.iterdir():
         if item.name != "testsets.yaml" and not (folder / item.name).exists():
@@ -41,11 +41,11 @@ def with_sets(scene: Path, folder: Path, sets: Mapping[str, Sequence[Sequence[st
 
 
 def percent(area: Mapping[float, float]) -> str:
-    """Format pose AUC by threshold in percent for a table cell."""
+    """Format pose AUC in percent, by threshold in degrees, as a cell of a table."""
     return " / ".join(f"{100 * value:.1f}" for value in area.values())
 
 
 def print_progress(record: BenchmarkRecord, known: bool) -> None:
-    """Print progress to stderr: a run is complete, or was before."""
+    """Print to stderr that a benchmark run is complete, or was read from an earlier benchmark."""
     what = "known" if known else record.error or f"{record.cpu_seconds:.1f} s"
     print(f"{record.config} {record.set_name} {record.label}: {what}", file=sys.stderr)

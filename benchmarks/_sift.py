@@ -1,4 +1,4 @@
-"""COLMAP's SIFT and exhaustive matching."""
+"""Extract and match SIFT features of all image pairs with COLMAP."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pycolmap
 def extract(
     database: Path, images: Path, model: str, params: Sequence[float], names: Sequence[str] = ()
 ) -> None:
-    """Extract SIFT features of images of one known camera; ``names`` None: all images."""
+    """Extract SIFT features of the named images (default: all) with one known camera."""
     pycolmap.extract_features(
         database,
         images,

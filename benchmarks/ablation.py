@@ -1,10 +1,10 @@
-"""Ablation of the mapper: one component changed at a time.
+"""Ablation of the mapper: each variant changes one component of the default mapper.
 
     python -m benchmarks.ablation [--scene rendered_kitchen] [--priors sensor,degraded]
         [--sets minimal,leq10,leq30,all] [--only NAME ...] [--output DIR] [--workers 1]
 
-Each variant is a row of :data:`VARIANTS`, settings below ``mapping`` that differ from the defaults.
-All variants use the same matches. An interrupted benchmark resumes from --output. Writes
+:data:`VARIANTS` lists the variants with their settings below ``mapping``. All variants use the same
+matches. An interrupted ablation resumes from the folder --output. Writes
 benchmarks/results/ablation-SCENE.md with AUC@1 / 5 / 20 degrees, as table 5 of the paper.
 """
 
@@ -52,7 +52,7 @@ VARIANTS: Mapping[str, Mapping[str, object]] = {
 
 
 def main() -> None:
-    """Run the variants and write the table."""
+    """Map the test sets with all variants of the mapper, and write the tables of pose AUC."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scene", default="rendered_kitchen")
     parser.add_argument("--priors", default="sensor,degraded")
@@ -92,7 +92,7 @@ def _file_name(variant: str) -> str:
 
 
 def _table(scene: str, rows: Sequence[BenchmarkRow], configs: Mapping[str, str]) -> str:
-    """Format one table per prior: a row per variant, a column per bucket."""
+    """Format one table per depth prior, with a row per mapper variant and a column per bucket."""
     convention = CONVENTIONS["paper"]
     parts = [
         f"# Ablation on {scene}",

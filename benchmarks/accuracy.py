@@ -2,10 +2,10 @@
 
     python -m benchmarks.accuracy [--tables rendered_kitchen ...] [--output DIR] [--workers 1]
 
-Runs ``mpsfm benchmark`` (resumable with --output) and writes one file per table to
-benchmarks/results/. Scenes are in $MPSFM_SHARED or ../shared. The report in --output has all
-methods and conventions. For rendered_kitchen the results are compared with targets; the exit code
-is 1 if one is missed.
+Runs ``mpsfm benchmark`` and writes one file per table to benchmarks/results/. An interrupted
+benchmark resumes from the folder --output, whose report has all methods and AUC conventions. Scenes
+are in $MPSFM_SHARED or ../shared. The exit code is 1 if a pose AUC on rendered_kitchen is below its
+target.
 """
 
 from __future__ import annotations
@@ -23,25 +23,27 @@ from mpsfm_core.evaluation.records import BenchmarkRecord
 from mpsfm_core.evaluation.report import BenchmarkRow, build_rows, format_markdown, write_report
 
 PRIORS = ("sensor", "degraded", "config")
-"""Depth priors; ``config`` is FastDepth."""
+"""Depth priors of the benchmark; the prior ``config`` is the network FastDepth."""
 SEEDS = 12
-"""Number of seeds of degraded depth on rendered_kitchen, whose small sets vary by several points.
+"""Number of seeds of degraded depth on rendered_kitchen.
+
+Seeds change pose AUC there by several points, because the test sets have few images.
 """
 DEGRADED = ("degraded", *(f"degraded-{seed}" for seed in range(1, SEEDS)))
-"""Names of the priors of these seeds."""
+"""Names of the degraded depth priors, one per seed."""
 TABLE_START = "Pose AUC in percent"
-"""First words of the generated part of a page; the text above it is kept."""
+"""First words of the generated part of a result page; the text above is hand-written."""
 WINDOWS, FRAMES = 6, 5
-"""Number of evenly spaced windows, and of consecutive frames in each, for low parallax."""
+"""Number of low-parallax test sets, and of consecutive video frames in each of them."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One table: a scene, its buckets (None: all) and priors, and the configuration.
+    """One table of pose AUC: a scene, its buckets (None: all) and priors, and the configuration.
 
-    ``configuration``: name and additional settings. ``depth``: settings of the prior ``config``,
-    None for FastDepth. ``note``: text above the table of a new page. ``ours_only``: omit COLMAP's
-    rows, which another page has.
+    ``configuration`` is the name of a YAML configuration and its settings. ``depth`` is the YAML
+    block of the depth network, None for FastDepth. ``note`` is the text above the table of a new
+    page. ``ours_only`` omits the rows of COLMAP.
     """
 
     scene: str
@@ -67,7 +69,7 @@ NETWORK_BUCKETS: Mapping[str, tuple[str, ...]] = {
     "rendered_kitchen": ("minimal", "leq30", "all"),
     "hololens_room": ("leq5", "leq10", "leq30", "all"),
 }
-"""Buckets for the comparison of networks."""
+"""Buckets of each scene on which depth networks are compared."""
 UNCONFIRMED = "unconfirmed", "mapping: {register_tentatively: true}\n"
 COMPARISONS: Mapping[str, Comparison] = {
     "rendered_kitchen": Comparison(
@@ -115,11 +117,11 @@ TARGETS: Mapping[tuple[str, str], tuple[float, float, float]] = {
     ("leq30", "ours-degraded"): (30, 65, 85),
     ("all", "ours-degraded"): (45, 80, 92),
 }
-"""Targets of AUC@1, 5, 20 on rendered_kitchen by bucket and method."""
+"""Target pose AUC in percent at 1, 5 and 20 degrees on rendered_kitchen, by bucket and method."""
 
 
 def main() -> int:
-    """Run the scenes; return the exit code."""
+    """Run the comparisons and write their tables; return 1 if a target is missed, else 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tables", nargs="+", default=list(COMPARISONS), choices=COMPARISONS)
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))
@@ -160,14 +162,14 @@ def main() -> int:
 
 
 def _is_shown(row: BenchmarkRow, comparison: Comparison) -> bool:
-    """Return if a page shows a row; the report in --output has all rows."""
+    """Return if the result page of a comparison shows a row of the benchmark report."""
     if row.method.startswith("chained-pnp"):
         return False
     return row.method.startswith("ours") or not comparison.ours_only
 
 
 def _written_note(file: Path) -> str:
-    """Return the text above the table of an existing page."""
+    """Return the hand-written text above the table of an existing result page."""
     if not file.is_file():
         return ""
     _, _, below_title = file.read_text(encoding="utf-8").partition("\n")
@@ -176,12 +178,12 @@ def _written_note(file: Path) -> str:
 
 
 def _pooled(record: BenchmarkRecord) -> BenchmarkRecord:
-    """Replace the label of a record by one that all seeds of degraded depth share."""
+    """Remove the seed from the label of a record with degraded depth, so that seeds are pooled."""
     return replace(record, label=re.sub(r"degraded-\d+$", "degraded", record.label))
 
 
 def _low_parallax(scene: Path, folder: Path) -> Path:
-    """Copy the scene with windows of consecutive frames as sets."""
+    """Copy a scene, and replace its test sets by windows of consecutive video frames."""
     frames = frame_names(scene)
     starts = [k * (len(frames) - FRAMES) // (WINDOWS - 1) for k in range(WINDOWS)]
     windows = [frames[start : start + FRAMES] for start in starts]
@@ -189,7 +191,7 @@ def _low_parallax(scene: Path, folder: Path) -> Path:
 
 
 def _compare_with_targets(rows: Sequence[BenchmarkRow]) -> list[str]:
-    """Format a table of targets and results."""
+    """Format a table of target and measured pose AUC as lines of Markdown."""
     lines = ["| bucket | method | target | measured | |", "| --- | --- | --- | --- | --- |"]
     for row in rows:
         bar = TARGETS.get((row.bucket, row.method))

@@ -1,10 +1,11 @@
-"""Upper bound for the pose search: our mapper, and our mapper initialized with the true poses.
+"""Upper bound of pose accuracy: our mapper compared with our mapper started at the true poses.
 
     python -m benchmarks.bounds [--buckets minimal leq30] [--output DIR]
 
-Uses rendered_kitchen with degraded depth of several seeds. With true poses the mapper only refines,
-and drops images without points. The remaining error is due to matches, depth errors or the
-objective. Writes benchmarks/results/bounds-rendered_kitchen.md.
+The scene is rendered_kitchen, with degraded depth of several seeds. A mapper that starts at the
+true poses only refines them, and drops images without points. The pose error that remains is due to
+matches, depth errors or the objective function. Writes
+benchmarks/results/bounds-rendered_kitchen.md.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ HEADER = (
 
 
 def main() -> None:
-    """Run all sets twice and write the table."""
+    """Map all test sets with and without true initial poses, and write the table of pose AUC."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--buckets", nargs="+", default=["minimal", "leq30"])
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))

@@ -2,11 +2,11 @@
 
     python -m benchmarks.bundle_adjustment [--sizes S M L] [--repeats 5] [--json]
 
-Both start from the same perturbed cameras and points and stop at a relative cost change of 1e-6.
-Times include building the problem (from arrays, or from a reconstruction) and are medians of
-interleaved runs. ``--json`` prints one JSON object as the last line. Targets: time ratio at most
-0.35, cost within 1e-6 and poses within 1e-5 of Ceres from 20 starts, covariances within 1 % of a
-dense inverse.
+Our adjuster and pycolmap start from the same perturbed cameras and points, and stop at a relative
+cost change of 1e-6. Times are medians of interleaved runs, and include building the problem.
+``--json`` prints one JSON object as the last line. Targets: time at most 0.35 of pycolmap's; cost
+within 1e-6 and poses within 1e-5 of Ceres from 20 starts; covariances within 1 % of a dense
+inverse.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from tests.optimize.bundle_reference import (
 )
 
 SIZES = {"S": (30, 19_300, 4.35), "M": (60, 48_000, 4.9), "L": (100, 99_900, 5.45)}
-"""Images, points, mean track length: 84 000, 235 000 and 545 000 observations."""
+"""Number of images, number of points and mean track length of each problem size."""
 LOCAL = (5, 3_000, 3.6)
 STARTS = 20
 
 
 def timed(function: Callable[[], Any]) -> tuple[float, Any]:
-    """Return seconds and result of a call."""
+    """Call a function; return the wall time in seconds and the function's result."""
     start = time.perf_counter()
     result = function()
     return time.perf_counter() - start, result
 
 
 def side_by_side(sides: dict[str, Callable[[], Any]], repeats: int) -> tuple[dict[str, float], Any]:
-    """Return median seconds of interleaved calls, and their last results."""
+    """Call functions alternately; return their median wall times in seconds and last results."""
     seconds: dict[str, list[float]] = {name: [] for name in sides}
     results: dict[str, Any] = {}
     for _ in range(repeats):
@@ -60,11 +60,11 @@ def side_by_side(sides: dict[str, Callable[[], Any]], repeats: int) -> tuple[dic
 
 
 def bench_speed(size: tuple[int, int, float], repeats: int) -> dict[str, float]:
-    """Measure times and ratios of one size; pycolmap starts from a new reconstruction each time."""
+    """Measure bundle adjustment time of one problem size, and its ratio to pycolmap's time."""
     problem = perturb(make_problem(*size), seed=1)
     plain = without_depth(problem)
     reconstructions = [to_pycolmap(problem) for _ in range(repeats)]
-    fresh = iter(reconstructions)  # keep a reference: the adjuster holds none
+    fresh = iter(reconstructions)  # pycolmap's adjuster does not keep them alive
     threads = SOFT_L1_OPTIONS.model_copy(update={"threads": 1})
     median, results = side_by_side(
         {
@@ -98,7 +98,7 @@ def bench_speed(size: tuple[int, int, float], repeats: int) -> dict[str, float]:
 
 
 def bench_optimum(starts: int) -> dict[str, float]:
-    """Measure the largest differences to Ceres (depth as a Python cost) over perturbed starts."""
+    """Measure the largest differences to Ceres (with Python depth costs) over perturbed starts."""
     truth = make_problem(6, 80, 3.5)
     tight = SOFT_L1_OPTIONS.model_copy(update={"function_tolerance": 1e-13, "max_iterations": 1000})
     cost, turn, shift = [], [], []
@@ -124,7 +124,7 @@ def bench_optimum(starts: int) -> dict[str, float]:
 
 
 def bench_covariance(repeats: int) -> dict[str, float]:
-    """Compare point covariances with the dense inverse, and measure their time."""
+    """Compare point covariances with the dense inverse, and measure the time of both."""
     small = replace(make_problem(6, 80, 3.5), obs_log_depth=None)
     information = dense_point_information(small) + DAMPING * np.eye(3 * len(small.points))
     inverse = np.linalg.inv(information).reshape(len(small.points), 3, -1, 3)
@@ -155,7 +155,7 @@ def bench_covariance(repeats: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Parse the command line and run the bundle adjustment benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", nargs="*", choices=list(SIZES), default=list(SIZES))
     parser.add_argument("--repeats", type=int, default=5)

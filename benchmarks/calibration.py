@@ -1,12 +1,13 @@
-"""Effect of calibration: coverage and poses with correct and wrong std, in a real room.
+"""Effect of a calibrated depth std on coverage and poses, compared with wrong std.
 
     python -m benchmarks.calibration [--buckets minimal leq5 leq10] [--output DIR] [--workers 1]
 
-Two depth priors of hololens_room are used: FastDepth, and sensor depth with smooth errors
-(`mpsfm_core.testing.synthetic.degraded_depth`). Each is calibrated on the images outside the sets,
-and declared in four ways: calibrated, std 5 times too small, 5 times too large, and uncalibrated
-(defaults of another network). Coverage is measured on the images of the sets. Poses are measured
-with and without the estimation of depth noise. Resumable with --output. Writes
+The scene hololens_room has two depth priors: FastDepth, and sensor depth with smooth errors
+(`mpsfm_core.testing.synthetic.degraded_depth`). Each depth prior is calibrated on the images
+outside the test sets. Its std is declared in four ways: calibrated, 5 times too small, 5 times too
+large, and uncalibrated (defaults of another network). Coverage is the share of depth errors within
+the std, on the images of the test sets. Poses are computed with and without the estimation of depth
+noise. An interrupted benchmark resumes from the folder --output. Writes
 benchmarks/results/calibration.md; scenes are in $MPSFM_SHARED or ../shared.
 """
 
@@ -34,19 +35,19 @@ from mpsfm_core.support.yaml_text import write_yaml
 
 FACTOR = 5.0
 MEASURED = {"measured": True, "trusted": False}
-"""Setting ``measure_depth_noise`` by label."""
+"""Values of the mapper option ``measure_depth_noise``, by the label in the table."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """Depth prior: its ``depth`` block."""
+    """Depth prior with its YAML block ``depth``."""
 
     name: str
     block: Mapping[str, Any]
 
 
 def main() -> None:
-    """Run and write the tables."""
+    """Calibrate each depth prior, map with each declared std, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--buckets", nargs="+", default=["minimal", "leq5", "leq10"])
     parser.add_argument("--output", type=Path, default=Path("build/calibration"))
@@ -76,13 +77,13 @@ def _priors(scene: SceneFolder, fastdepth: Path, output: Path) -> Iterator[Prior
     yield Prior("FastDepth", {"use": "onnx", "options": {"model": str(fastdepth)}})
     degraded = (output / "degraded").resolve()
     prior_overrides("degraded", scene, scene.truth, degraded)
-    # The declared std is negligible, so that only the calibration determines the variance.
+    # The std in the depth files is negligible, so only the calibration determines the variance.
     options = {"directory": str(degraded), "scale": 0.001, "relative_std": 1e-6}
     yield Prior("degraded sensor depth", {"use": "files", "options": options})
 
 
 def _declarations(calibrated: DepthCalibration) -> dict[str, DepthCalibration]:
-    """Return the calibrated uncertainty, wrong ones, and the defaults."""
+    """Return the calibrated, two wrong, and the default uncertainty models of a depth prior."""
     return {
         "calibrated": calibrated,
         "std 5 x too small": _scaled(calibrated, 1 / FACTOR),
@@ -97,7 +98,7 @@ def _scaled(calibration: DepthCalibration, factor: float) -> DepthCalibration:
 
 
 def _calibrated(prior: Prior, scene: SceneFolder, images: Path, output: Path) -> DepthCalibration:
-    """Fit the calibration on listed images, or read that of an earlier run."""
+    """Fit the calibration of a depth prior on listed images, or read it from an earlier run."""
     file = output / f"{_slug(prior.name)}.calibration.yaml"
     if not file.is_file():
         config = _config(prior, DepthCalibration(), True, output / "fit.yaml")
@@ -112,7 +113,7 @@ def _calibrated(prior: Prior, scene: SceneFolder, images: Path, output: Path) ->
 def _coverage(
     prior: Prior, scene: SceneFolder, images: Path, declared: Mapping[str, DepthCalibration]
 ) -> dict[str, dict[str, Any]]:
-    """Compute the metrics of each declaration on listed images."""
+    """Compute coverage and likelihood of each declared uncertainty on listed images."""
     config = _config(
         prior, DepthCalibration(), True, images.with_name("evaluate_calibrations.yaml")
     )
@@ -130,7 +131,7 @@ def _poses(
     output: Path,
     arguments: argparse.Namespace,
 ) -> dict[tuple[str, str], BenchmarkRow]:
-    """Compute the pose accuracy over all sets by declaration and depth weighting."""
+    """Compute pose AUC over all test sets, by declared std and by depth noise estimation."""
     configs = {
         (name, weighing): _config(
             prior,
@@ -157,7 +158,7 @@ def _poses(
 
 
 def _config(prior: Prior, calibration: DepthCalibration, measure: bool, path: Path) -> str:
-    """Write a configuration; return its path."""
+    """Write a YAML configuration of the benchmark, and return its path."""
     depth = {**prior.block, "calibration": calibration.model_dump(mode="json")}
     values = {
         "extends": "benchmark",

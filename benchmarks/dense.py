@@ -1,15 +1,16 @@
-"""Dense geometry before and after the stage ``dense``, with the same poses.
+"""Accuracy of depth maps and fused clouds before and after the stage ``dense``.
 
     python -m benchmarks.dense [--cases fountain-all-config ...] [--true-poses] [--output DIR]
 
-A case is a scene, a bucket of its sets and a depth prior. Mapped sets (poses, points, refined
-depth) are stored in the output folder and reused. With ``--true-poses`` the mapper keeps the true
-poses; scales of depth, points and refined maps are its own.
+A case is a scene, a bucket of its test sets and a depth prior. Reconstructions of the test sets are
+stored in the output folder and reused. With ``--true-poses`` the mapper keeps the true poses fixed,
+and estimates depth scales, points and refined depth maps.
 
-Depth is compared in the scale of the cameras, its std in the scale that fits the depth of the set
-best, and the cloud after aligning the camera centers, with all true depth maps of the set as the
-scan. ``fountain`` has no true depth: there the measure is the share of matches, triangulated with
-the true poses, whose depth is within 1 %. ``--json`` prints one JSON object as the last line.
+Depth errors are computed in the scale of the camera centers, std coverage in the scale that fits
+the depth best. The fused cloud is aligned by camera centers and compared with all true depth maps
+of the test set. The scene ``fountain`` has no true depth maps. Its metric is the share of points,
+triangulated with the true poses, whose depth is within 1 %. ``--json`` prints one JSON object as
+the last line.
 """
 
 from __future__ import annotations
@@ -60,22 +61,23 @@ from mpsfm_core.providers.registry import Registry
 from mpsfm_core.results.options import ResultOptions
 
 TOLERANCES = (0.02, 0.05)
-"""Distance thresholds of the clouds in meters."""
+"""Distance thresholds in meters for accuracy and completeness of point clouds."""
 NEAR = 0.1
-"""Maximum relative error of accurate depth."""
+"""Maximum relative depth error of a pixel that counts as accurate."""
 WAYS = ("mapper", "dense", "without prior")
-"""Kinds of maps: refined by the mapper, after the dense stage, and after a dense stage that only
-knows the depth range of the points.
+"""Sources of depth maps: the mapper, the dense stage, and the dense stage without depth prior.
+
+Without depth prior, the dense stage only knows the depth range of the triangulated points.
 """
 POINT_NEAR = 0.01
-"""Maximum relative error of accurate depth at true points."""
+"""Maximum relative depth error of an accurate pixel at a triangulated point of ``fountain``."""
 ANGLE, ERROR_PX = 3.0, 1.0
-"""Minimum triangulation angle in degrees and maximum reprojection error of true points."""
+"""Minimum triangulation angle in degrees and maximum reprojection error of reference points."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """Sets of a scene, mapped with a prior of :mod:`mpsfm_core.evaluation.prior_quality`."""
+    """Test sets of a scene and the depth prior (:mod:`mpsfm_core.evaluation.prior_quality`)."""
 
     scene: str
     bucket: str
@@ -97,11 +99,11 @@ CASES: Mapping[str, Case] = {
     for bucket in buckets
     for prior in priors
 }
-"""Cases by name; ``config`` is FastDepth."""
+"""Cases by name; the depth prior ``config`` is the network FastDepth."""
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Parse the command line and run the dense benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=CASES, metavar="CASE")
     parser.add_argument("--true-poses", action="store_true", help="map with the true poses, fixed")
@@ -122,7 +124,7 @@ def main() -> None:
 
 
 def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Reconstruction]:
-    """Map the sets of a case, or read the stored result; ``true_poses``: keep the true poses."""
+    """Map the test sets of a case, with true poses on request, or read the stored result."""
     stored = output / f"{name}{'-true-poses' if true_poses else ''}.pickle"
     if stored.is_file():
         return list(pickle.loads(stored.read_bytes()))
@@ -140,7 +142,7 @@ def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Recon
 
 
 def problem_of_case(name: str, output: Path) -> tuple[PreparedSets, list[EvaluationSet]]:
-    """Extract the mapping problems of a case, or read the stored ones."""
+    """Extract the mapping problems of the test sets of a case, or read them from the cache."""
     case = CASES[name]
     scene = read_scene(shared_folder() / "data" / case.scene)
     sets = scene.select_sets([case.bucket])
@@ -164,9 +166,9 @@ def measured(
     problem: MappingProblem | None,
     poses_use_depth: bool = True,
 ) -> list[dict[str, Any]]:
-    """Compute means over the sets of a case, one row per kind of map.
+    """Compute mean errors over the test sets of a case, one row per source of depth maps.
 
-    ``poses_use_depth``: the poses are those of the mapper.
+    ``poses_use_depth`` is true if the mapper estimated the poses with depth priors.
     """
     photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
     rows = []
@@ -196,7 +198,7 @@ def measured(
 
 
 def without_prior(model: Reconstruction) -> Reconstruction:
-    """Replace depth priors by one depth per image from its points; drop images without points."""
+    """Replace each depth prior by the depth range of the points of its image."""
     images = []
     for image in model.images:
         points = model.points[image.point_ids[image.point_ids >= 0]]
@@ -207,7 +209,7 @@ def without_prior(model: Reconstruction) -> Reconstruction:
 
 
 def view_of(photos: ImageSet) -> Any:
-    """Return the views by name."""
+    """Return a function that loads the undistorted view with a given image name."""
     index = {name: number for number, name in enumerate(photos.names)}
     return lambda name: photos.view(index[name])
 
@@ -220,10 +222,11 @@ def set_errors(
     seen: Mapping[str, Bool],
     cloud: Float64,
 ) -> dict[str, float]:
-    """Compute the errors of depth maps and cloud (n, 3) of one set; empty without a scale.
+    """Compute the errors of depth maps and fused cloud (n, 3) of one test set.
 
-    ``problem``: the mapping problem, whose matches define the true depth of fountain. ``seen``: by
-    image, mask (h, w) of the measured pixels of its map.
+    The result is empty if too few camera centers determine the scale. The matches of ``problem``
+    define the true depth of the scene ``fountain``. ``seen`` contains the mask (h, w) of measured
+    pixels of each depth map, by image name.
     """
     maps = {image.name: image.depth for image in reconstruction.images}
     errors = trajectory_errors(reconstruction.poses, scene.truth)
@@ -241,7 +244,7 @@ def set_errors(
     map_metrics = [map_errors(each, scale, own_scale_factor) for each in common_pixels]
     cameras = {photo.name: photo.pinhole for photo in photos}
     accuracy = evaluate_dense_geometry(reconstruction, cloud, scene, cameras, TOLERANCES)
-    assert accuracy is not None  # guaranteed by scale and true depth
+    assert accuracy is not None  # never None, because scale and true depth are known
     result = {"abs_rel": accuracy["depth"]["abs_rel"], **_means(map_metrics)}
     for tolerance in map(str, TOLERANCES):
         centimetres = round(100 * float(tolerance))
@@ -252,9 +255,10 @@ def set_errors(
 
 
 class MapBesideTruth(NamedTuple):
-    """Pixels (n,) with depth in a map and in the truth.
+    """Pixels with estimated and with true depth in one image.
 
-    Depth and its std, the true depth, and the mask of measured pixels.
+    Each field has one value per pixel, (n,): estimated depth, its std, true depth, and whether
+    multi-view stereo measured the pixel.
     """
 
     depth: Float64
@@ -264,7 +268,7 @@ class MapBesideTruth(NamedTuple):
 
     @classmethod
     def of(cls, depth: DepthPrior, truth: Float32, seen: Bool | None) -> MapBesideTruth:
-        """Collect the common pixels of a map and the true map; ``seen`` (h, w): measured pixels."""
+        """Collect pixels with estimated and true depth; ``seen`` (h, w) marks measured pixels."""
         assert depth.variance is not None  # refined maps always have a std
         xy, depth_samples, true = sample_depth_at_truth(depth.depth, depth.valid, truth)
         variance, _ = sample_bilinear(depth.variance, depth.valid, xy)
@@ -275,9 +279,10 @@ class MapBesideTruth(NamedTuple):
 
 
 def own_scale(maps: Sequence[MapBesideTruth]) -> float:
-    """Compute the median scale of the measured pixels of a set, or of all pixels.
+    """Compute the median of true over estimated depth over the measured pixels of a test set.
 
-    It is more accurate than the scale of a few camera centers.
+    All pixels are used if no pixel is measured. This scale is more accurate than the scale of a few
+    camera centers.
     """
     ratios = [each.truth / each.depth for each in maps]
     measured_ratios = [ratio[each.measured] for ratio, each in zip(ratios, maps, strict=True)]
@@ -287,11 +292,11 @@ def own_scale(maps: Sequence[MapBesideTruth]) -> float:
 
 
 def map_errors(pixels: MapBesideTruth, scale: float, own_scale_factor: float) -> dict[str, float]:
-    """Compute the errors of one map.
+    """Compute the depth errors of one depth map.
 
-    In the ``scale`` of the cameras: share of accurate pixels, AbsRel, and the part of AbsRel of
-    pixels that are not measured. In the ``own`` scale: AbsRel and the share within the stated std,
-    for measured and other pixels.
+    In the scale of the camera centers (``scale``): share of accurate pixels and AbsRel. In the
+    scale that fits the depth maps best (``own_scale_factor``): AbsRel, and the share of errors
+    within one std.
     """
     measured, relative = pixels.measured, np.abs(scale * pixels.depth - pixels.truth) / pixels.truth
     error = np.abs(own_scale_factor * pixels.depth - pixels.truth)
@@ -307,9 +312,9 @@ def map_errors(pixels: MapBesideTruth, scale: float, own_scale_factor: float) ->
 
 
 def triangulated(problem: MappingProblem, truth: Mapping[str, Pose]) -> dict[str, Float64]:
-    """Triangulate matches with true poses; return keypoints and true depth (n, 3) by image.
+    """Triangulate matches with true poses; return keypoints and depth (n, 3) of each image.
 
-    Points with a residual above a pixel or a small triangulation angle are excluded.
+    Points with a reprojection error above a pixel or a small triangulation angle are excluded.
     """
     points_by_image: dict[str, list[Float64]] = {}
     for pair in problem.pairs:
@@ -342,7 +347,7 @@ def points_near(
     maps: Mapping[str, DepthPrior],
     scale: float,
 ) -> dict[str, float]:
-    """Compute the share of true points whose depth in the map is within 1 %, and their number."""
+    """Compute the share of triangulated points whose depth is within 1 % of the depth map."""
     cameras = {image.name: image.camera for image in problem.images}
     right = total = 0
     for name, points in triangulated(problem, truth).items():
@@ -357,13 +362,13 @@ def points_near(
 
 
 def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Compute the mean of each key over the entries that have it."""
+    """Compute the mean of each metric over the dictionaries that contain the metric."""
     values = {key: [each[key] for each in rows if np.isfinite(each[key])] for key in rows[0]}
     return {key: float(np.mean(known)) if known else np.nan for key, known in values.items()}
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format a Markdown table."""
+    """Format the rows of all cases as a Markdown table."""
     keys = list(dict.fromkeys(key for row in rows for key in row))
     lines = ["| " + " | ".join(keys) + " |", "|" + " --- |" * len(keys)]
     for row in rows:

@@ -2,9 +2,10 @@
 
     python -m benchmarks.dense_memory [--photos 16 160] [--output FILE]
 
-Uses the photos of rendered_kitchen with true poses and true depth at a quarter of their size.
-Larger numbers use distant copies of the room. Each number runs in a process of its own. Memory is
-peak resident memory, and the memory before the stage (photos on disk, poses and known depth).
+The photos are those of rendered_kitchen, with true poses and with true depth at a quarter of the
+photo size. More photos than the scene has are views of distant copies of the room. Each number of
+photos runs in its own process. The table lists peak resident memory, and resident memory before the
+dense stage starts.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ from mpsfm_core.pipeline.stages import peak_memory_mb
 from mpsfm_core.support.disk_arrays import DiskArrays
 
 _STD = 0.05
-"""Relative std of the known depth."""
+"""Relative std that is declared for the true depth maps."""
 _APART = 1000.0
-"""Distance in meters between the copies of the room."""
+"""Distance in meters between two copies of the kitchen."""
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Parse the command line and measure each number of photos in a child process."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--photos", nargs="+", type=int, default=[16, 160])
     parser.add_argument("--output", type=Path)
@@ -67,7 +68,7 @@ def main() -> None:
 
 
 def measured(count: int) -> dict[str, float | None]:
-    """Run the stage on a number of photos in this process."""
+    """Run the dense stage on some photos, and measure memory and CPU time of the process."""
     scene = read_scene(shared_folder() / "data" / "rendered_kitchen")
     assert scene.depth is not None
     photos = load_images(scene.images, scene.intrinsics, None, InputOptions())
