@@ -1,4 +1,4 @@
-"""Install hints for the plugins of this project: which distribution has which provider."""
+"""Table of the distributions that contain the plugins of this project, for install hints."""
 
 from __future__ import annotations
 
@@ -57,29 +57,29 @@ PLUGIN_PROVIDERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "mpsfm-sky": ("mask/sky", "mask/sky-simple"),
     }
 )
-"""Providers as ``kind/name`` by pip requirement."""
+"""Pip requirement that contains a provider, by ``kind/name``."""
 
 EXECUTORS: Mapping[str, str] = MappingProxyType({"dask": "mpsfm-dask", "ray": "mpsfm-ray"})
-"""Distribution by name of the executor."""
+"""Distribution that contains an executor, by the name of the executor."""
 
 VIEWERS: Mapping[str, str] = MappingProxyType({"viser": "mpsfm-viser", "rerun": "mpsfm-rerun"})
-"""Distribution by name of the viewer."""
+"""Distribution that contains a viewer, by the name of the viewer."""
 
 EXPORTS: Mapping[str, str] = MappingProxyType({"rerun": "mpsfm-rerun"})
-"""Distribution by name of the export format."""
+"""Distribution that contains an export format, by the name of the format."""
 
 
 def install_hint(distributions: Mapping[str, str], name: str) -> str:
-    """Return the end of a message that tells how to install something, or empty.
+    """Return the install advice for a plugin as the end of a message, or an empty text.
 
     Args:
-        distributions: Distribution by name: :data:`EXECUTORS`, :data:`VIEWERS` or :data:`EXPORTS`.
-        name: Name to look up.
+        distributions: One of the tables :data:`EXECUTORS`, :data:`VIEWERS` and :data:`EXPORTS`.
+        name: Name of the executor, viewer or export format.
     """
     return f"; pip install {distributions[name]}" if name in distributions else ""
 
 
 def requirement_for(kind: str, name: str) -> str:
-    """Return the pip requirement that provides a provider, or an empty text."""
+    """Return the pip requirement that contains a provider, or an empty text."""
     provider = f"{kind}/{name}"
     return next((r for r, provided in PLUGIN_PROVIDERS.items() if provider in provided), "")

@@ -1,9 +1,9 @@
 """Protocols, hooks and specifications: the interface between MP-SfM and its plugins.
 
-Everything that predicts something from pixels is a *provider*: monocular depth, normals, features,
-matches and so on. A plugin is an installed package with an entry point in the group
-``mpsfm.plugins``. The entry point names a light module, which must not import torch, onnxruntime or
-similar libraries. That module implements the hook :func:`Hooks.mpsfm_providers`::
+A *provider* predicts something from pixels: monocular depth, normals, features, matches and so on.
+A plugin is an installed package with an entry point in the group ``mpsfm.plugins``. The entry point
+names a Python module, which must not import torch, onnxruntime or similar libraries. The entry
+point's module implements the hook :func:`Hooks.mpsfm_providers`::
 
     from mpsfm_core import ProviderSpec, hookimpl
 
@@ -13,9 +13,9 @@ similar libraries. That module implements the hook :func:`Hooks.mpsfm_providers`
 
 MP-SfM calls the factory as ``factory(options, context)`` when the provider is first used, and the
 factory of a wrapper as ``factory(inner, options, context)``. The factory returns an object with the
-method that the protocol of its kind defines below.
+method that the protocol of the provider's kind defines below.
 
-Conventions of all protocols:
+Conventions of all provider protocols:
 
 * A :class:`~mpsfm_core.data.View` is an undistorted image: ``image`` is (H, W, 3) uint8 RGB,
   ``camera`` has the pinhole intrinsics in pixels.
@@ -25,7 +25,8 @@ Conventions of all protocols:
 * Uncertainties are variances unless the name ends with ``std``.
 * A depth or normal map may have any grid that covers the whole view.
 * The same input and seed give the same output, bit for bit. Providers keep no state between calls.
-* A provider may raise any exception. The run reports it with the names of provider and image.
+* A provider may raise any exception. The run reports the exception with the names of provider and
+  image.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ from mpsfm_core.data.options import Options
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 API_VERSION = 1
-"""Version of this interface. A plugin that requires a newer one is listed as unavailable."""
+"""Version of the plugin interface. A plugin that requires a newer interface version is listed as
+unavailable."""
 
 ENTRY_POINT_GROUP = "mpsfm.plugins"
 """Group of the entry points that name plugin modules."""
@@ -86,18 +88,18 @@ CAPABILITIES: tuple[Capability, ...] = get_args(Capability)
 
 @dataclass(frozen=True)
 class ProviderContext:
-    """Resources of the run that a provider's factory receives."""
+    """Resources of a run that the factory of a provider receives."""
 
     resolve_weights: Callable[[str, str | None], Path]
     """``resolve_weights(uri, sha256)`` returns the local path of a weights file and downloads the
     file if necessary. It raises :class:`~mpsfm_core.data.errors.WeightsError`. URIs are described
     in :mod:`mpsfm_core.providers.weights`."""
     device: str = "cpu"
-    """``"cpu"`` or ``"cuda"``, already resolved."""
+    """Device of the networks, ``"cpu"`` or ``"cuda"``."""
     threads: int = 1
     """Number of threads that the provider may use."""
     seed: int = 0
-    """Seed of every random choice."""
+    """Seed of all random choices of the provider."""
 
 
 @runtime_checkable
@@ -105,39 +107,39 @@ class DepthProvider(Protocol):
     """Monocular depth network."""
 
     def predict(self, view: View) -> DepthPrior:
-        """Predict the z-depth of a view.
+        """Predict the z-depth map of a view.
 
         Args:
             view: Undistorted image with its camera.
 
         Returns:
-            Depth (h, w) float32 along the optical axis, in meters if ``metric``, else in a unit
-            of its own; optional variance (h, w) float32 in the squared unit; validity (h, w) bool.
-            The grid covers the view and may have any size.
+            Depth (h, w) float32 along the optical axis, in meters if ``metric``, else in a unit of
+            its own. Optional variance (h, w) float32 in the squared unit of depth. Validity (h, w)
+            bool. The map covers the view and may have any resolution.
         """
         ...
 
 
 @runtime_checkable
 class JointProvider(DepthProvider, Protocol):
-    """Depth network that also predicts normals in the same pass (``joint-normals``)."""
+    """Depth provider that also predicts normals in the same pass (``joint-normals``)."""
 
     def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
-        """Predict depth and normals of a view in one pass.
+        """Predict the depth and normals of a view in one network pass.
 
         Args:
             view: Undistorted image with its camera.
 
         Returns:
-            The depth that :meth:`predict` returns, and normals as
-            :meth:`NormalsProvider.predict` returns them.
+            Depth as :meth:`predict` returns it, and normals as :meth:`NormalsProvider.predict`
+            returns them.
         """
         ...
 
 
 @runtime_checkable
 class FocalEstimator(DepthProvider, Protocol):
-    """Depth network that also estimates the focal length of a view (``estimates-focal``)."""
+    """Depth provider that also estimates the focal length of a view (``estimates-focal``)."""
 
     def estimate_focal(self, view: View) -> float | None:
         """Estimate the focal length of a view from its pixels.
@@ -160,57 +162,57 @@ class NormalsProvider(Protocol):
 
         Args:
             view: Undistorted image with its camera.
-            depth: Depth prior of the view with its variance, if the specification declares
-                ``needs-depth``; else None.
+            depth: Depth prior of the view with its variance if the specification declares
+                ``needs-depth``, else None.
 
         Returns:
-            Unit normals (h, w, 3) float32 in the camera frame that face the camera; optional
-            variance (h, w) float32 of the angle in rad^2; validity (h, w) bool. The grid covers
-            the view and may have any size.
+            Unit normals (h, w, 3) float32 in the camera frame that face the camera. Optional
+            variance (h, w) float32 of the angle in rad^2. Validity (h, w) bool. The map covers the
+            view and may have any resolution.
         """
         ...
 
 
 @runtime_checkable
 class MultiViewProvider(Protocol):
-    """Network that predicts the depth of several views jointly."""
+    """Provider that predicts the depth of several views jointly."""
 
     def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
         """Predict the depth of a group of views in one common unit.
 
         Args:
-            views: One or more views of one scene, of any sizes.
+            views: One or more views of one scene, of any image sizes.
 
         Returns:
-            One depth prior per view, in the order of ``views`` and in one unit. With
-            ``proposes-poses`` also ``cam_from_group`` (n, 3, 4) float64, translations in the unit
-            of depth. With ``proposes-intrinsics`` also fx, fy, cx, cy (n, 4) float64 in pixels of
-            each view.
+            One depth prior per view, in the order of ``views`` and in one unit. With the capability
+            ``proposes-poses`` also ``cam_from_group`` (n, 3, 4) float64, with translations in the
+            unit of depth. With the capability ``proposes-intrinsics`` also fx, fy, cx, cy (n, 4)
+            float64 in pixels of each view.
         """
         ...
 
 
 @runtime_checkable
 class FeatureProvider(Protocol):
-    """Detector and descriptor of sparse local features."""
+    """Provider that detects and describes sparse local features."""
 
     def extract(self, view: View) -> Features:
-        """Detect and describe the features of a view.
+        """Detect and describe the local features of a view.
 
         Args:
             view: Undistorted image with its camera.
 
         Returns:
-            Keypoints (n, 2) float64 in pixels of the view, not of a resized image; descriptors
-            (n, d) float32 with the same d for every view; optional scores and scales (n,)
-            float32; ``std_px``, the standard deviation of a keypoint in pixels.
+            Keypoints (n, 2) float64 in pixels of the view, not of a resized image. Descriptors (n,
+            d) float32 with the same d for every view. Optional scores and scales (n,) float32.
+            ``std_px`` is the standard deviation of a keypoint in pixels.
         """
         ...
 
 
 @runtime_checkable
 class Matcher(Protocol):
-    """Matcher of two views, with features (``sparse``) or without (``dense``)."""
+    """Provider that matches two views, with given features (``sparse``) or without (``dense``)."""
 
     def match(
         self,
@@ -223,25 +225,27 @@ class Matcher(Protocol):
 
         Args:
             view_a: First view.
-            view_b: Second view; its size may differ.
+            view_b: Second view, which may have another image size.
             features_a: Features of the first view if the specification declares ``sparse``, else
-                None. There may be none or many thousands.
-            features_b: Features of the second view, likewise.
+                None. A view may have no features or many thousands.
+            features_b: Features of the second view if the specification declares ``sparse``, else
+                None.
 
         Returns:
-            Sparse matches: rows of both feature sets (m, 2) int64. Dense matches: points (m, 2)
-            float64 in pixels of each view. Both have scores (m,) float32 in [0, 1], higher is
-            better. With ``pair-depth`` also one depth prior per view.
+            Sparse matches are rows of both feature sets (m, 2) int64. Dense matches are points (m,
+            2) float64 in pixels of each view. Sparse and dense matches have scores (m,) float32 in
+            [0, 1], higher is better. With the capability ``pair-depth`` also one depth prior per
+            view.
         """
         ...
 
 
 @runtime_checkable
 class RetrievalProvider(Protocol):
-    """Global image descriptor for image retrieval."""
+    """Provider of global image descriptors for image retrieval."""
 
     def describe(self, view: View) -> Float32:
-        """Describe a view by one vector.
+        """Compute the global descriptor of a view.
 
         Args:
             view: Undistorted image with its camera.
@@ -255,10 +259,10 @@ class RetrievalProvider(Protocol):
 
 @runtime_checkable
 class MaskProvider(Protocol):
-    """Segmentation of the pixels that the reconstruction may use."""
+    """Provider that segments the pixels that the reconstruction may use."""
 
     def mask(self, view: View) -> Bool:
-        """Segment the usable pixels of a view.
+        """Segment the pixels of a view that the reconstruction may use.
 
         Args:
             view: Undistorted image with its camera.
@@ -270,23 +274,24 @@ class MaskProvider(Protocol):
 
 
 class Executor(Protocol):
-    """Executor that runs steps of the extraction on workers in other processes or machines."""
+    """Executor of feature extraction steps on workers in other processes or on other machines."""
 
     def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
-        """Run ``step(item)`` for all items.
+        """Run ``step(item)`` for all items on the workers.
 
-        A step writes its result to the cache. If a worker is lost, its step runs again on another
-        worker. Closing the generator cancels the items that have not started.
+        A step writes its result to the cache and returns nothing. If a worker is lost, its step
+        runs again on another worker. Closing the generator cancels the items whose step has not
+        started.
 
         Args:
-            step: Function that can be pickled.
-            items: Arguments that can be pickled.
+            step: Picklable function of one item.
+            items: Picklable arguments of ``step``.
 
         Yields:
-            None for each finished item, in any order.
+            None for each finished item, in the order of completion.
 
         Raises:
-            Exception: The exception that a step raised, unchanged.
+            Exception: Any exception that a step raised, unchanged.
         """
         ...
 
@@ -304,20 +309,21 @@ PROTOCOLS: dict[Kind, type] = {
     "retrieval": RetrievalProvider,
     "mask": MaskProvider,
 }
-"""Protocol of each kind. A wrapper implements the protocol of the provider that it wraps."""
+"""Protocol class of each provider kind. A wrapper has no protocol of its own and implements that of
+its inner provider."""
 
 
 CAPABILITY_METHODS: dict[Capability, str] = {
     "joint-normals": "predict_joint",
     "estimates-focal": "estimate_focal",
 }
-"""Additional method that a capability requires."""
+"""Additional method that a provider with the capability must have."""
 
 
 def require_features(
     purpose: str, features_a: Features | None, features_b: Features | None
 ) -> tuple[Features, Features]:
-    """Return the features of both views, for a matcher that cannot work without them.
+    """Return the features of both views, or raise an error for a matcher that requires them.
 
     Args:
         purpose: Beginning of the error message, such as "mutual-nearest matches features".
@@ -328,7 +334,7 @@ def require_features(
         Both feature sets.
 
     Raises:
-        ProviderError: One of them is None.
+        ProviderError: One of the feature sets is None.
     """
     if features_a is None or features_b is None:
         raise ProviderError(f"{purpose}: choose a features provider")
@@ -337,27 +343,29 @@ def require_features(
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """Weights file that a provider loads."""
+    """Weights file of a network that a provider loads."""
 
     uri: str
     """Location, see :mod:`mpsfm_core.providers.weights`."""
     sha256: str | None = None
-    """Hash in hex. With None the hash of the first download is recorded and compared later."""
+    """Expected SHA-256 in hex. With None the hash of the first download is recorded
+    and compared later."""
     license: str = "unknown"
-    """SPDX identifier or a short text."""
+    """License of the weights: SPDX identifier or a short text."""
     size: int | None = None
-    """Size in bytes, shown before a download; None if unknown."""
+    """Size of the file in bytes, shown before a download; None if unknown."""
 
 
 def weights_from_option(
     option: str, *known: WeightsFile, sha256: str = "sha256"
 ) -> Callable[[Any], tuple[WeightsFile, ...]]:
-    """Declare that an option names the weights file, for :attr:`ProviderSpec.weights`.
+    """Declare, for :attr:`ProviderSpec.weights`, the option that names the weights file.
 
     Args:
-        option: Name of the option. Its value is a path, a URI, or None for no file.
-        known: Files that the option may name, with license and size; usually its default.
-        sha256: Name of the option with the expected hash.
+        option: Name of the option that names the weights file. The option's value is a path, a URI,
+            or None for no file.
+        known: Files that the option may name, with license and size; usually the option's default.
+        sha256: Name of the option with the expected SHA-256.
 
     Returns:
         Function from the provider's options to its weights files.
@@ -375,84 +383,88 @@ def weights_from_option(
 
 @dataclass(frozen=True)
 class ModelExport:
-    """Recipe for the ONNX file of a network, see :mod:`mpsfm_core.providers.model_export`."""
+    """Recipe that exports a network to ONNX, see :mod:`mpsfm_core.providers.model_export`."""
 
     script: str
-    """Module of the plugin that exports the network. It runs as a program, never as an import."""
+    """Module of the plugin that exports the network. The export module runs as a program and is
+    never imported."""
     repository: str
-    """``OWNER/NAME`` of the authors' code on GitHub."""
+    """GitHub repository of the authors' code, ``OWNER/NAME``."""
     commit: str
-    """Commit with which the script was tested."""
+    """Git commit of the authors' code with which the export was tested."""
     license: str
-    """License of the authors' weights."""
+    """License of the authors' weights: SPDX identifier or a short text."""
     packages: tuple[str, ...] = ()
-    """Packages that the authors' code needs in addition to torch and onnx."""
+    """Python packages that the authors' code needs in addition to torch and onnx."""
 
 
 @dataclass(frozen=True)
 class ProviderSpec:
-    """Specification of one provider, which a plugin registers without importing the provider.
+    """Specification with which a plugin registers a provider without importing its code.
 
-    An option of type :class:`~pathlib.Path` names a file or folder that the provider reads. A run
-    stops before the first image if that path does not exist.
+    A provider option of type :class:`~pathlib.Path` names a file or folder that the provider reads.
+    A run stops before the first image if such a path does not exist.
     """
 
     kind: Kind
-    """Kind of provider; kind and name are unique together."""
+    """Kind of provider; the pair of kind and name is unique."""
     name: str
-    """Name that a configuration gives as ``use:``."""
+    """Name of the provider, which a configuration gives as ``use:``."""
     factory: str | Callable[..., object]
-    """``"package.module:Class"``, imported on first use. Only providers that are registered in the
-    same process may give a callable."""
+    """Factory of the provider as ``"package.module:Class"``, imported on first use. Only providers
+    that are registered in the same process may give a callable as factory."""
     options: type[Options] | str | None = None
-    """Subclass of :class:`~mpsfm_core.data.options.Options`, ``"package.module:Class"``, or None
-    if there are no options."""
+    """Options class of the provider: a subclass of :class:`~mpsfm_core.data.options.Options`,
+    ``"package.module:Class"``, or None if there are no options."""
     capabilities: frozenset[Capability] = frozenset()
-    """Capabilities from :data:`CAPABILITIES`; the validator checks what they promise."""
+    """Capabilities of the provider, from :data:`CAPABILITIES`; the validator checks them."""
     summary: str = ""
-    """One line for ``mpsfm plugins list``."""
+    """One-line description of the provider for ``mpsfm plugins list``."""
     requires: tuple[str, ...] = ()
-    """Import names that must be installed. They are looked up without an import."""
+    """Import names of Python packages that the provider requires. MP-SfM looks up the required
+    packages without importing them."""
     install_hint: str = ""
-    """Command that installs what ``requires`` names."""
+    """Command that installs the packages in ``requires``."""
     code_license: str = "unknown"
-    """SPDX identifier or short text for the code."""
+    """License of the code: SPDX identifier or short text."""
     weights_license: str = "none"
-    """SPDX identifier or short text for the weights."""
+    """License of the weights: SPDX identifier or short text."""
     weights: tuple[WeightsFile, ...] | Callable[[Any], tuple[WeightsFile, ...]] = ()
-    """Weights files, or a function from the options to them. A run finds or downloads the files
-    before it reads the first image."""
+    """Weights files of the provider, or a function from its options to the files. A run finds or
+    downloads the weights files before reading the first image."""
     accuracy: str = ""
-    """Expected accuracy and its source, in one line."""
+    """Expected accuracy of the provider and its source, in one line."""
     calibration: DepthCalibration | NormalCalibration | None = None
-    """Uncertainty model of a depth, multi-view or normals provider; None uses the defaults."""
+    """Uncertainty model of a depth, multi-view or normals provider; None uses the default
+    uncertainty model."""
     api_version: int = API_VERSION
-    """Version of this interface that the plugin requires."""
+    """Version of the plugin interface that the plugin requires."""
     tags: tuple[str, ...] = ()
-    """Feature families (``"xfeat"``) of features providers and matchers. A sparse matcher works
-    with features that share a tag, or with all features if it has no tag."""
+    """Feature families (such as ``"xfeat"``) of features providers and matchers. A sparse matcher
+    works with features that share a family, or with all features if the matcher has no family."""
     contract: str | Callable[[Path], object] | None = None
-    """Function, given like ``factory``, that returns the
-    :class:`~mpsfm_core.testing.ContractSetup` for tests without weights."""
+    """Function or ``"package.module:function"`` that returns the
+    :class:`~mpsfm_core.testing.ContractSetup` for contract tests without the real weights."""
 
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """File format of another program that ``mpsfm export`` writes."""
+    """Export format for another program, which ``mpsfm export`` writes."""
 
     name: str
-    """Name on the command line."""
+    """Name of the format on the command line."""
     description: str
-    """One line for users."""
+    """One-line description of the format for users."""
     entries: tuple[str, ...]
-    """Files and folders that the format writes into its folder."""
+    """Files and folders that the exporter writes into the output folder."""
     write: str | Callable[[Any, Path], None]
-    """Function of an :class:`~mpsfm_core.results.exports.source.ExportSource` and an empty folder,
-    or ``"package.module:function"``, imported on use. It raises
-    :class:`~mpsfm_core.data.errors.InputError` if the input lacks required data."""
+    """Exporter: a function of an :class:`~mpsfm_core.results.exports.source.ExportSource` and an
+    empty output folder. It is given as a callable or as ``"package.module:function"``, imported on
+    use. The exporter raises :class:`~mpsfm_core.data.errors.InputError` if the input lacks required
+    data."""
     align_gravity: bool = False
-    """True rotates the scene so that gravity is -z unless the user declines; for programs that show
-    or render it."""
+    """True rotates the scene so that gravity is -z unless the user declines, for programs that show
+    or render the scene."""
 
 
 hookspec = pluggy.HookspecMarker("mpsfm")
@@ -460,59 +472,61 @@ hookimpl = pluggy.HookimplMarker("mpsfm")
 
 
 class Hooks:
-    """Hooks that a plugin may implement. All except :meth:`mpsfm_providers` are optional.
+    """Hooks that a plugin may implement, as in pluggy.
 
-    A hook that raises is skipped for the rest of the run, with a warning that names its plugin.
+    Every hook except :meth:`mpsfm_providers` is optional. If a hook raises, the run skips this hook of the plugin from then on and warns the user.
     """
 
     @hookspec
     def mpsfm_providers(self) -> Sequence[ProviderSpec]:  # type: ignore[empty-body]
-        """List the providers of this plugin.
+        """List the provider specifications of this plugin.
 
         Returns:
-            List or tuple of specifications.
+            List or tuple of provider specifications.
         """
 
     @hookspec
     def mpsfm_filter_pairs(self, pairs: Sequence[tuple[str, str]]) -> Sequence[tuple[str, str]]:  # type: ignore[empty-body]
-        """Select the candidate pairs to match. The results of several filters are intersected.
+        """Select the candidate image pairs to match.
+
+        The run matches the pairs that the filters of all plugins select.
 
         Args:
             pairs: Pairs of image names.
 
         Returns:
-            Pairs of image names, a subset of ``pairs``.
+            Selected pairs of image names, a subset of ``pairs``.
         """
 
     @hookspec(firstresult=True)
     def mpsfm_calibration(
         self, kind: str, provider: str, options: BaseModel | None
     ) -> DepthCalibration | NormalCalibration | None:
-        """Return the uncertainty model of a provider with the given options.
+        """Return the uncertainty model of a provider of this plugin for the given options.
 
         Args:
-            kind: ``depth``, ``normals`` or ``multiview``, or ``wrapper`` for a wrapper around such
-                a provider.
+            kind: Kind of the provider: ``depth``, ``normals``, ``multiview``, or ``wrapper`` for a
+                wrapper around such a provider.
             provider: Name of the provider.
-            options: Its validated options, None if it has none.
+            options: Validated options of the provider, None if the provider has no options.
 
         Returns:
-            The calibration, or None to use the one of the specification.
+            The uncertainty model, or None to use the one of the specification.
         """
 
     @hookspec(firstresult=True)
     def mpsfm_executor(self, name: str, options: Mapping[str, Any]) -> Executor | None:
-        """Return the executor that ``runtime.executor`` names, connected to its workers.
+        """Return the executor that the option ``runtime.executor`` names, connected to its workers.
 
         Args:
             name: Value of ``runtime.executor``.
             options: Value of ``runtime.executor_options``.
 
         Returns:
-            The executor, or None if this plugin does not provide it.
+            The executor, or None if this plugin has no executor with that name.
 
         Raises:
-            ConfigError: The options are wrong or the workers cannot be reached.
+            ConfigError: The executor options are wrong or the workers cannot be reached.
         """
 
     @hookspec
@@ -525,47 +539,47 @@ class Hooks:
 
     @hookspec
     def mpsfm_notice(self, text: str) -> None:
-        """Report one line to the user during a run, such as the chosen provider or a download."""
+        """Receive one line for the user during a run, such as the chosen provider or a download."""
 
     @hookspec
     def mpsfm_stage_started(self, stage: str, total: int | None) -> None:
-        """Report that a pipeline stage starts; ``total`` is its number of steps, if known."""
+        """Receive the start of a pipeline stage and its number of steps ``total``, if known."""
 
     @hookspec
     def mpsfm_stage_progress(self, stage: str, done: int, total: int) -> None:
-        """Report the number of finished steps of a stage."""
+        """Receive the number of finished steps of a pipeline stage."""
 
     @hookspec
     def mpsfm_stage_finished(self, stage: str, seconds: float) -> None:
-        """Report that a stage has finished and how long it took."""
+        """Receive the end of a pipeline stage and its duration."""
 
     @hookspec
     def mpsfm_image_registered(self, name: str, registered: int, total: int) -> None:
-        """Report that the mapper registered an image; both counts are numbers of images."""
+        """Receive the registration of an image by the mapper; both counts are numbers of images."""
 
     @hookspec
     def mpsfm_scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """Report that poses or points have changed; ``scene()`` returns a copy of the state."""
+        """Receive changes of poses or points; ``scene()`` copies the current reconstruction."""
 
     @hookspec
     def mpsfm_viewers(self) -> Mapping[str, str]:  # type: ignore[empty-body]
-        """List the viewers of this plugin.
+        """List the live viewers of this plugin.
 
         Returns:
-            ``"package.module:Class"`` by name, imported on use; see
+            Viewer classes ``"package.module:Class"`` by name, imported on use; see
             :mod:`mpsfm_core.report.viewing`.
         """
 
     @hookspec
     def mpsfm_export_formats(self) -> Sequence[ExportFormat]:  # type: ignore[empty-body]
-        """List the formats that this plugin adds to ``mpsfm export``."""
+        """List the export formats that this plugin adds to ``mpsfm export``."""
 
     @hookspec
     def mpsfm_image_rejected(self, name: str, reason: Reason, text: str) -> None:
-        """Report that the mapper tried to register an image and rejected it.
+        """Receive an image that the mapper tried to register and rejected.
 
         Args:
-            name: Name of the image.
-            reason: Typed reason, see :mod:`mpsfm_core.data.decisions`.
-            text: The reason in words.
+            name: Name of the rejected image.
+            reason: Type of the reason, see :mod:`mpsfm_core.data.decisions`.
+            text: Reason of the rejection in words.
         """

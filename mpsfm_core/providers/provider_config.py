@@ -20,23 +20,23 @@ FROM_MULTIVIEW = "multiview"
 
 
 class ProviderConfig(Options):
-    """Configuration of one provider, with alternatives in order of preference."""
+    """Configuration of one provider, with fallback providers in order of preference."""
 
     use: str
     """Name of the provider, as ``mpsfm plugins list`` shows it."""
     fallback: tuple[str, ...] = ()
-    """Providers to try in this order if ``use`` is unavailable: the plugin or its weights are
-    missing, or it does not accept the given options."""
+    """Fallback providers, tried in this order if ``use`` is unavailable: the plugin or its weights
+    are missing, or the provider rejects the options."""
     environment: str | None = None
-    """Python environment that contains ``use`` (see ``mpsfm env create``). Validation merges this
-    field into the name: ``use: NAME@ENVIRONMENT``."""
+    """Python environment that contains the provider ``use`` (see ``mpsfm env create``). Validation
+    merges the environment into the provider's name: ``use: NAME@ENVIRONMENT``."""
     options: dict[str, Any] = Field(default_factory=dict)
-    """Options of the provider itself, checked by its own options class."""
+    """Options of the provider without its wrappers, validated by the provider's options class."""
     wrap: tuple[ProviderConfig, ...] = ()
-    """Wrappers around the provider, innermost first."""
+    """Configurations of the wrappers around the provider, innermost first."""
     calibration: dict[str, Any] | str | None = None
-    """Uncertainty of a depth or normals provider: values, or the path of a YAML or JSON file.
-    Null uses what the plugin declares."""
+    """Uncertainty model of a depth or normals provider: values, or the path of a YAML or JSON file.
+    Null uses the uncertainty model that the plugin declares."""
 
     @model_validator(mode="before")
     @classmethod
@@ -50,7 +50,7 @@ class ProviderConfig(Options):
 
     @property
     def is_unresolved(self) -> bool:
-        """True until provider resolution has chosen between several providers.
+        """True if several providers are possible and provider resolution has not chosen one.
 
         See :mod:`mpsfm_core.pipeline.provider_resolution`.
         """

@@ -1,7 +1,7 @@
 """Registry of providers: availability, options, weights, calibration and construction.
 
-A :class:`Registry` is an ordinary object. The pipeline creates one with :meth:`Registry.discover`
-and passes it on.
+A :class:`Registry` is an ordinary object. The pipeline creates a registry with
+:meth:`Registry.discover` and passes the registry on.
 """
 
 from __future__ import annotations
@@ -47,30 +47,31 @@ from mpsfm_core.providers.validation import validate_filtered_pairs
 _log = logging.getLogger(__name__)
 
 CORE = "mpsfm-core"
-"""Distribution of the built-in providers. Other plugins cannot replace their names."""
+"""Distribution package of the built-in providers. Other plugins cannot replace the names of the
+built-in providers."""
 
 TIMEOUT_VARIABLE = "MPSFM_PLUGIN_TIMEOUT_S"
-"""Environment variable with the time limit for loading one plugin, in seconds."""
+"""Environment variable that sets the time limit for loading one plugin, in seconds."""
 
 DEFAULT_TIMEOUT_S = 10.0
-"""Time limit for loading one plugin: milliseconds are normal, a network disk takes seconds."""
+"""Time limit in seconds for loading one plugin; a slow network disk needs several seconds."""
 
 _HOOK_VALIDATORS: Mapping[str, Callable[..., Any]] = MappingProxyType(
     {"mpsfm_filter_pairs": validate_filtered_pairs}
 )
-"""Validator by hook: receives the answer and the hook's arguments, returns the answer."""
+"""Validator of each hook's return value, which receives the value and the hook's arguments."""
 
 Calibration = DepthCalibration | NormalCalibration
 
 
 @dataclass(frozen=True)
 class ProviderStatus:
-    """Status of one provider or plugin: one line of ``mpsfm plugins list``."""
+    """Status of one provider or plugin, shown as one line of ``mpsfm plugins list``."""
 
     kind: Kind | Literal["plugin"]
-    """``"plugin"`` for a plugin that failed to load or that has hooks and no providers."""
+    """Kind of the provider, or ``"plugin"`` for a plugin without usable providers."""
     name: str
-    """Name of the provider, or entry point of the plugin."""
+    """Name of the provider, or of the plugin's entry point."""
     distribution: str
     version: str
     code_license: str = ""
@@ -80,14 +81,14 @@ class ProviderStatus:
     summary: str = ""
     available: bool = True
     reason: str = ""
-    """Reason if it is not available."""
+    """Reason why the provider or plugin is not available, else empty."""
     install_hint: str = ""
-    """Remedy if it is not available."""
+    """Advice for the user if the provider or plugin is not available."""
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """Registered provider and its origin."""
+    """Registered provider specification and its origin."""
 
     spec: ProviderSpec
     distribution: str
@@ -95,7 +96,7 @@ class _Entry:
     fault: str = ""
     """Reason why the provider is unavailable, else empty."""
     hint: str = ""
-    """Remedy for the fault."""
+    """Advice for the user that explains how to repair the fault."""
 
     @property
     def label(self) -> str:
@@ -104,10 +105,11 @@ class _Entry:
 
 
 class Registry:
-    """Providers by kind and name, and the hooks of all plugins.
+    """Collection of all providers by kind and name, and of the hooks of all plugins.
 
     A new registry is empty. :meth:`discover` returns one with the built-in providers and all
-    installed plugins. Listing providers imports no heavy module; :meth:`create` does.
+    installed plugins. Listing providers imports no heavy module; only :meth:`create` imports the
+    provider's code.
     """
 
     def __init__(self) -> None:
@@ -122,16 +124,15 @@ class Registry:
     ) -> Registry:
         """Load the built-in providers, every installed plugin and the environments.
 
-        A plugin that fails to load is listed with the reason and affects no other plugin.
+        A plugin that fails to load is listed with the reason and does not affect other plugins.
 
         Args:
             timeout_s: Time limit for loading one plugin; by default ``$MPSFM_PLUGIN_TIMEOUT_S`` or
                 10 s.
             environments: True also registers the providers of other Python environments as
                 ``NAME@ENVIRONMENT``, see :mod:`mpsfm_core.providers.environments`.
-            probe: True loads the plugins in another process first. A plugin that crashes the
-                process
-                is then listed too.
+            probe: True loads all plugins in a child process first. A plugin that crashes the child
+                process is then listed as unavailable.
 
         Returns:
             The registry.
@@ -153,13 +154,13 @@ class Registry:
         distribution: str = "this process",
         version: str = "0",
     ) -> None:
-        """Add a plugin of this process.
+        """Register a plugin of this process that has no entry point.
 
         Args:
             plugin: Module or object with ``@hookimpl`` functions.
-            name: Name of the plugin, by default the name of the module or class.
-            distribution: Distribution to show in lists.
-            version: Version to show in lists.
+            name: Name of the plugin, by default the name of ``plugin``.
+            distribution: Name of the distribution package, shown in lists.
+            version: Version of the distribution package, shown in lists.
 
         Raises:
             ProviderError: The plugin fails to load or is already registered.
@@ -176,12 +177,12 @@ class Registry:
     def add(
         self, *specs: ProviderSpec, distribution: str = "this process", version: str = "0"
     ) -> None:
-        """Add single providers of this process; their factory may be a callable.
+        """Register provider specifications of this process; their factory may be a callable.
 
         Args:
             specs: Specifications.
-            distribution: Distribution to show in lists.
-            version: Version to show in lists.
+            distribution: Name of the distribution package, shown in lists.
+            version: Version of the distribution package, shown in lists.
         """
         for spec in specs:
             self._entries.append(_Entry(spec, distribution, version, *find_spec_fault(spec)))
@@ -210,14 +211,13 @@ class Registry:
         """Return the specification of an available provider.
 
         Raises:
-            ProviderError: There is no such provider, or it is unavailable. The message has the
-                reason,
-                the most similar name, or the package to install.
+            ProviderError: No provider has that kind and name, or the provider is unavailable. The
+                message has the reason, the most similar name, or the package to install.
         """
         return self._entry(kind, name).spec
 
     def version(self, kind: Kind, name: str) -> str:
-        """Return distribution and version of a provider, such as ``mpsfm-onnx 0.1.0``."""
+        """Return the distribution and version of a provider, such as ``mpsfm-onnx 0.1.0``."""
         entry = self._entry(kind, name)
         return f"{entry.distribution} {entry.version}"
 
@@ -228,25 +228,26 @@ class Registry:
         values: Mapping[str, Any] | None = None,
         path: SettingPath = ("options",),
     ) -> Options | None:
-        """Validate the options of a provider and fill in defaults.
+        """Validate the options of a provider and fill in default values.
 
         Args:
             kind: Kind of the provider.
             name: Name of the provider.
-            values: Values from the configuration.
+            values: Option values from the configuration.
             path: Path of ``values`` in the configuration, for messages.
 
         Returns:
-            The options, or None if the provider has none.
+            The validated options, or None if the provider has no options.
 
         Raises:
-            SettingsError: A value is wrong; the message has the path and the most similar key.
+            SettingsError: An option value is wrong. The message has the path of the option and the
+                most similar key.
         """
         model = self._options_model(kind, name)
         return parse_settings(model or _NoOptions, values or {}, path) if model or values else None
 
     def default_options(self, kind: Kind, name: str) -> dict[str, Any]:
-        """Return the default options as plain values; None for options that the user must set."""
+        """Return the default options of a provider; required options have the value None."""
         model = self._options_model(kind, name) or _NoOptions
         return dict.fromkeys(model.model_fields) | model.model_construct().model_dump(mode="json")
 
@@ -258,14 +259,14 @@ class Registry:
         Args:
             kind: Kind of the provider.
             name: Name of the provider.
-            values: Values from the configuration.
+            values: Option values from the configuration.
 
         Returns:
             The files.
 
         Raises:
-            SettingsError: An option is wrong or missing.
-            ProviderError: The plugin's function fails.
+            SettingsError: An option value is wrong or missing.
+            ProviderError: The plugin's weights function raises an exception.
         """
         entry = self._entry(kind, name)
         files = entry.spec.weights
@@ -283,14 +284,14 @@ class Registry:
     def calibration(self, kind: Kind, config: ProviderConfig) -> Calibration:
         """Return the uncertainty model of a depth, multi-view or normals provider.
 
-        Sources in order: the configuration; then for each wrapper, outermost first, and for the
-        provider the plugin's ``mpsfm_calibration`` hook and the specification; then the defaults of
-        the class.
+        Sources are searched in this order: the configuration, each wrapper from the outermost, the
+        provider, and the defaults of the class. A wrapper or provider declares a model by the
+        plugin's ``mpsfm_calibration`` hook or in its specification.
 
         Args:
             kind: Kind of the provider.
-            config: Configuration of the provider. ``config.calibration`` has values only, because a
-                calibration file was read when the configuration was loaded.
+            config: Configuration of the provider. ``config.calibration`` contains values only,
+                because loading the configuration has already read a calibration file.
 
         Returns:
             The calibration.
@@ -319,21 +320,22 @@ class Registry:
         context: ProviderContext,
         wrap: Sequence[ProviderConfig] = (),
     ) -> Any:
-        """Import and construct a provider inside its wrappers.
+        """Import and construct a provider and its wrappers.
 
         Args:
             kind: Kind of the provider.
             name: Name of the provider.
-            options: Validated options or values from the configuration.
-            context: Resources of the run.
+            options: Validated options, or option values from the configuration.
+            context: Resources of the run that the factory receives.
             wrap: Wrappers, innermost first.
 
         Returns:
-            Object with the methods of ``PROTOCOLS[kind]``.
+            Provider object with the methods of ``PROTOCOLS[kind]``.
 
         Raises:
-            ProviderError: The provider cannot be imported or constructed, or lacks a method.
-            MpsfmError: An error that the provider raises itself, unchanged.
+            ProviderError: The provider cannot be imported or constructed, or the object lacks a
+                method.
+            MpsfmError: An MP-SfM error that the factory raises, unchanged.
         """
         entry = self._entry(kind, name)
         provider = self._construct(entry, (), options, context)
@@ -355,15 +357,15 @@ class Registry:
     def call_hook(self, name: str, /, **arguments: Any) -> list[Any]:
         """Call a hook of every plugin and return the answers that are not None.
 
-        A plugin that raises or answers wrongly is skipped with a warning that names it, and not
-        called for this hook again. A broken viewer or logger must not end a run.
+        A plugin whose hook raises or returns an invalid value is skipped with a warning, and this
+        hook of the plugin is not called again. A broken viewer or logger plugin must not end a run.
 
         Args:
-            name: Name of the hook.
-            arguments: Arguments of the hook.
+            name: Name of the hook to call.
+            arguments: Keyword arguments of the hook.
 
         Returns:
-            Answers in the order of registration.
+            Return values in the order of registration.
         """
         answers = []
         for implementation in reversed(getattr(self.hook, name).get_hookimpls()):
@@ -420,7 +422,7 @@ class Registry:
         raise ProviderError(self._unknown(kind, name))
 
     def _fault(self, entry: _Entry) -> tuple[str, str]:
-        """Return why a provider is unavailable (its own fault or a shared name), and a remedy."""
+        """Return why a provider is unavailable (own fault or duplicate name), and the repair."""
         if entry.fault:
             return entry.fault, entry.hint
         same_name = [e for e in self._entries if _key(e) == _key(entry) and not e.fault]
@@ -479,7 +481,7 @@ class Registry:
 
 
 class _NoOptions(Options):
-    """Options of a provider without options: rejects every key."""
+    """Options class of a provider without options, which rejects every key."""
 
 
 def _label(plugin: LoadedPlugin) -> str:
@@ -546,7 +548,7 @@ def _default_timeout() -> float:
 
 
 def core_version() -> str:
-    """Return the version of the installed core, ``"source"`` if it was never installed."""
+    """Return the version of mpsfm-core, ``"source"`` if the package is not installed."""
     try:
         return metadata.version(CORE)
     except metadata.PackageNotFoundError:

@@ -1,4 +1,7 @@
-"""Helpers for plugins with torch networks. Imports torch: only for their heavy modules."""
+"""Helpers for provider plugins that run torch networks.
+
+Only provider modules may import this module, because it imports torch.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,13 @@ from mpsfm_core.providers import ProviderContext
 
 
 def use_threads(context: ProviderContext) -> None:
-    """Set the number of threads of torch, which applies to the whole process."""
+    """Set the number of CPU threads of torch for the whole process."""
     torch.set_num_threads(context.threads)
 
 
 @contextmanager
 def inference() -> Iterator[None]:
-    """Disable gradients and nondeterministic kernels of torch."""
+    """Disable gradients and nondeterministic kernels of torch for a block of code."""
     with (
         torch.inference_mode(),
         torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True),

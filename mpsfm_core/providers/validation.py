@@ -1,9 +1,10 @@
-"""Validation of providers: everything that a provider returns passes through this module.
+"""Validation of everything that a provider returns.
 
-``run_*`` calls a provider and validates the answer. Any failure becomes one
-:class:`~mpsfm_core.data.errors.MpsfmError` that names provider and image. ``validate_*`` validates
-an answer alone. The data types validate themselves on construction. Here they are validated again,
-because arrays are mutable, and against the view and the capabilities of the specification.
+``run_*`` calls a provider and validates its return value. Any failure of a provider becomes one
+:class:`~mpsfm_core.data.errors.MpsfmError` that names provider and image. ``validate_*`` only
+validates a given return value. The data types validate themselves on construction. This module
+validates them again, because arrays are mutable. It also compares them with the view and with the
+capabilities of the specification.
 """
 
 from __future__ import annotations
@@ -47,16 +48,16 @@ from mpsfm_core.providers import (
 )
 
 MAX_MEDIAN_NORMAL_VARIANCE = np.pi**2
-"""Largest plausible median in rad^2. No angle exceeds pi: larger values are degrees or no
-variance."""
+"""Largest plausible median of the angular variance of normals in rad^2. No angle exceeds pi, so a
+larger value is in degrees or no variance."""
 
 FACING_TOLERANCE = 1e-3
-"""Largest ``n . ray`` of a normal that faces the camera; positive because of rounding, see
+"""Largest ``n . ray`` of a normal that faces the camera. It is positive because of rounding, see
 :data:`~mpsfm_core.data.UNIT_NORMAL_TOLERANCE`."""
 
 
 def run_depth(spec: ProviderSpec, provider: DepthProvider, view: View) -> DepthPrior:
-    """Predict the depth of a view and validate the answer, see :meth:`DepthProvider.predict`."""
+    """Predict the depth of a view and validate the result, see :meth:`DepthProvider.predict`."""
     with provider_errors(spec, view.name):
         return validate_depth(spec, view, provider.predict(view))
 
@@ -64,7 +65,7 @@ def run_depth(spec: ProviderSpec, provider: DepthProvider, view: View) -> DepthP
 def run_joint(
     spec: ProviderSpec, provider: JointProvider, view: View
 ) -> tuple[DepthPrior, NormalPrior]:
-    """Predict depth and normals of a view in one pass and validate both."""
+    """Predict depth and normals of a view in one network pass and validate both."""
     with provider_errors(spec, view.name):
         answer = provider.predict_joint(view)
         if not (isinstance(answer, tuple) and len(answer) == 2):
@@ -73,7 +74,7 @@ def run_joint(
 
 
 def run_focal(spec: ProviderSpec, provider: FocalEstimator, view: View) -> float | None:
-    """Estimate the focal length of a view in pixels; None if the provider has no estimate."""
+    """Estimate the focal length of a view in pixels, or return None without an estimate."""
     with provider_errors(spec, view.name):
         focal = provider.estimate_focal(view)
         if focal is None:
@@ -86,9 +87,9 @@ def run_focal(spec: ProviderSpec, provider: FocalEstimator, view: View) -> float
 def run_normals(
     spec: ProviderSpec, provider: NormalsProvider, view: View, depth: DepthPrior | None = None
 ) -> NormalPrior:
-    """Predict the normals of a view and validate the answer.
+    """Predict the normals of a view and validate the result.
 
-    ``depth`` reaches the provider only if the specification declares ``needs-depth``.
+    The provider receives ``depth`` only if the specification declares ``needs-depth``.
     """
     given = depth if "needs-depth" in spec.capabilities else None
     with provider_errors(spec, view.name):
@@ -98,13 +99,13 @@ def run_normals(
 def run_multiview(
     spec: ProviderSpec, provider: MultiViewProvider, views: Sequence[View]
 ) -> MultiViewPrior:
-    """Predict the depth of a group of views and validate the answer."""
+    """Predict the depth of a group of views and validate the result."""
     with provider_errors(spec, _group_name(views)):
         return validate_multiview(spec, views, provider.predict_group(tuple(views)))
 
 
 def run_features(spec: ProviderSpec, provider: FeatureProvider, view: View) -> Features:
-    """Extract the features of a view and validate the answer."""
+    """Extract the features of a view and validate the result."""
     with provider_errors(spec, view.name):
         return validate_features(spec, view, provider.extract(view))
 
@@ -115,9 +116,9 @@ def run_matcher(
     views: tuple[View, View],
     features: tuple[Features, Features] | None = None,
 ) -> PairMatches:
-    """Match two views and validate the answer.
+    """Match two views and validate the result.
 
-    ``features`` reach the provider only if the specification declares ``sparse``.
+    The provider receives ``features`` only if the specification declares ``sparse``.
     """
     given = features if features and "sparse" in spec.capabilities else (None, None)
     with provider_errors(spec, _pair_name(views)):
@@ -125,7 +126,7 @@ def run_matcher(
 
 
 def run_retrieval(spec: ProviderSpec, provider: RetrievalProvider, view: View) -> Float32:
-    """Compute the global descriptor of a view and validate it."""
+    """Compute the global descriptor of a view and validate the descriptor."""
     with provider_errors(spec, view.name):
         return validate_retrieval(spec, view, provider.describe(view))
 
@@ -137,36 +138,38 @@ def run_mask(spec: ProviderSpec, provider: MaskProvider, view: View) -> Bool:
 
 
 def validate_depth(spec: ProviderSpec, view: View, output: object) -> DepthPrior:
-    """Validate a depth prior: type, values, not empty, and the declared capabilities.
+    """Validate a depth prior: type, values, at least one valid pixel, declared capabilities.
 
     Args:
         spec: Specification of the provider.
-        view: View that the answer belongs to.
-        output: Answer of the provider.
+        view: View from which the provider computed the result.
+        output: Return value of the provider.
 
     Returns:
         The prior.
 
     Raises:
-        ProviderOutputError: A rule is violated; it names provider, image, field and rule.
+        ProviderOutputError: The result violates a rule. The message names provider, image, field
+            and rule.
     """
     with _name_violations(spec, view.name):
         return _check_depth(spec, output, "depth")
 
 
 def validate_normals(spec: ProviderSpec, view: View, output: object) -> NormalPrior:
-    """Validate a normal prior: also facing the camera, with a variance in rad^2.
+    """Validate a normal prior: type, unit normals that face the camera, variance in rad^2.
 
     Args:
         spec: Specification of the provider.
-        view: View that the answer belongs to.
-        output: Answer of the provider.
+        view: View from which the provider computed the result.
+        output: Return value of the provider.
 
     Returns:
         The prior.
 
     Raises:
-        ProviderOutputError: A rule is violated; it names provider, image, field and rule.
+        ProviderOutputError: The result violates a rule. The message names provider, image, field
+            and rule.
     """
     with _name_violations(spec, view.name):
         prior = _revalidate(output, NormalPrior, "normals")
@@ -183,18 +186,19 @@ def validate_normals(spec: ProviderSpec, view: View, output: object) -> NormalPr
 
 
 def validate_multiview(spec: ProviderSpec, views: Sequence[View], output: object) -> MultiViewPrior:
-    """Validate the priors of a group: one per view, with the declared proposals.
+    """Validate the priors of a group: one per view, with the declared poses and intrinsics.
 
     Args:
         spec: Specification of the provider.
-        views: Views that the answer belongs to.
-        output: Answer of the provider.
+        views: Views from which the provider computed the result.
+        output: Return value of the provider.
 
     Returns:
         The group prior.
 
     Raises:
-        ProviderOutputError: A rule is violated; it names provider, images, field and rule.
+        ProviderOutputError: The result violates a rule. The message names provider, images, field
+            and rule.
     """
     with _name_violations(spec, _group_name(views)):
         group = _revalidate(output, MultiViewPrior, "output")
@@ -215,14 +219,15 @@ def validate_features(spec: ProviderSpec, view: View, output: object) -> Feature
 
     Args:
         spec: Specification of the provider.
-        view: View that the answer belongs to.
-        output: Answer of the provider.
+        view: View from which the provider computed the result.
+        output: Return value of the provider.
 
     Returns:
         The features.
 
     Raises:
-        ProviderOutputError: A rule is violated; it names provider, image, field and rule.
+        ProviderOutputError: The result violates a rule. The message names provider, image, field
+            and rule.
     """
     with _name_violations(spec, view.name):
         features = _revalidate(output, Features, "features")
@@ -240,15 +245,15 @@ def validate_matches(
 
     Args:
         spec: Specification of the provider.
-        views: Views that the answer belongs to.
-        features: Features of both views, None without features.
-        output: Answer of the provider.
+        views: Views from which the provider computed the result.
+        features: Features of both views, None for a matcher without features.
+        output: Return value of the provider.
 
     Returns:
         The matches.
 
     Raises:
-        ProviderOutputError: A rule is violated or a declared capability is missing.
+        ProviderOutputError: The result violates a rule or lacks the field of a declared capability.
     """
     with _name_violations(spec, _pair_name(views)):
         matches = _revalidate(output, PairMatches, "matches")
@@ -275,14 +280,15 @@ def validate_retrieval(spec: ProviderSpec, view: View, output: object) -> Float3
 
     Args:
         spec: Specification of the provider.
-        view: View that the answer belongs to.
-        output: Answer of the provider.
+        view: View from which the provider computed the result.
+        output: Return value of the provider.
 
     Returns:
         The descriptor.
 
     Raises:
-        ProviderOutputError: A rule is violated; it names provider, image, field and rule.
+        ProviderOutputError: The result violates a rule. The message names provider, image, field
+            and rule.
     """
     with _name_violations(spec, view.name):
         vector = _require_array(output, "descriptor", np.dtype(np.float32), 1)
@@ -293,18 +299,19 @@ def validate_retrieval(spec: ProviderSpec, view: View, output: object) -> Float3
 
 
 def validate_mask(spec: ProviderSpec, view: View, output: object) -> Bool:
-    """Validate a mask: (H, W) bool on the pixel grid of the view.
+    """Validate a mask: The mask is (H, W) bool on the pixel grid of the view.
 
     Args:
         spec: Specification of the provider.
-        view: View that the answer belongs to.
-        output: Answer of the provider.
+        view: View from which the provider computed the result.
+        output: Return value of the provider.
 
     Returns:
         The mask.
 
     Raises:
-        ProviderOutputError: A rule is violated; it names provider, image, field and rule.
+        ProviderOutputError: The result violates a rule. The message names provider, image, field
+            and rule.
     """
     with _name_violations(spec, view.name):
         mask = _require_array(output, "mask", np.dtype(np.bool_), 2)
@@ -317,18 +324,19 @@ def validate_mask(spec: ProviderSpec, view: View, output: object) -> Bool:
 def validate_filtered_pairs(
     answer: object, pairs: Sequence[tuple[str, str]]
 ) -> list[tuple[str, str]]:
-    """Validate the answer of the hook ``mpsfm_filter_pairs``.
+    """Validate the pairs that the hook ``mpsfm_filter_pairs`` of a plugin returns.
 
     Args:
-        answer: Answer of a plugin.
+        answer: Return value of the plugin's hook.
         pairs: Candidate pairs of image names.
 
     Returns:
-        The answer as a list. Pairs that are no candidates remain and have no effect.
+        The selected pairs as a list. Pairs that are no candidates remain in the list and have no
+        effect.
 
     Raises:
-        TypeError: The answer is not an iterable of pairs of image names.
-        ValueError: The answer has pairs, but none of them is a candidate.
+        TypeError: The return value is not an iterable of pairs of image names.
+        ValueError: The plugin returns pairs, but none of them is a candidate.
     """
     if not isinstance(answer, Iterable):
         raise TypeError(f"must return pairs of image names, got {_type(answer)}")
@@ -351,18 +359,18 @@ def validate_filtered_pairs(
 
 @contextmanager
 def provider_errors(spec: ProviderSpec, image: str) -> Iterator[None]:
-    """Convert exceptions of a provider to one error that names provider and image.
+    """Convert exceptions of a provider to an error that names provider and image.
 
-    Errors of MP-SfM itself (missing weights, unreadable files) pass unchanged: they name their
-    remedy.
+    Errors of MP-SfM itself (missing weights, unreadable files) pass unchanged, because they already
+    name the next step.
 
     Args:
         spec: Specification of the provider.
-        image: Name of the image, pair or group.
+        image: Name of the image, pair or group that the provider processes.
 
     Raises:
         ProviderRunError: The provider raised an exception.
-        ProviderOutputError: The answer violates a rule.
+        ProviderOutputError: The return value of the provider violates a rule.
     """
     with _name_violations(spec, image):
         try:
@@ -400,10 +408,10 @@ Checked = TypeVar(
 
 
 def _revalidate(output: object, expected: type[Checked], field: str) -> Checked:
-    """Require the type of an output and validate its values again."""
+    """Require the type of a provider's output and validate its values again."""
     if not isinstance(output, expected):
         raise DataError(field, f"must be a {expected.__name__}, got {_type(output)}")
-    return replace(output)  # the constructor validates the values again
+    return replace(output)  # The constructor validates the values again.
 
 
 def _check_depth(spec: ProviderSpec, output: object, field: str) -> DepthPrior:
@@ -435,7 +443,7 @@ def _check_sparse(sparse: SparseMatches, features: tuple[Features, Features] | N
 
 
 def _require_undeclared(spec: ProviderSpec, capability: str, field: str) -> None:
-    """Raise if the specification declares the capability of an absent field."""
+    """Raise an error if the field of a declared capability is None."""
     if capability in spec.capabilities:
         raise DataError(field, f"lacks what the specification declares: {capability!r}")
 

@@ -11,11 +11,11 @@ URI                                    Meaning
 ``export:NAME``                        file that ``mpsfm models export NAME`` made
 =====================================  ========================================================
 
-Interrupted downloads continue. A file appears in the cache only when it is complete and verified.
-Its SHA-256 is compared with the hash that the plugin or the user gives. Without one, the hash of
-the first download is recorded in ``hashes.json`` of the cache, and later files with another hash
-are rejected. Files in the cache of huggingface_hub are used in place and verified alike. No code of
-a weights file is ever executed.
+Interrupted downloads continue. A weights file appears in the cache only when the file is complete
+and verified. The SHA-256 of the file is compared with the hash that the plugin or the user gives.
+Without a given hash, the hash of the first download is recorded in ``hashes.json`` of the cache.
+Later files with another hash are rejected. Files in the cache of huggingface_hub are verified in
+the same way and not copied. No code of a weights file is ever executed.
 """
 
 from __future__ import annotations
@@ -48,23 +48,24 @@ from mpsfm_core.support.user_folders import user_cache_folder, user_data_folder
 FORMAT = 1
 """Version of ``hashes.json``."""
 CACHE_VARIABLE = "MPSFM_CACHE"
-"""Environment variable that names the cache directory."""
+"""Environment variable that names the weights cache directory."""
 OFFLINE_VARIABLES = ("MPSFM_OFFLINE", "HF_HUB_OFFLINE")
 """Environment variables that forbid downloads unless they are unset, empty or 0."""
 
 Progress = Callable[[str, int, "int | None"], None]
-"""Called with the file name, the number of downloaded bytes and the total number if known."""
+"""Progress function: receives the file name, the downloaded bytes, and the total bytes if known."""
 
 EXPORTS_VARIABLE = "MPSFM_EXPORTS"
-"""Environment variable that names the folder of networks exported on this machine."""
+"""Environment variable that names the folder of networks that were exported on this machine."""
 
 _CONNECT_TIMEOUT_S = 4.0
-"""Time limit for name look-up, connection, encryption and headers."""
+"""Time limit in seconds for DNS lookup, connection, TLS handshake and HTTP headers."""
 _READ_TIMEOUT_S = 30.0
 _MAX_ATTEMPTS_WITHOUT_PROGRESS = 4
 _RETRY_WAIT_S = 0.5
 _CHUNK = 1 << 20
-_SCHEME = re.compile(r"^([a-z][a-z0-9+.-]+):")  # at least two letters, because "C:\x" is a path
+# A URI scheme has at least two letters, because "C:\x" is a path.
+_SCHEME = re.compile(r"^([a-z][a-z0-9+.-]+):")
 _HUB = re.compile(r"^hf://(?P<repo>[^/@]+/[^/@]+)@(?P<revision>[^/]+)/(?P<path>.+)$")
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _HEADERS = {"User-Agent": "mpsfm"}
@@ -78,9 +79,10 @@ _CONNECTION_FAILURES = (
 
 
 class WeightStore:
-    """Cache of weights files: finds, downloads and verifies them by URI.
+    """Cache of weights files that finds, downloads and verifies files by URI.
 
-    Threads and processes may share a cache. One of them downloads a file, the others wait for it.
+    Threads and processes may share a cache directory. If several need the same file, one of them
+    downloads the file while the rest wait.
     """
 
     def __init__(
@@ -89,11 +91,11 @@ class WeightStore:
         offline: bool | None = None,
         progress: Progress | None = None,
     ) -> None:
-        """Create a store; the cache directory is created at the first download.
+        """Create a weight store; the first download creates the cache directory.
 
         Args:
-            cache_dir: Cache directory; by default ``$MPSFM_CACHE``, else the user cache of the
-                platform.
+            cache_dir: Cache directory, by default ``$MPSFM_CACHE``, else the user cache folder of
+                the platform.
             offline: True forbids downloads; by default ``$MPSFM_OFFLINE`` or ``$HF_HUB_OFFLINE``.
             progress: Called during downloads.
         """
@@ -103,19 +105,19 @@ class WeightStore:
         self._progress = progress
 
     def resolve(self, uri: str, sha256: str | None = None) -> Path:
-        """Return the verified local path of a file, downloading it if necessary.
+        """Return the verified local path of a weights file, downloading the file if necessary.
 
         Args:
-            uri: Location, see the table of the module.
-            sha256: Expected hash in hex, or None.
+            uri: URI of the file, see the table in the docstring of the module.
+            sha256: Expected SHA-256 in hex, or None.
 
         Returns:
-            Path of the file.
+            Local path of the weights file.
 
         Raises:
             WeightsError: The file is missing, cannot be downloaded, must not be downloaded
                 (offline), or
-                has another hash. The message has the remedy.
+                has another hash. The message names the next step for the user.
         """
         expected = _normalize_hash(uri, sha256)
         if not is_remote(uri):
@@ -138,7 +140,7 @@ class WeightStore:
         return path
 
     def locate(self, uri: str) -> Path | None:
-        """Return the path of a file if it is on this machine, else None. Uses no network."""
+        """Return the local path of a weights file, or None if only a download provides it."""
         if not is_remote(uri):
             try:
                 return _find_local_file(uri)
@@ -148,7 +150,7 @@ class WeightStore:
         return path if path.is_file() else self._find_in_hub_cache(uri)
 
     def size(self, uri: str) -> int | None:
-        """Return the size of a remote file in bytes as the server reports it, or None."""
+        """Return the size in bytes that the server reports for a remote file, or None."""
         if self.offline or not is_remote(uri):
             return None
         try:
@@ -163,11 +165,11 @@ class WeightStore:
         return int(length) if length else None
 
     def verify(self, uri: str, sha256: str | None = None) -> str:
-        """Hash a local file and compare it with the expected or the recorded hash.
+        """Hash a local weights file and compare the hash with the expected or the recorded one.
 
         Args:
-            uri: Location, see the table of the module.
-            sha256: Expected hash in hex; None uses the hash recorded at the download.
+            uri: URI of the file, see the table in the docstring of the module.
+            sha256: Expected SHA-256 in hex; None uses the hash that was recorded at the download.
 
         Returns:
             SHA-256 of the file.
@@ -186,7 +188,7 @@ class WeightStore:
 
     @staticmethod
     def _find_in_hub_cache(uri: str) -> Path | None:
-        """Return the file in the cache of huggingface_hub, or None. Uses no network."""
+        """Return the path of a file in the cache of huggingface_hub, or None. Uses no network."""
         parts = _HUB.match(uri)
         if parts is None:
             return None
@@ -226,16 +228,19 @@ class WeightStore:
             _delete_partial(part)
             raise _hash_mismatch(uri, None, str(expected), actual)
         self._record(
-            uri, part, actual
-        )  # before the file: every file in the cache has a recorded hash
+            uri,
+            part,
+            actual,
+            # The hash is stored before the file, so that every file in the cache has a recorded hash.
+        )
         part.replace(path)
         _delete_partial(part)
 
     def _cached_path(self, uri: str) -> Path:
-        """Return the path of a remote file in the cache.
+        """Return the path of a remote file in the weights cache.
 
-        Files of one remote folder share a folder, because ONNX expects external data next to the
-        model.
+        Files of one remote folder share a cache folder, because ONNX expects external data next to
+        the model.
         """
         address, _, query = uri.partition("?")
         parent, _, name = address.rpartition("/")
@@ -243,7 +248,7 @@ class WeightStore:
         return self.cache_dir / folder / re.sub(r"[^\w.-]", "_", urllib.parse.unquote(name))
 
     def _is_verified(self, uri: str, path: Path, expected: str | None) -> bool:
-        """Return whether the file exists, was verified, and has not changed since."""
+        """Return whether a cached file exists, was verified, and has not changed since."""
         entry = self._entries().get(uri, {})
         return (
             path.is_file()
@@ -290,7 +295,7 @@ def is_remote(uri: str) -> bool:
 
 
 def file_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file in hex."""
+    """Return the SHA-256 of a file in hex digits."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK):
@@ -301,8 +306,8 @@ def file_sha256(path: Path) -> str:
 def load_torch_state(path: Path) -> dict[str, Any]:
     """Load the tensors of a ``.safetensors`` file or of a torch checkpoint to the CPU.
 
-    A checkpoint may nest tensors in dictionaries. Only tensors and plain containers are loaded
-    (``weights_only``), so that a file cannot run code.
+    A checkpoint may nest tensors in dictionaries. The function loads only tensors and plain
+    containers (``weights_only``), so that a file cannot run code.
 
     Args:
         path: Path of the file.
@@ -311,7 +316,7 @@ def load_torch_state(path: Path) -> dict[str, Any]:
         Tensors by name.
 
     Raises:
-        WeightsError: The file is damaged or contains other objects.
+        WeightsError: The file is damaged or contains other objects than tensors.
     """
     try:
         if path.suffix == ".safetensors":
@@ -319,7 +324,8 @@ def load_torch_state(path: Path) -> dict[str, Any]:
         else:
             torch = importlib.import_module("torch")
             loaded = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # the readers of pickle, zip and safetensors share no base class
+    # The readers of pickle, zip and safetensors share no exception base class.
+    except Exception as error:
         raise WeightsError(
             f"{path} cannot be loaded as plain tensors ({type(error).__name__}): it is damaged, "
             f"or it holds Python objects, which are never executed here"
@@ -350,7 +356,7 @@ def _hash_mismatch(uri: str, path: Path | None, expected: str, actual: str) -> W
 
 
 def _file_stamp(path: Path) -> list[int]:
-    """Return size and modification time, which change on a write and survive a rename."""
+    """Return size and modification time of a file, which change on a write and survive a rename."""
     status = path.stat()
     return [status.st_size, status.st_mtime_ns]
 
@@ -373,13 +379,13 @@ def _find_local_file(uri: str) -> Path:
 
 
 def exports_folder() -> Path:
-    """Return ``$MPSFM_EXPORTS``, or ``exports`` in the user data folder."""
+    """Return the export folder, ``$MPSFM_EXPORTS`` or ``exports`` in the user data folder."""
     variable = os.environ.get(EXPORTS_VARIABLE)
     return Path(variable).expanduser() if variable else user_data_folder() / "exports"
 
 
 def _find_exported_file(uri: str) -> Path:
-    """Return the file of ``export:NAME``, which its manifest names."""
+    """Return the ONNX file of ``export:NAME``, which the export's manifest names."""
     name = uri.removeprefix("export:")
     manifest = exports_folder() / f"{name}.json"
     if Path(name).name != name or not manifest.is_file():
@@ -394,7 +400,7 @@ def _find_exported_file(uri: str) -> Path:
 
 
 def _find_package_resource(uri: str) -> Path:
-    """Return the path of ``package:NAME/PATH`` without importing the package."""
+    """Return the path of the resource ``package:NAME/PATH`` without importing the package."""
     package, _, resource = uri.removeprefix("package:").partition("/")
     if not package.isidentifier() or not resource or ".." in resource.split("/"):
         raise WeightsError(f"{uri}: expected package:NAME/PATH inside of the package")
@@ -410,7 +416,7 @@ def _find_package_resource(uri: str) -> Path:
 
 
 def _make_request(uri: str, expected: str | None) -> urllib.request.Request:
-    """Create the HTTP request for a remote URI."""
+    """Create the HTTP request for the remote URI of a weights file."""
     if uri.startswith("hf://"):
         return _make_hub_request(uri)
     request = urllib.request.Request(uri, headers=_HEADERS)
@@ -421,7 +427,7 @@ def _make_request(uri: str, expected: str | None) -> urllib.request.Request:
 
 
 def _make_hub_request(uri: str) -> urllib.request.Request:
-    """Create the request for ``hf://`` with the endpoint and token of huggingface_hub."""
+    """Create the HTTP request for an ``hf://`` URI with huggingface_hub's endpoint and token."""
     parts = _HUB.match(uri)
     if parts is None:
         raise WeightsError(f"{uri}: expected hf://ORG/REPO@REVISION/PATH with a fixed revision")
@@ -429,15 +435,16 @@ def _make_hub_request(uri: str) -> urllib.request.Request:
     url = hub.hf_hub_url(parts["repo"], parts["path"], revision=parts["revision"])
     request = urllib.request.Request(url, headers=_HEADERS)
     if token := hub.get_token():
-        # must not reach the content server that the hub redirects to
+        # The token must not reach the content server that the model hub redirects to.
         request.add_unredirected_header("Authorization", f"Bearer {token}")
     return request
 
 
 def _download(uri: str, part: Path, expected: str | None, progress: Progress | None) -> None:
-    """Download into ``part``, continuing a partial download.
+    """Download into the file ``part``, continuing a partial download.
 
-    A server that cannot be reached at all is not tried again: most likely there is no network.
+    If the server cannot be reached, the download is not retried, because there is probably no
+    network.
     """
     num_failed, reached = 0, False
     while True:
@@ -468,7 +475,7 @@ def _download(uri: str, part: Path, expected: str | None, progress: Progress | N
 
 
 def _describe_failure(failure: Exception) -> str:
-    """Return the answer of the server or the message of the system."""
+    """Return the server's HTTP status or the message of the operating system."""
     if isinstance(failure, urllib.error.HTTPError):
         return f"{failure.code} {failure.reason}"
     cause = failure.reason if isinstance(failure, urllib.error.URLError) else failure
@@ -478,9 +485,9 @@ def _describe_failure(failure: Exception) -> str:
 def _open_download(
     request: urllib.request.Request, part: Path, uri: str, hash_is_known: bool
 ) -> http.client.HTTPResponse | None:
-    """Open a download, continuing after ``part`` if it belongs to the same file.
+    """Open an HTTP download that continues after the bytes in ``part`` of the same file.
 
-    Returns None if ``part`` is already complete.
+    The function returns None if ``part`` is already complete.
     """
     etag_path = _etag_path(part)
     etag = etag_path.read_text(encoding="utf-8") if etag_path.is_file() else ""
@@ -506,7 +513,7 @@ def _open_download(
 def _open_with_timeout(
     request: urllib.request.Request, redirects: _RedirectPolicy
 ) -> http.client.HTTPResponse:
-    """Open a connection in a thread, because no socket timeout covers the name look-up."""
+    """Open an HTTP connection in a thread, because no socket timeout covers the DNS lookup."""
     outcome: list[Any] = []
 
     def work() -> None:
@@ -528,10 +535,11 @@ def _open_with_timeout(
 
 
 class _RedirectPolicy(urllib.request.HTTPRedirectHandler):
-    """Policy for redirects of a server.
+    """Policy that decides which HTTP redirects of a server are followed.
 
-    Forbidden are redirects from the network to this machine or its local network, and from https to
-    http. Another host is allowed only for files of a hub and for files with a known hash.
+    Redirects from the network to this machine or its local network, and from https to http, are
+    forbidden. A redirect to another host is allowed only for files of a model hub and for files
+    with a known hash.
     """
 
     def __init__(self, request: urllib.request.Request, host_may_change: bool) -> None:
@@ -542,7 +550,7 @@ class _RedirectPolicy(urllib.request.HTTPRedirectHandler):
     def redirect_request(
         self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str
     ) -> Any:
-        """Return the request for the new address; raise WeightsError if it is forbidden."""
+        """Return the request for a redirect, or raise WeightsError if it is forbidden."""
         new = urllib.parse.urlsplit(newurl)
         why = ""
         if not self._is_local_origin and is_local(new.netloc):
@@ -557,7 +565,7 @@ class _RedirectPolicy(urllib.request.HTTPRedirectHandler):
 
 
 def is_local(netloc: str) -> bool:
-    """Return whether a host (with or without port) is in this machine or the local network.
+    """Return whether a host (with or without port) is this machine or in the local network.
 
     A host whose name cannot be resolved is not local.
     """
@@ -572,7 +580,7 @@ def is_local(netloc: str) -> bool:
 def _receive_body(
     response: http.client.HTTPResponse, part: Path, progress: Progress | None
 ) -> None:
-    """Append a response to ``part``, or replace ``part`` if the response is complete."""
+    """Append an HTTP response to ``part``, or replace ``part`` by a whole file."""
     with response:
         have = _size(part) if response.status == http.HTTPStatus.PARTIAL_CONTENT else 0
         etag = response.headers.get("ETag", "")

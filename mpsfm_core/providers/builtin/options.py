@@ -60,7 +60,7 @@ class DepthFileOptions(FileOptions):
     """Options of depth map files: z-depth in 16-bit PNG or TIFF, EXR, NPY or NPZ.
 
     Depth values that are zero or not finite are invalid. An NPZ file has ``depth`` and optionally
-    ``variance``, in the stored unit, and ``valid``.
+    ``variance`` (squared unit of depth) and ``valid``.
     """
 
     scale: float = Field(1.0, gt=0)

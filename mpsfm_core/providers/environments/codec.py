@@ -1,6 +1,6 @@
-"""Encoding of values as JSON text and a block of array bytes.
+"""Encoding of values as JSON text plus one block with the bytes of all arrays.
 
-The encoding is not pickle: a message can only contain the types below, and both processes may have
+Pickle is not used: a message can only contain the types below, and both processes may have
 different versions of Python and numpy. Supported are None, bool, int, float, str, paths, lists,
 tuples, dictionaries with text keys, numpy arrays, the data types of :mod:`mpsfm_core.data`, weights
 files and calibrations.
@@ -49,16 +49,16 @@ _TYPES: Mapping[str, type] = MappingProxyType(
 
 
 class EncodedMessage:
-    """Value ready to send: ``text`` and the arrays that the text refers to, in order."""
+    """Encoded value: JSON ``text`` and the arrays that the text refers to, in order."""
 
     def __init__(self, value: Any) -> None:
         self.arrays: list[NDArray[Any]] = []
         self.size = 0
-        """Size in bytes of the block that :meth:`write` fills."""
+        """Size in bytes of the block that holds all arrays."""
         self.text = json.dumps(self._plain(value)).encode()
 
     def write(self, block: memoryview) -> None:
-        """Copy the arrays to their offsets in a block of ``size`` bytes."""
+        """Copy the arrays into a block of ``size`` bytes, each at its offset."""
         start = 0
         for array in self.arrays:
             place = np.frombuffer(block, array.dtype, array.size, start).reshape(array.shape)
@@ -94,13 +94,14 @@ class EncodedMessage:
 def decode_message(text: bytes, block: UInt8, copy: bool) -> Any:
     """Decode a value.
 
-    Data types are restored without validation. The constructors of the other side validated them,
-    and :mod:`mpsfm_core.providers.validation` validates every answer of a provider.
+    The decoder does not validate the restored data types. The constructors in the sending process
+    validated them, and :mod:`mpsfm_core.providers.validation` validates every return value of a
+    provider.
 
     Args:
         text: JSON text of the message.
         block: Bytes of the arrays.
-        copy: True returns copies of the arrays, else read-only views of the block.
+        copy: True copies the arrays; False returns read-only views of the block.
 
     Returns:
         The value.
@@ -115,7 +116,7 @@ def decode_message(text: bytes, block: UInt8, copy: bool) -> Any:
 
 
 class _Decoder:
-    """Decoder of one message. Only the arrays outlive it and keep the block alive."""
+    """Decoder of one message, whose decoded arrays keep the block of bytes alive."""
 
     def __init__(self, block: UInt8, copy: bool) -> None:
         self._block, self._copy = block, copy
@@ -152,7 +153,7 @@ class _Decoder:
 
 
 def _restore(kind: type, values: dict[str, Any]) -> Any:
-    """Create an instance of a data type without validation."""
+    """Create an instance of a data type without calling its validation."""
     if issubclass(kind, BaseModel):
         return kind(**values)
     assert is_dataclass(kind)

@@ -1,4 +1,4 @@
-"""Python environments with providers: creation, lookup, description and removal."""
+"""Python environments that contain providers: creation, lookup, description and removal."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from mpsfm_core.support.user_folders import user_data_folder
 _log = logging.getLogger(__name__)
 
 FORMAT = 1
-"""Version of the description of an environment."""
+"""Format version of the stored description of an environment."""
 FOLDER_VARIABLE = "MPSFM_ENVIRONMENTS"
-"""Environment variable that names the folder with all environments."""
+"""Environment variable that names the folder of all provider environments."""
 
 _NAME = re.compile(r"[a-z0-9]+([._-][a-z0-9]+)*")
 _CORE = "mpsfm-core"
 _DESCRIPTION = "providers.json"
 _UNFINISHED = ".unfinished-"
 _REQUEST_TIMEOUT_S = 120.0
-"""Time limit in seconds for a request that runs no network."""
+"""Time limit in seconds for a worker request that runs no network."""
 
 
 class Environment:
-    """Python environment with providers in its own folder."""
+    """Python environment in its own folder that contains providers."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -60,16 +60,16 @@ class Environment:
 
     @property
     def python(self) -> Path:
-        """Path of the interpreter."""
+        """Path of the environment's Python interpreter."""
         inside = ("Scripts", "python.exe") if os.name == "nt" else ("bin", "python")
         return self.folder.joinpath("venv", *inside)
 
     def start(self) -> Worker:
-        """Start a worker process."""
+        """Start a worker process in the environment."""
         return Worker(self.python, self.label)
 
     def ask(self, **request: Any) -> Any:
-        """Send a request about the providers to a worker that stays alive for the next request."""
+        """Send a request about providers to a worker, which stays alive for the next request."""
         with self._lock:
             if self._worker is None or not self._worker.alive:
                 self._worker = self.start()
@@ -77,17 +77,18 @@ class Environment:
         return worker.ask(request, _REQUEST_TIMEOUT_S)
 
     def close(self) -> None:
-        """End the worker that answers requests."""
+        """End the worker process that answers requests about providers."""
         if self._worker is not None:
             self._worker.close()
             self._worker = None
 
     def describe(self) -> list[dict[str, Any]]:
-        """Return the stored description of the providers. Starts no process."""
+        """Return the stored description of the environment's providers. Starts no process."""
         path = self.folder / _DESCRIPTION
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            if isinstance(content, list):  # written before the description had a version
+            # The file was written before the description had a version.
+            if isinstance(content, list):
                 content = {"providers": content}
             check_version(content, FORMAT, path)
             found: list[dict[str, Any]] = content["providers"]
@@ -99,7 +100,7 @@ class Environment:
         return found
 
     def refresh(self) -> list[dict[str, Any]]:
-        """Request the description of the providers and store it."""
+        """Request the description of the providers from a worker and store the description."""
         found: list[dict[str, Any]] = self.ask(do="describe")
         content = {VERSION: FORMAT, "providers": found}
         text = json.dumps(content, indent=1, sort_keys=True)
@@ -114,7 +115,7 @@ def environments_folder() -> Path:
 
 
 def all_environments() -> list[Environment]:
-    """List the existing environments by name."""
+    """List the existing provider environments by name."""
     root = environments_folder()
     if not root.is_dir():
         return []
@@ -124,7 +125,7 @@ def all_environments() -> list[Environment]:
 
 
 def find_environment(name: str) -> Environment:
-    """Return the environment with a name.
+    """Return the provider environment with the given name.
 
     Raises:
         InputError: There is none.
@@ -141,19 +142,19 @@ def find_environment(name: str) -> Environment:
 def create_environment(
     name: str, packages: Sequence[str], python: str | None = None
 ) -> tuple[Environment, list[dict[str, Any]]]:
-    """Create an environment with the core and other packages, by uv or by venv and pip.
+    """Create a Python environment with mpsfm-core and other packages, by uv or by venv and pip.
 
     Args:
         name: Name of the environment.
-        packages: Requirements or folders, as for pip.
-        python: Interpreter or version, by default this one.
+        packages: Requirements or source folders to install, as for pip.
+        python: Python interpreter or version; by default the running interpreter.
 
     Returns:
-        The environment and the description of its providers.
+        The new environment and the description of its providers.
 
     Raises:
-        InputError: The name is invalid or taken.
-        ProviderError: The environment cannot be created; nothing of it remains.
+        InputError: The name is invalid or an environment with that name exists.
+        ProviderError: The environment cannot be created. A partly created environment is removed.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"{name!r} is not made of lower-case letters, digits and - . _")
@@ -161,7 +162,8 @@ def create_environment(
     if environment.folder.exists():
         raise InputError(f"{environment.label} exists; 'mpsfm env remove {name}' removes it")
     environments_folder().mkdir(parents=True, exist_ok=True)
-    # created next to its final folder, so that an interrupted creation leaves no environment
+    # The environment is created next to its final folder, so that an interruption leaves nothing
+    # behind.
     with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=environments_folder()) as scratch:
         made = Environment(Path(scratch) / name)
         for command in _commands(made, [*_core_requirement(), *packages], python):
@@ -174,14 +176,14 @@ def create_environment(
 
 
 def remove_environment(name: str) -> None:
-    """Remove an environment and its folder."""
+    """Remove a provider environment and its folder."""
     shutil.rmtree(find_environment(name).folder)
 
 
 def _commands(
     environment: Environment, packages: Sequence[str], python: str | None
 ) -> list[list[str]]:
-    """Return the commands that create an environment and install packages."""
+    """Return the commands that create a Python environment and install packages."""
     venv, inside = str(environment.folder / "venv"), str(environment.python)
     uv = shutil.which("uv")
     if uv:
@@ -196,17 +198,17 @@ def _commands(
 
 
 def _relocate_scripts(scripts: Path, before: Path, after: Path) -> None:
-    """Replace the path of the interpreter in the scripts of an environment."""
+    """Replace the interpreter path in the scripts of a moved environment."""
     old, new = os.fsencode(before), os.fsencode(after)
     for path in scripts.iterdir():
         if path.is_file() and not path.is_symlink():
             content = path.read_bytes()
-            if old in content and b"\0" not in content:  # launchers on Windows are binaries
+            if old in content and b"\0" not in content:  # On Windows, launchers are binary files.
                 path.write_bytes(content.replace(old, new))
 
 
 def _core_requirement() -> list[str]:
-    """Return the pip requirement of this core: its source folder or its version."""
+    """Return the pip requirement of the running mpsfm-core: its source folder or its version."""
     distribution = metadata.distribution(_CORE)
     origin = json.loads(distribution.read_text("direct_url.json") or "{}")
     url = str(origin.get("url", ""))
@@ -217,7 +219,7 @@ def _core_requirement() -> list[str]:
 
 
 def _run(command: list[str], label: str) -> None:
-    """Run a command; a failure becomes a ProviderError with the reason."""
+    """Run a command; raise ProviderError with the last output if the command fails."""
     try:
         done = subprocess.run(command, capture_output=True, text=True)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Providers of another environment: specifications for the registry, and clients."""
+"""Providers of other Python environments: specifications for the registry, and clients."""
 
 from __future__ import annotations
 
@@ -27,26 +27,27 @@ from mpsfm_core.providers.environments.worker_process import Worker, WorkerLost
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 _CONSTRUCTION_TIMEOUT_S = 1800.0
-"""Time limit in seconds: large weights from a slow disk to a GPU. Downloads have no limit."""
+"""Time limit in seconds for constructing a provider, such as large weights from a slow disk to a
+GPU. Downloads of weights have no time limit."""
 _CALL_TIMEOUT_S = 600.0
-"""Time limit in seconds for one view or pair: minutes on a CPU are normal."""
+"""Time limit in seconds for one view or pair; minutes on a CPU are normal."""
 
 
 @dataclass(frozen=True)
 class ProviderLocation:
-    """Location of a provider: environment, kind, and name there."""
+    """Location of a remote provider: environment, kind, and name in the environment."""
 
     environment: Environment
     kind: Kind
     name: str
 
     def ask(self, do: str, **request: Any) -> Any:
-        """Send a request about the provider and return the answer."""
+        """Send a request about the remote provider and return the reply."""
         return self.environment.ask(do=do, kind=self.kind, name=self.name, **request)
 
 
 class RemoteOptions(Options):
-    """Options whose class is in the other environment, which validates them."""
+    """Options of a remote provider; the other environment has their class and validates them."""
 
     model_config = ConfigDict(
         frozen=True, extra="allow", protected_namespaces=(), ser_json_inf_nan="constants"
@@ -56,19 +57,19 @@ class RemoteOptions(Options):
 
     @classmethod
     def model_validate(cls, values: Any, **_: Any) -> Any:  # type: ignore[override]
-        """Validate as pydantic does, in the other environment; raises SettingsError."""
+        """Validate options as pydantic does, in the other environment; raise SettingsError."""
         return cls._from_values(cls.location.ask("options", values=dict(values)))
 
     @classmethod
     def model_construct(  # type: ignore[override]
         cls, _fields_set: Any = None, **values: Any
     ) -> Any:
-        """Construct without validation, as pydantic does."""
+        """Construct options without validation, as pydantic does."""
         return cls._from_values({**cls.defaults, **values})
 
     @classmethod
     def _from_values(cls, values: Mapping[str, Any]) -> Any:
-        """Create an instance with validated values."""
+        """Create an options instance from validated values."""
         return super().model_construct(**values)
 
     def __reduce__(self) -> Any:
@@ -87,10 +88,11 @@ def _options(
 
 
 class RemoteProvider:
-    """Provider in a worker process.
+    """Client of a provider in a worker process.
 
-    It has the methods of all kinds; the specification declares which of them work. If the worker
-    crashes, hangs or runs out of memory, the call fails and the next call starts another worker.
+    The client has the methods of all provider kinds; the specification declares which of them work.
+    If the worker crashes, hangs or runs out of memory, the current call fails and the next call
+    starts another worker.
     """
 
     def __init__(
@@ -108,17 +110,17 @@ class RemoteProvider:
         return self._call("predict", *given)
 
     def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
-        """Predict depth and normals in one pass."""
+        """Predict depth and normals in one network pass."""
         depth, normals = self._call("predict_joint", view)
         return depth, normals
 
     def estimate_focal(self, view: View) -> float | None:
-        """Estimate the focal length in pixels of the view."""
+        """Estimate the focal length of the view in pixels."""
         focal: float | None = self._call("estimate_focal", view)
         return focal
 
     def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
-        """Predict the depth of a group of views."""
+        """Predict the depth of a group of views jointly."""
         group: MultiViewPrior = self._call("predict_group", tuple(views))
         return group
 
@@ -139,7 +141,7 @@ class RemoteProvider:
         return matches
 
     def describe(self, view: View) -> Float32:
-        """Compute a global descriptor."""
+        """Compute the global image descriptor of a view."""
         descriptor: Float32 = self._call("describe", view)
         return descriptor
 
@@ -153,7 +155,7 @@ class RemoteProvider:
         return self._running().ask(request, _CALL_TIMEOUT_S)
 
     def _running(self) -> Worker:
-        """Return a worker with the constructed provider, starting one if necessary."""
+        """Return a worker in which the provider is constructed; start a worker if necessary."""
         if self._worker is None or not self._worker.alive:
             worker, context = self._location.environment.start(), self._context
             request = {
@@ -178,7 +180,7 @@ class RemoteProvider:
 
 @dataclass(frozen=True)
 class _Factory:
-    """Factory of a remote provider that can be pickled."""
+    """Picklable factory of a remote provider."""
 
     location: ProviderLocation
 
@@ -189,7 +191,7 @@ class _Factory:
 
 @dataclass(frozen=True)
 class _Weights:
-    """Function from options to weights files that can be pickled."""
+    """Picklable function from the options of a remote provider to its weights files."""
 
     location: ProviderLocation
 
@@ -200,7 +202,7 @@ class _Weights:
 
 @dataclass(frozen=True)
 class RemoteSpec:
-    """Specification of a provider of an environment, for the registry."""
+    """Return the registry specification of a provider in another environment."""
 
     location: ProviderLocation
     spec: ProviderSpec
@@ -211,15 +213,15 @@ class RemoteSpec:
 
 
 def remote_providers(environment: Environment) -> list[RemoteSpec]:
-    """List the providers of an environment from its stored description.
+    """List the provider specifications of an environment from its stored description.
 
-    Starts no process. The names are ``NAME@ENVIRONMENT``.
+    Starts no process. The names of the providers are ``NAME@ENVIRONMENT``.
 
     Args:
         environment: The environment.
 
     Returns:
-        Specifications with their origin and fault.
+        Provider specifications with their origin and fault.
     """
     specs: list[RemoteSpec] = []
     for entry in environment.describe():
@@ -248,7 +250,7 @@ def remote_providers(environment: Environment) -> list[RemoteSpec]:
 
 @dataclass(frozen=True)
 class _Contract:
-    """Contract function that requests the setup from the environment."""
+    """Contract function that requests the ContractSetup from the other environment."""
 
     location: ProviderLocation
 
@@ -258,7 +260,7 @@ class _Contract:
 
 
 class EnvironmentHooks:
-    """Hooks of the registry that answer for providers of environments."""
+    """Hook implementations that the registry calls for providers of other environments."""
 
     def __init__(self, remotes: Sequence[RemoteSpec]) -> None:
         self._locations: dict[tuple[str, str], ProviderLocation] = {
@@ -269,7 +271,7 @@ class EnvironmentHooks:
     def mpsfm_calibration(
         self, kind: str, provider: str, options: BaseModel | None
     ) -> DepthCalibration | NormalCalibration | None:
-        """Return the calibration that the plugin declares in its environment."""
+        """Return the calibration that the plugin declares in the other environment."""
         location = self._locations.get((kind, provider))
         if location is None:
             return None

@@ -1,6 +1,6 @@
-"""Worker process: serves the providers of its environment, one request at a time.
+"""Worker process that serves the providers of its environment, one request at a time.
 
-Started as ``python -m mpsfm_core.providers.environments.worker FOLDER``.
+The client starts the worker as ``python -m mpsfm_core.providers.environments.worker FOLDER``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mpsfm_core.support.threads import limit_threads
 
 
 class ProviderServer:
-    """Server of the providers of this environment for one client process."""
+    """Server that runs the providers of this environment for one client process."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
@@ -33,7 +33,7 @@ class ProviderServer:
         self._limit, self._num_limited_modules = ExitStack(), 0
 
     def serve(self) -> None:
-        """Send the greeting and answer requests until the client has ended."""
+        """Send the version and answer requests until the client process has ended."""
         self._channel.send(
             {
                 "protocol": PROTOCOL,
@@ -87,14 +87,14 @@ class ProviderServer:
         raise ProviderError(f"unknown request {action!r}")
 
     def _limit_threads(self) -> None:
-        """Apply the thread limit again if modules, and maybe thread pools, were loaded since."""
+        """Apply the thread limit again if new modules, which may create threads, were loaded."""
         if self._num_limited_modules != len(sys.modules):
             self._limit.close()
             self._limit.enter_context(limit_threads(self._threads))
             self._num_limited_modules = len(sys.modules)
 
     def _resolve(self, uri: str, sha256: str | None) -> Path:
-        """Let the client find or download a weights file."""
+        """Request the path of a weights file from the client, which finds or downloads the file."""
         self._channel.send({"resolve": [uri, sha256]})
         answer = self._channel.receive()
         if "error" in answer:
@@ -104,10 +104,10 @@ class ProviderServer:
 
 
 def _description(registry: Registry) -> list[dict[str, Any]]:
-    """Describe the providers of the installed plugins.
+    """Describe the providers of the plugins that are installed in this environment.
 
-    Built-in providers exist in every environment. A wrapper has to run in the process of its inner
-    provider. Both are excluded.
+    Built-in providers are left out, because every environment has them. Wrappers are left out,
+    because a wrapper has to run in the process of its inner provider. Both are excluded.
     """
     entries = []
     for line in registry.status():
@@ -140,7 +140,7 @@ def _description(registry: Registry) -> list[dict[str, Any]]:
 
 
 def _setup(registry: Registry, kind: Any, name: str, folder: Path) -> dict[str, Any]:
-    """Return the fields of the contract setup that can be sent to the client."""
+    """Return the fields of a ContractSetup that can be sent to the client."""
     from mpsfm_core.testing.contract_case import load_setup
 
     setup = load_setup(registry.spec(kind, name), folder)
@@ -157,7 +157,7 @@ def _setup(registry: Registry, kind: Any, name: str, folder: Path) -> dict[str, 
 
 
 def main() -> None:
-    """Serve over stdin and stdout; the standard output of providers goes to stderr."""
+    """Serve over stdin and stdout, sending other output of providers to stderr."""
     reader = os.fdopen(os.dup(0), "rb")
     writer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)

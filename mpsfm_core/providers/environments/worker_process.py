@@ -1,4 +1,4 @@
-"""Client of a worker process in another environment: start, requests, errors, time limits."""
+"""Client of a worker process in another environment: start, requests and time limits."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from mpsfm_core.providers import API_VERSION
 from mpsfm_core.providers.environments.channel import Channel, ChannelClosed, create_shared_folder
 
 PROTOCOL = 3
-"""Version of the messages; client and worker must have the same."""
+"""Version of the message protocol; client and worker must have the same version."""
 
 _MODULE = "mpsfm_core.providers.environments.worker"
 _START_TIMEOUT_S = 120.0
-"""Time limit in seconds for starting and importing the core, from a slow network disk."""
+"""Time limit in seconds until the worker has imported mpsfm-core, for slow network disks."""
 _NEEDED_BYTES = 256 << 20
-"""Free memory that the messages of a worker need; with less they use the temporary folder."""
+"""Free bytes of shared memory that a worker needs; with less, messages use the temporary folder."""
 _NUM_LENT_BLOCKS = 2
-"""Number of answers whose arrays may be alive in parallel: one is requested while one is stored."""
+"""Number of replies whose arrays may be alive: one is computed while one is stored."""
 _EXIT_TIMEOUT_S = 5.0
 _MPSFM_ERRORS: Mapping[str, type[MpsfmError]] = MappingProxyType(
     {
@@ -39,21 +39,22 @@ _MPSFM_ERRORS: Mapping[str, type[MpsfmError]] = MappingProxyType(
 
 
 class WorkerLost(RuntimeError):
-    """The worker crashed or did not answer; the next call starts another worker."""
+    """Error for a worker that crashed or did not answer; the next call starts another worker."""
 
 
 class Worker:
-    """Client of a running worker process."""
+    """Client of a running worker process in another environment."""
 
     def __init__(self, python: Path, label: str) -> None:
         """Start a worker.
 
         Args:
-            python: Interpreter of the environment.
-            label: Name of the environment for messages.
+            python: Python interpreter of the environment.
+            label: Name of the environment, for messages.
 
         Raises:
-            ProviderError: The worker does not start, or has another version of the protocols.
+            ProviderError: The worker does not start, or has another version of the message
+                protocol.
         """
         self._label = label
         self._folder = create_shared_folder(_NEEDED_BYTES)
@@ -96,7 +97,7 @@ class Worker:
 
     @property
     def alive(self) -> bool:
-        """True while the process is running."""
+        """True while the worker process is running."""
         return self._process.poll() is None
 
     def ask(
@@ -105,20 +106,21 @@ class Worker:
         timeout_s: float,
         resolve_weights: Callable[[str, str | None], Path] | None = None,
     ) -> Any:
-        """Send a request and wait for the answer.
+        """Send a request to the worker and wait for the reply.
 
         Args:
             request: The request.
             timeout_s: Time limit.
-            resolve_weights: Function for weights files that the worker needs meanwhile.
+            resolve_weights: Function that resolves weights files, which the worker may request
+                before it replies.
 
         Returns:
             The answer.
 
         Raises:
-            MpsfmError: An error of MP-SfM in the worker.
-            RuntimeError: Any other exception of the provider, with its type and text.
-            WorkerLost: There is no answer.
+            MpsfmError: Any MP-SfM exception that was raised in the worker.
+            RuntimeError: Any other exception of the provider; the message has its type and text.
+            WorkerLost: The worker crashed or did not reply within the time limit.
         """
         with self._lock:
             self._send(dict(request))
@@ -143,7 +145,7 @@ class Worker:
             raise self._lost("") from error
 
     def _receive(self, timeout_s: float, late: str) -> Any:
-        """Receive the next message; a worker that takes too long is killed, which ends the wait."""
+        """Receive the next message, killing a worker that exceeds the time limit."""
         timed_out: list[bool] = []
 
         def kill() -> None:
@@ -161,7 +163,7 @@ class Worker:
             timer.cancel()
 
     def _lost(self, late: str) -> WorkerLost:
-        """Describe how the worker ended and clean up."""
+        """Describe how the worker process ended and release its resources."""
         try:
             code = self._process.wait(_EXIT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
@@ -175,7 +177,7 @@ class Worker:
 
 
 def _ended(code: int) -> str:
-    """Describe an exit code."""
+    """Describe the exit code of a process in words."""
     if code == -getattr(signal, "SIGKILL", 9):
         return "was killed from outside, most likely because memory ran out"
     if code < 0:
@@ -186,7 +188,7 @@ def _ended(code: int) -> str:
 def _resolved(
     resolve: Callable[[str, str | None], Path] | None, uri: str, sha256: str | None
 ) -> dict[str, Any]:
-    """Resolve a weights file for the worker; an error becomes a message."""
+    """Resolve a weights file for the worker; return an error as a message."""
     try:
         if resolve is None:
             raise ProviderError(f"weights {uri} cannot be fetched without a weight store")
@@ -196,7 +198,7 @@ def _resolved(
 
 
 def encode_error(error: BaseException) -> dict[str, Any]:
-    """Encode an error as a message of the protocol; :func:`decode_error` is the inverse."""
+    """Encode an exception as a protocol message; :func:`decode_error` is the inverse."""
     kind = next((k.__name__ for k in type(error).__mro__ if k.__name__ in _MPSFM_ERRORS), "")
     if isinstance(error, SettingsError):
         problems = [[list(p.path), p.text, p.missing] for p in error.problems]
@@ -208,7 +210,7 @@ def encode_error(error: BaseException) -> dict[str, Any]:
 
 
 def decode_error(message: Mapping[str, Any]) -> Exception:
-    """Decode the error of a message."""
+    """Decode the exception of a protocol message."""
     if "settings" in message:
         problems = (
             SettingProblem(tuple(p), text, missing) for p, text, missing in message["settings"]
@@ -220,12 +222,12 @@ def decode_error(message: Mapping[str, Any]) -> Exception:
 
 
 def _environment() -> dict[str, str]:
-    """Return environment variables without the search path of this process."""
+    """Return the environment variables without the Python search path of this process."""
     return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill the process and its children."""
+    """Kill a process and its children."""
     if process.poll() is None:
         if os.name == "posix":
             os.killpg(process.pid, signal.SIGKILL)
@@ -234,13 +236,13 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]) -> None:
-    """Kill the process, close its pipes and remove its folder."""
+    """Kill the worker process, close its pipes and remove its shared memory folder."""
     _kill(process)
     process.wait()
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
             try:
                 pipe.close()
-            except OSError:  # buffered data could not be written
+            except OSError:  # Buffered data could not be written.
                 continue
     folder.cleanup()

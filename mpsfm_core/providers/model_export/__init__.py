@@ -1,6 +1,6 @@
-"""Export of unpublished ONNX files from the authors' code and weights of a network.
+"""Export of networks to ONNX from the authors' code and weights.
 
-The authors' code runs in its own process, with the script of a plugin that uses
-:mod:`author_script`. This process (:mod:`export`) only compares the file with the output of the
-original network.
+The authors' code runs in its own process, in a script of a plugin that uses :mod:`author_script`.
+The MP-SfM process (:mod:`export`) only compares the ONNX file with the outputs of the original
+network.
 """

@@ -1,6 +1,6 @@
 """Helpers for plugin scripts that export a network in the process of its authors' code.
 
-A script runs as a program with the authors' checkouts on its search path::
+A script runs as a program that has the authors' source checkouts on its search path::
 
     from mpsfm_core.providers.model_export.author_script import ExportJob
 
@@ -11,7 +11,7 @@ A script runs as a program with the authors' checkouts on its search path::
             job.load(model, job.checkpoint()["model"])
         job.export(model, [{"image": torch.rand(1, 3, 96, 128)}], ["normal"])
 
-Imports torch, therefore only for such scripts.
+Only such scripts may import this module, because it imports torch.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from torch.overrides import TorchFunctionMode
 OPSET = 17
 
 Inputs: TypeAlias = Mapping[str, torch.Tensor]
-"""Inputs of a network by name, in the order of its arguments."""
+"""Input arrays of a network by name, in the order of the network's arguments."""
 
 
 @dataclass(frozen=True)
 class ExportJob:
-    """Export request for the script of a plugin."""
+    """Export request that MP-SfM sends to the export script of a plugin."""
 
     weights: Path | None
-    """Checkpoint; None for seeded random weights."""
+    """Checkpoint; Path of the checkpoint, None for seeded random weights."""
     output: Path
-    """Path of the ONNX file."""
+    """Path of the ONNX file to write."""
     size: str = ""
-    """Size of the network if there are several."""
+    """Size of the network, such as "large", if there are several."""
 
     @classmethod
     def from_arguments(cls) -> ExportJob:
-        """Read the job from the program argument; seeds torch for random weights."""
+        """Read the export request from the program argument and seed torch for random weights."""
         warnings.simplefilter("ignore")
         torch.manual_seed(0)
         job = json.loads(sys.argv[1])
@@ -56,10 +56,10 @@ class ExportJob:
         return cls(Path(weights) if weights else None, Path(job["output"]), job["size"])
 
     def checkpoint(self, *allowed: type) -> Any:
-        """Load the checkpoint to the CPU: tensors and plain values, no code.
+        """Load the tensors of the authors' checkpoint to the CPU without running its code.
 
         Args:
-            allowed: Further classes without code of their own that the file may contain.
+            allowed: Further classes without executable code that the checkpoint may contain.
         """
         assert self.weights is not None
         if self.weights.suffix == ".safetensors":
@@ -70,7 +70,7 @@ class ExportJob:
             return torch.load(self.weights, map_location="cpu", weights_only=True)
 
     def load(self, model: torch.nn.Module, state: Mapping[str, torch.Tensor]) -> None:
-        """Load weights into the network; every parameter of the network has to be present."""
+        """Load the checkpoint into a network and require every parameter of the network."""
         missing = model.load_state_dict(state, strict=False).missing_keys
         if missing:
             raise SystemExit(f"the checkpoint lacks {missing[0]} and {len(missing) - 1} more")
@@ -83,14 +83,16 @@ class ExportJob:
         dynamic: Mapping[str, Mapping[int, str]] | None = None,
         expected: Sequence[Sequence[torch.Tensor]] = (),
     ) -> None:
-        """Write the network, traced on the first input, and its outputs for all inputs.
+        """Write the ONNX file, traced on the first input, and the network's outputs for all inputs.
 
         Args:
             model: Network to export.
-            inputs: Inputs by name, in the order of the arguments.
-            outputs: Names of the outputs.
-            dynamic: Name of each axis of variable length by tensor; the inputs should differ there.
-            expected: Outputs of the original network if ``model`` is a modified form of it.
+            inputs: Input arrays by name, in the order of the network's arguments.
+            outputs: Names of the network's outputs.
+            dynamic: Names of the axes of variable length, by tensor name. The inputs should differ
+                in these axes.
+            expected: Outputs of the original network if ``model`` is a modified form of that
+                network.
         """
         expected = expected or run_network(model, inputs)
         register_custom_op_symbolic("aten::expm1", _expm1, OPSET)
@@ -117,11 +119,11 @@ class ExportJob:
 
 
 def gather_weights(output: Path, tensor_files: Collection[Path]) -> None:
-    """Merge the external weights of a network larger than 2 GB into one file.
+    """Merge the external weights of an ONNX network above 2 GB into one file.
 
     Args:
-        output: The ONNX file; the weights go to a file with its name and ``.data``.
-        tensor_files: Files with one tensor each that the exporter wrote.
+        output: Path of the ONNX file; the weights go to a file with its name and ``.data``.
+        tensor_files: Files with one tensor each, written by torch's exporter.
     """
     import onnx
 
@@ -131,7 +133,7 @@ def gather_weights(output: Path, tensor_files: Collection[Path]) -> None:
 
 
 def run_network(model: torch.nn.Module, inputs: Sequence[Inputs]) -> list[tuple[torch.Tensor, ...]]:
-    """Run a network on several inputs."""
+    """Run a network on several inputs and return its outputs."""
     model = model.eval()
     with torch.inference_mode():
         return [_answer(model, tensors) for tensors in inputs]
@@ -148,7 +150,7 @@ class MaskedWriteRewriter(TorchFunctionMode):
     def __init__(self) -> None:
         super().__init__()
         self._last: tuple[torch.Tensor, torch.Tensor, Any] | None = None
-        """Last view, its tensor and the index."""
+        """Last view of a tensor that was indexed, its tensor and the index."""
 
     def __torch_function__(
         self,
@@ -157,7 +159,7 @@ class MaskedWriteRewriter(TorchFunctionMode):
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
-        """Execute a torch function, see the class."""
+        """Execute a torch function, replacing masked writes as the class describes."""
         if func is torch.Tensor.__getitem__:
             view = func(*args)
             self._last = view, args[0], args[1]
@@ -179,6 +181,6 @@ def _expm1(graph: Any, x: Any) -> Any:
 
 def _answer(model: torch.nn.Module, inputs: Inputs) -> tuple[torch.Tensor, ...]:
     result = model(*(tensor.clone() for tensor in inputs.values()))
-    if isinstance(result, Mapping):  # the exporter takes the values, in their order
+    if isinstance(result, Mapping):  # The exporter takes the values of the mapping in their order.
         result = tuple(result.values())
     return tuple(result) if isinstance(result, (list, tuple)) else (result,)

@@ -1,4 +1,4 @@
-"""Export of a network: run the authors' code, verify the file, write a manifest."""
+"""Export of a network: run the authors' code, verify the ONNX file, write a manifest."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from mpsfm_core.providers.weights import WeightStore, exports_folder, file_sha25
 from mpsfm_core.support.files import write_file
 
 RANDOM = "random"
-"""Checkpoint name for seeded random weights, which test an export. The file is not registered."""
+"""Checkpoint name that selects seeded random weights, to test an export without a download. An ONNX
+file with random weights gets no manifest."""
 
 TOLERANCE = 1e-3
-"""Largest relative difference of 99.9 % of the values. Kernels differ in float32, and iterative
-networks amplify differences of single values."""
+"""Largest relative difference of 99.9 % of the values between the ONNX file and the network. CPU
+and GPU kernels differ in float32, and iterative networks amplify differences of single values."""
 _QUANTILE = 0.999
 
 
@@ -45,26 +46,27 @@ def export_model(
 ) -> dict[str, Any]:
     """Export a network from its authors' code and weights to an ONNX file.
 
-    A manifest is stored with the file, and ``export:NAME`` refers to the file from then on.
+    A manifest is stored with the ONNX file, and ``export:NAME`` refers to the file from then on.
 
     Args:
-        name: Name of the export.
-        recipe: Recipe of the plugin.
-        code: Checkouts, first the network's own, then required libraries.
-        checkpoint: Path or URI of the weights, or ``random``.
-        output: Path of the file, by default in the folder of exports.
-        sha256: Expected hash of the checkpoint.
+        name: Name of the exported network.
+        recipe: Export recipe that the plugin declares.
+        code: Source checkouts: first that of the network, then those of required libraries.
+        checkpoint: Path or URI of the authors' weights, or ``random``.
+        output: Path of the ONNX file, by default in the folder of exports.
+        sha256: Expected SHA-256 of the checkpoint in hex.
         size: Size of the network if there are several.
-        python: Interpreter for the authors' code, by default this one.
-        store: Store for the checkpoint.
+        python: Python interpreter for the authors' code, by default the running one.
+        store: Weight store that finds or downloads the checkpoint.
 
     Returns:
         The manifest.
 
     Raises:
-        InputError: A checkout does not exist.
+        InputError: A source checkout does not exist.
         WeightsError: The checkpoint is not available.
-        ProviderError: The authors' code fails, or the file computes other outputs.
+        ProviderError: The authors' code fails, or the ONNX file computes other outputs than the
+            network.
     """
     for folder in code:
         if not folder.is_dir():
@@ -79,7 +81,7 @@ def export_model(
     with tempfile.TemporaryDirectory(prefix=".export-", dir=target.parent) as scratch:
         made = (
             Path(scratch) / target.name
-        )  # the network refers to the file of large weights by its name
+        )  # The ONNX file refers to the file of large weights by its file name.
         script = importlib.util.find_spec(recipe.script)
         if script is None or script.origin is None:
             raise ProviderError(f"the plugin of {name} has no script {recipe.script!r}")
@@ -113,7 +115,7 @@ def export_model(
         }
         for part in sorted(
             Path(scratch).glob(f"{target.name}*")
-        ):  # including the file of large weights
+        ):  # The pattern includes the file of large weights.
             shutil.move(part, target.with_name(part.name))
     text = json.dumps(manifest, indent=1) + "\n"
     write_file(target.with_suffix(".json"), text)
@@ -124,13 +126,13 @@ def export_model(
 
 
 def compare_with_original(made: Path) -> dict[str, float]:
-    """Compare an exported file with the outputs of the original network.
+    """Compare the outputs of an exported ONNX file with those of the original network.
 
     Args:
-        made: ONNX file, with the inputs and outputs of the script in an NPZ file next to it.
+        made: ONNX file. An NPZ file next to it has the inputs and outputs that the script wrote.
 
     Returns:
-        For each output the largest relative difference over the inputs, see
+        Largest relative difference over all inputs by output name, see
         :func:`measure_relative_difference`.
     """
     runtime = importlib.import_module("onnxruntime")
@@ -149,16 +151,17 @@ def compare_with_original(made: Path) -> dict[str, float]:
 
 
 def measure_relative_difference(actual: Any, expected: Any) -> float:
-    """Return the relative difference that 99.9 % of the values stay below.
+    """Return the 99.9 % quantile of the relative differences between two arrays.
 
-    Differences are relative to the expected value, or to the median of the values if larger.
+    Differences are relative to the expected value, or to the median of the expected values if that
+    is larger.
 
     Args:
-        actual: Array of the exported network.
-        expected: Array of the original network.
+        actual: Output array of the exported ONNX file.
+        expected: Expected output array of the original network.
 
     Returns:
-        The difference; infinite if the shapes differ or a value is not finite.
+        The quantile; infinite if the shapes differ or a value is not finite.
     """
     if actual.shape != expected.shape or not np.isfinite([actual, expected]).all():
         return float("inf")
@@ -178,18 +181,19 @@ def run_script(
     size: str = "",
     python: Path | None = None,
 ) -> None:
-    """Run an export script with the authors' checkouts on its search path.
+    """Run a plugin's export script with the authors' checkouts on its search path.
 
     Args:
-        script: The script, see :class:`~mpsfm_core.providers.model_export.author_script.ExportJob`.
+        script: Export script, see
+            :class:`~mpsfm_core.providers.model_export.author_script.ExportJob`.
         code: Checkouts.
-        output: File that the script writes.
-        weights: Checkpoint, None for random weights.
+        output: ONNX file that the script writes.
+        weights: Path of the checkpoint, None for random weights.
         size: Size of the network if there are several.
-        python: Interpreter, by default this one.
+        python: Python interpreter, by default the running one.
 
     Raises:
-        ProviderError: The script fails; the message is the last line of its output.
+        ProviderError: The script fails; the message is the last line of the script's output.
     """
     job = {"weights": weights and str(weights.resolve()), "output": str(output), "size": size}
     environment = {
@@ -209,12 +213,12 @@ def run_script(
 
 
 def _core_folder() -> list[str]:
-    """Return the parent folder of this core for an interpreter without it."""
+    """Return the folder that contains mpsfm_core, for an interpreter without this package."""
     return [str(Path(__file__).parents[3])]
 
 
 def _commit(folder: Path) -> Mapping[str, Any]:
-    """Return commit and state of a checkout; the commit is None outside of git."""
+    """Return the git commit and state of a source checkout; the commit is None without git."""
 
     def ask(*arguments: str) -> str | None:
         try:

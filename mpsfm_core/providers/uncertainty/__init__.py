@@ -1,1 +1,1 @@
-"""Uncertainty of priors: the model of the standard deviation and its files."""
+"""Uncertainty of priors: the model of the standard deviation and its calibration files."""

@@ -1,8 +1,9 @@
-"""Uncertainty model of a prior: from the std of a network to a calibrated std.
+"""Uncertainty model of a prior, which converts the std of a network to a calibrated std.
 
-Paper appendix C: the total std is the maximum of the scaled network std, a std proportional to
-depth, and a floor. Two extensions serve relative networks: a common shift, so that the mapper only
-estimates a scale per image, and a larger variance at depth edges.
+As in appendix C of the paper, the total std is the maximum of three terms: the scaled network std,
+a std proportional to depth, and a floor. Two extensions serve relative depth networks: a common
+depth offset, so that the mapper only estimates a scale per image, and a larger variance at depth
+edges.
 """
 
 from __future__ import annotations
@@ -18,38 +19,39 @@ from mpsfm_core.geometry import log_depth_steps
 
 _MIN_VARIANCE = 1e-12
 _MIN_SHIFTED_RATIO = 0.01
-"""Smallest shifted depth or inverse depth relative to its median; smaller values are invalid."""
+"""Smallest shifted depth or inverse depth relative to its median; pixels below are invalid."""
 
 
 class DepthCalibration(Options):
-    """Depth uncertainty ``max(std_scale * network_std, relative_std * depth, std_floor)``.
+    """Uncertainty model of depth priors.
 
-    The defaults are those of Metric3D v2 giant2 in the reference implementation. Plugins declare
-    values for other networks. The variance describes the errors after each image has received its
-    own scale, as in the mapper; it excludes the error of that scale.
+    The std is ``max(std_scale * network_std, relative_std * depth, std_floor)``. The default values are those of Metric3D v2 giant2 in the reference implementation. Plugins
+    declare the values of other networks. The variance describes the depth errors after each image
+    has received its own scale, as in the mapper. The error of that scale is excluded.
     """
 
     std_scale: float = Field(3.33, gt=0)
-    """Factor of the network's std [reference prior_std_multiplier]; raising it trusts depth
-    less."""
+    """Factor of the network's depth std [reference prior_std_multiplier]. Raising it lowers the
+    weight of the depth prior."""
     relative_std: float = Field(0.0263, ge=0)
     """Smallest std relative to depth [reference depth_uncertainty]."""
     std_floor: float = Field(0.02, ge=0)
-    """Smallest std in meters, for metric priors only [paper appendix C]."""
+    """Smallest depth std in meters, for metric priors only [paper appendix C]."""
     use_network_variance: bool = True
-    """False ignores the variance of the network."""
+    """False ignores the depth variance that the network predicts."""
     shift: float = 0.0
-    """Offset of depth or inverse depth in multiples of its median over the map; 0 for metric
+    """Offset added to depth or inverse depth, in multiples of its median over the map; 0 for metric
     networks."""
     shift_space: Literal["depth", "disparity"] = "depth"
-    """Quantity to shift: disparity for networks that predict affine-invariant inverse depth."""
+    """Quantity to which the offset is added: disparity for networks that predict affine-invariant
+    inverse depth."""
     edge_ratio: float | None = Field(None, gt=1)
-    """Ratio of neighboring depths above which a pixel is on an edge; null disables edges."""
+    """Ratio of neighboring depths above which a pixel is on a depth edge; null disables edges."""
     edge_std_scale: float = Field(1.0, ge=1)
-    """Factor of the std of pixels on an edge."""
+    """Factor of the depth std of pixels on a depth edge."""
 
     def apply(self, prior: DepthPrior) -> DepthPrior:
-        """Return the prior with its calibrated variance; every valid pixel has one."""
+        """Return the depth prior with its calibrated variance, defined at every valid pixel."""
         shifted = self.shifted(prior)
         depth = shifted.depth.astype(np.float64)
         std = self.relative_std * depth
@@ -64,7 +66,7 @@ class DepthCalibration(Options):
         return DepthPrior(shifted.depth, variance.astype(np.float32), shifted.valid, shifted.metric)
 
     def shifted(self, prior: DepthPrior) -> DepthPrior:
-        """Return the prior with :attr:`shift` applied to depth and network variance."""
+        """Return the depth prior with :attr:`shift` applied to depth and network variance."""
         if self.shift == 0 or not prior.valid.any():
             return prior
         depth = np.where(prior.valid, prior.depth, np.float32(1)).astype(np.float64)
@@ -75,14 +77,15 @@ class DepthCalibration(Options):
     def shift_depth(
         self, depth: Float64, medians: tuple[float, float]
     ) -> tuple[Float64, Float64, Bool]:
-        """Apply :attr:`shift` to depth values.
+        """Apply the offset :attr:`shift` to depth values.
 
         Args:
             depth: Depth values of a map, of any shape.
             medians: Medians of depth and inverse depth over the map, see :func:`depth_medians`.
 
         Returns:
-            Shifted depth, factor of its std, and validity, of the shape of ``depth``.
+            Shifted depth, the factor by which the shift changes its std, and validity, in the shape
+            of ``depth``.
         """
         in_depth = self.shift_space == "depth"
         quantity = depth if in_depth else 1 / depth
@@ -102,22 +105,23 @@ def depth_medians(prior: DepthPrior) -> tuple[float, float]:
 
 
 class NormalCalibration(Options):
-    """Angular uncertainty of normals: ``max(std_scale * network_std, std_floor_deg)``.
+    """Uncertainty model of normal priors.
 
-    ``std_default_deg`` replaces the std of a network without variance.
+    The angular std is ``max(std_scale * network_std, std_floor_deg)``. ``std_default_deg`` replaces the std of a network that predicts no variance.
     """
 
     std_scale: float = Field(1.0, gt=0)
     """Factor of the network's angular std [reference prior_std_multiplier]."""
     std_floor_deg: float = Field(1.0, ge=0)
-    """Smallest angular std [reference inherent_polar_noise]."""
+    """Smallest angular std of normals [reference inherent_polar_noise]."""
     std_default_deg: float = Field(7.6, gt=0)
-    """Angular std without network variance [reference: effect of its floor]."""
+    """Angular std of normals if the network predicts no variance [reference: effect of its
+    floor]."""
     use_network_variance: bool = True
-    """False ignores the variance of the network."""
+    """False ignores the angular variance that the network predicts."""
 
     def apply(self, prior: NormalPrior) -> NormalPrior:
-        """The prior with its total variance; every valid pixel has one."""
+        """Return the normal prior with its calibrated variance, defined at every valid pixel."""
         if prior.variance is not None and self.use_network_variance:
             std = self.std_scale * np.sqrt(np.maximum(prior.variance.astype(np.float64), 0))
         else:

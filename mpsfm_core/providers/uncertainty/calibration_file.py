@@ -1,8 +1,9 @@
-"""Calibration files: values of an uncertainty model and their provenance.
+"""Calibration files: the values of an uncertainty model and their provenance.
 
-A file is YAML or JSON. It contains either the bare values or a :class:`CalibrationFile`, as
-``mpsfm calibrate`` writes it. A configuration refers to it by ``depth.calibration: FILE``. A plugin
-declares it by ``ProviderSpec(calibration=load_calibration(path))``.
+A calibration file is YAML or JSON. The file contains either the bare values or a
+:class:`CalibrationFile`, as ``mpsfm calibrate`` writes it. A configuration refers to the file by
+``depth.calibration: FILE``. A plugin declares the file by
+``ProviderSpec(calibration=load_calibration(path))``.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.yaml_text import parse_yaml, write_yaml
 
 FORMAT = 1
-"""Version of calibration files."""
+"""Format version of calibration files."""
 
 CalibratedKind = Literal["depth", "normals"]
 CALIBRATIONS: Mapping[str, type[DepthCalibration] | type[NormalCalibration]] = {
@@ -36,37 +37,38 @@ CALIBRATIONS: Mapping[str, type[DepthCalibration] | type[NormalCalibration]] = {
 
 
 class Provenance(Options):
-    """Origin of a calibration: provider, data and quality of the fit."""
+    """Provenance of a calibration: provider, data and quality of the fit."""
 
     provider: str
     distribution: str
-    """Package and version of the provider."""
+    """Distribution package and version of the provider."""
     wrappers: tuple[str, ...] = ()
     options: dict[str, Any] = Field(default_factory=dict)
-    """Options of the provider; files by name only."""
+    """Options of the provider; paths of files are reduced to their names."""
     weights: dict[str, str] = Field(default_factory=dict)
-    """SHA-256 of each file that the provider loaded, by name or URI."""
+    """SHA-256 of each weights file that the provider loaded, by file name or URI."""
     truth: str
-    """Source of the true values."""
+    """Source of the ground truth."""
     data: str
-    """Images of the fit."""
+    """Names of the images that were used for the fit."""
     date: str
-    """Date of the fit, ISO 8601."""
+    """Date of the fit in ISO 8601."""
     core: str
     """Version of mpsfm-core."""
     images: int
-    """Number of images of the fit."""
+    """Number of images that were used for the fit."""
     pixels: int
-    """Number of pixels of the fit."""
+    """Number of pixels that were used for the fit."""
     intervals_95: dict[str, tuple[float, float]] = Field(default_factory=dict)
-    """Confidence interval of each value, 95 %."""
+    """95 % confidence interval of each fitted value."""
     metrics: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """coverage, z_mad, nll and ause on held-out images, ``before`` and ``after`` the fit."""
+    """Quality metrics coverage, z_mad, nll and ause on held-out images, ``before`` and ``after``
+    the fit."""
     warnings: tuple[str, ...] = ()
 
 
 class CalibrationFile(Options):
-    """Calibration with its provenance."""
+    """Values of an uncertainty model with their provenance."""
 
     kind: CalibratedKind
     calibration: DepthCalibration | NormalCalibration
@@ -75,7 +77,7 @@ class CalibrationFile(Options):
     @model_validator(mode="before")
     @classmethod
     def _by_kind(cls, values: Any) -> Any:
-        """Select the calibration class by kind, because both classes share field names."""
+        """Select the calibration class by provider kind, because both classes share field names."""
         if isinstance(values, Mapping) and isinstance(values.get("calibration"), Mapping):
             model = CALIBRATIONS.get(values.get("kind", ""))
             if model is not None:
@@ -83,7 +85,7 @@ class CalibrationFile(Options):
         return values
 
     def write(self, path: Path) -> None:
-        """Write the file as JSON if its name ends with ``.json``, else as YAML."""
+        """Write the calibration as JSON if the file name ends with ``.json``, else as YAML."""
         content = {VERSION: FORMAT, **self.model_dump(mode="json")}
         is_json = path.suffix == ".json"
         text = json.dumps(content, indent=2) + "\n" if is_json else write_yaml(content)
@@ -101,9 +103,8 @@ def read_values(path: Path, kind: str) -> Mapping[str, Any]:
         Values by name.
 
     Raises:
-        ConfigError: The file cannot be read, is not a mapping, has a newer version, or is for
-            another
-            kind.
+        ConfigError: The file cannot be read, is not a mapping, has a newer format version, or is
+            for another provider kind.
     """
     try:
         content = parse_yaml(path.read_text(encoding="utf-8"), str(path))
@@ -123,7 +124,7 @@ def read_values(path: Path, kind: str) -> Mapping[str, Any]:
 
 
 def load_calibration(path: Path, kind: CalibratedKind = "depth") -> Calibration:
-    """Load the calibration of a file.
+    """Load the uncertainty model of a calibration file.
 
     Args:
         path: The file.
@@ -133,7 +134,7 @@ def load_calibration(path: Path, kind: CalibratedKind = "depth") -> Calibration:
         The calibration.
 
     Raises:
-        ConfigError: See :func:`read_values`, or a value is wrong.
+        ConfigError: The file is unreadable (see :func:`read_values`), or a value is wrong.
     """
     try:
         return parse_settings(CALIBRATIONS[kind], read_values(path, kind))

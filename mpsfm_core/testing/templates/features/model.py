@@ -20,7 +20,7 @@ class $Class:
         corners = cv2.goodFeaturesToTrack(gray, self._options.max_keypoints, 0.01, 3)
         columns, rows = _none(corners).reshape(-1, 2).astype(np.int64).T
         return Features(
-            keypoints=np.stack([columns, rows], axis=1) + 0.5,  # COLMAP convention: the first pixel's center is at 0.5
+            keypoints=np.stack([columns, rows], axis=1) + 0.5,  # COLMAP: pixel centers
             descriptors=self._describe(gray, columns, rows),
         )
 

@@ -5,7 +5,7 @@ from mpsfm_core.testing.painted_views import decoder
 
 
 def contract(folder):
-    """Write test weights with which the network can accept pixels whose painted depth is positive."""
+    """Write weights for which the network accepts pixels with a painted depth above 0."""
     weights, bias = decoder()
     np.savez(folder / "tiny.npz", weights=255 * weights[0], bias=bias[0])
     return ContractSetup(options={"weights": str(folder / "tiny.npz")}, truth_source="painted")

@@ -18,4 +18,4 @@ class $Class:
         size = (self._size, self._size)
         small = cv2.resize(view.image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         vector = small.ravel() - small.mean()
-        return vector / max(np.linalg.norm(vector), np.float32(1))  # unit length: dot product = similarity
+        return vector / max(np.linalg.norm(vector), np.float32(1))  # unit length
