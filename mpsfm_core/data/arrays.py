@@ -24,12 +24,12 @@ def require_array(owner: object, name: str, dtype: Any, shape: tuple[int | None,
 
     Args:
         owner: Data class instance.
-        name: Name of the attribute.
+        name: Name of the array attribute.
         dtype: Required dtype.
-        shape: Required shape; None accepts any size.
+        shape: Required shape; None accepts any size along the axis.
 
     Raises:
-        DataError: The attribute is no array, or its dtype or shape is wrong.
+        DataError: The attribute is not a numpy array, or its dtype or shape is wrong.
     """
     value = getattr(owner, name)
     if not isinstance(value, np.ndarray):
@@ -55,7 +55,7 @@ def require_finite(owner: object, name: str) -> None:
 
 
 def require_positive_where_valid(values: Float32, valid: Bool, name: str) -> None:
-    """Raise :class:`DataError` if a valid value is not positive."""
+    """Raise :class:`DataError` if a value is not positive where the mask is True."""
     if ((values <= 0) & valid).any():
         raise DataError(name, "must be positive where valid")
 

@@ -39,23 +39,23 @@ class PinholeCamera:
 
     @property
     def matrix(self) -> Float64:
-        """Calibration matrix K, (3, 3) float64."""
+        """Calibration matrix K of the pinhole camera, (3, 3) float64."""
         return np.array(
             [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=np.float64
         )
 
     @property
     def params(self) -> Float64:
-        """``(fx, fy, cx, cy)``, (4,) float64."""
+        """Intrinsics ``(fx, fy, cx, cy)`` in pixels, (4,) float64."""
         return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64)
 
     @property
     def size(self) -> tuple[int, int]:
-        """``(width, height)`` in pixels."""
+        """Size ``(width, height)`` of the view in pixels."""
         return self.width, self.height
 
     def resized(self, width: int, height: int) -> PinholeCamera:
-        """Return the camera for a grid of another size; exact because pixel centers are at 0.5."""
+        """Return the camera of a grid with another size over the whole view."""
         sx, sy = width / self.width, height / self.height
         return PinholeCamera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
@@ -67,11 +67,12 @@ class View:
     name: str
     """Path of the original image below the images folder, with forward slashes."""
     image: UInt8
-    """(H, W, 3) uint8 RGB."""
+    """(H, W, 3) uint8 RGB pixels of the view."""
     camera: PinholeCamera
     """Intrinsics of the view."""
     mask: Bool | None = None
-    """(H, W) bool, False outside the undistorted area and where the user masked; None: all True."""
+    """(H, W) bool, False at pixels outside the undistorted image or masked by the user; None for
+    all True."""
 
     def __post_init__(self) -> None:
         height, width = self.camera.height, self.camera.width
@@ -83,7 +84,7 @@ class View:
 def dot_with_rays(camera: PinholeCamera, normals: NDArray[Any]) -> Float64:
     """Compute dot products of normals with the unit rays through their pixels.
 
-    A negative product means that the normal faces the camera.
+    A negative dot product means that the normal faces the camera.
 
     Args:
         camera: Intrinsics of the view.

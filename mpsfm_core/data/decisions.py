@@ -1,8 +1,8 @@
 """Typed reasons of the decisions that a run makes about images, pairs and providers.
 
-A reason is a code with the fields that its code declares. The code that decides
-creates the reason, and ``summary.json`` stores it as ``{"code": ..., field: ...}``. Only
-:mod:`mpsfm_core.report.reasons` renders a reason into words and a remedy.
+A reason has a code and the fields that the code declares. ``summary.json`` stores a reason as
+``{"code": ..., field: ...}``. Only :mod:`mpsfm_core.report.reasons` renders a reason into words and
+a remedy.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ Code = TypeVar("Code", bound="ReasonCode")
 
 
 class ReasonCode(Enum):
-    """Base of the enumerations: a code for ``summary.json`` and the names of its fields."""
+    """Base class of reason codes; a member has a text code and the names of its fields."""
 
     fields: tuple[str, ...]
 
     def __new__(cls, code: str, *fields: str) -> ReasonCode:
-        """Create a member from its code and the names of its fields."""
+        """Create a reason code from its text code and the names of its fields."""
         member = object.__new__(cls)
         member._value_ = code
         member.fields = fields
         return member
 
     def because(self, **values: Value) -> Reason:
-        """Return the reason with this code; ``values`` has exactly the fields of the code."""
+        """Build a reason with the code; ``values`` must have exactly the fields of the code."""
         return Reason(self, values)
 
 
@@ -42,16 +42,18 @@ class ImageReason(ReasonCode):
     NO_REGISTERED_NEIGHBOR = ("no-registered-neighbor",)
     NO_VALID_DEPTH = ("no-valid-depth",)
     TOO_FEW_POINTS = ("too-few-points", "num_matches", "min_matches")
-    """Too few matches have a 3D point."""
+    """Too few matches of the image have a 3D point to estimate a pose from."""
     NO_POSE = ("no-pose",)
-    """No estimator returns a pose."""
+    """No pose estimator returns a pose for the image."""
     TOO_FEW_INLIERS = ("too-few-inliers", "num_inliers", "min_inliers")
     LOW_INLIER_RATIO = ("low-inlier-ratio", "inlier_ratio", "min_inlier_ratio")
     TOO_FEW_POINTS_AFTER_REFINEMENT = ("too-few-points-after-refinement",)
     LOST_POINTS = ("lost-points", "step")
-    """The image lost its points in a step: local-refinement, global-refinement, re-registration."""
+    """The image lost its 3D points in ``step``: local-refinement, global-refinement or
+    re-registration."""
     CONTRADICTS_IMAGE = ("contradicts-image", "violation_ratio", "other_image")
-    """The depth of another image contradicts the pose: share of contradicting pixels."""
+    """The depth of another image contradicts the pose at the ratio ``violation_ratio`` of
+    pixels."""
     CONTRADICTS_DEPTH = ("contradicts-depth", "violation_ratio", "step")
     """Share of pixels that contradict the depth of other images, in a check of all images.
 
@@ -59,14 +61,14 @@ class ImageReason(ReasonCode):
     """
     CONTRADICTED_BY_IMAGES = ("contradicted-by-images", "num_images")
     MISREGISTERED = ("misregistered", "num_matches")
-    """Number of matches that contradict the pose in excess of those that support it."""
+    """More matches contradict the pose than support the pose; ``num_matches`` is the difference."""
     CONNECTED_BY_DROPPED_IMAGE = ("connected-by-dropped-image", "step")
     COMPONENT_TOO_SMALL = ("component-too-small", "num_images", "min_images")
     COMPONENT_LIMIT = ("component-limit", "max_components")
     OTHER_COMPONENT = ("other-component", "component")
-    """Registered in a model of its own, in the folder components/<component>."""
+    """The image is registered in another component, in the folder components/<component>."""
     NO_KNOWN_POSE = ("no-known-pose",)
-    """Known poses are fixed, and the image has none."""
+    """The run fixes known poses, and the image has no known pose."""
     NOT_RECORDED = ("not-recorded",)
 
 
@@ -78,7 +80,7 @@ class PairReason(ReasonCode):
     DEGENERATE = ("degenerate", "num_inliers", "num_matches", "geometry")
     """COLMAP classifies the two-view geometry as degenerate, watermark or undefined."""
     EXPLAINED_BY_CHANCE = ("explained-by-chance", "num_inliers", "num_matches")
-    """Random matches reach as many inliers (a-contrario test)."""
+    """Random matches would have as many inliers (a-contrario test)."""
     NO_RELATIVE_POSE = ("no-relative-pose",)
 
 
@@ -86,9 +88,9 @@ class ProviderReason(ReasonCode):
     """Reasons why the configuration uses a fallback instead of a preferred provider."""
 
     UNAVAILABLE = ("unavailable", "detail")
-    """The plugin is missing or broken, or the options do not fit it."""
+    """The plugin is missing or broken, or rejects the options."""
     INCOMPATIBLE = ("incompatible", "detail")
-    """The provider does not fit the other chosen providers."""
+    """The provider cannot be combined with the other chosen providers."""
     NO_WEIGHTS = ("no-weights", "detail")
 
 
@@ -105,9 +107,9 @@ class CameraReason(ReasonCode):
 
     TOO_FEW_IMAGES = ("too-few-images", "num_images", "min_images")
     NOT_OBSERVABLE = ("not-observable", "focal_length_std_ratio")
-    """Relative std of a focal length that the images do not constrain."""
+    """The images do not constrain the focal length; the field is its relative std."""
     OUT_OF_RANGE = ("out-of-range", "focal_length_px")
-    """The refined value is no plausible focal length."""
+    """The refined focal length is outside of the plausible range."""
 
 
 class GpsReason(ReasonCode):
@@ -116,7 +118,7 @@ class GpsReason(ReasonCode):
     TOO_FEW_POSITIONS = ("too-few-positions", "num_positions", "min_positions")
     TOO_LITTLE_SPREAD = ("too-little-spread", "spread_m", "std_m")
     INCONSISTENT = ("inconsistent",)
-    """No similarity transform fits the positions."""
+    """No similarity transform fits the GPS positions."""
     FEW_INLIERS = ("few-inliers", "num_inliers", "num_positions")
 
 
@@ -126,42 +128,42 @@ class DoubtReason(ReasonCode):
     UNEXPLAINED_PAIRS = ("unexplained-pairs", "num_pairs", "image_a", "image_b", "num_matches")
     """Verified pairs whose images share hardly any point in the model."""
     DISCONNECTED = ("disconnected", "num_parts", "num_images")
-    """Parts of the model share no points; number of images outside of the largest part."""
+    """Parts of the model share no points; ``num_images`` are outside of the largest part."""
     LOW_PARALLAX = ("low-parallax", "angle_deg")
     """The rays of most points are nearly parallel, so the depth priors alone give the depth."""
     FEW_POINTS = ("few-points", "num_images", "min_points")
-    """Images that see few points."""
+    """``num_images`` images observe fewer than ``min_points`` 3D points."""
     FEW_EXPLAINED_MATCHES = ("few-explained-matches", "num_images", "min_ratio")
-    """Images whose matches the model mostly leaves unexplained."""
+    """``num_images`` images have mostly matches that contradict the model."""
     GPS_MISFIT = ("gps-misfit", "num_inliers", "num_positions")
     UNKNOWN_FOCAL_LENGTH = ("unknown-focal-length", "num_images")
-    """Guessed focal lengths that bundle adjustment did not refine."""
+    """``num_images`` images have a guessed focal length that bundle adjustment did not refine."""
 
 
 @dataclass(frozen=True)
 class Reason:
-    """One reason: a code and the values of its fields."""
+    """Reason of a decision: a code and the values of the code's fields."""
 
     code: ReasonCode
     values: Mapping[str, Value] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check that the values are those that the code declares."""
+        """Check that the values have exactly the fields of the code."""
         if set(self.values) != set(self.code.fields):
             wanted = ", ".join(self.code.fields) or "no field"
             raise DataError(self.code.value, f"needs {wanted}, got {', '.join(self.values)}")
 
     def to_json(self) -> dict[str, Value]:
-        """Return the reason as stored in ``summary.json``."""
+        """Convert the reason to the dictionary in ``summary.json``."""
         return {"code": self.code.value, **self.values}
 
 
 def reason_from_json(codes: type[Code], stored: Mapping[str, Any]) -> Reason:
-    """Return the reason that :meth:`Reason.to_json` stored.
+    """Restore a reason from the output of :meth:`Reason.to_json`.
 
     Args:
-        codes: The enumeration of the code.
-        stored: The code and its fields.
+        codes: Enumeration that contains the reason code.
+        stored: Dictionary with the code and the values of its fields.
 
     Raises:
         DataError: The code is unknown, or its fields are incomplete.

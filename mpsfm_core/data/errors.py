@@ -24,10 +24,11 @@ class MpsfmError(Exception):
     """Base class of all errors that the package raises on purpose."""
 
     exit_code = 1
-    """Exit code of the command line."""
+    """Exit code of the command line for this error class."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Constructors take other arguments than `args`, and errors cross process boundaries.
+        # Default pickling fails, because the constructors have other parameters than `args`. Worker
+        # processes return pickled errors.
         return _restore_error, (type(self), self.args, self.__dict__)
 
 
@@ -35,7 +36,7 @@ class InputError(MpsfmError):
     """Error in the user's input: images, intrinsics, configuration, weights or options."""
 
     exit_code = 2
-    """Exit code of the command line."""
+    """Exit code of the command line for this error class."""
 
 
 class ConfigError(InputError):
@@ -54,7 +55,7 @@ class DataError(MpsfmError, ValueError):
     """Value that violates a rule of the data classes in :mod:`mpsfm_core.data`.
 
     Attributes:
-        field: Name of the field.
+        field: Name of the invalid field.
         rule: The violated rule.
     """
 
@@ -65,12 +66,12 @@ class DataError(MpsfmError, ValueError):
 
 
 class ProviderOutputError(MpsfmError):
-    """Output of a provider that violates the contract.
+    """Output of a provider that violates the provider contract.
 
     Attributes:
         provider: Name of the provider.
-        image: Name of the image.
-        field: Name of the field.
+        image: Name of the image that the provider processed.
+        field: Name of the invalid field.
         rule: The violated rule.
     """
 
@@ -83,25 +84,25 @@ class ProviderOutputError(MpsfmError):
 
 
 class ProviderRunError(MpsfmError):
-    """Exception of a provider on an image; the message names both, and the cause is chained."""
+    """Exception that a provider raised on an image; ``__cause__`` is the original exception."""
 
 
 class OutputError(MpsfmError):
     """Results that cannot be written because the disk is full or fails.
 
-    Earlier results are unchanged.
+    The results of earlier runs are unchanged.
     """
 
 
 class ReconstructionError(MpsfmError):
-    """Failed reconstruction of valid input.
+    """Failure to reconstruct a model from valid input.
 
     Attributes:
         summary: Content of `summary.json`, with the reasons for each image and pair.
     """
 
     exit_code = 3
-    """Exit code of the command line."""
+    """Exit code of the command line for this error class."""
 
     def __init__(self, message: str, summary: Mapping[str, Any] | None = None) -> None:
         super().__init__(message)

@@ -1,4 +1,4 @@
-"""Features of an image and matches of an image pair."""
+"""Local features of an image, and matches of an image pair."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Features:
     """Sparse local features of one view."""
 
     keypoints: Float64
-    """(n, 2) float64, COLMAP pixels of the view."""
+    """(n, 2) float64 positions of the keypoints, COLMAP pixels of the view."""
     descriptors: Float32
     """(n, d) float32."""
     scores: Float32 | None = None
@@ -57,9 +57,10 @@ class SparseMatches:
     """Matches between the features of two views."""
 
     indices: Int64
-    """(m, 2) int64 rows of the two feature sets; each feature occurs at most once."""
+    """(m, 2) int64 indices of the matched features of both views; each feature occurs at most
+    once."""
     scores: Float32
-    """(m,) float32 confidence in [0, 1]; the mapper weights matches by the score."""
+    """(m,) float32 confidence of each match in [0, 1]; the mapper weights matches by the score."""
 
     def __post_init__(self) -> None:
         require_array(self, "indices", np.int64, (None, 2))
@@ -76,8 +77,8 @@ class SparseMatches:
         """Build matches from raw arrays.
 
         Args:
-            indices: (m, 2) rows of the two feature sets, any number type.
-            scores: (m,) scores, clipped to [0, 1].
+            indices: (m, 2) indices of the matched features of both views, any number type.
+            scores: (m,) scores of the matches, clipped to [0, 1].
         """
         clipped = np.clip(scores, 0, 1).astype(np.float32)
         return cls(indices.astype(np.int64), clipped)
@@ -87,8 +88,8 @@ class SparseMatches:
         """Build one-to-one matches from raw arrays; the match with the best score wins.
 
         Args:
-            indices: (m, 2) rows of the two feature sets; features may repeat.
-            scores: (m,) scores, clipped to [0, 1].
+            indices: (m, 2) indices of the matched features of both views; features may repeat.
+            scores: (m,) scores of the matches, clipped to [0, 1].
         """
         order = np.argsort(-scores, kind="stable")
         for column in (0, 1):
@@ -104,11 +105,11 @@ class DenseMatches:
     """Matches between positions of two views, without keypoints."""
 
     points_a: Float64
-    """(m, 2) float64, COLMAP pixels of the first view."""
+    """(m, 2) float64 positions of the matches in COLMAP pixels of the first view."""
     points_b: Float64
-    """(m, 2) float64, COLMAP pixels of the second view."""
+    """(m, 2) float64 positions of the matches in COLMAP pixels of the second view."""
     scores: Float32
-    """(m,) float32 confidence in [0, 1]."""
+    """(m,) float32 confidence of each match in [0, 1]."""
     std_px: float = 1.0
     """Std of the localization noise of a match in pixels."""
 

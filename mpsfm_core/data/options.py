@@ -1,6 +1,6 @@
 """Base class of all options, and error messages for wrong settings.
 
-:class:`Options` is the base of a provider's options and of the options of each package.
+:class:`Options` is the base class of the options of providers and of all packages.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ def expert(default: Any, **constraints: Any) -> Any:
     """Declare an option that users are not expected to set; help and templates may hide it.
 
     Args:
-        default: Value of the option if nothing sets it.
+        default: Default value of the option.
         constraints: Keyword arguments of :func:`pydantic.Field`, such as ``ge`` and ``gt``.
     """
     return Field(default, json_schema_extra={"expert": True}, **constraints)
 
 
 SettingPath = tuple[str | int, ...]
-"""Path of a setting in a configuration: keys and list indices."""
+"""Keys and list indices that lead to a setting of a configuration."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class SettingProblem:
     """Wrong setting."""
 
     path: SettingPath
-    """Path, such as ``("depth", "options", "scale")``."""
+    """Path of the setting, such as ``("depth", "options", "scale")``."""
     text: str
     """What is wrong."""
     missing: bool = False
@@ -53,7 +53,7 @@ class SettingProblem:
 
 
 class SettingsError(ConfigError):
-    """Settings that their options class rejects.
+    """Settings that an options class rejects.
 
     Attributes:
         problems: All wrong settings.
@@ -75,15 +75,15 @@ def parse_settings(
     Args:
         model: Options class.
         values: Settings by key.
-        path: Path of the settings in the configuration, for messages.
+        path: Path of the settings in the configuration, for error messages.
 
     Raises:
-        SettingsError: Some settings are wrong. The message gives path and problem of each, and the
-            closest valid key for an unknown key.
+        SettingsError: Some settings are wrong. The message has the path and problem of each
+            setting, and the closest valid key for an unknown key.
     """
     try:
         return model.model_validate(dict(values))
-    except SettingsError as error:  # from a provider of another environment
+    except SettingsError as error:  # A provider in another Python environment raised the error.
         raise SettingsError(
             tuple(replace(problem, path=(*path, *problem.path)) for problem in error.problems)
         ) from error
@@ -103,7 +103,7 @@ def dotted(path: SettingPath) -> str:
 
 
 def _keys(details: ErrorDetails) -> SettingPath:
-    """Return the location of an error without pydantic's union tags such as ``dict[str,any]``."""
+    """Return the setting path of a pydantic error, without union tags such as ``dict[str,any]``."""
     return tuple(part for part in details["loc"] if isinstance(part, int) or "[" not in part)
 
 
@@ -120,7 +120,7 @@ def _explain(model: type[BaseModel], details: ErrorDetails) -> str:
 
 
 def _fields_at(model: type[BaseModel], path: SettingPath) -> list[str]:
-    """Return the valid keys at a path below a model."""
+    """Return the valid setting keys at a path below an options class."""
     current = [model]
     for part in path:
         if isinstance(part, int):
@@ -131,7 +131,7 @@ def _fields_at(model: type[BaseModel], path: SettingPath) -> list[str]:
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the models in a type annotation."""
+    """Yield the pydantic models in a type annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for argument in get_args(annotation):

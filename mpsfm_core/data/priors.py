@@ -27,19 +27,20 @@ UNIT_NORMAL_TOLERANCE = 1e-3
 class DepthPrior:
     """Depth map with variance, on a grid of any size over the whole view.
 
-    Values at invalid pixels are finite and meaningless.
+    Depth and variance at invalid pixels are finite and undefined.
     """
 
     depth: Float32
     """(h, w) float32 z-depth, > 0 where valid; meters if ``metric``, else an unknown unit."""
     variance: Float32 | None
-    """(h, w) float32 variance in depth units squared, > 0 where valid.
+    """(h, w) float32 variance of depth in squared depth units, > 0 where valid.
 
-    None if the network predicts no variance; a calibration then declares the variance."""
+    If the network predicts no variance, the value is None and a calibration declares the
+    variance."""
     valid: Bool
     """(h, w) bool, True where depth is valid."""
     metric: bool = True
-    """True if the unit is meters."""
+    """True if the unit of depth is meters."""
 
     def __post_init__(self) -> None:
         require_array(self, "depth", np.float32, (None, None))
@@ -61,13 +62,13 @@ class DepthPrior:
         *,
         metric: bool = True,
     ) -> DepthPrior:
-        """Build a prior from raw arrays; pixels that are not finite and positive become invalid.
+        """Build a depth prior from arrays; pixels without finite positive depth become invalid.
 
         Args:
-            depth: (h, w) depth, any number type.
-            variance: (h, w) variance in depth units squared, or None.
-            valid: (h, w) mask, or None for all True.
-            metric: True if the unit is meters.
+            depth: (h, w) z-depth, any number type.
+            variance: (h, w) variance of depth in squared depth units, or None.
+            valid: (h, w) mask of valid pixels, or None for all True.
+            metric: True if the unit of depth is meters.
         """
         depth = np.asarray(depth, dtype=np.float32)
         usable = np.isfinite(depth) & (depth > 0)
@@ -81,7 +82,7 @@ class DepthPrior:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of the map."""
+        """Number of (rows, columns) of the map."""
         return self.depth.shape[0], self.depth.shape[1]
 
 
@@ -89,17 +90,18 @@ class DepthPrior:
 class NormalPrior:
     """Surface normal map with variance, on a grid of any size over the whole view.
 
-    Normals face the camera: the dot product with the ray through the pixel is negative. Off the
-    optical axis ``n_z`` may be positive, for example on a floor. The constructor has no camera, so
-    :mod:`mpsfm_core.providers.validation` checks the facing.
+    Normals face the camera: the dot product with the ray through the pixel is negative. The
+    component ``n_z`` of a normal may be positive off the optical axis, for example on a floor.
+    :mod:`mpsfm_core.providers.validation` checks that normals face the camera, because the
+    constructor has no camera.
     """
 
     normals: Float32
-    """(h, w, 3) float32, unit length where valid, camera frame."""
+    """(h, w, 3) float32 surface normals in the camera frame, unit length where valid."""
     variance: Float32 | None
     """(h, w) float32 angular variance in rad^2 along each tangent direction, > 0 where valid.
 
-    None if the network predicts no variance."""
+    The variance is None if the network predicts no variance."""
     valid: Bool
     """(h, w) bool, True where the normal is valid."""
 
@@ -125,16 +127,16 @@ class NormalPrior:
         *,
         camera: PinholeCamera | None = None,
     ) -> NormalPrior:
-        """Build a prior from raw arrays and normalize lengths.
+        """Build a normal prior from arrays and normalize the normals.
 
-        Pixels that are not finite or have no length become invalid, and with a camera also normals
-        that do not face the camera.
+        Normals that are not finite or have zero length become invalid. With a camera, normals that
+        face away from the camera also become invalid.
 
         Args:
             normals: (h, w, 3) normals in the camera frame, any number type and length.
             variance: (h, w) angular variance in rad^2, or None.
-            valid: (h, w) mask, or None for all True.
-            camera: Intrinsics of the view, to check the facing.
+            valid: (h, w) mask of valid pixels, or None for all True.
+            camera: Intrinsics of the view, to check that normals face the camera.
         """
         raw = np.asarray(normals, dtype=np.float32)
         finite = np.where(np.isfinite(raw).all(axis=-1, keepdims=True), raw, np.float32(0))
@@ -153,7 +155,7 @@ class NormalPrior:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of the map."""
+        """Number of (rows, columns) of the map."""
         return self.normals.shape[0], self.normals.shape[1]
 
 
@@ -162,22 +164,22 @@ class PairDepth:
     """Depth of both views of a pair from a two-view network such as MASt3R."""
 
     depth_a: DepthPrior
-    """Depth of the first view."""
+    """Depth prior of the first view."""
     depth_b: DepthPrior
-    """Depth of the second view."""
+    """Depth prior of the second view."""
 
 
 @dataclass(frozen=True, eq=False)
 class MultiViewPrior:
     """Output of a multi-view network for a group of n views, in one frame and one unit.
 
-    Poses and intrinsics are proposals; verified matches decide about their use.
+    Predicted poses and intrinsics are hypotheses, which the mapper tests with verified matches.
     """
 
     depth: tuple[DepthPrior, ...]
-    """n depth priors in the order of the views, in one unit; meters if ``metric``."""
+    """One depth prior for each of the n views, all in the same unit; meters if ``metric``."""
     poses: Float64 | None = None
-    """(n, 3, 4) float64 ``cam_from_group``, lengths in the unit of depth; None if not predicted."""
+    """(n, 3, 4) float64 poses ``cam_from_group`` in the unit of depth; None if not predicted."""
     intrinsics: Float64 | None = None
     """(n, 4) float64 fx, fy, cx, cy in COLMAP pixels of each view; None if not predicted."""
 

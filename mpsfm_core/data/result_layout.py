@@ -5,27 +5,27 @@ Readers of images skip folders that contain :data:`SUMMARY`; ``results`` writes 
 """
 
 SUMMARY = "summary.json"
-"""Marks a result folder: what was run, what was reconstructed, and why images are missing."""
+"""Summary of a run: configuration, reconstructed components, and reasons for missing images."""
 SPARSE = "sparse"
-"""COLMAP model of the original images, binary."""
+"""COLMAP model of the original (distorted) images in binary format."""
 SPARSE_TEXT = "sparse_text"
-"""The same model as text."""
+"""COLMAP model of the original (distorted) images in text format."""
 COMPONENTS = "components"
-"""Models of further components, numbered from 1, largest first."""
+"""COLMAP models of the components after the largest, numbered from 1 by decreasing size."""
 UNDISTORTED = "undistorted"
-"""Undistorted images with a COLMAP model of pinhole cameras."""
+"""Undistorted images, and their COLMAP model with pinhole cameras."""
 POINTS = "points.ply"
 """Triangulated points of the largest component."""
 DENSE = "dense.ply"
 """Fused depth maps."""
 DEPTH = "depth"
-"""Refined depth maps, ``NAME.npz``."""
+"""Refined depth maps of the images, ``NAME.npz``."""
 MESH = ("mesh.ply", "mesh.glb")
-"""Surface mesh, made from the depth maps after the run."""
+"""Surface mesh, which ``mpsfm mesh`` extracts from the depth maps."""
 TRANSFORMS = "transforms.json"
 """Cameras and poses for nerfstudio."""
 VIEWS = "views"
-"""Small images, priors and matches that the report shows."""
+"""Thumbnails, priors and matches that the HTML report displays."""
 REPORT = "report.html"
 """Report page."""
 ENTRIES = (
@@ -42,4 +42,4 @@ ENTRIES = (
     REPORT,
     SUMMARY,
 )
-"""All entries of an output folder that a run may replace."""
+"""All files and folders of the output folder that a run may replace."""

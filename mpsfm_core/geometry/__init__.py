@@ -1,4 +1,4 @@
-"""Projection, transforms, robust statistics and patch alignment."""
+"""Camera projection, rigid transforms, robust statistics and patch alignment."""
 
 from mpsfm_core.geometry.projection import (
     inside,

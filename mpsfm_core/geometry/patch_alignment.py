@@ -1,9 +1,9 @@
 """Subpixel patch alignment by inverse compositional Lucas-Kanade.
 
-The method is that of Baker and Matthews, "Lucas-Kanade 20 Years On" (IJCV 2004).
-Gradients and the Hessian come from the template and are computed once. A Gaussian weights the
-patch. The residual is invariant to brightness and gain. The warp is a translation first, then
-affine.
+The method is that of Baker and Matthews, "Lucas-Kanade 20 Years On" (IJCV 2004). Image gradients
+and the Hessian are computed once, from the template patch. A Gaussian window weights the pixels of
+the patch. The residual is invariant to brightness and gain. The warp model is a translation first,
+then affine.
 """
 
 # mypy: allow-untyped-decorators
@@ -21,32 +21,32 @@ from mpsfm_core.support.jit import helper, kernel
 WINDOW_STD_RATIO = 0.6
 """Std of the Gaussian window relative to the radius of the patch [ours]."""
 _MAX_ITERATIONS = 12
-"""Maximum number of iterations of each warp model."""
+"""Maximum number of Gauss-Newton iterations for each warp model."""
 _CONVERGENCE_PX = 0.1, 0.01
-"""Step sizes at which the translation and the affine warp have converged."""
+"""Step sizes in pixels below which the translation and the affine warp have converged."""
 _DAMPING = 0.01
-"""Damping of the affine parameters, relative to the diagonal of the Hessian [ours]."""
+"""Levenberg damping of the affine parameters, relative to the diagonal of the Hessian [ours]."""
 _REGULARIZATION = 1e-9
-"""Value added to the diagonal of the Hessian."""
+"""Constant added to the diagonal of the Hessian, so that the inverse exists."""
 _NUM_TRANSLATION = 2
-"""Parameters of a translation."""
+"""Number of parameters of a translation."""
 _NUM_AFFINE = 6
-"""Parameters of an affine warp."""
+"""Number of parameters of an affine warp."""
 _DERIVATIVES = 2
-"""Index of the first derivative in a basis."""
+"""First column of derivatives in the basis of a template patch."""
 _MIN_CONTRAST = 1e-3
-"""Minimum std of gray values in a patch."""
+"""Minimum std of gray values in a patch with enough texture."""
 
 
 class PatchAlignment(NamedTuple):
-    """Alignment of n patches."""
+    """Result of the alignment of n patches."""
 
     shift: Float64
-    """(n, 2) from the initial to the aligned position, pixels of the searched image."""
+    """(n, 2) aligned minus initial position in pixels of the searched image."""
     warp: Float64
-    """(n, 2, 2) maps offsets in the template to offsets in the searched image."""
+    """(n, 2, 2) linear part of the affine warp from the template to the searched image."""
     correlation: Float64
-    """(n,) NCC of the aligned patches, -1 where alignment failed."""
+    """(n,) normalized cross-correlation (NCC) of the aligned patches, -1 if alignment failed."""
     covariance: Float64
     """(n, 2, 2) covariance of the shift from image noise, pixels^2."""
 
@@ -63,16 +63,16 @@ def align_patches(
     """Align patches of one image to another.
 
     Args:
-        template: (h, w) gray values of the image with the patches.
-        searched: (h, w) gray values of the other image.
-        template_xy: (n, 2) centers of the patches, COLMAP pixels.
-        searched_xy: (n, 2) initial positions, COLMAP pixels.
-        warp: (n, 2, 2) initial warps, template offsets to offsets in the other image.
+        template: (h, w) gray values of the image that contains the template patches.
+        searched: (h, w) gray values of the searched image.
+        template_xy: (n, 2) centers of the template patches, COLMAP pixels.
+        searched_xy: (n, 2) initial positions in the searched image, COLMAP pixels.
+        warp: (n, 2, 2) initial affine warps from the template to the searched image.
         radius: Radius of the round patch in pixels of the template.
         correlation_length: Correlation length of image noise in pixels of the template.
     """
     offsets, window = _sample_patch(radius)
-    # Effective number of independent pixels; each sample represents two pixels.
+    # Effective number of independent pixels in a patch; each sample represents two pixels.
     num_independent = 1.0 / ((window**2).sum() / 2 * correlation_length**2)
     return PatchAlignment(
         *_align(
@@ -92,7 +92,7 @@ def align_patches(
 def _sample_patch(radius: int) -> tuple[Float64, Float64]:
     """Return offsets (q, 2) and weights (q,) of the samples of a round patch.
 
-    Only every other pixel is sampled, in a checkerboard, because images are smooth.
+    The samples are every second pixel in a checkerboard pattern, because images are smooth.
     """
     line = np.arange(-radius, radius + 1, dtype=np.float64)
     x, y = (grid.ravel() for grid in np.meshgrid(line, line))
@@ -114,7 +114,7 @@ def _align(
     window: Float64,
     num_independent: float,
 ) -> tuple[Float64, Float64, Float64, Float64]:
-    """Align each patch; returns the fields of :class:`PatchAlignment`."""
+    """Align each patch and return the fields of :class:`PatchAlignment`."""
     count = len(template_xy)
     shifts = np.zeros((count, 2))
     refined_warps = np.zeros((count, 2, 2))
@@ -149,8 +149,8 @@ def _align(
         if correlation < 0.0:
             continue
         correlations[n] = correlation
-        # Covariance of the translation in the template with free affine parameters, transformed to
-        # the other image by the warp.
+        # Marginal covariance of the translation in the template, transformed to the searched image
+        # by the warp.
         noise = 2.0 * (1.0 - correlation) / num_independent
         for i in range(2):
             shifts[n, i] = at[i] - searched_xy[n, i]
@@ -164,7 +164,7 @@ def _align(
 
 @helper()
 def _bilinear(image: Float32, x: float, y: float) -> float:
-    """Interpolate an image at an array position."""
+    """Interpolate an image bilinearly at an array position."""
     column, row = int(x), int(y)
     right, down = x - column, y - row
     above = image[row, column] * (1.0 - right) + image[row, column + 1] * right
@@ -192,13 +192,13 @@ def _derive(
 ) -> bool:
     """Compute the basis and the Hessian of a template patch.
 
-    The basis has 8 columns per sample: the window; the window times the normalized template; and
-    the window times the derivatives by 2 translation and 4 affine parameters. Affine offsets are
-    relative to the radius. The derivatives are orthogonal to changes of mean and contrast.
+    The basis has 8 columns: the window weights, the weighted normalized template, and the weighted
+    derivatives by 2 translation and 4 affine parameters. The unit of affine offsets is the radius.
+    The derivatives are orthogonal to changes of mean and contrast.
 
     Args:
         image: (h, w) gray values.
-        at: (2,) center of the patch, array position.
+        at: (2,) center of the patch as array position.
         radius: Radius of the patch.
         offsets: (q, 2) samples.
         window: (q,) weights.
@@ -206,7 +206,7 @@ def _derive(
         hessian: (6, 6), written.
 
     Returns:
-        False if the patch leaves the image or has no contrast.
+        False if the patch exceeds the image or has no contrast.
     """
     if not _inside(image, at[0], at[1], radius + 1.0, radius + 1.0):
         return False
@@ -264,16 +264,16 @@ def _compare(
     """Compute the NCC of the template with a warped patch of another image.
 
     Args:
-        image: (h, w) gray values of the other image.
-        at: (2,) center of the patch, array position.
-        warp: (2, 2) template offsets to offsets in the other image.
+        image: (h, w) gray values of the searched image.
+        at: (2,) center of the patch as array position.
+        warp: (2, 2) linear part of the affine warp from the template to the searched image.
         radius: Radius of the template patch.
         offsets: (q, 2) samples.
         basis: (q, 8) basis of the template, see :func:`_derive`.
-        gradient: (6,) products of the template's derivatives with the patch, written.
+        gradient: (6,) output, products of the template's derivatives with the searched patch.
 
     Returns:
-        The NCC, or -1 if the patch leaves the image or has no contrast.
+        The NCC, or -1 if the patch exceeds the image or has no contrast.
     """
     reach_x = radius * math.hypot(warp[0, 0], warp[0, 1])
     reach_y = radius * math.hypot(warp[1, 0], warp[1, 1])
@@ -306,7 +306,7 @@ def _compare(
 
 @helper()
 def _invert(matrix: Float64, size: int, inverse: Float64) -> None:
-    """Invert the leading block of a Hessian with damped affine part by Gauss-Jordan elimination."""
+    """Invert the leading block of a damped Hessian by Gauss-Jordan elimination."""
     for i in range(size):
         for j in range(size):
             inverse[i, j] = matrix[i, j]
@@ -341,7 +341,7 @@ def _solve(
 
 @helper()
 def _compose(warp: Float64, at: Float64, step: Float64) -> None:
-    """Compose the warp with the inverse of a step, in place."""
+    """Compose a warp in place with the inverse of a Gauss-Newton step."""
     a, b, c, d = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
     determinant = a * d - b * c
     w00 = (warp[0, 0] * d - warp[0, 1] * c) / determinant

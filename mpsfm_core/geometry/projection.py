@@ -1,8 +1,8 @@
 """Projection and unprojection of a pinhole camera, and sampling of maps.
 
-All functions are vectorized over leading axes. Pixels follow COLMAP: the center of the first pixel
-is (0.5, 0.5), so ``map[row, col]`` is the value at ``(col + 0.5, row + 0.5)``. Resizing a W x H
-view to w x h maps ``x`` to ``x * w / W`` exactly.
+All projection functions are vectorized over leading axes. Pixels follow COLMAP: the center of the
+first pixel is (0.5, 0.5), so ``map[row, col]`` is the value at ``(col + 0.5, row + 0.5)``. Resizing
+a W x H view to w x h maps ``x`` to ``x * w / W`` exactly.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def unproject(camera: PinholeCamera, xy: Float64, depth: NDArray[Any]) -> Float6
 def project(camera: PinholeCamera, points: Float64) -> Float64:
     """Project points (..., 3) in the camera frame to pixels (..., 2).
 
-    Points with z <= 0 give NaN.
+    The pixel of a point with z <= 0 is NaN.
     """
     z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
     x = camera.fx * points[..., 0] / z + camera.cx
@@ -65,15 +65,15 @@ def sample_nearest(values: NDArray[Any], xy: Float64) -> NDArray[Any]:
 
 
 def sample_bilinear(values: NDArray[Any], valid: Bool, xy: Float64) -> tuple[Float64, Bool]:
-    """Sample a map bilinearly; the outer half pixel takes the border's values.
+    """Sample a map bilinearly; positions in the outer half pixel use the border's values.
 
     Args:
         values: (h, w) map.
         valid: (h, w) mask.
-        xy: (n, 2) COLMAP pixels of the map.
+        xy: (n, 2) sample positions in COLMAP pixels of the map.
 
     Returns:
-        Samples (n,) float64, and a mask (n,), True where all pixels with weight are valid.
+        Samples (n,) float64, and a mask (n,) that is True if all interpolated pixels are valid.
     """
     height, width = values.shape
     x = np.clip(np.nan_to_num(xy[:, 0]) - 0.5, 0, width - 1)
@@ -100,14 +100,15 @@ def resize_map(values: NDArray[Any], width: int, height: int, *, linear: bool = 
 
     Args:
         values: (h, w) or (h, w, c) map.
-        width: Columns of the grid.
-        height: Rows of the grid.
-        linear: Use area averages to shrink and bilinear interpolation to enlarge; else nearest.
+        width: Number of columns of the resized map.
+        height: Number of rows of the resized map.
+        linear: If True, average areas to shrink and interpolate bilinearly to enlarge; if False,
+            use the nearest pixel.
 
     Returns:
         (height, width) or (height, width, c) float32.
     """
-    import cv2  # local, because plugins and the command line import this module and must start fast
+    import cv2  # A local import of OpenCV keeps the start of plugins and of the command line fast.
 
     values = np.ascontiguousarray(values, dtype=np.float32)
     if values.shape[:2] == (height, width):
@@ -119,14 +120,14 @@ def resize_map(values: NDArray[Any], width: int, height: int, *, linear: bool = 
 
 
 def log_depth_steps(depth: Float32, valid: Bool) -> Float32:
-    """Compute the largest step of log depth to a 4-neighbor; 0.1 is about 10 %.
+    """Compute the maximum difference of log depth to the four neighboring pixels.
 
     Args:
         depth: (h, w) depth.
-        valid: (h, w) mask. Steps to or from invalid pixels do not count.
+        valid: (h, w) mask of valid pixels; differences to invalid pixels are ignored.
 
     Returns:
-        (h, w) float32, >= 0.
+        (h, w) float32 maximum difference of log depth, >= 0; 0.1 is about 10 % of depth.
     """
     steps = np.zeros(depth.shape, dtype=np.float32)
     log_depth = np.log(np.where(valid, depth, np.float32(1)))

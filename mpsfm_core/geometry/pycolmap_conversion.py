@@ -8,14 +8,14 @@ from mpsfm_core.data import PinholeCamera
 
 
 def colmap_from_pinhole(camera: PinholeCamera) -> pycolmap.Camera:
-    """Return the PINHOLE camera of COLMAP with the same size and intrinsics."""
+    """Convert a pinhole camera to a COLMAP camera of model PINHOLE."""
     return pycolmap.Camera(
         model="PINHOLE", width=camera.width, height=camera.height, params=camera.params
     )
 
 
 def pinhole_from_colmap(camera: pycolmap.Camera) -> PinholeCamera:
-    """Return size, focal lengths and principal point of a COLMAP camera; drops its distortion."""
+    """Convert a COLMAP camera to a pinhole camera; the distortion is ignored."""
     idxs = camera.focal_length_idxs()
     params = camera.params
     return PinholeCamera(
@@ -29,5 +29,5 @@ def pinhole_from_colmap(camera: pycolmap.Camera) -> PinholeCamera:
 
 
 def camera_key(camera: pycolmap.Camera) -> str:
-    """Return a text that is equal for cameras of equal model, size and parameters."""
+    """Return a text key that identifies model, size and parameters of a camera."""
     return f"{camera.model_name} {camera.width} {camera.height} {camera.params.tolist()}"

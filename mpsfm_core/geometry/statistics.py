@@ -7,13 +7,13 @@ import numpy as np
 from mpsfm_core.data import Float64, Int64
 
 MAD_TO_STD = 1.4826
-"""Std of normal errors relative to the median of their absolute values."""
+"""Ratio of std to median absolute value of a normal distribution with zero mean."""
 ONE_SIGMA = 0.683
-"""Probability within one std of a normal distribution."""
+"""Probability that a normally distributed error is within one std."""
 
 
 def weighted_quantile(values: Float64, weights: Float64, ratio: float) -> float:
-    """Return the value below which this ratio of the total weight falls; both (n,)."""
+    """Compute a weighted quantile of values (n,) with weights (n,)."""
     order = np.argsort(values)
     cumulative = np.cumsum(weights[order])
     position = int(np.searchsorted(cumulative, ratio * cumulative[-1]))
@@ -25,11 +25,11 @@ def group_medians(values: Float64, groups: Int64, count: int) -> Float64:
 
     Args:
         values: (m,) values.
-        groups: (m,) group of each value, in [0, count).
+        groups: (m,) index of each value's group, in [0, count).
         count: Number of groups.
 
     Returns:
-        (count,) medians, NaN for empty groups.
+        (count,) medians of the groups, NaN for empty groups.
     """
     order = np.lexsort((values, groups))
     sizes = np.bincount(groups, minlength=count)

@@ -8,7 +8,7 @@ from mpsfm_core.data import Float64
 
 
 def rotation_angle_deg(rotation: Float64) -> Float64:
-    """Compute the angle of rotations (..., 3, 3) in degrees, accurate near 0 and 180."""
+    """Compute the rotation angle of matrices (..., 3, 3) in degrees, accurate near 0 and 180."""
     sine = 0.5 * np.linalg.norm(
         np.stack(
             [
@@ -41,7 +41,7 @@ def triangulation_angle_deg(center_a: Float64, center_b: Float64, points: Float6
     parallel rays.
 
     Returns:
-        (...) angles in [0, 90] degrees.
+        (...) triangulation angles in [0, 90] degrees.
     """
     angle = angle_between_deg(points - center_a, points - center_b)
     folded: Float64 = np.minimum(angle, 180.0 - angle)
@@ -68,5 +68,5 @@ def invert(rotation: Float64, translation: Float64) -> tuple[Float64, Float64]:
 def compose(
     b_from_a: tuple[Float64, Float64], a_from_world: tuple[Float64, Float64]
 ) -> tuple[Float64, Float64]:
-    """Compose ``b_from_a`` and ``a_from_world`` to ``b_from_world``."""
+    """Compose the rigid transforms ``b_from_a`` and ``a_from_world`` to ``b_from_world``."""
     return b_from_a[0] @ a_from_world[0], b_from_a[0] @ a_from_world[1] + b_from_a[1]
