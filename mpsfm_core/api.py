@@ -1,7 +1,7 @@
-"""Public functions, exported by :mod:`mpsfm_core`.
+"""Public functions of the package, exported by :mod:`mpsfm_core`.
 
-Each function imports what it needs when it is called, because the light module of a plugin imports
-``mpsfm_core``, and listing plugins must not load the optimizers.
+Each function imports its dependencies when called, because the descriptor module of a plugin
+imports ``mpsfm_core``, and listing plugins must not load the optimizers.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ def load_config(
     Args:
         name_or_path: Name of a shipped configuration, or a YAML file.
         overrides: Settings such as ``"runtime.workers=2"``, applied last.
-        registry: Providers to check against; default: those of all installed plugins.
+        registry: Providers to check names against; default: all installed providers.
 
     Returns:
         The configuration with all defaults.
 
     Raises:
-        ConfigError: with file, line and the nearest valid key.
+        ConfigError: a setting is wrong. The message has file, line and the nearest valid key.
     """
     from mpsfm_core.config import load_config
 
@@ -62,12 +62,14 @@ def reconstruct(
             of ``poses``, else EXIF, else the estimate of the depth provider, else a default.
         image_list: Text file with one image name per line; default: all images.
         poses: COLMAP model or ``transforms.json`` with poses of some or all images;
-            ``mapping.known_poses`` chooses whether they are fixed or refined.
-        overrides: Settings such as ``"runtime.workers=2"``; not with a loaded configuration.
-        registry: Providers to choose from; default: those of all installed plugins.
+            ``mapping.known_poses`` chooses whether known poses are fixed or refined.
+        overrides: Settings such as ``"runtime.workers=2"``; not allowed with a loaded
+        configuration.
+        registry: Providers to choose from; default: all installed providers.
         fresh: Ignore the checkpoint of an interrupted run, and map from the start.
-        database: COLMAP database whose keypoints and matches replace features and matchers. They
-            are verified again. Its cameras are ignored unless it is also given as ``intrinsics``.
+        database: COLMAP database whose keypoints and matches replace features and matchers. Its
+            matches are verified again. Its cameras are ignored unless the database is also given as
+            ``intrinsics``.
         hloc: Features file and matches file of hloc, instead of ``database``.
 
     Returns:
@@ -77,7 +79,7 @@ def reconstruct(
         InputError: images, intrinsics, poses, configuration, weights or output are wrong. Missing
             providers are found before any image is decoded.
         ReconstructionError: no reconstruction was possible; ``summary.json`` has the reasons.
-        MpsfmError: a provider failed or broke its contract, or the disk is full.
+        MpsfmError: a provider failed or violated the provider contract, or the disk is full.
     """
     from mpsfm_core.pipeline.run import reconstruct
 

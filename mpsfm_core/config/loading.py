@@ -1,16 +1,19 @@
 """Read YAML files and ``--set`` overrides into one checked :class:`Config`.
 
-A file may extend a shipped configuration or another file with ``extends:``. Mappings merge key by
-key, and other values replace those of the parent. There are three exceptions:
+A configuration file may extend a shipped configuration or another file with ``extends:``. Mappings
+are merged key by key, and other values replace those of the parent file. There are three
+exceptions:
 
-* A block with another ``use:`` drops the other keys of its parent, because another provider has
+* A provider block with another ``use:`` drops the parent's other keys, because another provider has
   other options.
-* A block with ``use:`` drops the parent's ``fallback:``.
-* Naming features, a matcher or a multi-view network drops the parent's ``fast_pass:``, because the
-  fast pass would replace them for most images.
 
-Which ``fallback:`` a run takes depends on the machine;
-:mod:`mpsfm_core.pipeline.provider_resolution` decides when a run starts.
+* A provider block with ``use:`` drops the parent's ``fallback:``.
+
+* Naming features, a matcher or a multi-view network drops the parent's ``fast_pass:``, because the
+  fast pass would replace the named provider for most images.
+
+The choice among ``use:`` and ``fallback:`` depends on the machine and is made at the start of a
+run, in :mod:`mpsfm_core.pipeline.provider_resolution`.
 """
 
 from __future__ import annotations
@@ -36,14 +39,14 @@ from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.yaml_text import find_line, parse_assignment, parse_yaml
 
 _REPLACE_FAST_PASS = ("features", "matcher", "dense_matcher", "multiview")
-"""Blocks whose ``use:`` drops the parent's fast pass. A multi-view network is among them because
-matches decide which images it sees together."""
+"""Blocks whose ``use:`` drops the parent's fast pass. ``multiview`` is included because the groups
+of images of a multi-view network are chosen by their matches."""
 
 
 def shipped_configs() -> dict[str, Path]:
     """Return the files of the shipped configurations by name, sorted."""
     package = Path(__file__).parents[1]
-    # A wheel contains them in the package, a source tree next to the package.
+    # A wheel has the folder ``configs`` in the package, a source tree next to the package.
     folder = next(f for f in (package / "configs", package.parent / "configs") if f.is_dir())
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
@@ -64,20 +67,21 @@ def load_config(
     """Read, merge and check a configuration.
 
     Args:
-        name_or_path: Shipped name, or a YAML file (with a slash, or ending in .yaml or .yml).
+        name_or_path: Name of a shipped configuration, or a YAML file (a slash, .yaml or .yml marks
+        a file).
         overrides: Texts ``a.b=value`` with a YAML value, applied last; list entries by index.
         registry: Providers to check names and options against; default: ``Registry.discover()``.
-        complete: False allows missing required options of providers (null in the result), to show
-            a configuration.
+        complete: If false, required provider options may be missing (null in the result).
 
     Returns:
         The configuration with all defaults filled in.
 
     Raises:
-        ConfigError: with file, line, YAML path and, for unknown keys, the nearest valid key.
+        ConfigError: a setting is wrong. The message has file, line, YAML path and, for unknown
+        keys, the nearest valid key.
     """
     layers = _read_chain(_find_file(str(name_or_path), Path()))
-    # Naming a provider drops options and fast pass, so it must precede overrides that set them.
+    # ``--set X.use=...`` drops options and fast pass, so it precedes overrides that set them.
     order = sorted(overrides, key=lambda text: (text.startswith("fast_pass"), ".use=" not in text))
     layers += [_Layer(f"--set {text}", parse_assignment(text)) for text in order]
     try:
@@ -91,20 +95,20 @@ def load_config(
 
 @dataclass(frozen=True)
 class _Layer:
-    """Settings of one file or one ``--set``."""
+    """Settings of one configuration file or one ``--set`` override."""
 
     source: str
-    """Path of the file, or the override as the user wrote it."""
+    """Path of the configuration file, or the override as the user wrote it."""
     data: Mapping[str, Any]
     text: str = ""
-    """Text of the file, to find line numbers."""
+    """Text of the configuration file, to find line numbers."""
     folder: Path = Path()
-    """Folder of the file, for relative paths."""
+    """Folder of the configuration file, to resolve relative paths."""
     shipped: bool = False
-    """Whether the file is a shipped configuration."""
+    """True for a shipped configuration."""
 
     def has(self, path: SettingPath) -> bool:
-        """Check whether there is an entry at a path."""
+        """Check whether the layer has a setting at a path."""
         node: Any = self.data
         for part in path:
             if isinstance(node, list) and isinstance(part, int) and part < len(node):
@@ -116,13 +120,13 @@ class _Layer:
         return True
 
     def locate(self, path: SettingPath) -> str:
-        """Return ``FILE:LINE`` of an entry, or the override."""
+        """Return ``FILE:LINE`` of a setting, or the text of the override."""
         line = find_line(self.text, path) if self.text else None
         return f"{self.source}:{line}" if line else self.source
 
 
 def _find_file(name: str, folder: Path) -> Path:
-    """Return the file of a shipped name, or of a path relative to a folder."""
+    """Return the file of a shipped configuration, or of a path relative to a folder."""
     if "/" in name or "\\" in name or name.endswith((".yaml", ".yml")):
         path = folder / Path(name).expanduser()
         if not path.is_file():
@@ -137,7 +141,7 @@ def _find_file(name: str, folder: Path) -> Path:
 
 
 def _read_chain(path: Path, children: tuple[Path, ...] = ()) -> list[_Layer]:
-    """Read a file and the files that it extends, the base file first."""
+    """Read a configuration file and the files that it extends, the base file first."""
     path = path.resolve()
     chain = (*children, path)
     if path in children:
@@ -167,7 +171,7 @@ def _read_chain(path: Path, children: tuple[Path, ...] = ()) -> list[_Layer]:
 
 
 def _merge_all(layers: Sequence[_Layer]) -> tuple[dict[str, Any], list[str]]:
-    """Merge the layers; return the settings, and a warning if a user drops the fast pass."""
+    """Merge layers of settings; return a warning if a user's file drops the fast pass."""
     merged: dict[str, Any] = {}
     warnings = []
     for layer in layers:
@@ -189,7 +193,7 @@ def _merge_all(layers: Sequence[_Layer]) -> tuple[dict[str, Any], list[str]]:
 
 
 def _merge(base: Any, change: Any) -> Any:
-    """Merge one value of a child into the value of its parent."""
+    """Merge a setting of a child file into the setting of its parent file."""
     if not isinstance(change, Mapping):
         return change
     is_indexed = bool(change) and all(isinstance(k, str) and k.isdigit() for k in change)
@@ -214,9 +218,10 @@ def _merge_items(base: list[Any], change: Mapping[str, Any]) -> list[Any]:
 
 
 def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complete: bool) -> Config:
-    """Check the options of every provider, and fill in their defaults.
+    """Check the options of every provider block, and fill in default options.
 
-    An unresolved block needs one valid candidate, and its options stay as given.
+    A block with ``fallback:`` or ``same-network`` needs one valid candidate. The options of such a
+    block stay as given.
     """
     problems: list[SettingProblem] = []
     checked = config
@@ -243,7 +248,7 @@ def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complet
 def _check_candidates(
     path: SettingPath, kind: Kind, block: ProviderConfig, registry: Registry, complete: bool
 ) -> None:
-    """Raise SettingsError if no candidate of a block could ever be used."""
+    """Raise SettingsError if no provider named by a block can be used on any machine."""
     names = (block.use, *block.fallback)
     installed = [name for name in names if name in registry.names(kind)]
     valid_keys = {key for name in installed for key in registry.default_options(kind, name)}
@@ -274,20 +279,20 @@ def check_provider_config(
     registry: Registry,
     complete: bool = True,
 ) -> ProviderConfig:
-    """Check a block with one provider; fill in its options and those of its wrappers.
+    """Check a block with one provider; fill in the options of provider and wrappers.
 
     Args:
-        path: Path of the block, for messages.
+        path: Path of the block in the configuration, for messages.
         kind: Kind of the provider.
-        block: The block, without fallbacks.
-        registry: The installed providers.
-        complete: False allows missing required options.
+        block: Provider block without fallbacks.
+        registry: Installed providers.
+        complete: If false, required options may be missing.
 
     Returns:
-        The block with all options.
+        The block with the options of the provider and its wrappers.
 
     Raises:
-        SettingsError: no such provider or wrapper, or a wrong option.
+        SettingsError: a provider or wrapper is not installed, or an option is wrong.
     """
     try:
         options = registry.validate_options(kind, block.use, block.options, (*path, "options"))
@@ -312,7 +317,7 @@ def check_provider_config(
 def _read_calibration(
     path: SettingPath, kind: Kind, block: ProviderConfig, layers: Sequence[_Layer]
 ) -> dict[str, Any] | None:
-    """Return the values of a calibration; read its file if it names one."""
+    """Return the calibration values of a block; read the calibration file if one is named."""
     values, path = block.calibration, (*path, "calibration")
     if values is None:
         return None
@@ -330,7 +335,7 @@ def _read_calibration(
 
 
 def _missing_blocks(config: Config) -> list[SettingProblem]:
-    """Return the blocks that other blocks need and that are missing."""
+    """Find missing blocks that other blocks require."""
     if config.matcher is None and config.dense_matcher is None:
         return [SettingProblem(("matcher",), "a matcher or a dense_matcher is needed")]
     problems = []
@@ -349,9 +354,10 @@ def _missing_blocks(config: Config) -> list[SettingProblem]:
 
 
 def combination_problems(config: Config, registry: Registry) -> list[SettingProblem]:
-    """Find blocks that are valid alone but do not fit together.
+    """Find provider blocks that are valid alone but incompatible with each other.
 
-    Unresolved blocks are ignored. The path of a problem starts with the block that should change.
+    Blocks with ``fallback:`` or ``same-network`` are ignored. The path of a problem starts with the
+    block that should change.
     """
     problems = []
     if (fast_pass := config.fast_pass_config()) is not None:
@@ -377,7 +383,7 @@ def combination_problems(config: Config, registry: Registry) -> list[SettingProb
 
 
 def _locate(layers: Sequence[_Layer], problem: SettingProblem) -> str:
-    """Return the problem with its place: the last layer with the longest prefix of its path."""
+    """Format a problem with file and line of the longest prefix of its path, last layer first."""
     for length in range(len(problem.path), 0, -1):
         path = problem.path[:length]
         for layer in reversed(layers):

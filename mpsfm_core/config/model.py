@@ -26,75 +26,78 @@ from mpsfm_core.support.format_versions import VERSION
 from mpsfm_core.support.yaml_text import write_yaml
 
 FORMAT = 1
-"""Format version of configuration files."""
+"""Version number of the format of configuration files."""
 
 
 class RuntimeOptions(Options):
     """Options of the computation: workers, device, cache, executor, error handling.
 
-    Only the seed changes what a run computes. Results of networks may differ by rounding between
-    devices and thread counts. Cached results stay valid for all devices.
+    Of these options, only the seed changes the results. Results of networks may differ by rounding
+    between devices and thread counts. Cached results are valid on all devices.
     """
 
     workers: int | None = Field(None, ge=1)
-    """Images or pairs that extraction and the dense stage process at the same time. More workers
-    are faster and need more memory. Null uses one per core, at most four in extraction."""
+    """Number of images or pairs that extraction and the dense stage process in parallel. More
+    workers are faster and need more memory. Null uses one worker per core, at most four in
+    extraction."""
     threads: int = expert(1, ge=1)
-    """Threads of a provider per worker. If ``workers`` is null, idle cores are added."""
+    """Number of threads of a provider per worker. If ``workers`` is null, idle cores are added."""
     seed: int = Field(0, ge=0)
     """Seed of every random choice: providers, verification, mapper, points of ``dense.ply``."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device of the providers; ``auto`` uses a GPU if there is one."""
+    """Device on which providers run; ``auto`` uses a GPU if one is available."""
     cache_dir: Path | None = None
-    """Folder of weights and extraction results; null uses the cache folder of the platform."""
+    """Folder of weights, extraction results and checkpoints; null uses the platform's cache
+    folder."""
     executor: str = "threads"
     """Where providers run: ``threads`` of this process, or the workers of an executor plugin
     (``dask``, ``ray``), which share ``cache_dir`` and the images."""
     executor_options: dict[str, Any] = expert({})
-    """Options of the executor plugin, such as ``address``."""
+    """Options of the executor plugin, such as ``address`` of a Dask scheduler."""
     on_error: Literal["fail", "skip"] = "fail"
-    """If a provider fails on an image or pair: ``fail`` ends the run, ``skip`` continues without
-    it. Failures of more than half of the images always end the run."""
+    """Reaction if a provider fails on an image or pair: ``fail`` ends the run, ``skip`` continues
+    without the image or pair. Failures of more than half of the images always end the run."""
     timeout_s: float | None = expert(1800.0, gt=0)
-    """Seconds that a provider may take per image or pair; null sets no limit."""
+    """Maximum seconds that a provider may take per image or pair; null sets no limit."""
     checkpoint_s: float | None = expert(10.0, ge=0)
-    """Minimum seconds between checkpoints of mapping. Null writes no checkpoints, of the dense
-    stage neither."""
+    """Minimum seconds between checkpoints of mapping. Null disables the checkpoints of mapping and
+    of the dense stage."""
     check_resources: bool = expert(True)
     """Use fewer workers if memory is short, and refuse a run that cannot fit into memory or onto
     the disk."""
     offline: bool = False
-    """Never download; missing weights are an error."""
+    """If true, never download weights; missing weights are an error."""
 
 
 class FastPass(Options):
-    """Inexpensive features and sparse matcher that run before ``features`` and ``matcher``.
+    """Inexpensive features and sparse matcher for a first matching and mapping pass.
 
-    Images that the fast pass constrains are not matched again with each other.
+    The blocks ``features`` and ``matcher`` then match only pairs with an image that has fewer than
+    ``min_points`` points.
     """
 
     features: ProviderConfig
     matcher: ProviderConfig
     min_points: int = expert(100, ge=1)
-    """Points with at least three observations that constrain an image. Raising it matches more
-    images again. [COLMAP init_min_num_inliers]"""
+    """Minimum number of points with at least three observations per image. Images with fewer points
+    are matched again; a larger value matches more images again. [COLMAP init_min_num_inliers]"""
     partners: int = expert(15, ge=1)
-    """``pairs.partners`` of the images that are matched again, if not all pairs are. Raising it
-    costs time. [tuned: benchmarks.pairs]"""
+    """Value of ``pairs.partners`` for images that are matched again, unless all pairs are matched.
+    A larger value costs time. [tuned: benchmarks.pairs]"""
 
 
 class Config(Options):
     """All settings of a run, except its images and its output folder."""
 
     description: str = ""
-    """One line for ``mpsfm config list``; not inherited."""
+    """Description of the configuration for ``mpsfm config list``; not inherited."""
     inputs: InputOptions = Field(default_factory=InputOptions)
     pairs: PairOptions = Field(default_factory=PairOptions)
     fast_pass: FastPass | None = None
     """First, inexpensive pass of matching and mapping. Null matches all pairs with ``matcher``."""
     features: ProviderConfig | None = None
     matcher: ProviderConfig | None = None
-    """Sparse matcher; needs ``features``."""
+    """Matcher of sparse features; requires the block ``features``."""
     dense_matcher: ProviderConfig | None = None
     """Detector-free matcher, instead of or in addition to the sparse matcher."""
     retrieval: ProviderConfig | None = None
@@ -102,9 +105,9 @@ class Config(Options):
     """Network that predicts depth for groups of images; needed by ``depth: {use: multiview}``."""
     depth: ProviderConfig
     normals: ProviderConfig
-    """Normals; ``use: same-network`` takes those that the depth network predicts."""
+    """Provider of normals; ``use: same-network`` uses the normals of the depth network."""
     masks: tuple[ProviderConfig, ...] = ()
-    """Mask providers. A pixel is used if all masks allow it."""
+    """Mask providers. A pixel is used if no mask excludes the pixel."""
     verification: VerificationOptions = Field(default_factory=VerificationOptions)
     adjustment: AdjustmentOptions = Field(default_factory=AdjustmentOptions)
     extraction: ExtractionOptions = Field(default_factory=ExtractionOptions)
@@ -116,7 +119,7 @@ class Config(Options):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Effects of the configuration files that their author may not expect."""
+        """Warnings about side effects of the configuration files, such as a dropped fast pass."""
         return self._warnings
 
     def with_warnings(self, warnings: tuple[str, ...]) -> Config:
@@ -138,7 +141,7 @@ class Config(Options):
             yield ("masks", index), "mask", block
 
     def replaced(self, path: SettingPath, block: ProviderConfig) -> Config:
-        """Return a copy with another block at a path of :meth:`provider_configs`."""
+        """Return a copy of the configuration with another provider block at a path."""
         name, *keys = path
         value: Any = block
         if name == "fast_pass" and self.fast_pass is not None:
@@ -156,10 +159,10 @@ class Config(Options):
 
     @property
     def has_second_pass(self) -> bool:
-        """True if ``features`` and ``matcher`` follow the fast pass.
+        """True if ``features`` and ``matcher`` run after the fast pass.
 
-        False if ``features`` is the provider of the fast pass, because a second pass would find
-        the same features again.
+        If ``features`` is the provider of the fast pass, a second pass would detect the same
+        features again and is skipped.
         """
         if self.fast_pass is None:
             return False
@@ -173,10 +176,10 @@ class Config(Options):
         return MapperOptions(**dict(self.mapping), seed=self.runtime.seed)
 
     def to_yaml(self, *, expert_settings: bool = True) -> str:
-        """Return the configuration as YAML with all defaults.
+        """Format the configuration as YAML with all defaults.
 
         Args:
-            expert_settings: False leaves out expert settings that have their default value.
+            expert_settings: If false, omit expert settings that have their default value.
         """
         values = self.model_dump(mode="json") if expert_settings else user_settings(self)
         return write_yaml({VERSION: FORMAT, **values})
@@ -191,7 +194,7 @@ PROVIDER_BLOCKS: dict[str, Kind] = {
     "depth": "depth",
     "normals": "normals",
 }
-"""Blocks with one provider and the kind of the provider."""
+"""Configuration blocks with one provider, and the kind of the provider."""
 
 BLOCKS = ("fast_pass", *PROVIDER_BLOCKS, "masks")
-"""Blocks that name providers; each block follows those that its resolution depends on."""
+"""Configuration blocks that name providers, in the order of provider resolution."""

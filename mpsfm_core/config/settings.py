@@ -9,15 +9,15 @@ from pydantic.fields import FieldInfo
 
 
 def is_expert(field: FieldInfo) -> bool:
-    """Check whether :func:`mpsfm_core.data.options.expert` declared a field."""
+    """Check whether an option is declared with :func:`mpsfm_core.data.options.expert`."""
     extra = field.json_schema_extra
     return isinstance(extra, dict) and extra.get("expert") is True
 
 
 def user_settings(options: BaseModel) -> dict[str, Any]:
-    """Return the settings as plain data, without expert settings that have their default value.
+    """Return settings as plain data; expert settings with default values are omitted.
 
-    Blocks that contain nothing else are left out.
+    Blocks that contain only such expert settings are omitted.
     """
     values = options.model_dump(mode="json")
     settings = {}
@@ -35,7 +35,7 @@ def user_settings(options: BaseModel) -> dict[str, Any]:
 
 
 def count_user_settings(options: type[BaseModel]) -> int:
-    """Count the settings of an options class and its nested classes that are not expert."""
+    """Count the non-expert settings of an options class and its nested options classes."""
     count = 0
     for field in options.model_fields.values():
         if is_expert(field):

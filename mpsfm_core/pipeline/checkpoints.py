@@ -1,8 +1,8 @@
 """Checkpoints of mapping and of the dense stage in the cache folder.
 
-Mapping stores its state in one file per problem, the dense stage one file per image. A checkpoint
-is valid for the same problem, options, code and numerical libraries, so a resumed run gives the
-same result as an uninterrupted run.
+Mapping writes one checkpoint file per mapping problem, the dense stage one file per image. A
+checkpoint is only used for the same problem, options, code and numerical libraries. A resumed run
+therefore gives the same result as an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from mpsfm_core.support.npz import read_npz
 _log = logging.getLogger(__name__)
 
 FORMAT = 1
-"""Format version of checkpoints; raising it invalidates all files."""
+"""Version of the checkpoint format; raising the number invalidates all checkpoints."""
 
 _HEADER = "header"
 _MAX_SAVING_RATIO = 0.02
-"""Share of the run time that saving may take."""
+"""Maximum ratio of the time for writing checkpoints to the run time."""
 _MAX_AGE_S = 30 * 24 * 3600.0
-"""Age at which unused checkpoints are deleted."""
+"""Age above which unused checkpoints are deleted, in seconds (30 days)."""
 _DISK_ERROR = "no checkpoints from now on: %s"
 _LIBRARIES = ("numpy", "scipy", "numba", "pycolmap", "cv2")
 _NUMERICS = (
@@ -58,16 +58,16 @@ _NUMERICS = (
 
 
 class MappingCheckpoints:
-    """Checkpoints of the mapper for one problem.
+    """Checkpoint of the mapper for one mapping problem.
 
     Implements :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`.
 
     Args:
         cache_dir: Cache folder; None uses the cache folder of the platform.
-        problem: The mapping problem.
+        problem: Input of the mapper.
         options: Options of the mapper.
-        stages: Receives notices.
-        every_s: Minimum seconds between checkpoints; more if writing is slow.
+        stages: Receiver of messages to the user.
+        every_s: Minimum seconds between checkpoints; the interval is extended if writing is slow.
     """
 
     def __init__(
@@ -87,12 +87,12 @@ class MappingCheckpoints:
         self._failed = False
 
     def forget(self) -> None:
-        """Delete the checkpoint."""
+        """Delete the checkpoint file."""
         with suppress(OSError):
             self._path.unlink()
 
     def load(self) -> CheckpointArrays | None:
-        """Load the checkpoint; None if it is missing or invalid."""
+        """Load the mapper state from the checkpoint; None if missing or invalid."""
         self._clear_up()
         if not self._path.is_file():
             return None
@@ -114,17 +114,17 @@ class MappingCheckpoints:
         return arrays
 
     def unreadable(self, reason: str) -> None:
-        """Tell the user why the checkpoint is not used."""
+        """Report to the user why the checkpoint is not used."""
         self._stages.notice(
             f"the checkpoint of this mapping is not used: {reason}; mapping starts again"
         )
 
     def due(self) -> bool:
-        """Check whether it is time for the next checkpoint."""
+        """Check whether the next checkpoint should be written."""
         return not self._failed and time.monotonic() - self._last >= self._wait_s
 
     def save(self, state: CheckpointArrays, registered: int) -> None:
-        """Write a checkpoint; after a disk error, warn once and write no more."""
+        """Write a checkpoint; after a disk error, warn once and disable checkpoints."""
         if self._failed:
             return
         started = time.monotonic()
@@ -163,7 +163,7 @@ class DenseCheckpoints:
 
     Args:
         cache_dir: Cache folder; None uses the cache folder of the platform.
-        reconstruction: The reconstruction.
+        reconstruction: Reconstruction whose depth maps the dense stage computes.
         image_keys: Content keys of all images.
         options: Options of the dense stage.
     """
@@ -186,11 +186,11 @@ class DenseCheckpoints:
         self._failed, self._warning_lock = False, Lock()
 
     def load(self, name: str) -> StereoDepth | None:
-        """Load the depth of an image; None if it is missing."""
+        """Load the stereo depth of an image; None if not stored."""
         return self._cache.load("dense", self._key(name), StereoDepth)
 
     def save(self, name: str, depth: StereoDepth) -> None:
-        """Store the depth of an image; after a disk error, warn once and store no more."""
+        """Store the stereo depth of an image; after a disk error, warn once and disable."""
         if self._failed:
             return
         try:
@@ -202,7 +202,7 @@ class DenseCheckpoints:
                 self._failed = True
 
     def forget(self) -> None:
-        """Delete the checkpoints of all images."""
+        """Delete the stored depth of all images."""
         for name in self._names:
             self._cache.forget("dense", self._key(name))
 
@@ -211,10 +211,10 @@ class DenseCheckpoints:
 
 
 def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], CheckpointArrays]:
-    """Read header and state of a checkpoint.
+    """Read header and mapper state of a checkpoint file.
 
     Raises:
-        DataError: the file is damaged.
+        DataError: the checkpoint file is damaged.
     """
     try:
         arrays = read_npz(path)
@@ -229,7 +229,7 @@ def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], CheckpointArrays]:
 
 @functools.cache
 def code_key() -> str:
-    """Return a hash of all code and libraries that determine the result bit for bit."""
+    """Return a hash of the code and library versions that determine the exact result."""
     package = Path(__file__).parents[1]
     sha256 = hashlib.sha256()
     for name in _NUMERICS:

@@ -1,4 +1,4 @@
-"""Dense depth and meshes of finished models (``mpsfm dense`` and ``mpsfm mesh``)."""
+"""Dense depth maps and meshes of existing models (``mpsfm dense`` and ``mpsfm mesh``)."""
 
 from __future__ import annotations
 
@@ -42,24 +42,24 @@ def densify_model(
     options: DenseOptions | None = None,
     workers: int | None = None,
 ) -> DenseReport:
-    """Compute depth maps of a posed model by multi-view stereo, and write them.
+    """Compute and write depth maps of a posed model by multi-view stereo.
 
-    The search starts from the maps in ``model/depth`` of a result folder, or else from the depth
-    range of the points that an image observes. Images without either are left out.
+    The depth search of an image starts from its map in ``model/depth`` of a result folder, or else
+    from the depth range of its observed points. Images with neither are omitted.
 
     Args:
         model: COLMAP model, ``transforms.json`` or result folder.
         images: Folder of the original photos.
-        output: Folder to write: the depth maps, ``dense.ply`` and the model.
+        output: Output folder for the depth maps, ``dense.ply`` and the model.
         options: Options of the dense stage.
-        workers: Number of threads; None means one per core.
+        workers: Number of threads; None uses one thread per core.
 
     Returns:
-        The report of the dense stage.
+        Report of the dense stage.
 
     Raises:
-        InputError: model or photos cannot be read, names do not match, the model has no points, or
-            ``output`` cannot be written.
+        InputError: model or photos cannot be read, image names do not match, the model has no
+            points, or ``output`` cannot be written.
     """
     with lock_output_folder(Path(output)), limit_threads(workers):
         return _densify_model(Path(model), Path(images), Path(output), options)
@@ -106,7 +106,7 @@ def _densify_model(
 def _reconstruction_of_maps(
     photos: ImageSet, poses: Sequence[Pose], depths: Sequence[DepthPrior | None]
 ) -> Reconstruction:
-    """Return a reconstruction without points of the images that have a depth map."""
+    """Build a reconstruction without points from the posed images that have a depth map."""
     none = np.zeros(0, np.int64)
     found = enumerate(zip(photos, poses, depths, strict=True))
     images = tuple(
@@ -118,13 +118,13 @@ def _reconstruction_of_maps(
 
 
 def _view_of(photos: ImageSet) -> Callable[[str], View]:
-    """Return a function that loads the view of an image name."""
+    """Return a function that loads the undistorted view of an image by name."""
     rows = {name: row for row, name in enumerate(photos.names)}
     return lambda name: photos.view(rows[name])
 
 
 def _point_depths(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Float64:
-    """Return the depths (n,) of the points that an image observes."""
+    """Return the camera-frame depths (n,) of the 3D points that an image observes."""
     seen = [point.point3D_id for point in image.points2D if point.has_point3D()]
     seen = [number for number in seen if model.exists_point3D(number)]
     if not seen or not image.has_pose:
@@ -141,19 +141,19 @@ def mesh_model(
 ) -> TriangleMesh:
     """Mesh the depth maps of a result folder into its ``mesh.ply`` and ``mesh.glb``.
 
-    The PLY file has the axes of the model. The GLB file has gravity down.
+    The PLY file has the frame of the model. The GLB file is rotated so that gravity points down.
 
     Args:
         folder: Result folder with depth maps.
-        photos: Folder of the original photos; default: where the run found them.
-        options: Options of the mesh.
+        photos: Folder of the original photos; default: the folder recorded by the run.
+        options: Options of meshing.
 
     Returns:
         The mesh in the frame of the model.
 
     Raises:
-        InputError: folder or photos cannot be read, there are no depth maps, they show no surface,
-            or the libraries for meshes are not installed.
+        InputError: folder or photos cannot be read, depth maps are missing or give no surface, or
+            the libraries for meshes are not installed.
     """
     with lock_output_folder(Path(folder)):
         source = ExportSource.read(Path(folder), None if photos is None else Path(photos))

@@ -1,8 +1,9 @@
 """Precompile the numba kernels of extraction, mapping and the dense stage.
 
-A run without compiled kernels starts the compilation next to its extraction, and waits for it
-before mapping. ``python -m mpsfm_core.pipeline.precompile`` compiles at installation. Two processes
-reconstruct a small scene and share the kernels on disk; each starts with other kernels.
+If kernels are not compiled yet, a run compiles them in parallel to extraction, and waits for the
+end of compilation before mapping. ``python -m mpsfm_core.pipeline.precompile`` compiles all kernels
+at installation. Two processes reconstruct a small synthetic scene and share the kernels on disk.
+Each process starts with other kernels.
 """
 
 from __future__ import annotations
@@ -31,27 +32,27 @@ from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 _FIRST_KERNELS = ("bundles", "depth")
-"""Kernels that each of the two processes compiles first."""
+"""Kernels that the first and the second compilation process compile first."""
 _PACKAGES = ("geometry", "providers/builtin", "extraction", "optimize", "mapping", "dense")
 _SOURCES = tuple(f"{package}/**/*.py" for package in _PACKAGES)
 _CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
 class Compilation(NamedTuple):
-    """Compilation in background processes."""
+    """Compilation of numba kernels in background processes."""
 
     processes: tuple[subprocess.Popen[bytes], ...]
     stamp: Path
-    """File that marks a finished compilation."""
+    """File whose existence marks a finished compilation."""
 
     def wait(self) -> None:
-        """Wait for the end. After a failure, the stages compile their kernels themselves."""
+        """Wait for the end of compilation; after a failure, kernels compile at first use."""
         codes = [process.wait() for process in self.processes]
         if not any(codes):
             self.stamp.touch()
 
     def stop(self) -> None:
-        """End processes that still run."""
+        """End the compilation processes that are still running."""
         for process in self.processes:
             if process.poll() is None:
                 process.kill()
@@ -59,10 +60,11 @@ class Compilation(NamedTuple):
 
 
 def start_compilation() -> Compilation | None:
-    """Start compiling in the background.
+    """Start compiling the kernels in background processes.
 
     Returns:
-        The compilation; None if the kernels are compiled already, or cannot be stored on disk.
+        The running compilation; None if the kernels are compiled already, or cannot be stored on
+        disk.
     """
     stamp = _stamp_path()
     if stamp is None or stamp.exists():
@@ -76,7 +78,7 @@ def start_compilation() -> Compilation | None:
 
 
 def compile_kernels(first: str) -> None:
-    """Compile all kernels by reconstructing a small scene.
+    """Compile all kernels by reconstructing a small synthetic scene.
 
     Args:
         first: ``bundles`` starts with bundle adjustment, ``depth`` with depth integration.
@@ -102,7 +104,7 @@ def compile_kernels(first: str) -> None:
 
 
 def _stamp_path() -> Path | None:
-    """Return the stamp file next to the kernels; its name hashes all sources and versions."""
+    """Return the stamp file next to the kernels, named by a hash of sources and versions."""
     folder = update_points.stats.cache_path  # type: ignore[attr-defined]
     if folder is None:
         return None

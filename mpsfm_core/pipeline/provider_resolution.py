@@ -1,8 +1,9 @@
 """Resolution of providers, weights and files before the first image is decoded.
 
-A block with ``fallback`` or ``same-network`` gets the first provider that is available on this
-machine. Available means: the plugin is installed, it accepts the options, and its weights are
-present or can be downloaded. If a download fails, the next provider is tried.
+A configuration block with ``fallback`` or ``same-network`` gets the first provider that is
+available on this machine. A provider is available if its plugin is installed and accepts the
+options, and if its weights are present or can be downloaded. If a download fails, the next provider
+is tried.
 """
 
 from __future__ import annotations
@@ -28,18 +29,18 @@ _MEGABYTE = 1_000_000
 
 @dataclass(frozen=True)
 class ProviderChoice:
-    """The provider of one block, and why it was chosen."""
+    """Provider chosen for one configuration block, with the reason of the choice."""
 
     block: str
-    """Name of the block, such as ``depth`` or ``masks.0``."""
+    """Name of the configuration block, such as ``depth`` or ``masks.0``."""
     provider: ProviderSpec
     origin: str
     """Distribution and version of the provider."""
     reason: ChoiceReason
     passed_over: Mapping[str, Reason] = field(default_factory=dict)
-    """Preferred providers that are unavailable, with the reason."""
+    """Preferred but unavailable providers by name, with the reason."""
     to_fetch: tuple[WeightsFile, ...] = ()
-    """Weights that are not on this machine yet; only in a preview."""
+    """Weights files to download; empty after :func:`resolve_providers`."""
 
     def __str__(self) -> str:
         spec = self.provider
@@ -59,11 +60,11 @@ class ProviderChoice:
 
 @dataclass(frozen=True)
 class ProviderResolution:
-    """A configuration with one provider per block, and the choice of each."""
+    """Configuration with one provider per block, and the reasons of the choices."""
 
     config: Config
     choices: tuple[ProviderChoice, ...]
-    """One choice per provider, in the order of :meth:`Config.provider_configs`."""
+    """One entry per provider block, in the order of :meth:`Config.provider_configs`."""
 
 
 def resolve_providers(
@@ -72,23 +73,23 @@ def resolve_providers(
     stages: Stages | None = None,
     blocks: Collection[str] = BLOCKS,
 ) -> ProviderResolution:
-    """Choose the provider of every block, and download its weights.
+    """Choose the provider of every configuration block, and download weights.
 
-    Errors without remedy are found before anything is downloaded.
+    Blocks for which no provider can be available raise an error before the first download.
 
     Args:
-        config: The configuration.
-        registry: The installed providers.
-        stages: Receives choices and downloads.
-        blocks: Blocks to resolve; other blocks stay unchanged.
+        config: Configuration of the run.
+        registry: Installed providers.
+        stages: Receiver of messages about choices and downloads.
+        blocks: Configuration blocks to resolve; other blocks stay unchanged.
 
     Returns:
-        The resolved configuration and the choices.
+        The configuration with one provider per block, and the choices.
 
     Raises:
-        ConfigError: a provider, or a file or folder that its options name, is missing; or the
-            providers do not fit together.
-        WeightsError: weights are missing, and there is no fallback.
+        ConfigError: a provider or a file named in its options is missing, or the providers are
+            incompatible.
+        WeightsError: weights are missing, and no fallback is available.
     """
     stages = stages or Stages(registry)
     preview_providers(config, registry, blocks)
@@ -111,7 +112,7 @@ def preview_providers(
 ) -> ProviderResolution:
     """Resolve providers as if every download succeeded; download nothing.
 
-    Takes the arguments and raises the errors of :func:`resolve_providers`.
+    Arguments and errors are those of :func:`resolve_providers`.
     """
     runtime = config.runtime
     store = WeightStore(runtime.cache_dir, True if runtime.offline else None)
@@ -132,13 +133,13 @@ def describe_file(file: WeightsFile) -> str:
 
 
 class _ProviderSearch:
-    """Searches the first available provider of each block.
+    """Search for the first available provider of each configuration block.
 
     Args:
-        registry: The installed providers.
+        registry: Installed providers.
         require_weights: Makes a weights file available, or raises WeightsError. May add a file
             that must be downloaded to ``absent``.
-        absent: Weights of the current candidate that are not on this machine.
+        absent: Weights of the current candidate provider that must be downloaded.
     """
 
     def __init__(
@@ -189,7 +190,7 @@ class _ProviderSearch:
     def _prepare(
         self, config: Config, path: SettingPath, kind: Kind, block: ProviderConfig, name: str
     ) -> ProviderConfig:
-        """Return the block with one provider, after making its files and weights available."""
+        """Return a block with one provider, after making files and weights available."""
         candidate = block.model_copy(update={"use": name, "fallback": ()})
         if name == SAME_NETWORK:
             candidate = self._same_network(config.depth, candidate)
@@ -208,7 +209,7 @@ class _ProviderSearch:
         return block.model_copy(update={"use": depth.use, "options": depth.options})
 
     def _check_fit(self, config: Config, path: SettingPath) -> None:
-        """Raise SettingsError if a matcher does not fit the resolved features."""
+        """Raise SettingsError if a matcher is incompatible with the resolved features."""
         problems = [p for p in combination_problems(config, self._registry) if p.path[0] == path[0]]
         if problems:
             raise SettingsError(tuple(problems))
@@ -224,7 +225,7 @@ class _ProviderSearch:
 
 
 def _reason_of(error: InputError) -> Reason:
-    """Return the typed reason why a provider cannot be used."""
+    """Convert an error to the typed reason why a provider is unavailable."""
     code = ProviderReason.UNAVAILABLE
     if isinstance(error, WeightsError):
         code = ProviderReason.NO_WEIGHTS
@@ -234,7 +235,7 @@ def _reason_of(error: InputError) -> Reason:
 
 
 class _Downloads:
-    """Announces each download with its size, and reports its progress in megabytes."""
+    """Reports the start and the progress of weight downloads, in megabytes."""
 
     def __init__(self, stages: Stages) -> None:
         self._stages = stages
@@ -242,7 +243,7 @@ class _Downloads:
 
     @contextmanager
     def announced(self, file: WeightsFile, store: WeightStore) -> Iterator[None]:
-        """Announce a download inside a ``with`` block, if the file must be downloaded."""
+        """Report the download of a weights file in a ``with`` block, if a download is needed."""
         if store.offline or not is_remote(file.uri) or store.locate(file.uri) is not None:
             yield
             return
@@ -252,7 +253,7 @@ class _Downloads:
             yield
 
     def progress(self, name: str, done: int, total: int | None) -> None:
-        """Report progress; implements :data:`mpsfm_core.providers.weights.Progress`."""
+        """Report download progress; implements :data:`mpsfm_core.providers.weights.Progress`."""
         self._stages.stage_progress(self._stage, _megabytes(done), _megabytes(total or done))
 
 
@@ -261,7 +262,7 @@ def _megabytes(size: int) -> int:
 
 
 def _paths(options: Options | None, key: SettingPath = ()) -> Iterator[tuple[SettingPath, Path]]:
-    """Yield the files and folders that options name, with their setting paths."""
+    """Yield all files and folders in provider options, with their setting paths."""
     for name, value in options or ():
         if isinstance(value, Path):
             yield (*key, name), value

@@ -1,9 +1,9 @@
-"""Memory and disk of a run: estimated before decoding, measured afterwards.
+"""Memory and disk space of a run: estimated before images are decoded, measured at the end.
 
-The memory of a run is a fixed part, the caches, and the largest of its three memory-hungry stages:
-extraction, dense depth and results. Constants are bytes per pixel of arrays that the code keeps,
-or were read from the peak resident memory of a stage (CPython 3.11 on Linux,
-[tuned: benchmarks.resources]). The estimate assumes one component, which needs most memory.
+The memory estimate is the sum of a fixed part, the caches, and the largest of three stages:
+extraction, dense depth and results. Constants are bytes per pixel of arrays in memory, or derived
+from the peak resident memory of a stage (CPython 3.11 on Linux, [tuned: benchmarks.resources]). The
+estimate assumes a single component, which needs most memory.
 """
 
 from __future__ import annotations
@@ -35,63 +35,63 @@ from mpsfm_core.support.disk_arrays import MEMORY_LIMIT
 from mpsfm_core.support.threads import count_cores
 
 TOLERANCE = 1.3
-"""Largest factor between an estimate and the measured value."""
+"""Maximum factor between estimated and measured memory or disk space."""
 
 _MB = float(1 << 20)
 _PROGRAM_MB = 320.0
-"""Interpreter, libraries and compiled kernels."""
+"""Memory of interpreter, libraries and compiled kernels, MB."""
 _TORCH_MB = 250.0
-"""Additional memory if a provider needs torch."""
+"""Additional memory if a provider needs torch, MB."""
 _VIEW_BYTES = 3.0
-"""A pixel of a cached view: RGB."""
+"""Bytes per pixel of a cached RGB view."""
 _GRAY_BYTES = 4.0
-"""A pixel of a cached gray image of keypoint adjustment: float32."""
+"""Bytes per pixel of a cached float32 gray image of keypoint adjustment."""
 _DECODE_BYTES = 9.0
-"""A pixel of a view while it is decoded: file, RGB and undistorted copies."""
+"""Bytes per pixel of a view during decoding: file, RGB and undistorted copies."""
 _DETECTOR_BYTES = 280.0
-"""A pixel that a detector sees: SIFT's Gaussian and gradient pyramids of the doubled image."""
+"""Bytes per pixel of a detector's input: SIFT's pyramids of the upsampled image."""
 _NETWORK_RATIO = 2.0
-"""Memory of a loaded network over the size of its weights file."""
+"""Ratio of a loaded network's memory to the size of its weights file."""
 _ACTIVATION_RATIO, _MAX_ACTIVATION_MB = 3.0, 320.0
-"""Activations of a network over the size of its weights file, and their limit."""
+"""Ratio of a network's activations to the size of its weights file, and the maximum in MB."""
 _PRIOR_BYTES = 106.0
-"""A pixel of the prior maps: depth and normals with variances, and what the mapper adds."""
+"""Bytes per pixel of depth, normals and variances in the mapper, with derived maps."""
 _DENSE_WORKER_BYTES = 320.0
-"""A pixel of a view in stereo matching: the cost volume of 11 labels and its aggregation."""
+"""Bytes per pixel of stereo matching: cost volume of 11 labels and its aggregation."""
 _DENSE_MAP_BYTES = 20.0
-"""A pixel of a dense depth map with its variance and support."""
+"""Bytes per pixel of a dense depth map with variance and support."""
 _FUSION_BYTES = 4.6
-"""A pixel of a depth map while maps are fused into a point cloud."""
+"""Bytes per pixel of a depth map during fusion into a point cloud."""
 _POINT_BYTES = 120.0
-"""A point of the cloud: once in arrays, once in parts, once as written."""
+"""Bytes per point of the dense cloud, including two temporary copies."""
 _POINT_RATIO = 0.4
-"""Pixels of the depth maps that become points of the cloud."""
+"""Ratio of points of the dense cloud to pixels of the depth maps."""
 
 _KEYPOINT_BYTES = 544.0
-"""A keypoint with position, scale and 128 float32 values."""
+"""Bytes per cached keypoint: position, scale and 128 float32 descriptor values."""
 _PIXELS_PER_KEYPOINT = 60.0
-"""Pixels of an image per SIFT keypoint, at least."""
+"""Minimum number of image pixels per SIFT keypoint."""
 _DEFAULT_MAX_KEYPOINTS = 4096
-"""Keypoints of an image if the options of the features set no limit."""
+"""Assumed keypoints per image if the feature options set no limit."""
 _CACHED_PRIOR_MB = 0.27
-"""Cached depth and normals of an image."""
+"""Disk space of the cached depth and normals of an image, MB."""
 _CACHED_PAIR_BYTES = 6_000.0
-"""Cached matches and two-view geometry of a pair."""
+"""Disk space of the cached matches and two-view geometry of a pair, bytes."""
 _CACHED_DENSE_BYTES = 12.0
-"""A pixel of a dense checkpoint."""
+"""Disk space per pixel of a checkpoint of the dense stage, bytes."""
 _WRITTEN_POINT_BYTES = 32.0
 _WRITTEN_MAP_BYTES = 7.3
-"""A pixel of a written depth map, compressed."""
+"""Disk space per pixel of a compressed depth map, bytes."""
 _REPORT_MAP_BYTES = 8.0
-"""A pixel of a prior that the report shows, compressed."""
+"""Disk space per pixel of a prior map in the report page, compressed, bytes."""
 _REPORT_MB, _REPORT_IMAGE_MB = 2.0, 0.22
-"""The report page, and its pictures of one image."""
+"""Disk space of the report page without images, and per image, MB."""
 _SAMPLING_PERIOD_S = 1.0
 
 
 @dataclass(frozen=True)
 class ResourceEstimate:
-    """Peak memory of a run with its child processes, and disk space of its cache and results."""
+    """Estimated peak memory (with child processes) and disk space of a run, in MB."""
 
     memory_mb: float
     cache_mb: float
@@ -111,14 +111,14 @@ def estimate_resources(
     networks: Sequence[int],
     workers: int | None = None,
 ) -> ResourceEstimate:
-    """Estimate memory and disk of a run.
+    """Estimate memory and disk space of a run.
 
     Args:
         sizes: (width, height) of the undistorted views.
-        config: The configuration, with resolved providers.
+        config: Configuration with resolved providers.
         providers: Specifications of the chosen providers.
         networks: Size in bytes of the weights of each network, see :func:`measure_weights`.
-        workers: Number of worker threads; default: those of ``config.runtime``.
+        workers: Number of worker threads; default: the number in ``config.runtime``.
     """
     memory = _PROGRAM_MB * _MB + _TORCH_MB * _MB * any("torch" in p.requires for p in providers)
     memory += _cached_bytes(sizes, config)
@@ -135,12 +135,12 @@ def estimate_resources(
 def reduce_workers(
     estimate: Callable[[int], ResourceEstimate], workers: int, free_mb: float
 ) -> int:
-    """Return the largest number of workers whose estimate fits into free memory, at least one.
+    """Return the largest number of workers (at least 1) that fits into free memory.
 
     Args:
-        estimate: Estimates the run for a number of workers.
-        workers: Largest number of workers.
-        free_mb: Free memory.
+        estimate: Function that estimates the resources for a number of workers.
+        workers: Maximum number of workers.
+        free_mb: Free memory, MB.
     """
     counts = range(workers, 1, -1)
     return next((count for count in counts if estimate(count).memory_mb <= free_mb), 1)
@@ -149,7 +149,7 @@ def reduce_workers(
 def measure_weights(file: WeightsFile, store: WeightStore) -> int:
     """Return the size of a network's weights in bytes, including files of external data.
 
-    A file that is not on this machine has the size that its publisher declares, or 0.
+    For a missing file, the size is the one declared by the plugin, or 0.
     """
     path = store.locate(file.uri)
     if path is None:
@@ -158,7 +158,7 @@ def measure_weights(file: WeightsFile, store: WeightStore) -> int:
 
 
 def find_shortages(estimate: ResourceEstimate, cache: Path, output: Path | None) -> list[str]:
-    """Compare an estimate with this machine; return one warning per resource that is short.
+    """Compare an estimate with free memory and disk; return a warning per shortage.
 
     Raises:
         InputError: the run cannot fit: the estimate exceeds all memory of the machine or container,
@@ -193,7 +193,7 @@ def measure_memory(groups: ControlGroups | None = None) -> tuple[float, float]:
     """Return total and free memory in MB that this process may use.
 
     Args:
-        groups: Source of the limits of containers; default: the control groups of this process.
+        groups: Control groups with memory limits; default: those of this process.
     """
     machine = psutil.virtual_memory()
     limits = (groups or ControlGroups()).memory_limits()
@@ -210,7 +210,7 @@ class ChildMemoryMonitor:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Sample the memory once per second inside a ``with`` block."""
+        """Sample the memory of child processes once per second inside a ``with`` block."""
         ended = threading.Event()
         thread = threading.Thread(target=self._sample_until, args=(ended,), name="mpsfm memory")
         thread.start()
@@ -237,7 +237,7 @@ def measure_folder_mb(folder: Path) -> float:
 
 
 def _cached_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    """Estimate the in-memory caches of views, features and gray images."""
+    """Estimate the bytes of the in-memory caches of views, features and gray images."""
     views = min(CACHED_VIEW_BYTES, _VIEW_BYTES * _num_pixels(sizes))
     features = min(CACHED_FEATURE_BYTES, _feature_bytes(sizes, config))
     gray = 0.0
@@ -250,7 +250,7 @@ def _cached_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
 def _extraction_bytes(
     sizes: Sequence[tuple[int, int]], config: Config, networks: Sequence[int], workers: int
 ) -> float:
-    """Estimate what the workers of extraction hold: a decoding, a detector or the networks."""
+    """Estimate the bytes of extraction workers: decoding, a detector or the networks."""
     decoding = _DECODE_BYTES * max(width * height for width, height in sizes)
     detector = _DETECTOR_BYTES * max(_detection_pixels(size, config) for size in sizes)
     limit = _MAX_ACTIVATION_MB * _MB
@@ -259,7 +259,7 @@ def _extraction_bytes(
 
 
 def _dense_bytes(sizes: Sequence[tuple[int, int]], config: Config, workers: int) -> float:
-    """Estimate what the dense stage holds: all maps, and a cost volume per worker."""
+    """Estimate the bytes of the dense stage: all maps, and a cost volume per worker."""
     if not config.dense.enabled:
         return _PRIOR_BYTES * _num_pixels(_prior_grids(sizes, config))
     grids = _final_grids(sizes, config)
@@ -268,13 +268,13 @@ def _dense_bytes(sizes: Sequence[tuple[int, int]], config: Config, workers: int)
 
 
 def _result_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    """Estimate what the results hold: all maps, and the points of the cloud."""
+    """Estimate the bytes of the results stage: all maps, and the points of the cloud."""
     fusion = _FUSION_BYTES * _num_pixels(_final_grids(sizes, config))
     return _map_bytes(sizes, config) + fusion + _POINT_BYTES * _num_points(sizes, config)
 
 
 def _map_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    """Estimate the maps that stay in memory from mapping to the results."""
+    """Estimate the bytes of the maps in memory from mapping to the results."""
     priors = _PRIOR_BYTES * _num_pixels(_prior_grids(sizes, config))
     if not config.dense.enabled:
         return priors
@@ -328,7 +328,7 @@ def _feature_configs(config: Config) -> list[ProviderConfig]:
 
 
 def _detection_pixels(size: tuple[int, int], config: Config) -> float:
-    """Return the pixels of the largest image that a feature detector gets of a view."""
+    """Return the number of pixels of the largest image that a detector processes."""
     pixels = 0.0
     for block in _feature_configs(config):
         side = block.options.get("resize") or max(size)
@@ -338,7 +338,7 @@ def _detection_pixels(size: tuple[int, int], config: Config) -> float:
 
 
 def _feature_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    """Estimate the features of all images, without a limit of the cache."""
+    """Estimate the bytes of the features of all images, without a cache limit."""
     limits = [
         int(block.options.get("max_keypoints") or _DEFAULT_MAX_KEYPOINTS)
         for block in _feature_configs(config)
@@ -350,7 +350,7 @@ def _feature_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
 
 
 def _max_pairs(num_images: int, config: Config) -> int:
-    """Return the largest number of pairs that are matched."""
+    """Return the maximum number of pairs that pair selection can give."""
     pairs = config.pairs
     partners = {
         "exhaustive": num_images,
@@ -370,6 +370,6 @@ def _same_disk(a: Path, b: Path) -> bool:
 
 
 def _nearest_existing(folder: Path) -> Path:
-    """Return the folder, or its nearest ancestor that exists."""
+    """Return the folder, or its nearest existing ancestor."""
     folder = folder.resolve()
     return next(path for path in (folder, *folder.parents) if path.exists())

@@ -1,4 +1,4 @@
-"""Run a reconstruction from a folder of photos to a folder of results."""
+"""Run all stages of a reconstruction, from a folder of photos to a result folder."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class ReconstructionResult:
     summary: dict[str, Any]
     """Content of ``summary.json``."""
     output: Path | None
-    """Result folder, None if nothing was written."""
+    """Result folder; None for a run without output folder."""
 
 
 def reconstruct(
@@ -117,7 +117,7 @@ def reconstruct(
 
 @dataclass(frozen=True)
 class _Source:
-    """Files that a run reads."""
+    """Input files of a run."""
 
     images: Path
     """Folder of photos, or a video."""
@@ -125,11 +125,11 @@ class _Source:
     image_list: Path | None
     poses: Path | None
     matches: tuple[Path, ...]
-    """A COLMAP database, or the features and matches files of hloc; empty: run the matchers."""
+    """COLMAP database, or features and matches files of hloc; empty to run the matchers."""
 
 
 class _Run:
-    """One reconstruction; :meth:`execute` names its stages in the order of the data."""
+    """State of one reconstruction run; :meth:`execute` runs its stages in order."""
 
     def __init__(
         self,
@@ -176,7 +176,7 @@ class _Run:
             yield
 
     def execute(self) -> ReconstructionResult:
-        """Run all stages and return the result."""
+        """Run all stages of the reconstruction and return the result."""
         self._resolve_providers()
         self._extract_video_frames()
         self._start_compilation()
@@ -198,7 +198,7 @@ class _Run:
         return result
 
     def _resolve_providers(self) -> None:
-        """Choose providers and fetch weights before any image is decoded."""
+        """Choose providers and download weights before any image is decoded."""
         if not is_video(self._source.images):
             find_images(self._source.images)  # a missing folder must not cause downloads
         with self._stages.stage("providers"):
@@ -219,7 +219,7 @@ class _Run:
             )
 
     def _extract_video_frames(self) -> None:
-        """Write the keyframes of a video into the output folder, and use them as images."""
+        """Write keyframes of a video to the output folder, and use the keyframes as images."""
         video = self._source.images
         if not is_video(video):
             return
@@ -231,7 +231,7 @@ class _Run:
             )
 
     def _load_inputs(self) -> ImageSet:
-        """Read headers, intrinsics, poses and imported matches; check memory and disk."""
+        """Read image headers, intrinsics, poses and imported matches; check memory and disk."""
         source = self._source
         with self._stages.stage("inputs"):
             images = load_images(
@@ -249,7 +249,7 @@ class _Run:
         return images
 
     def _extract(self, images: ImageSet) -> tuple[ImageSet, Extraction]:
-        """Run all providers; with a fast pass, its features and matcher."""
+        """Run the providers; if configured, with features and matcher of the fast pass."""
         with self._stages.stage("extraction"):
             images = estimate_focal_lengths(images, self._config, self._registry, self._stages)
             config = self._config.fast_pass_config() or self._config
@@ -257,7 +257,7 @@ class _Run:
         return images, extraction
 
     def _start_compilation(self) -> None:
-        """Compile the kernels of mapping next to extraction, if a core is free."""
+        """Compile the numba kernels in parallel to extraction, if a core is free."""
         if thread_limit() > 1:
             self._compilation = precompile.start_compilation()
 
@@ -267,7 +267,7 @@ class _Run:
                 self._compilation.wait()
 
     def _stop_compilation(self) -> None:
-        """End the compilation of a run that failed before mapping."""
+        """End the kernel compilation of a run that failed before mapping."""
         if self._compilation is not None:
             self._compilation.stop()
 
@@ -281,7 +281,7 @@ class _Run:
     def _run_second_pass(
         self, images: ImageSet, extraction: Extraction, mapping: MappingResult
     ) -> tuple[Extraction, MappingResult]:
-        """Match the images that the fast pass does not constrain, and map again from seed poses."""
+        """Match images with too few points after the fast pass, and map again from seed poses."""
         config = self._config
         assert config.fast_pass is not None
         seeds = select_seed_images(mapping, config.fast_pass.min_points)
@@ -303,7 +303,7 @@ class _Run:
     def _map_from_seeds(
         self, extraction: Extraction, seeds: list[RegisteredImage]
     ) -> MappingResult:
-        """Map again from the poses of the fast pass; poses that the user fixed take precedence."""
+        """Map again from the fast pass's poses; poses that the user fixed take precedence."""
         problem = extraction.problem.with_poses(self._known_poses)
         options = self._config.mapper_options()
         if not self._known_poses:
@@ -313,7 +313,7 @@ class _Run:
         return self._map(problem, options)
 
     def _georeference(self, images: ImageSet, mapping: MappingResult) -> MappingResult:
-        """Align reconstructions with the GPS positions of their images, if these suffice."""
+        """Align reconstructions with GPS positions, if enough images have a position."""
         positions = {image.name: image.gps for image in images if image.gps is not None}
         if self._known_poses or not self._config.results.georeference or not positions:
             return mapping
@@ -360,7 +360,7 @@ class _Run:
         mapping: MappingResult,
         originals: OriginalImages,
     ) -> ReconstructionResult:
-        """Convert to COLMAP models, and write the result folder with its summary."""
+        """Convert reconstructions to COLMAP models, and write result folder and summary."""
         summary: dict[str, Any] = {}
         config = self._config
         with self._stages.stage("results"):
@@ -385,7 +385,7 @@ class _Run:
         mapping: MappingResult,
         originals: OriginalImages,
     ) -> None:
-        """Write the reasons into the summary, and raise ReconstructionError."""
+        """Write a summary with the reasons of the failure, and raise ReconstructionError."""
         self._delete_checkpoints()
         summary = self._summarize("failed", images, extraction, mapping, ())
         hint = ""
@@ -401,7 +401,7 @@ class _Run:
         )
 
     def _write_report(self) -> None:
-        """Write the report page; an error there must not lose the results."""
+        """Write the report page; log errors, because the results are complete already."""
         if self._output is None or not self._config.results.report:
             return
         with self._stages.stage("report"):
@@ -412,13 +412,13 @@ class _Run:
                 _log.debug("the report", exc_info=True)
 
     def _complete_summary(self, summary: dict[str, Any]) -> None:
-        """Add the resources of the whole run to the written summary."""
+        """Add measured memory and disk space of the whole run to ``summary.json``."""
         if self._output is None:
             return
         summary["resources"] = summarize_resources(
             self._estimate, self._stages, self._children, self._output
         )
-        with suppress(OSError):  # the summary of the results stage stays valid
+        with suppress(OSError):  # summary.json of the results stage stays valid
             update_summary(self._output, summary)
 
     def _summarize(
@@ -441,10 +441,10 @@ class _Run:
         }
 
     def _check_resources(self, images: ImageSet) -> None:
-        """Announce memory and disk of the run, and use fewer workers if memory is short.
+        """Report estimated memory and disk space; use fewer workers if memory is short.
 
         Raises:
-            InputError: the run cannot fit even with one worker.
+            InputError: the run exceeds memory or disk even with one worker.
         """
         config = self._config
         store = WeightStore(config.runtime.cache_dir, offline=True)
@@ -474,7 +474,7 @@ class _Run:
                 self._stages.warn(text)
 
     def _limit_workers(self, workers: int) -> None:
-        """Use fewer workers in extraction and in the dense stage than configured."""
+        """Reduce the number of workers of extraction and of the dense stage."""
         runtime = self._config.runtime
         configured = worker_count(runtime)
         workers = min(workers, configured)
@@ -518,7 +518,7 @@ class _Run:
 
 
 def _without_matching(config: Config) -> Config:
-    """Return the configuration without the providers that imported matches replace."""
+    """Remove the provider blocks that imported matches replace from a configuration."""
     if config.depth.use == FROM_MATCHER:
         raise ConfigError(
             "depth.use: 'matcher' needs a matcher, and imported matches replace it: "
@@ -529,7 +529,7 @@ def _without_matching(config: Config) -> Config:
 
 
 def _read_matches(files: tuple[Path, ...], images: ImageSet) -> ImportedMatches | None:
-    """Read matches from a COLMAP database, or from the two files of hloc."""
+    """Read matches from a COLMAP database, or from hloc's features and matches files."""
     if not files:
         return None
     if len(files) == 1:
@@ -538,7 +538,7 @@ def _read_matches(files: tuple[Path, ...], images: ImageSet) -> ImportedMatches 
 
 
 def _read_known_poses(model: Path, images: ImageSet, images_folder: Path) -> dict[str, Pose]:
-    """Read the poses of a model, by the names of our images."""
+    """Read the poses of a model, keyed by the matching image names of the run."""
     poses = read_poses(model, images_folder)
     matched = match_names(images.names, poses)
     if not matched:
@@ -555,7 +555,7 @@ def _read_known_poses(model: Path, images: ImageSet, images_folder: Path) -> dic
 
 
 def _has_poses(part: Reconstruction, known: Mapping[str, Pose]) -> bool:
-    """Check whether the poses of all images of a component equal the user's poses."""
+    """Check whether all poses of a component are exactly the poses given by the user."""
     return all(
         name in known and all(map(np.array_equal, pose, known[name]))
         for name, pose in part.poses.items()

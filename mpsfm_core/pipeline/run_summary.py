@@ -1,4 +1,4 @@
-"""Content of ``summary.json``: what a run did, in plain data."""
+"""Content of ``summary.json``: results, providers, times and resources of a run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def summarize_results(
     mapping: MappingResult,
     models: Sequence[pycolmap.Reconstruction],
 ) -> dict[str, Any]:
-    """Describe what extraction and mapping did with images and pairs."""
+    """Summarize images, pairs and reconstructions after extraction and mapping."""
     return {
         "images": describe_images(images, extraction.report, mapping),
         "pairs": describe_pairs(extraction.report, mapping, extraction.problem),
@@ -48,13 +48,13 @@ def summarize_results(
 def summarize_run(
     status: str, resolution: ProviderResolution, stages: Stages, usage: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Describe the run itself: status, warnings, times, providers, configuration and versions.
+    """Summarize a run: status, warnings, times, providers, configuration and versions.
 
     Args:
         status: ``success`` or ``failed``.
-        resolution: The resolved configuration and the choice of each provider.
-        stages: Times and memory of the stages.
-        usage: One entry per provider of the extraction's report.
+        resolution: Configuration with one provider per block, and the choices.
+        stages: Records of times, memory and warnings.
+        usage: Provider entries of the extraction report.
     """
     return {
         VERSION: SUMMARY_FORMAT,
@@ -77,7 +77,7 @@ def summarize_resources(
     children: ChildMemoryMonitor,
     output: Path | None = None,
 ) -> dict[str, Any]:
-    """Compare the estimated with the measured resources; memory is the peak so far."""
+    """Compare estimated with measured memory and disk space; memory is the peak so far."""
     peaks = [record.peak_memory_mb or 0.0 for record in stages.report().values()]
     measured = {
         "memory_mb": round(max(peaks, default=0.0) + children.peak_mb),
@@ -89,7 +89,7 @@ def summarize_resources(
 def _describe_providers(
     resolution: ProviderResolution, usage: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Describe each provider: why it was chosen, its licenses, its calls and its time."""
+    """Describe each provider: reason of the choice, licenses, number of results and time."""
     used = {(line["kind"], line["name"]): line for line in usage}
     unused = {"computed": 0, "from_cache": 0, "seconds": 0.0}
     described = []

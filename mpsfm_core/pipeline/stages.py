@@ -1,4 +1,4 @@
-"""Stages of a run: events for plugins, time and memory for the summary."""
+"""Stages of a run: forward events to plugins, record time and memory for the summary."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _PROC = Path("/proc/self")
 
 @dataclass(frozen=True)
 class StageRecord:
-    """Time and memory of a stage."""
+    """Duration and peak memory of a pipeline stage."""
 
     seconds: float
     peak_memory_mb: float | None
-    """Peak resident memory of this process; None if the system does not report it."""
+    """Peak resident memory of this process; None if the operating system reports none."""
 
     def after(self, earlier: StageRecord | None) -> StageRecord:
-        """Add an earlier run of the same stage: sum of times, maximum of peaks."""
+        """Combine with an earlier record of the same stage: sum of times, maximum of peaks."""
         if earlier is None:
             return self
         peaks = [p for p in (earlier.peak_memory_mb, self.peak_memory_mb) if p is not None]
@@ -34,18 +34,18 @@ class StageRecord:
 
 
 class Stages:
-    """Receives the events of all packages, and forwards them to the hooks of plugins."""
+    """Receives progress events of a run, and forwards them to the hooks of plugins."""
 
     def __init__(self, registry: Registry) -> None:
         self._registry = registry
         self._finished: dict[str, StageRecord] = {}
         self._running: dict[str, float] = {}
         self.warnings: list[str] = []
-        """Warnings so far, for ``summary.json``."""
+        """Warnings to the user so far, for ``summary.json``."""
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Run a stage of the pipeline in a ``with`` block."""
+        """Record a pipeline stage that runs in the ``with`` block."""
         self.stage_started(name, None)
         _reset_peak_memory()
         self._running[name] = time.perf_counter()
@@ -59,7 +59,7 @@ class Stages:
 
     @contextmanager
     def step(self, name: str, total: int | None) -> Iterator[None]:
-        """Run a step within a stage in a ``with`` block; ``total`` is its number of units."""
+        """Report a step of a stage that runs in the ``with`` block; ``total`` counts its units."""
         started = time.perf_counter()
         self.stage_started(name, total)
         try:
@@ -68,7 +68,7 @@ class Stages:
             self.stage_finished(name, time.perf_counter() - started)
 
     def report(self) -> dict[str, StageRecord]:
-        """Return the record of each stage in order; of a running stage its values so far.
+        """Return the records of all stages in order; running stages have their current values.
 
         Steps within a stage (features, depth, ...) are not recorded.
         """
@@ -87,35 +87,35 @@ class Stages:
         self.notice(f"warning: {text}")
 
     def stage_started(self, stage: str, total: int | None) -> None:
-        """Forward the start of a stage with ``total`` steps, None if unknown."""
+        """Forward the start of a stage to plugins; ``total`` is the number of steps or None."""
         self._registry.call_hook("mpsfm_stage_started", stage=stage, total=total)
 
     def stage_progress(self, stage: str, done: int, total: int) -> None:
-        """Forward the number of finished steps."""
+        """Forward the number of finished steps of a stage to plugins."""
         self._registry.call_hook("mpsfm_stage_progress", stage=stage, done=done, total=total)
 
     def stage_finished(self, stage: str, seconds: float) -> None:
-        """Forward the end of a stage."""
+        """Forward the end of a stage to plugins."""
         self._registry.call_hook("mpsfm_stage_finished", stage=stage, seconds=seconds)
 
     def image_registered(self, name: str, registered: int, total: int) -> None:
-        """Forward the registration of an image."""
+        """Forward the registration of an image to plugins."""
         self._registry.call_hook(
             "mpsfm_image_registered", name=name, registered=registered, total=total
         )
 
     def scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """Forward a change of poses or points."""
+        """Forward a change of poses or points to plugins."""
         self._registry.call_hook("mpsfm_scene_changed", scene=scene)
 
     def image_rejected(self, name: str, reason: Reason) -> None:
-        """Forward the rejection of an image, with its reason as text."""
+        """Forward the rejection of an image, with the reason, to plugins."""
         text = explain(reason).text
         self._registry.call_hook("mpsfm_image_rejected", name=name, reason=reason, text=text)
 
 
 def _reset_peak_memory() -> None:
-    """Reset the peak of this process on Linux; other systems report the peak since the start."""
+    """Reset the peak memory of this process; only Linux can do so."""
     with suppress(OSError):
         (_PROC / "clear_refs").write_text("5")
 

@@ -1,1 +1,1 @@
-"""Files, arrays on disk, YAML, compilation and threads: support code without any SfM."""
+"""Utilities without SfM code: files, arrays on disk, YAML, numba kernels and threads."""

@@ -13,19 +13,19 @@ _MEMBERSHIP = Path("/proc/self/cgroup")
 
 @dataclass(frozen=True)
 class MemoryLimit:
-    """Memory limit of one control group, in bytes."""
+    """Memory limit of one Linux control group, in bytes."""
 
     total: int
     free: int
-    """What the group may still allocate, including the file cache, which Linux reclaims."""
+    """Bytes that the group may still allocate, with the file cache that Linux can reclaim."""
 
 
 class ControlGroups:
-    """The control groups that limit this process, innermost first; versions 1 and 2.
+    """Linux control groups (versions 1 and 2) that limit this process, innermost first.
 
     Args:
         root: Mount point of the control group file system.
-        membership: File that lists the groups of this process.
+        membership: File that lists the control groups of this process.
     """
 
     def __init__(self, root: Path = _ROOT, membership: Path = _MEMBERSHIP) -> None:
@@ -43,7 +43,7 @@ class ControlGroups:
         return min(quotas, default=None)
 
     def memory_limits(self) -> list[MemoryLimit]:
-        """Return the memory limit of every group that has one."""
+        """Return the memory limits of all control groups with a limit."""
         limits = []
         for folder in self._folders("memory"):
             with suppress(OSError, ValueError, StopIteration):
@@ -57,7 +57,7 @@ class ControlGroups:
         return limits
 
     def _folders(self, controller: str) -> Iterator[Path]:
-        """Yield the folder of this process's group and of its visible ancestors."""
+        """Yield the folders of this process's control group and its visible ancestors."""
         with suppress(OSError):
             for line in self._membership.read_text().splitlines():
                 _, controllers, path = line.split(":", 2)
@@ -70,10 +70,10 @@ class ControlGroups:
 
 
 def _read_cpu_quota(folder: Path) -> tuple[float, float]:
-    """Return quota and period in microseconds; raises ValueError if there is no quota."""
+    """Return CPU quota and period in microseconds; raise ValueError without a quota."""
     if (folder / "cpu.max").is_file():
         quota, period = (folder / "cpu.max").read_text().split()
-        return float(quota), float(period)  # a group without quota has the word "max"
+        return float(quota), float(period)  # the quota "max" means no quota
     quota, period = ((folder / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
     return float(quota), float(period)
 

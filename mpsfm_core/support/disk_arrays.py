@@ -17,24 +17,24 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T", bound=np.generic)
 
 MEMORY_LIMIT = 2**29
-"""Bytes of arrays that stay in memory, about 80 images of densification [ours]."""
+"""Maximum bytes of arrays in memory, about 80 images of the dense stage [ours]."""
 _MIN_FILE_BYTES = 2**26
-"""Minimum size of a file; a process may have only 1024 file descriptors."""
+"""Minimum size of a temporary file in bytes; a process may open only 1024 files."""
 _ALIGNMENT = 64
 """Alignment of arrays in a file, in bytes."""
 
 
 class DiskArrays:
-    """Storage that keeps arrays in memory up to a limit and then in unnamed temporary files.
+    """Storage of arrays in memory up to a limit, then in unnamed temporary files.
 
     Files are memory-mapped, so the operating system reads pages on demand and frees them when
-    memory is short. A file disappears with its last array or with the process. If the disk is full,
-    arrays stay in memory. The class is thread-safe.
+    memory is short. A temporary file is deleted with its last array or with the process. If the
+    disk is full, arrays stay in memory. The class is thread-safe.
 
     Args:
-        folder: Folder of the files. The folder should be on a disk, because the temporary folder of
-            some systems is in memory.
-        in_memory: Bytes of arrays that stay in memory.
+        folder: Folder of the temporary files. The folder should be on a disk, because the system's
+            temporary folder may be in memory.
+        in_memory: Maximum bytes of arrays in memory.
     """
 
     def __init__(self, folder: Path, in_memory: int = MEMORY_LIMIT) -> None:
@@ -47,7 +47,7 @@ class DiskArrays:
         self._usable = True
 
     def store(self, array: NDArray[_T]) -> NDArray[_T]:
-        """Store an array and return an array of equal values, on disk above the memory limit."""
+        """Store an array; return an array of equal values, on disk above the memory limit."""
         with self._lock:
             if array.nbytes <= self._memory_left:
                 self._memory_left -= array.nbytes
@@ -62,7 +62,7 @@ class DiskArrays:
         return stored
 
     def _allocate(self, size: int) -> tuple[mmap.mmap, int] | None:
-        """Reserve bytes in a mapped file; returns (file, offset), or None without disk."""
+        """Reserve bytes in a mapped file; return (file, offset), or None without disk space."""
         if not size or not self._usable:
             return None
         if self._chunk is None or self._used + size > len(self._chunk):
@@ -75,11 +75,11 @@ class DiskArrays:
         return self._chunk, start
 
     def _create_file(self, size: int) -> mmap.mmap | None:
-        """Create and map an unnamed file; returns None if the disk is full or not writable."""
+        """Create and map an unnamed file; return None if the disk is full or not writable."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self._folder) as file:
-                file.write(bytes(size))  # reserve the space; a sparse file could fail later
+                file.write(bytes(size))  # reserves disk space; a sparse file could fail later
                 file.flush()
                 chunk = mmap.mmap(file.fileno(), size)
         except OSError as error:

@@ -1,6 +1,6 @@
-"""Atomic writes: a file or a set of results is replaced completely or not at all.
+"""Atomic writes of files and result folders: replaced completely or not at all.
 
-If a process is killed while it writes, the old content stays or the new content is complete. The
+If a process is killed while writing, either the old or the complete new content is on disk. The
 next run in the same folder finishes or removes the remains of a killed run.
 """
 
@@ -34,12 +34,13 @@ _TEMPORARY = ".tmp"
 _GRACE_S = 60.0
 """Age in seconds below which a temporary file may not be locked yet by its writer."""
 _READY = "ready.json"
-"""File of a scratch folder that lists the entries to replace; its presence commits the exchange."""
+"""File in a scratch folder that lists the entries to replace. Its existence commits the
+replacement."""
 FORMAT = 1
-"""Format version of ``ready.json``."""
+"""Version number of the format of ``ready.json``."""
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EINVAL, errno.ENOLCK}
-"""Errors of file systems without locks."""
+"""Error numbers of file systems without file locks."""
 
 
 def write_file(
@@ -49,7 +50,7 @@ def write_file(
 
     Args:
         path: File to write.
-        content: Bytes, a text (encoded as UTF-8), or a function that writes into an open file.
+        content: Bytes, a text (encoded as UTF-8), or a function that writes to an open file.
         temporary: Folder on the same disk for the incomplete file; the folder of `path` by default.
 
     Raises:
@@ -87,8 +88,8 @@ def remove_temporary_files(folder: Path) -> None:
 def lock_output_folder(output: Path) -> Iterator[None]:
     """Create an output folder if needed, check that it is writable, and lock it.
 
-    Remains of a killed run are finished or removed. A created folder that stays empty is removed at
-    the end.
+    Remains of a killed run are finished or removed. An output folder that was created and stays
+    empty is removed at the end.
 
     Raises:
         InputError: `output` cannot be created or written, or another run has locked it.
@@ -111,9 +112,9 @@ def lock_output_folder(output: Path) -> Iterator[None]:
 def replace_entries(output: Path, entries: tuple[str, ...]) -> Iterator[Path]:
     """Yield a scratch folder whose content replaces entries of an output folder on success.
 
-    On success the old entries are removed and the content of the scratch folder takes their place,
-    by renaming. On failure or interruption `output` is unchanged. If the process is killed while
-    renaming, the next :func:`lock_output_folder` finishes the exchange.
+    On success, the content of the scratch folder replaces the old entries by renaming. On failure
+    or interruption, `output` is unchanged. If the process is killed while renaming, the next
+    :func:`lock_output_folder` finishes the replacement.
 
     Args:
         output: Output folder.
@@ -141,12 +142,12 @@ def replace_entries(output: Path, entries: tuple[str, ...]) -> Iterator[Path]:
 
 
 def _exchange(output: Path, scratch: Path) -> None:
-    """Exchange entries by renaming; undo the renames on failure, resume after a kill."""
+    """Replace entries by renaming; undo renames on failure, resume after a kill."""
     entries, new = _read_plan(scratch)
     fresh, old = scratch / "new", scratch / "old"
     remaining = sorted(entry.name for entry in fresh.iterdir())
     moves = []
-    if remaining == new:  # else all old entries have gone, as they go first
+    if remaining == new:  # else all old entries are moved already, because they are moved first
         moves = [(output / name, old / name) for name in entries]
         moves = [(source, target) for source, target in moves if source.exists()]
     moves += [(fresh / name, output / name) for name in remaining]
@@ -166,7 +167,7 @@ def _read_plan(scratch: Path) -> tuple[list[str], list[str]]:
     """Read the names of the old and the new entries from ``ready.json``.
 
     Raises:
-        InputError: The file is not from `replace_entries`; a foreign file could name any path.
+        InputError: ``ready.json`` was not written by `replace_entries`; it could name any path.
     """
     path = scratch / _READY
     try:
@@ -185,7 +186,7 @@ def _read_plan(scratch: Path) -> tuple[list[str], list[str]]:
 
 
 def _clear_up(output: Path) -> None:
-    """Finish or remove the remains of killed runs; the caller holds the lock."""
+    """Finish or remove the remains of killed runs in a locked output folder."""
     for scratch in output.glob(f"{_SCRATCH}*"):
         if scratch.is_symlink() or not scratch.is_dir():
             continue  # not a scratch folder
@@ -197,10 +198,11 @@ def _clear_up(output: Path) -> None:
 
 @contextmanager
 def _lock(folder: Path) -> Iterator[bool]:
-    """Lock a folder until the end of the block or process; yields False without locks.
+    """Lock a folder until the end of the block; yield False if locks are unsupported.
 
     The folder itself is locked, so no lock file remains. Windows and some network disks do not
-    support such locks: concurrent runs are not detected there, and remains stay.
+    support folder locks. Concurrent runs are not detected on such systems, and remains of killed
+    runs are not removed.
     """
     if fcntl is None:
         yield False
@@ -235,7 +237,7 @@ def _create_folder(output: Path) -> list[Path]:
 
 
 def _remove_empty(folders: list[Path]) -> None:
-    """Remove those folders that are empty."""
+    """Remove empty folders; skip folders that are not empty."""
     for folder in folders:
         with suppress(OSError):
             folder.rmdir()
@@ -253,7 +255,7 @@ def _scratch(output: Path) -> Iterator[Path]:
 
 @contextmanager
 def _translate_disk_errors(output: Path) -> Iterator[None]:
-    """Translate errors of the disk to errors with a hint for users."""
+    """Translate OSError to InputError or OutputError with a message for users."""
     try:
         yield
     except OSError as error:
@@ -265,7 +267,7 @@ def _translate_disk_errors(output: Path) -> Iterator[None]:
 
 
 def _sync(folder: Path) -> None:
-    """Flush every file to disk before old entries are removed."""
+    """Flush all files of a folder to disk, before old results are removed."""
     for path in folder.rglob("*"):
         if path.is_file():
             with path.open("rb") as file:
@@ -273,14 +275,14 @@ def _sync(folder: Path) -> None:
 
 
 def _lock_file(file: BinaryIO) -> None:
-    """Lock a temporary file while its writer is alive."""
+    """Lock a temporary file as long as its writing process runs."""
     if fcntl is not None:
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _is_locked(file: BinaryIO) -> bool:
-    """Return True if a running process writes the file, or if locks are not supported."""
+    """Check whether a running process writes a file; true if locks are unsupported."""
     if fcntl is None:
         return True
     try:

@@ -1,8 +1,8 @@
-"""Format versions of files.
+"""Version numbers of file formats.
 
-The module that reads a format defines its version number. The number increases when the meaning of
-existing content changes, not when content is added. A file without a number has version 1.
-``docs/formats.md`` lists all formats.
+The module that reads a file format defines its version number. The version number increases when
+the meaning of existing content changes, not when content is added. A file without version number
+has version 1. ``docs/formats.md`` lists all formats.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Any
 from mpsfm_core.data.errors import InputError
 
 VERSION = "format_version"
-"""Key of the version in a file, or name of its array."""
+"""Key of the version number in YAML and JSON files; name of its array in NPZ files."""
 
 
 def check_version(
     content: Mapping[str, Any], known: int, path: Path, error: type[InputError] = InputError
 ) -> int:
-    """Return the format version of a file's content.
+    """Check and return the format version of a file's content.
 
     Args:
         content: Content of the file by key.
@@ -29,7 +29,7 @@ def check_version(
         error: Class of the raised error.
 
     Raises:
-        InputError: The version is newer than `known` or is no number (raised as `error`).
+        InputError: The format version is newer than `known` or no number (raised as `error`).
     """
     value = content.get(VERSION, 1)
     try:

@@ -1,9 +1,9 @@
 """Numba decorators for inner loops: kernels for Python callers, helpers for kernels.
 
-Compiled kernels are cached in ``$NUMBA_CACHE_DIR``, else next to the module. If the package is not
-writable, they are cached in ``kernels`` of the user's cache (``$MPSFM_CACHE``). Helpers are
-compiled into their kernels. Pass counters to helpers as ``np.int64(0)``: a literal 0 has its own
-numba type, which would compile the helper twice.
+Compiled kernels are cached in ``$NUMBA_CACHE_DIR``, else next to the module. If the package folder
+is not writable, kernels are cached in ``kernels`` of the user's cache (``$MPSFM_CACHE``). Helpers
+are compiled into the kernels that call them. Pass counters to helpers as ``np.int64(0)``: a literal
+0 has its own numba type, which would compile the helper twice.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ _ALWAYS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 def kernel(**options: Any) -> Callable[[F], F]:
     """Return a decorator that compiles a function for Python callers.
 
-    The compiled function releases the interpreter lock and divides floats like numpy.
+    The compiled function releases Python's global interpreter lock. Division by zero gives inf or
+    nan, as in numpy.
 
     Args:
         options: Keyword arguments of :func:`numba.njit`.
@@ -50,7 +51,7 @@ def kernel(**options: Any) -> Callable[[F], F]:
 
 
 def helper(**options: Any) -> Callable[[F], F]:
-    """Return a decorator that makes a Python function callable from kernels."""
+    """Return a decorator that makes a function callable from kernels and from Python."""
     without = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     decorate: Callable[[F], F] = register_jitable(**_ALWAYS, **without, **options)
     return decorate
@@ -63,10 +64,10 @@ def _compiled(function: F, **options: Any) -> F:
 
 @cache
 def _discard_unreadable_indices() -> None:
-    """Let numba treat an index of an earlier version that it cannot unpickle as a cache miss.
+    """Make numba treat a cache index that cannot be unpickled as a cache miss.
 
-    numba unpickles the types in an index before it compares the index with the source. A type that
-    an upgrade renamed would raise AttributeError in the first call of the kernel.
+    numba unpickles the types in a cache index before comparing the index with the source. A type
+    that an upgrade renamed would raise AttributeError in the first call of a kernel.
     """
     load: Callable[[Any], Any] = IndexDataCacheFile._load_index
 
@@ -81,7 +82,7 @@ def _discard_unreadable_indices() -> None:
 
 @cache
 def _choose_cache_folder() -> None:
-    """Cache kernels in the user's cache if the package is not writable."""
+    """Cache kernels in the user's cache if the package folder is not writable."""
     if os.environ.get("NUMBA_CACHE_DIR") or os.access(Path(__file__).parent, os.W_OK):
         return
     folder = user_cache_folder() / "kernels"
@@ -90,7 +91,7 @@ def _choose_cache_folder() -> None:
     except OSError:
         return
     if os.access(folder, os.W_OK):
-        os.environ["NUMBA_CACHE_DIR"] = str(folder)  # for the processes of workers
+        os.environ["NUMBA_CACHE_DIR"] = str(folder)  # inherited by worker processes
         numba.config.CACHE_DIR = str(folder)
 
 

@@ -14,7 +14,7 @@ Value = TypeVar("Value")
 class LruCache(Generic[Key, Value]):
     """Thread-safe cache that evicts the least recently used values above a total size.
 
-    Two threads that miss the same key at the same time may both compute its value.
+    Two threads that request the same missing key at the same time may both compute the value.
     """
 
     def __init__(self, limit: int, size: Callable[[Value], int]) -> None:

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_BYTES = 4_000_000_000
-"""Maximum size of the arrays of a file, unless the file itself is larger.
+"""Maximum bytes of the unpacked arrays of an NPZ file, unless the file itself is larger.
 
-A small compressed file could expand to any size; the limit is 16 bytes per pixel of the largest
-image [ours]."""
+A small compressed file could expand to any size. The limit is 16 bytes per pixel of the largest
+supported image [ours]."""
 _COMPRESSION_LEVEL = 1
-"""Level of zlib; numpy's level 6 takes twice the time on depth maps to save 0.5 %."""
+"""Compression level of zlib; level 6 takes twice the time and saves 0.5 % on depth maps."""
 
 
 def write_npz(path: Path, **arrays: NDArray[Any]) -> None:
-    """Write compressed arrays by name and create the folder.
+    """Write named arrays to a compressed NPZ file and create its folder.
 
     Raises:
         OSError: The file cannot be written.
@@ -34,7 +34,7 @@ def write_npz(path: Path, **arrays: NDArray[Any]) -> None:
 
 
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays of a file by name.
+    """Read all arrays of an NPZ file by name.
 
     Raises:
         OSError: The file cannot be read.

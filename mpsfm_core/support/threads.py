@@ -1,8 +1,8 @@
-"""Number of threads of a run: its own worker threads and those of BLAS, OpenMP and OpenCV.
+"""Number of threads of a run: worker threads and threads of BLAS, OpenMP and OpenCV.
 
-A run sets the limit once with :func:`limit_threads`, and thread pools read it with
-:func:`thread_limit`. Providers get their number of threads from their context, because networks
-have thread pools of their own.
+A run sets the thread limit once with :func:`limit_threads`, and thread pools read the limit with
+:func:`thread_limit`. Providers get their number of threads from ``ProviderContext``, because
+networks have separate thread pools.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ _LIMIT: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
 def count_cores(groups: ControlGroups | None = None) -> int:
-    """Return the number of processors that this process may use.
+    """Return the number of CPU cores that this process may use.
 
-    Respects the CPU affinity and the CPU quota of containers. A fraction of a core counts as one.
+    CPU affinity and the CPU quota of containers are respected. A quota is rounded up to whole
+    cores.
 
     Args:
-        groups: Source of the CPU quota; default: the control groups of this process.
+        groups: Control groups with a CPU quota; default: those of this process.
     """
     if hasattr(os, "sched_getaffinity"):
         available = len(os.sched_getaffinity(0))
@@ -43,25 +44,26 @@ def count_cores(groups: ControlGroups | None = None) -> int:
 
 
 def thread_limit() -> int:
-    """Return the number of threads that the caller may keep busy; without a limit, one per core."""
+    """Return the thread limit of the caller; without a limit, the number of cores."""
     return _LIMIT.get() or count_cores()
 
 
 def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Call a function on every item in parallel threads; returns the results in order."""
+    """Call a function on every item in parallel threads; return the results in order."""
     with ThreadPoolExecutor(thread_limit()) as pool:
         return list(pool.map(function, items))
 
 
 @contextmanager
 def limit_threads(count: int | None) -> Iterator[None]:
-    """Limit the number of busy threads inside a ``with`` block.
+    """Limit the number of threads inside a ``with`` block.
 
-    The limit of :func:`thread_limit` applies to the calling thread, the limit of libraries to the
-    whole process. OpenCV gets one thread, because several worker threads call it at the same time.
+    The limit of :func:`thread_limit` applies to the calling thread. The limit of BLAS and OpenMP
+    applies to the whole process. OpenCV gets one thread, because several worker threads call OpenCV
+    at the same time.
 
     Args:
-        count: Largest number of threads; None means one per core.
+        count: Maximum number of threads; None means one per core.
     """
     token, opencv = _LIMIT.set(count), cv2.getNumThreads()
     cv2.setNumThreads(1)

@@ -1,4 +1,4 @@
-"""Folders for caches and data of the user, also for accounts without a home."""
+"""Cache and data folders of the user, also for accounts without a home folder."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def user_cache_folder() -> Path:
     if variable:
         try:
             return Path(variable).expanduser()
-        except RuntimeError:  # "~" of an account without a home
+        except RuntimeError:  # "~" fails for an account without a home folder
             return Path(variable)
     try:
         return Path(platformdirs.user_cache_dir("mpsfm"))

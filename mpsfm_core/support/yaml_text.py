@@ -40,7 +40,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Dumper of YAML 1.2 scalars without aliases."""
+    """Dumper of YAML 1.2 scalars; repeated objects are written in full instead of as aliases."""
 
     yaml_implicit_resolvers = {}  # noqa: RUF012
 
@@ -59,11 +59,11 @@ def parse_yaml(text: str, source: str) -> Any:
     """Parse a YAML document.
 
     Args:
-        text: The document.
-        source: Name of the document, for messages.
+        text: Text of the YAML document.
+        source: File name or option of the document, for messages.
 
     Raises:
-        ConfigError: The document is not valid; the message gives source and line.
+        ConfigError: The document is not valid YAML; the message has source and line.
     """
     try:
         return yaml.load(text, Loader=_Loader)
@@ -80,7 +80,7 @@ def parse_assignment(text: str) -> dict[str, Any]:
     """Parse ``a.b=value`` with a YAML value to ``{"a": {"b": value}}``.
 
     Raises:
-        ConfigError: The text is no assignment, or the value is not valid YAML.
+        ConfigError: The text is no assignment, or its value is not valid YAML.
     """
     key, equals, value = text.partition("=")
     parts = key.strip().split(".")
@@ -94,13 +94,13 @@ def parse_assignment(text: str) -> dict[str, Any]:
 
 
 def write_yaml(value: Any) -> str:
-    """Format a value of plain types as block-style YAML; inverse of :func:`parse_yaml`."""
+    """Format plain data as block-style YAML; inverse of :func:`parse_yaml`."""
     text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
     return text
 
 
 def find_line(text: str, path: tuple[str | int, ...]) -> int | None:
-    """Find the line, from 1, of the entry at a path in a YAML text; None if absent."""
+    """Find the line number (from 1) of the setting at a path of a YAML text, or None."""
     node = yaml.compose(text, Loader=_Loader)
     line = None
     for part in path:
