@@ -1,4 +1,4 @@
-"""Upper bound of pose accuracy: our mapper compared with our mapper started at the true poses.
+"""Upper bound of pose accuracy: our mapper, and our mapper started at the true poses.
 
     python -m benchmarks.bounds [--buckets minimal leq30] [--output DIR]
 

@@ -2,14 +2,14 @@
 
     python -m benchmarks.dense_peer [--cases kitchen-all-config ...] [--true-poses] [--output DIR]
 
-The peer is pyarchinit-photogrammetry (GPL), which is used only here:
+The other pipeline is pyarchinit-photogrammetry (GPL), a dependency of this benchmark only:
 
     pip install --no-deps pyarchinit-photogrammetry pyarchinit-photogrammetry-core
 
-It runs PatchMatch in Rust, initialized by OpenCV's semi-global matching of rectified pairs, and
-COLMAP's fusion on the CPU, with its defaults for close range (``moderate``). Its input is the
-photos and the COLMAP model of the mapper. Cases are those of :mod:`benchmarks.dense`, whose mapped
-sets are reused.
+pyarchinit-photogrammetry runs PatchMatch stereo in Rust and COLMAP's fusion on the CPU, with the
+defaults for close range (``moderate``). OpenCV's semi-global matching of rectified pairs
+initializes PatchMatch. Both pipelines start from the photos and from our sparse model. The cases
+and their reconstructions are those of :mod:`benchmarks.dense`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.ply import read_ply
 
 MODE = "moderate"
-"""Default mode of the peer."""
+"""Mode of pyarchinit-photogrammetry, its default for close range."""
 _INSTALL = "pip install --no-deps pyarchinit-photogrammetry pyarchinit-photogrammetry-core"
 Maps = dict[str, DepthPrior]
 
@@ -56,7 +56,7 @@ Maps = dict[str, DepthPrior]
 def peer_result(
     model: Reconstruction, view: Callable[[str], View], folder: Path
 ) -> tuple[Maps, Float64]:
-    """Run the peer as its ``_PatchMatchJob``; return maps by image name and cloud (n, 3)."""
+    """Run pyarchinit-photogrammetry; return depth maps by image name and the cloud (n, 3)."""
     try:
         from pyarchinit_photogrammetry.engine import dense as peer
     except ImportError as error:
@@ -136,7 +136,7 @@ def _params(peer: Any, matrix: Float64) -> tuple[float, ...]:
 def ours(
     model: Reconstruction, view: Callable[[str], View], prior: bool, true_poses: bool
 ) -> tuple[Maps, Float64, dict[str, Bool]]:
-    """Run our stage; return maps, cloud, and masks of measured pixels."""
+    """Run our dense stage; return depth maps, fused cloud, and masks of measured pixels."""
     model = model if prior else without_prior(model)
     poses_use_depth = prior and not true_poses
     model, report = densify(model, view, DenseOptions(), poses_use_depth=poses_use_depth)
@@ -147,7 +147,7 @@ def ours(
 def depth_errors(
     scene: SceneFolder, maps: Maps, chosen: dict[str, Bool], names: Sequence[str], scale: float
 ) -> dict[str, float]:
-    """Compute median relative error and share within 1 % of chosen pixels, and their share."""
+    """Compute median relative depth error, share within 1 %, and share of the measured pixels."""
     assert scene.depth is not None
     total, errors = 0, [np.zeros(0)]
     for name in names:
@@ -167,7 +167,7 @@ def depth_errors(
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Parse the command line and compare the dense pipelines."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     chosen = ["kitchen-all-config", "kitchen-leq30-config"]
     parser.add_argument("--cases", nargs="+", default=chosen, choices=CASES, metavar="CASE")

@@ -2,12 +2,12 @@
 
     python -m benchmarks.depth_integration [SECTION ...] [--repeats 5] [--ablation] [--json]
 
-The reference is the same iteratively reweighted least squares in scipy with a Jacobi-CG solve to
-1e-3 before each reweighting, as published (`tests/optimize/integration_reference.py`). It runs
-until its energy is within 1e-4 of ours or below. Runs are interleaved; ratios are of medians of
-wall time, or of CPU time where stated. Real data ($MPSFM_SHARED or ../shared) are used if present.
-Sections: analytic, hololens_room, variance, scaling, and the race at 387x258 and 768x512.
-``--json`` prints one JSON object as the last line.
+The reference is the published iteratively reweighted least squares, in scipy
+(`tests/optimize/integration_reference.py`): conjugate gradients with a Jacobi preconditioner, to
+1e-3 before each reweighting. The reference runs until its energy is at most 1e-4 above ours. Runs
+are interleaved. Ratios are those of median wall times, or of CPU times where stated. The scene
+hololens_room is used if $MPSFM_SHARED or ../shared has it. ``--json`` prints one JSON object as the
+last line.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SCENES = 6
 
 @dataclass(frozen=True)
 class Problem:
-    """Noisy priors and points of one image, and its true log depth if known."""
+    """Noisy depth and normal priors and points of one image, and true log depth if known."""
 
     depth: DepthPrior
     normals: NormalPrior
@@ -60,7 +60,7 @@ class Problem:
         return DepthIntegrator(self.depth, self.normals, self.camera, options)
 
     def errors(self, log_depth: Float64) -> tuple[float, float]:
-        """Compute rms and median of the error in log depth."""
+        """Compute the root mean square and the median of log depth errors."""
         error = np.abs(log_depth - self.truth)[self.known]
         return float(np.sqrt(np.mean(error**2))), float(np.median(error))
 
@@ -71,7 +71,7 @@ class Problem:
 def smooth_noise(
     rng: np.random.Generator, shape: tuple[int, int], parts: dict[float, float]
 ) -> Float64:
-    """Create unit-variance noise, a sum of fields of {correlation length in pixels: share}."""
+    """Create noise of unit variance as a sum of fields, {correlation length in pixels: share}."""
     total = np.zeros(shape)
     for length, share in parts.items():
         step = max(1.0, length / 4)
@@ -83,11 +83,12 @@ def smooth_noise(
 
 
 def analytic_problem(size: tuple[int, int], seed: int) -> Problem:
-    """Create a furnished room with network-like errors.
+    """Create priors of a furnished synthetic room, with errors like those of networks.
 
-    Depth: edges blurred by 2 px, 6 % of error in patches of 50, 15 and 5 px (at 387 px width);
-    normals: edges blurred by 1 px, 6 deg of error in patches of 8 and 1.5 px. Points: 1 % of error,
-    5 % of them wrong by up to 50 %.
+    Depth has edges blurred by 2 px, and errors of 6 % with correlation lengths of 50, 15 and 5 px
+    at a map width of 387 px. Normals have edges blurred by 1 px, and errors of 6 deg with
+    correlation lengths of 8 and 1.5 px. Triangulated points have depth errors of 1 %; 5 % of the
+    points are wrong by up to 50 %.
     """
     width, height = size
     rng, pixel = np.random.default_rng(seed), width / 387
@@ -114,7 +115,7 @@ def analytic_problem(size: tuple[int, int], seed: int) -> Problem:
 def sample_anchors(
     rng: np.random.Generator, truth: Float64, known: Bool, *, wrong: float = 0.0
 ) -> Anchors:
-    """Sample points at random pixels with 1 % of depth error, and a share of outliers."""
+    """Sample points at random pixels, with depth errors of 1 % and a share of outliers."""
     pixels = rng.choice(np.flatnonzero(known), POINTS, replace=False)
     rows, columns = np.divmod(pixels, truth.shape[1])
     error = rng.normal(0, 0.01, POINTS)
@@ -124,9 +125,10 @@ def sample_anchors(
 
 
 def room_problems(shared: Path, every: int = 10) -> Iterator[Problem]:
-    """Create problems of hololens_room: FastDepth, normals of its smoothed depth, sensor depth.
+    """Create depth integration problems from frames of hololens_room.
 
-    Points are random sensor pixels. The relative std of 25 % is that of FastDepth on such frames.
+    Priors are the depth of FastDepth, and normals of the smoothed depth. Points are random pixels
+    with sensor depth. The relative std of 25 % is that of FastDepth on these frames.
     """
     import onnxruntime
 
@@ -163,7 +165,7 @@ def room_problems(shared: Path, every: int = 10) -> Iterator[Problem]:
 
 
 def normals_of(depth: Float64, camera: PinholeCamera) -> Float64:
-    """Compute normals (h, w, 3) of a depth map by finite differences of its points."""
+    """Compute normals (h, w, 3) of a depth map by finite differences of its 3D points."""
     points = geometry.unproject(camera, geometry.pixel_centers(*camera.size), depth)
     normals = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
     return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -172,7 +174,7 @@ def normals_of(depth: Float64, camera: PinholeCamera) -> Float64:
 def timed(
     function: Callable[[], Any], clock: Callable[[], float] = time.perf_counter
 ) -> tuple[float, Any]:
-    """Return seconds and result of a call."""
+    """Call a function; return the time in seconds and the function's result."""
     start = clock()
     result = function()
     return clock() - start, result
@@ -185,7 +187,7 @@ def median_time(
 
 
 def bench_speed(size: tuple[int, int], repeats: int) -> dict[str, float]:
-    """Measure a whole refinement with our defaults, and the reference to the same energy."""
+    """Measure depth integration with our defaults, and the reference up to the same energy."""
     problem = analytic_problem(size, seed=0)
     integrator = problem.integrator()
     reference = ReferenceIntegration(
@@ -218,7 +220,7 @@ def bench_speed(size: tuple[int, int], repeats: int) -> dict[str, float]:
 
 
 def bench_warm(problem: Problem, repeats: int) -> float:
-    """Measure a second refinement after all points moved by their std, without skipping."""
+    """Measure a second depth integration after all points moved by their std."""
     integrator = problem.integrator(IntegrationOptions(max_point_growth=0.0))
     before = integrator.refine(problem.anchors)
     moved = problem.anchors._replace(depth=1.01 * problem.anchors.depth)
@@ -226,9 +228,9 @@ def bench_warm(problem: Problem, repeats: int) -> float:
 
 
 def bench_scaling(repeats: int) -> dict[str, Any]:
-    """Measure the exponent of CPU time over the number of pixels, in one thread.
+    """Fit the exponent of CPU time as a power of the number of pixels, in one thread.
 
-    Errors verify that the solutions are equally good.
+    Depth errors at each map size show that the solutions are equally accurate.
     """
     pixels, seconds, errors = [], [], []
     for size in SCALING_SIZES:
@@ -249,7 +251,7 @@ def bench_scaling(repeats: int) -> dict[str, Any]:
 def bench_accuracy(
     problems: list[Problem], options: IntegrationOptions | None = None
 ) -> dict[str, float] | None:
-    """Compute mean errors before and after over the images; None without images."""
+    """Compute mean depth errors before and after integration; None without problems."""
     if not problems:
         return None
     rows = []
@@ -269,7 +271,7 @@ def bench_accuracy(
 
 
 def bench_variance(repeats: int) -> dict[str, float]:
-    """Compare selected inversion with the dense inverse, its time, and that of single solves."""
+    """Compare marginal variances of selected inversion with the dense inverse, and their times."""
     small = analytic_problem((48, 32), seed=0)
     reference = ReferenceIntegration(small.depth, small.normals, small.camera, small.anchors)
     refined = small.integrator().refine(small.anchors)
@@ -293,7 +295,7 @@ def bench_variance(repeats: int) -> dict[str, float]:
 
 
 def single_solve(integrator: DepthIntegrator, problem: Problem) -> float:
-    """Measure the seconds of one column of the inverse, to 1 % of its diagonal, by multigrid."""
+    """Measure the time of multigrid for one column of the inverse, to 1 % of the diagonal."""
     refined = integrator.refine(problem.anchors)
     here = majorize(refined.log_depth, integrator._terms(problem.anchors, 1.0))
     solver = Multigrid(*here.mass.shape)
@@ -304,10 +306,10 @@ def single_solve(integrator: DepthIntegrator, problem: Problem) -> float:
 
 
 def ablation(analytic: list[Problem], real: list[Problem]) -> dict[str, Any]:
-    """Print errors (rms, median) for changes of each default."""
+    """Print log depth errors (rms, median) with each option changed from its default."""
     changes: list[dict[str, float]] = [
         {},
-        {"independent_depths": 1e9, "independent_normals": 1e9},  # weights of the reference
+        {"independent_depths": 1e9, "independent_normals": 1e9},  # cvg/mpsfm
         *({"independent_depths": v} for v in (10.0, 30.0, 300.0, 1000.0)),
         *({"independent_normals": v} for v in (100.0, 300.0, 3000.0, 10_000.0)),
         *({"sharpness": v} for v in (0.5, 1.0, 4.0)),
@@ -340,7 +342,7 @@ def analytic_problems(count: int) -> list[Problem]:
 
 
 def real_problems(shared: Path) -> list[Problem]:
-    """Return problems of hololens_room, or none if it is missing."""
+    """Return depth integration problems of hololens_room, or an empty list without this scene."""
     return list(room_problems(shared)) if (shared / "data" / "hololens_room").is_dir() else []
 
 

@@ -1,11 +1,12 @@
-"""Sensitivity of hololens_room `minimal` to errors of the device poses.
+"""Sensitivity of pose AUC on hololens_room, bucket `minimal`, to errors of the true poses.
 
     python -m benchmarks.device_poses [--output DIR]
 
-The true poses of hololens_room are tracked by the device, with an accuracy of one or two degrees.
-In the set of the bucket `minimal` only one pair can be posed, so the score measures one relative
-pose. Frames around that pair overlap well; COLMAP poses them without depth, on matches of two
-features. Here these poses replace the device poses. Writes benchmarks/results/device_poses.md.
+The true poses of hololens_room are tracked by the HoloLens, with an accuracy of one or two degrees.
+Only one pair of the test set `minimal` can be registered, so pose AUC measures one relative pose.
+COLMAP registers a window of well overlapping frames around this pair, with two kinds of features.
+This benchmark evaluates with COLMAP's poses of the pair instead of the device poses. Writes
+benchmarks/results/device_poses.md.
 """
 
 from __future__ import annotations
@@ -35,18 +36,18 @@ from mpsfm_core.evaluation.scene_folder import read_scene
 SCENE = "hololens_room"
 BUCKET = "minimal"
 WINDOW = 12
-"""Number of frames around a pair, which may be up to half of it apart."""
+"""Number of frames of a window; the two frames of the pair are at most half a window apart."""
 PEERS = ("colmap-tuned", "colmap-global")
 METHODS = ("ours-sensor", "colmap-tuned")
-"""Methods whose poses of the bucket are compared with the device and with the window."""
+"""Methods whose poses are evaluated with the device poses and with the window poses."""
 CONVENTION = CONVENTIONS["paper"]
 FEATURES = {"benchmark": "XFeat", ALIKED[0]: "ALIKED"}
-"""Features of each configuration."""
+"""Settings of local features and matcher, by the name of the configuration."""
 Poses = Mapping[str, Pose]
 
 
 def main() -> None:
-    """Run the bucket and the windows, and write the table."""
+    """Map the test set `minimal` and the windows, and write the table of pose AUC."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))
     output = parser.parse_args().output / "device_poses"
@@ -81,7 +82,7 @@ def main() -> None:
 
 
 def _around(a: str, b: str, frames: Sequence[str]) -> list[str]:
-    """Return the window centered at two frames, or none if they are too far apart."""
+    """Return the window of frames around a pair, or no frames if the pair is too far apart."""
     first, last = sorted((frames.index(a), frames.index(b)))
     if last - first > WINDOW // 2:
         return []
@@ -90,7 +91,7 @@ def _around(a: str, b: str, frames: Sequence[str]) -> list[str]:
 
 
 def _table(records: Sequence[BenchmarkRecord]) -> str:
-    """Format a row for each truth: the device, and each peer and feature."""
+    """Format one table row for each source of true poses: the device, and COLMAP on each window."""
     hard = {r.label: r for r in records if r.bucket == BUCKET and r.config == "benchmark"}
     device = hard[METHODS[0]].truth
     truths: dict[str, list[Poses]] = {}
@@ -113,7 +114,7 @@ def _table(records: Sequence[BenchmarkRecord]) -> str:
 
 
 def _area(record: BenchmarkRecord, truths: Sequence[Poses]) -> str:
-    """Compute AUC@20 with the first truth that has both images of a pair."""
+    """Compute AUC@20 with the first set of true poses that contains both images of a pair."""
     errors = []
     for pair in combinations(record.truth, 2):
         truth = _of_pair(truths, pair) or {name: record.truth[name] for name in pair}
@@ -122,7 +123,7 @@ def _area(record: BenchmarkRecord, truths: Sequence[Poses]) -> str:
 
 
 def _apart(some: Sequence[Poses], others: Sequence[Poses], images: Poses) -> float:
-    """Compute the largest pose difference in degrees of the pairs that both models contain."""
+    """Compute the largest relative pose difference in degrees over the pairs of two models."""
     errors = [0.0]
     for pair in combinations(images, 2):
         ours, theirs = _of_pair(some, pair), _of_pair(others, pair)
@@ -132,7 +133,7 @@ def _apart(some: Sequence[Poses], others: Sequence[Poses], images: Poses) -> flo
 
 
 def _of_pair(models: Sequence[Poses], pair: tuple[str, str]) -> Poses:
-    """Return the poses of two images in the first model with both; empty if none has."""
+    """Return the poses of two images in the first model that contains both images."""
     model = next((model for model in models if model.keys() >= set(pair)), None)
     return {name: model[name] for name in pair} if model else {}
 

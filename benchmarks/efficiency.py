@@ -1,12 +1,12 @@
-"""CPU time of the steps of mapping, and memory, as the efficiency table of the paper.
+"""CPU time and memory of the steps of mapping, compared with the table of the paper.
 
     python -m benchmarks.efficiency [--views 25 49 100 250 505]
 
-Halls of :mod:`benchmarks.everyday` with honest priors, with maps of the size that photos have. A
-step includes all functions that it calls. Rows of the paper of one kind (global, local, after
-registration) are summed; they are of other scenes (ETH3D) and of the authors' machine, so compare
-growth rather than seconds. All sizes run in one process, the smallest first; peak memory is that of
-the largest so far.
+The scenes are the synthetic halls of :mod:`benchmarks.everyday`, with calibrated depth priors and
+prior maps as large as those of photos. The time of a step includes all called functions. The
+paper's times of global and local steps are summed. The paper's times are of ETH3D on the authors'
+machine, so compare the growth with the number of images. All image numbers run in one process, in
+increasing order, so peak memory is that of the present number.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ WHOLE = "mapping"
 
 
 class Step(NamedTuple):
-    """One step: (file, name) of its functions, and the paper's seconds by number of images."""
+    """Step of the mapper: its functions (file, name), and the paper's seconds by image number."""
 
     functions: frozenset[tuple[str, str]]
     paper: Mapping[int, float]
@@ -71,7 +71,7 @@ STEPS: Mapping[str, Step] = MappingProxyType(
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Parse the command line, map synthetic halls, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--views", type=int, nargs="+", default=[25, 49, 100, 250, 505])
     sizes = sorted(parser.parse_args().views)
@@ -88,7 +88,7 @@ def main() -> None:
 
 
 def _measured(views: int) -> dict[str, float]:
-    """Measure CPU seconds of each step over all threads, and ``peak`` in MiB."""
+    """Measure CPU seconds of each mapping step over all threads, and peak memory in MiB."""
     problem = make_hall_problem(views, CALIBRATED_PRIORS, map_width=MAP_WIDTH).problem
     profile = cProfile.Profile(time.process_time)
     with threadpool_limits(1):

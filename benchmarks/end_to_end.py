@@ -1,11 +1,12 @@
-"""From photos to poses: ``mpsfm reconstruct`` compared with COLMAP's SIFT pipeline.
+"""Accuracy and time of ``mpsfm reconstruct``, compared with COLMAP's SIFT pipeline.
 
     python -m benchmarks.end_to_end [--scenes fountain ...] [--output FILE]
 
-COLMAP: SIFT, exhaustive matching, incremental mapper, as ``colmap automatic_reconstructor``, each
-step with its default number of threads. Ours: whole commands with an empty cache, compiled kernels,
-without the dense stage and the report. Both use true intrinsics. Pose AUC in percent, convention
-`paper`. Wall time of one run on an idle machine.
+COLMAP runs SIFT, exhaustive matching and the incremental mapper, as ``colmap
+automatic_reconstructor``, with the default number of threads. ``mpsfm reconstruct`` runs with an
+empty cache and compiled kernels, without the dense stage and the report. Both programs use true
+intrinsics. The table lists pose AUC in percent (convention `paper`), and wall time of one run on an
+idle machine.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ from mpsfm_core.support.user_folders import CACHE_VARIABLE
 
 SCENES = ("fountain", "rendered_kitchen", "hololens_room")
 OURS = ("sift", "fast-cpu")
-"""Configurations of our runs."""
+"""Configurations of ``mpsfm reconstruct`` that are measured."""
 _ALONE = ("dense.enabled=false", "results.dense_cloud=false", "results.report=false")
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Parse the command line, run both programs, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--scenes", nargs="+", default=["fountain"], choices=SCENES)
     parser.add_argument("--output", type=Path, help="also write the table to this file")
@@ -61,7 +62,7 @@ def main() -> None:
 
 
 def compared(scene: SceneFolder) -> list[str]:
-    """Yield the rows of the table."""
+    """Yield the table rows of a scene: COLMAP, and each configuration of ``mpsfm reconstruct``."""
     folder = scene.images.parent
     rows = []
     with tempfile.TemporaryDirectory() as work:
@@ -82,7 +83,7 @@ def compared(scene: SceneFolder) -> list[str]:
 
 
 def timed(command: list[str], environment: Mapping[str, str]) -> float:
-    """Return the wall seconds of a command."""
+    """Run a command, and return its wall time in seconds."""
     started = time.perf_counter()
     subprocess.run(command, check=True, env={**os.environ, **environment}, stdout=sys.stderr)
     return time.perf_counter() - started
@@ -91,7 +92,7 @@ def timed(command: list[str], environment: Mapping[str, str]) -> float:
 def row(
     scene: SceneFolder, label: str, poses: Mapping[str, Pose], seconds: float, reference: float
 ) -> str:
-    """Format one row of the table."""
+    """Format registered images, pose AUC and time of one method as a table row."""
     convention = CONVENTIONS["paper"]
     area = pose_auc(pose_errors_deg(poses, scene.truth, convention), convention)
     registered = f"{len(poses)} of {len(scene.truth)}"
@@ -103,7 +104,7 @@ def row(
 
 
 def colmap(scene: SceneFolder, output: Path) -> None:
-    """Compute COLMAP's largest model of a scene."""
+    """Reconstruct a scene with COLMAP, and return the largest model."""
     photos = load_images(scene.images, scene.intrinsics)
     output.mkdir(parents=True)
     database = output / "database.db"

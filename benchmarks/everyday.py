@@ -1,14 +1,15 @@
-"""Well-connected image sets: our mapper and COLMAP's on the same verified matches.
+"""Our mapper and COLMAP's mapper on well-connected images with the same verified matches.
 
-    python -m benchmarks.everyday [--views 49 100 ...] [--priors exact honest "locally wrong"]
+    python -m benchmarks.everyday [--views 49 100 ...] [--priors exact calibrated "locally biased"]
         [--only NAME ...] [--threads 1] [--repeats 1] [--json] [--output FILE]
 
-Analytic halls with boxes (:mod:`mpsfm_core.testing.synthetic.halls`): neighboring views overlap
-well, keypoints have 0.7 px of noise and 5 % of the matches are outliers. Each run has a process of
-its own, with compiled loops loaded before. Times are medians of the repeats, interleaved with
-COLMAP's; memory is the peak of the process. With more than one thread, compare wall times.
-``--only`` selects :data:`VARIANTS`, settings below ``mapping`` that differ from the defaults.
-``--json`` prints one JSON object as the last line.
+Scenes are synthetic halls with boxes, seen by cameras along a path
+(:mod:`mpsfm_core.testing.synthetic.halls`). Neighboring views overlap well, keypoints have 0.7 px
+of noise and 5 % of the matches are outliers. Each run has its own process, which loads compiled
+code before the time starts. Times are medians over repeats; runs of both mappers are interleaved.
+Memory is the peak of the process. Compare wall times if ``--threads`` is above 1. ``--only``
+selects from :data:`VARIANTS`, mapper settings that differ from the defaults. ``--json`` prints one
+JSON object as the last line.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ CONVENTION = CONVENTIONS["paper"]
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Parse the command line, run both mappers, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--views", type=int, nargs="+", default=[49, 100])
     parser.add_argument("--priors", nargs="+", choices=list(QUALITIES), default=list(QUALITIES))
@@ -66,7 +67,7 @@ def main() -> None:
 def measured(
     views: int, prior: str, variants: Sequence[str], repeats: int, threads: int = 1
 ) -> list[dict[str, Any]]:
-    """Yield a row for COLMAP and one for each variant of ours."""
+    """Yield a table row for COLMAP's mapper and for each variant of our mapper."""
     hall = make_hall_problem(views, QUALITIES[prior])
     methods = {PEER: (PEER, MapperOptions())}
     for variant in variants:
@@ -96,7 +97,7 @@ def measured(
 
 
 def _row(hall: HallProblem, outcomes: Sequence[MethodResult]) -> dict[str, Any]:
-    """Compute medians of the repeats; the accuracy is the same in all."""
+    """Compute median times over repeated runs, whose reconstructions are identical."""
     first = outcomes[0]
     poses = first.models[0] if first.models else {}
     area = pose_auc(pose_errors_deg(poses, hall.truth, CONVENTION), CONVENTION)
@@ -112,7 +113,7 @@ def _row(hall: HallProblem, outcomes: Sequence[MethodResult]) -> dict[str, Any]:
 
 
 def growth(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Compute the exponent of CPU time over views, by method and prior."""
+    """Fit the exponent of CPU time as a power of the number of views, by mapper and depth prior."""
     points: dict[str, list[tuple[int, float]]] = {}
     for row in rows:
         name = f"{row['method']}, {row['priors']}"
@@ -125,7 +126,7 @@ def growth(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format a Markdown table with a row per run, and the exponents of growth."""
+    """Format a Markdown table with one row per run, and the growth exponents of CPU time."""
     lines = [
         "| views | priors | method | registered | AUC@1/5/20 | CPU, s | wall, s | CPU / COLMAP | "
         "wall / COLMAP | peak, MiB |",

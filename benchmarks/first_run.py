@@ -1,11 +1,11 @@
-"""First run of a new user: a phone video, a reconstruction in the browser, a folder for splatting.
+"""Time of a new user's first run: from a video to a report and to splatting input.
 
     python -m benchmarks.first_run [--gsplat FOLDER]
 
-Encodes hololens_room (123 photos of a head-mounted camera, with motion blur) as twelve seconds of
-H.264 (needs PyAV: pip install av); runs the commands of docs/first-run.md; opens the page in
-headless Chromium; and reads the exported folder with gsplat's loader, if FOLDER is the ``examples``
-folder of its repository (pip install imageio piexif tqdm). Prints a table.
+Encodes hololens_room (123 photos of a head-mounted camera, with motion blur) as an H.264 video of
+twelve seconds (needs ``pip install av``). Runs the commands of docs/first-run.md, and opens the
+report in headless Chromium. If FOLDER is the ``examples`` folder of gsplat's repository, gsplat's
+loader reads the exported folder (needs ``pip install imageio piexif tqdm``). Prints a table.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ print(len(parser.image_names), "images and", len(parser.points), "points")
 
 
 def film(photos: Sequence[Path], video: Path) -> None:
-    """Encode photos as H.264."""
+    """Encode photos as an H.264 video."""
     try:
         import av
     except ImportError as error:
@@ -58,7 +58,7 @@ def film(photos: Sequence[Path], video: Path) -> None:
 
 
 def timed(command: Sequence[str], folder: Path) -> tuple[float, float, str]:
-    """Return CPU and wall seconds of a command, and its output."""
+    """Run a command; return CPU seconds, wall seconds and the command's output."""
     before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     ended = subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, text=True, check=False)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -69,7 +69,7 @@ def timed(command: Sequence[str], folder: Path) -> tuple[float, float, str]:
 
 
 def look(page: Path) -> tuple[float, str]:
-    """Open a report; return the wall seconds until its scene is drawn, and its first sentence."""
+    """Open a report; return the seconds until its 3D scene is drawn, and its first sentence."""
     with start_browser() as browser:
         started = time.perf_counter()
         browser.get(page.resolve().as_uri())
@@ -87,7 +87,7 @@ def look(page: Path) -> tuple[float, str]:
 
 
 def main() -> None:
-    """Parse the command line and run the commands."""
+    """Parse the command line, run the commands of docs/first-run.md, and print their times."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("first-run"))
     parser.add_argument("--frames", type=int, default=30, help="as many are taken from the video")

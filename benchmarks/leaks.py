@@ -2,9 +2,9 @@
 
     python -m benchmarks.leaks [--count 200]
 
-Three photos of an analytic room, all stages; provider results come from the cache after the first
-run. Prints memory, objects, files and threads of the process, and their slopes in the second half.
-Writes benchmarks/results/leaks.md.
+Every run passes three rendered photos of a synthetic room through all stages. Results of providers
+come from the cache after the first run. Prints memory, Python objects, open files and threads of
+the process. Slopes are fitted to the second half of the runs. Writes benchmarks/results/leaks.md.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
 
 
 def main() -> None:
-    """Reconstruct, and write the table."""
+    """Reconstruct the scene repeatedly, and write the table of memory."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=200)
     count = parser.parse_args().count
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def reconstruction(folder: Path) -> Callable[[], object]:
-    """Return a function that reconstructs generated photos."""
+    """Return a function that reconstructs rendered photos of a synthetic room."""
     photos = folder / "photos"
     photos.mkdir()
     for number, pose in enumerate(arc_poses(3, 10.0)):

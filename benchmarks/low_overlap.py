@@ -1,11 +1,11 @@
-"""Low overlap from photos alone: with the fast pass, with networks only, with SIFT only.
+"""Accuracy on photos with low overlap, with the fast pass, networks only, and SIFT only.
 
     python -m benchmarks.low_overlap [--scenes rendered_kitchen ...] [--buckets minimal ...]
 
-Compares `fast-cpu`, `fast-cpu` without its fast pass (``fast_pass: null``), and `sift` on the sets
-of each bucket, by the mean pose AUC of the sets in percent, convention `paper`. A set without a
-reconstruction has no registered image. Seconds are of whole runs, with cached features and depth of
-earlier runs.
+Compares the configurations `fast-cpu`, `fast-cpu` without fast pass (``fast_pass: null``), and
+`sift`. The measure is the mean pose AUC over the test sets of each bucket in percent, convention
+`paper`. A test set without a reconstruction counts as no registered image. Seconds are wall times
+of whole runs, with features and depth from the cache.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ METHODS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "without fast pass": ("fast-cpu", ("fast_pass=null",)),
     "`sift`": ("sift", ()),
 }
-"""Configuration and settings by label."""
+"""Configuration and additional settings, by the label in the table."""
 CONVENTION = CONVENTIONS["paper"]
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Parse the command line, reconstruct the test sets, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
     parser.add_argument("--buckets", nargs="+", help="default: all of a scene")
@@ -57,7 +57,7 @@ def main() -> None:
 def row(
     scene: SceneFolder, bucket: str, sets: Sequence[Sequence[str]], method: str, cache: Path
 ) -> str:
-    """Format one row of the table."""
+    """Format registered images, pose AUC and time of a bucket and configuration as a table row."""
     started, registered, areas = time.perf_counter(), 0, []
     for names in sets:
         poses = found(scene, names, method, cache)
@@ -75,7 +75,7 @@ def row(
 
 
 def found(scene: SceneFolder, names: Sequence[str], method: str, cache: Path) -> Mapping[str, Pose]:
-    """Return the poses of the largest reconstruction of a set."""
+    """Reconstruct a test set, and return the poses of the largest component."""
     config, settings = METHODS[method]
     overrides = ("dense.enabled=false", f"runtime.cache_dir={cache}", *settings)
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as listed:

@@ -1,11 +1,12 @@
-"""Mapping time compared with COLMAP's incremental mapper on the same matches, and its growth.
+"""Mapping time of our mapper and of COLMAP's incremental mapper on the same matches.
 
     python -m benchmarks.mapping_time [--scenes rendered_kitchen ...] [--output DIR]
 
-Evenly spaced frames of a scene, twice as many in each set. Matches are XFeat + LighterGlue, priors
-are true depth; neither is timed. A small set runs first to load compiled code. COLMAP runs without
-and with structure-less registration, its default since version 4. Writes
-benchmarks/results/mapping_time.md. Needs an idle machine.
+Each test set has twice as many evenly spaced frames as the previous test set. Matches are those of
+XFeat and LighterGlue, and depth priors are true depth; only mapping is timed. A small test set is
+mapped first to load compiled code. COLMAP runs without and with structure-less registration, the
+default since version 4. Writes benchmarks/results/mapping_time.md. Run this benchmark on an idle
+machine.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ METHODS = ("ours-sensor", *PEERS)
 
 
 def main() -> None:
-    """Run the scenes and write the table."""
+    """Map the frames of each scene, and write the table of mapping times."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="+", default=["rendered_kitchen", "hololens_room"])
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))
@@ -54,7 +55,7 @@ def _spaced(frames: Sequence[str], count: int) -> list[str]:
 
 
 def _table(sizes: Sequence[int], records: Sequence[BenchmarkRecord]) -> str:
-    """Format a row for each number of images, and the exponents of growth."""
+    """Format a table row for each number of images, and a row of growth exponents of the time."""
     record_by_run = {(record.bucket, record.label): record for record in records}
     lines = [
         f"| images | {' | '.join(METHODS)} | ours / colmap | ours / colmap-structureless |",

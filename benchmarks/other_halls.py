@@ -1,11 +1,12 @@
-"""Halls that no option was tuned on: other seeds, worse matches, fewer pairs, worse priors.
+"""Our mapper and COLMAP's mapper on synthetic halls that were not used to tune any option.
 
     python -m benchmarks.other_halls [--views 49] [--seeds 1 2 3 4] [--matches NAME ...]
         [--priors NAME ...] [--workers 2] [--output FILE]
 
-Extends :mod:`benchmarks.everyday`, whose halls have one kind of matches. Our mapper and COLMAP's
-incremental mapper use the same verified matches; images are summed and pose AUC is over the pairs
-of all seeds. CPU time is summed over concurrent processes.
+The halls of :mod:`benchmarks.everyday` get other seeds, worse matches, fewer pairs and worse depth
+priors. Our mapper and COLMAP's incremental mapper use the same verified matches. Registered images
+are summed over the seeds, and pose AUC is over the image pairs of all seeds. CPU time is summed
+over concurrent processes.
 """
 
 from __future__ import annotations
@@ -35,10 +36,11 @@ from mpsfm_core.testing.synthetic.halls import (
 
 @dataclass(frozen=True)
 class Matches:
-    """Kind of matches of a hall.
+    """Degradation of the matches of a synthetic hall.
 
-    ``options``: of :func:`make_hall_problem`. ``share``: share of random pairs that are kept.
-    ``reach``: maximum distance of kept pairs in views along the walk.
+    ``options`` are arguments of :func:`make_hall_problem`. ``share`` is the share of the image
+    pairs that are used, at random. ``reach`` is the maximum index difference of the two views of a
+    pair.
     """
 
     options: Mapping[str, float] = field(default_factory=dict)
@@ -46,7 +48,7 @@ class Matches:
     reach: int = 10**9
 
     def hall(self, views: int, errors: PriorErrors, seed: int) -> HallProblem:
-        """Create a hall of this kind."""
+        """Create a synthetic hall with these degraded matches."""
         hall = make_hall_problem(views, errors, seed=seed, **self.options)  # type: ignore[arg-type]
         rng = np.random.default_rng(seed)
         selected = [
@@ -72,7 +74,7 @@ PRIORS = QUALITIES | {
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Parse the command line, run both mappers on all halls, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--views", type=int, default=49)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4])
@@ -99,7 +101,7 @@ def main() -> None:
 
 
 def compared(halls: Sequence[HallProblem], workers: int) -> str:
-    """Compute the cells of a row: images, accuracy and time of both mappers."""
+    """Compute registered images, pose AUC and CPU time of both mappers for one table row."""
     tasks = [
         MethodRun(f"{number}", method, hall.problem, MapperOptions())
         for number, hall in enumerate(halls)

@@ -1,15 +1,18 @@
-"""Recall, number and time of the pairs of ``pairs.mode: auto``.
+"""Recall, number and time of the image pairs that ``pairs.mode: auto`` selects.
 
     python -m benchmarks.pairs [--scenes rendered_kitchen ...] [--output DIR]
 
-Real scenes are in $MPSFM_SHARED or ../shared, with XFeat as in `fast-cpu`. `hall` is an analytic
-hall of 200 views (mpsfm_core/testing/synthetic/halls.py) with random descriptors: a view detects
-half of its points, with descriptor noise of half the descriptor length, and as many outliers. At
-most a quarter of its keypoints is repeated, as for XFeat on rendered_kitchen (18 to 25 %). A pair
-is true if its views overlap by more than a limit (mpsfm_core/evaluation/overlap.py). *Matched*
-pairs can contribute to a reconstruction: for real photos, pairs with an overlap of 0.15 whose
-LighterGlue matches are verified with a rotation error below 10 degrees; in the hall, pairs with 30
-points that look alike from both views. Writes benchmarks/results/pairs.md.
+Photos of real scenes are in $MPSFM_SHARED or ../shared; features are XFeat as in `fast-cpu`. The
+scene `hall` is a synthetic hall of 200 views (mpsfm_core/testing/synthetic/halls.py) with random
+descriptors. Each view of the hall detects half of its points, and as many outliers. Descriptor
+noise is half the descriptor length. At most a quarter of the keypoints are repeatable, as for XFeat
+on rendered_kitchen (18 to 25 %).
+
+A pair is true if its two-view overlap (mpsfm_core/evaluation/overlap.py) is above a limit.
+*Matched* pairs can contribute to a reconstruction. A real pair counts as matched if its overlap is
+at least 0.15 and its verified LighterGlue matches give a rotation error below 10 degrees. A pair of
+the hall counts as matched if it has 30 common points with similar descriptors. Writes
+benchmarks/results/pairs.md.
 """
 
 from __future__ import annotations
@@ -49,7 +52,7 @@ VIEWS = 200
 
 
 class Case(NamedTuple):
-    """``overlap``: (n, n). ``matched``: true pairs that can be matched, if known."""
+    """Scene with descriptors and pairwise two-view overlap (n, n); ``matched`` may be unknown."""
 
     names: Sequence[str]
     descriptors: Sequence[Float32]
@@ -58,7 +61,7 @@ class Case(NamedTuple):
 
 
 def main() -> None:
-    """Run the scenes and write the table."""
+    """Select the pairs of each scene, and write the table of recall."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))
@@ -143,7 +146,7 @@ def _real(name: str, output: Path) -> Case:
 
 
 def _hall(seed: int = 0) -> Case:
-    """Create the views of a hall in random order."""
+    """Create descriptors and overlaps of the views of a synthetic hall, in random order."""
     hall = make_hall_problem(VIEWS, seed=seed)
     images = hall.problem.images
     depths = {image.name: image.depth.depth for image in images}

@@ -1,11 +1,11 @@
-"""``paper-mast3r`` with the real architectures and random weights, end to end.
+"""Run the configuration ``paper-mast3r`` with the authors' architectures and random weights.
 
     python -m benchmarks.paper_chain PHOTOS [--mast3r DIR --dsine DIR] [--work DIR]
 
 Runs ``mpsfm models export ... --checkpoint random`` and ``mpsfm reconstruct`` on a folder of
 photos: SuperPoint (of transformers), MASt3R (ViT-L) matches and depth, DSINE (EfficientNet-B5)
-normals with a mirrored pass, mapper. Random weights give no matches, so exit code 3 with a report
-is expected. Prints the time of each step and the peak memory.
+normals with a mirrored pass, mapper. Random weights give no matches, so ``mpsfm reconstruct`` ends
+with exit code 3 and a report. Prints the time and peak memory of each command.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from benchmarks._scenes import MPSFM
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Parse the command line, export the networks, and reconstruct the photos."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("photos", type=Path)
     parser.add_argument("--mast3r", type=Path, nargs="*", help="Checkouts for its export.")
@@ -75,7 +75,7 @@ def _random_superpoint(folder: Path) -> Path:
 
 
 def _measured(command: list[str], what: str, allowed: tuple[int, ...] = (0,)) -> None:
-    """Run a command; measure time and peak memory of its processes."""
+    """Run a command, and measure time and peak memory of the command's processes."""
     start, peak = time.perf_counter(), 0
     running = subprocess.Popen([*MPSFM, *command])
     process = psutil.Process(running.pid)

@@ -1,8 +1,8 @@
-"""Cost of a provider in another environment: ``python -m benchmarks.passage``.
+"""CPU time of calls to a provider in another environment: ``python -m benchmarks.passage``.
 
-Calls a provider with a constant result through a worker process. Measures CPU time of both
-processes for a view of a megapixel and a depth map of a megapixel, without and with variance; the
-best of several rounds. Validation of the result is not included.
+Calls a provider with a constant result through a worker process. Measures CPU time of the main
+process and the worker. View and depth map have one megapixel each, without and with variance. Each
+time is the smallest of several rounds, without validation of the result.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _CALLS, _ROUNDS = 100, 5
 
 
 class _Holding:
-    """Provider with constant results."""
+    """Depth provider that returns constant depth maps."""
 
     def __init__(self) -> None:
         depth = np.random.default_rng(0).uniform(1, 2, (_SIDE, _SIDE))
@@ -34,7 +34,7 @@ class _Holding:
         }
 
     def predict(self, view: View) -> DepthPrior:
-        """Return the result that the name of the view selects."""
+        """Return the constant depth map (with or without variance) that the view's name selects."""
         return self._answers[view.name]
 
 
@@ -68,7 +68,7 @@ def _cpu_ms(asked: Worker, call: dict[str, Any]) -> float:
         return sum(sum(process.cpu_times()[:2]) for process in processes)
 
     rounds = []
-    for _ in range(1 + _ROUNDS):  # the first call allocates the memory
+    for _ in range(1 + _ROUNDS):  # the first call allocates the shared memory
         begin = spent()
         for _ in range(_CALLS):
             asked.ask(call, 60)

@@ -1,8 +1,8 @@
-"""All pictures of the documentation, from the sample scene: ``python -m benchmarks.pictures``.
+"""Create all pictures of the documentation: ``python -m benchmarks.pictures``.
 
-Reconstructs the sample scene on a pseudo terminal, and two of its photos without overlap, which
-fails. Then captures both reports and the viewer in headless Chromium. Needs chromium, chromedriver,
-selenium and mpsfm-viser.
+Reconstructs the sample scene on a pseudo terminal. Also reconstructs two photos without overlap to
+get the report of a failed run. Then captures both reports and the viewer in headless Chromium.
+Needs chromium, chromedriver, selenium and mpsfm-viser.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from benchmarks._scenes import MPSFM
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = ROOT / "docs" / "pictures"
 WIDTH = 1100
-"""Width of a picture in pixels."""
+"""Width of a picture of the documentation in pixels."""
 _APART = ("view_0.jpg", "view_4.jpg")
-"""Two photos of opposite walls."""
+"""Two photos of the sample scene without overlap, on opposite walls."""
 _COLUMNS = 118
 _MAPS = ("photo", "prior", "refined", "std", "normals")
 
 
 def on_terminal(*arguments: str, code: int = 0) -> str:
-    """Return the output of a command on a terminal."""
+    """Run a command on a pseudo terminal, and return its output."""
     ours, theirs = pty.openpty()
     environment = {**os.environ, "COLUMNS": str(_COLUMNS), "TERM": "xterm-256color"}
     process = subprocess.Popen(
@@ -51,7 +51,7 @@ def on_terminal(*arguments: str, code: int = 0) -> str:
     while True:
         try:
             part = os.read(ours, 65536)
-        except OSError:  # Linux: the other side is closed
+        except OSError:  # Linux: the command closed the terminal
             break
         if not part:
             break
@@ -83,7 +83,7 @@ def draw_terminal(output: str, command: str, path: Path) -> None:
 
 
 def shoot(browser: Any, name: str) -> None:
-    """Capture the window as JPEG."""
+    """Capture the browser window as a JPEG picture."""
     png = np.frombuffer(capture_png(browser), np.uint8)
     picture = cv2.imdecode(png, cv2.IMREAD_COLOR)
     size = (WIDTH, round(picture.shape[0] * WIDTH / picture.shape[1]))
@@ -97,7 +97,7 @@ def _write(name: str, picture: np.ndarray) -> None:
 
 
 def wait_for(browser: Any, script: str) -> None:
-    """Wait until an expression is true."""
+    """Wait until a JavaScript expression is true in the browser."""
     end = time.monotonic() + 300
     while not browser.execute_script(f"return {script}"):
         if time.monotonic() > end:
@@ -106,7 +106,7 @@ def wait_for(browser: Any, script: str) -> None:
 
 
 def shoot_report(browser: Any, folder: Path) -> None:
-    """Capture the first screen, a photo, and the points in each coloring."""
+    """Capture the first screen of a report, one photo, and the points in each color mode."""
     browser.get((folder / "report.html").resolve().as_uri())
     wait_for(browser, "window.report !== undefined")
     time.sleep(3)  # textures
@@ -137,7 +137,7 @@ def _colour(browser: Any, color: str) -> None:
 
 
 def draw_maps(folder: Path, row: int = 5) -> None:
-    """Draw the maps of a photo side by side, from the data of the report."""
+    """Draw photo, depth and normal maps of one image side by side, from the data of the report."""
     text = (folder / "report.html").read_text(encoding="utf-8")
     match = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
     assert match is not None
@@ -161,7 +161,7 @@ def shoot_viewer(browser: Any, folder: Path) -> None:
         address = next(filter(None, (re.search(r"http://\S+", line) for line in process.stdout)))
         browser.get(address[0])
         wait_for(browser, "location.protocol === 'http:' && document.querySelector('canvas')")
-        time.sleep(20)  # the scene comes through a socket
+        time.sleep(20)  # the viewer gets the scene through a socket after the page has loaded
         # it warns of browsers that draw without a GPU
         close = "document.querySelectorAll('.mantine-Notification-closeButton')"
         browser.execute_script(f"{close}.forEach((button) => button.click())")

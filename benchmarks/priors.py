@@ -1,14 +1,15 @@
-"""Accuracy of depth and normal networks, as shipped.
+"""Accuracy of depth and normal networks with their shipped weights and calibrations.
 
     python -m benchmarks.priors [--scenes NAME ...] [--set KEY=VALUE ...] [--json FILE]
 
 Scenes are hololens_room (sensor depth), rendered_kitchen (exact depth and normals) and fountain
-(points triangulated with true poses, up to scale). Depth is scaled per image by the ratio of the
-medians: AbsRel, delta < 1.25, and the scale. Uncertainty of log depth: share of errors within one
-std, and area between the sparsification curve and the ideal one (AUSE), compared with that of a
-constant std. Normals: median angular error. Every image has equal weight; time per photo is CPU and
-wall time in one thread. Writes benchmarks/results/priors.md; scenes and FastDepth are in
-$MPSFM_SHARED or ../shared.
+(points triangulated with true poses, up to scale). Depth metrics are AbsRel and the share with
+delta < 1.25, after scaling each image by the ratio of the medians, and this scale. Uncertainty
+metrics of log depth are the share of errors within one std, and AUSE. AUSE is the area between the
+sparsification curve and the ideal curve, compared with the AUSE of a constant std. The metric of
+normals is the median angular error. Every image has equal weight. Times are CPU and wall time per
+photo in one thread. Writes benchmarks/results/priors.md; scenes and FastDepth are in $MPSFM_SHARED
+or ../shared.
 """
 
 from __future__ import annotations
@@ -43,15 +44,15 @@ from mpsfm_core.support.yaml_text import write_yaml
 SCENES = ("hololens_room", "rendered_kitchen", "fountain")
 _MILLIMETRE = {"scale": 0.001}
 _TIMED = 8
-"""Number of timed photos, after one warm-up."""
+"""Number of photos over which inference time is measured, after one warm-up photo."""
 
 
 @dataclass(frozen=True)
 class DepthRow:
     """Metrics of a depth network on a scene.
 
-    ``scale``: median over images of truth / prediction, None if the truth has no unit;
-    ``ause_constant``: AUSE of a constant relative std.
+    ``scale`` is the median over images of true over predicted depth, None if true depth is only
+    known up to scale. ``ause_constant`` is the AUSE of a constant relative std.
     """
 
     prior: str
@@ -67,7 +68,7 @@ class DepthRow:
 
 @dataclass(frozen=True)
 class NormalsRow:
-    """Metrics of normals on a scene, in degrees and shares."""
+    """Metrics of predicted normals on a scene: angular errors in degrees, and shares of pixels."""
 
     prior: str
     scene: str
@@ -78,7 +79,7 @@ class NormalsRow:
 
 
 def main() -> None:
-    """Run and write the tables."""
+    """Evaluate depth and normal networks, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="+", default=SCENES, choices=SCENES)
     parser.add_argument("--set", nargs="*", default=[], help="options of compact, KEY=VALUE")
@@ -172,7 +173,7 @@ def _normals_row(name: str, folder: Path, config: str, registry: Registry) -> No
 
 
 def _triangulated(folder: Path, work: Path) -> Path:
-    """Triangulate SIFT matches with COLMAP, with true cameras and poses."""
+    """Triangulate SIFT matches with COLMAP, using the true cameras and poses."""
     model = work / "triangulated"
     if not (model / "points3D.bin").exists():
         model.mkdir(parents=True, exist_ok=True)
@@ -189,7 +190,7 @@ def _triangulated(folder: Path, work: Path) -> Path:
 
 
 def _as_in_database(truth: pycolmap.Reconstruction, path: Path) -> pycolmap.Reconstruction:
-    """Renumber true poses as in the database."""
+    """Return the true poses as a COLMAP model with the image ids of the database."""
     known = pycolmap.Reconstruction()
     poses = {image.name: image.cam_from_world() for image in truth.images.values()}
     with pycolmap.Database.open(path) as database:
@@ -204,7 +205,7 @@ def _as_in_database(truth: pycolmap.Reconstruction, path: Path) -> pycolmap.Reco
 
 
 def _time(block: Mapping[str, Any], folder: Path, registry: Registry) -> tuple[float, float]:
-    """Measure CPU and wall seconds per photo in one thread; medians."""
+    """Measure median CPU and wall seconds of inference per photo, in one thread."""
     scene = read_scene(folder)
     images = load_images(scene.images, scene.intrinsics)
     context = ProviderContext(resolve_weights=WeightStore().resolve)

@@ -24,13 +24,13 @@ CHANGELOG = "CHANGELOG.md"
 
 
 def collect_sentences(root: Path) -> dict[str, list[Sentence]]:
-    """Collect all sentences of the repository by kind of prose.
+    """Collect the sentences of docstrings, comments, messages and Markdown files.
 
     Args:
         root: Folder of the repository.
 
     Returns:
-        The sentences of each kind, in a fixed order.
+        The sentences of each kind of prose, ordered by file and line.
     """
     paths = [path for folder in CODE_FOLDERS for path in sorted((root / folder).rglob("*.py"))]
     paths += [path for pattern in DOCUMENT_PATTERNS for path in sorted(root.glob(pattern))]
@@ -47,14 +47,15 @@ def collect_sentences(root: Path) -> dict[str, list[Sentence]]:
 
 
 def allocate_draws(sentences: dict[str, list[Sentence]], num: int) -> dict[str, int]:
-    """Divide the draws among the kinds by their share of words, at least one for each kind.
+    """Divide the number of drawn sentences among the kinds of prose by their share of words.
 
     Args:
-        sentences: Sentences of each kind.
-        num: Number of sentences to draw in total.
+        sentences: All sentences, by kind of prose.
+        num: Total number of sentences to draw.
 
     Returns:
-        The number of draws of each kind; the sum is `num` (largest-remainder method).
+        The number of sentences to draw of each kind, at least one; their sum is `num`
+        (largest-remainder method).
     """
     words = {
         kind: sum(len(sentence.text.split()) for sentence in group)
@@ -69,15 +70,15 @@ def allocate_draws(sentences: dict[str, list[Sentence]], num: int) -> dict[str, 
 
 
 def draw_sentences(root: Path, num: int, seed: int) -> list[tuple[str, Sentence]]:
-    """Draw sentences without replacement, in random order.
+    """Draw sentences of the repository at random without replacement, in random order.
 
     Args:
         root: Folder of the repository.
-        num: Number of sentences.
+        num: Number of sentences to draw.
         seed: Seed of the random generator.
 
     Returns:
-        Pairs of kind and sentence.
+        Pairs of the kind of prose and the drawn sentence.
     """
     rng = np.random.default_rng(seed)
     sentences = collect_sentences(root)
@@ -93,7 +94,7 @@ def main(
     seed: Annotated[int, typer.Option(help="Seed of the draw.")] = 1,
     num: Annotated[int, typer.Option(help="Number of sentences.")] = 60,
 ) -> None:
-    """Print numbered sentences with kind, file and line."""
+    """Print the drawn sentences with number, kind of prose, file and line."""
     for number, (kind, sentence) in enumerate(draw_sentences(ROOT, num, seed), start=1):
         print(f"{number:3}. {sentence.text}\n     [{kind}, {sentence.path}:{sentence.line}]")
 

@@ -1,10 +1,10 @@
-"""Memory and disk of whole runs, compared with their estimates.
+"""Measured memory and disk space of whole runs, compared with the estimates before each run.
 
     python -m benchmarks.resources [CASE ...]
 
-Rendered photos: a walk through a hall, which is one component, or rooms without connection, one
-component each. SIFT with 1024 keypoints, exact depth from files, pairs of neighbors. Prints a row
-for each case.
+The rendered photos show a synthetic hall, which gives one component, or several unconnected rooms,
+one component each. Runs use SIFT with 1024 keypoints, exact depth from files, and pairs of
+neighboring photos. Prints a table row for each case.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mpsfm_core.testing.synthetic.halls import make_hall
 from mpsfm_core.testing.synthetic.scenes import AnalyticScene, arc_poses, room_scene
 
 ARC_DEG = 120.0
-"""Angle in degrees of the arc of cameras around the center of a room."""
+"""Angle in degrees of the circular arc of cameras around the center of a synthetic room."""
 CONFIG = """
 features: {{use: sift, options: {{max_keypoints: 1024}}}}
 matcher: {{use: mutual-nearest}}
@@ -40,7 +40,7 @@ runtime: {{workers: {workers}, cache_dir: {folder}/cache}}
 
 @dataclass(frozen=True)
 class Case:
-    """Number of rooms (0: a hall), size (width, height) of the photos, width of the priors."""
+    """Case: number of rooms (0: a hall), photo size (width, height) and width of prior maps."""
 
     count: int
     rooms: int
@@ -49,7 +49,7 @@ class Case:
     workers: int
 
     def photos(self) -> Iterable[tuple[AnalyticScene, Float64]]:
-        """Return a scene and a pose for each photo."""
+        """Return the synthetic scene and the camera pose of each photo."""
         if not self.rooms:
             poses, scene = make_hall(self.count, np.random.default_rng(0))
             yield from ((scene, pose) for pose in poses)
@@ -69,7 +69,7 @@ CASES = {
 
 
 def main() -> None:
-    """Run the cases and print the table."""
+    """Run the cases, and print measured and estimated memory and disk space."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=", ".join(CASES))
     print("| case | groups | MB predicted, measured | results predicted, measured |")
@@ -86,7 +86,7 @@ def main() -> None:
 
 
 def run(case: Case, folder: Path) -> dict:
-    """Write photos and depth maps, run in a process of its own, and read the summary."""
+    """Render photos and depth maps, reconstruct them in a child process, and read the summary."""
     width, height = case.size
     focal = (0.875 if case.rooms else 0.7) * width
     camera = PinholeCamera(width, height, focal, focal, width / 2, height / 2)

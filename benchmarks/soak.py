@@ -1,12 +1,12 @@
-"""A long run that is killed repeatedly, compared with an undisturbed run.
+"""A reconstruction that is killed and resumed repeatedly, compared with an undisturbed one.
 
     python -m benchmarks.soak [--photos 300] [--kills 10] [--gap 30] [--seed 0] [--output DIR]
 
-The photos are noisy copies of the frames of hololens_room, with SIFT features, pairs of neighbors
-and `compact` priors. Both runs are concurrent and share the machine. One gets SIGKILL after a
-random CPU time, uniform up to twice `--gap` seconds, and is restarted with the same command, until
-it was killed often enough. All files of the results, and CPU time including child processes are
-compared. Writes benchmarks/results/soak.md. Linux only.
+The photos are noisy copies of the frames of hololens_room. Runs use SIFT features, pairs of
+neighboring frames, and depth and normals of `compact`. Both reconstructions run at the same time.
+One reconstruction gets SIGKILL after a random CPU time, uniform up to twice `--gap` seconds, and is
+restarted with the same command, `--kills` times. The benchmark compares all result files, and CPU
+time including child processes. Writes benchmarks/results/soak.md. Linux only.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from tests.support.result_files import content
 
 SCENE = "hololens_room"
 NOISE = 4.0
-"""Std of the image noise in gray values (of 255)."""
+"""Std of the noise that is added to each photo, in gray values (0 to 255)."""
 POLL_S = 0.05
 CONFIG = """
 features: {{use: sift, options: {{max_keypoints: 2048}}}}
@@ -46,7 +46,7 @@ runtime: {{workers: {workers}, cache_dir: {cache}}}
 
 @dataclass(frozen=True)
 class Life:
-    """One process: its CPU seconds, its return code, and its output."""
+    """Process of an interrupted reconstruction, with CPU seconds, return code and output lines."""
 
     seconds: float
     code: int
@@ -54,18 +54,18 @@ class Life:
 
     @property
     def doing(self) -> str:
-        """Return the stage after the last completed one."""
+        """Return the last stage that the process completed before SIGKILL."""
         finished = [line.partition(":")[0] for line in self.said if line.endswith(" s")]
         return f"after {finished[-1]}" if finished else "at the start"
 
     @property
     def resumed(self) -> str:
-        """Return the message about the resumed mapping."""
+        """Return the message of the process about the resumed mapping."""
         return next((line for line in self.said if "continues from a checkpoint" in line), "")
 
 
 def main() -> None:
-    """Run both and write the table."""
+    """Run the interrupted and the undisturbed reconstruction, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--photos", type=int, default=300)
     parser.add_argument("--width", type=int, default=400, help="Of the photos, pixels.")
@@ -92,7 +92,7 @@ def main() -> None:
 
 
 def make_photos(folder: Path, count: int, width: int, seed: int) -> None:
-    """Write photos and intrinsics: repeated frames with different noise."""
+    """Write photos (repeated frames with different noise) and their intrinsics."""
     scene = shared_folder() / "data" / SCENE
     frames = sorted((scene / "images").iterdir())
     rng = np.random.default_rng(seed)
@@ -111,7 +111,7 @@ def make_photos(folder: Path, count: int, width: int, seed: int) -> None:
 
 
 def run(folder: Path, name: str, limits: list[float], workers: int) -> list[Life]:
-    """Start the command until it completes; each process except the last has a limit."""
+    """Restart the command until it completes; all processes but the last have a CPU time limit."""
     cache, output = folder / name / "cache", folder / name / "out"
     cache.mkdir(parents=True)
     config = folder / name / "config.yaml"
@@ -132,7 +132,7 @@ def run(folder: Path, name: str, limits: list[float], workers: int) -> list[Life
 
 
 def live(command: list[str], log: Path, limit: float) -> Life:
-    """Run a process, and kill it after ``limit`` CPU seconds."""
+    """Run the command in a process, and kill the process after ``limit`` CPU seconds."""
     with log.open("w") as file:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=file)
         while cpu_seconds(process.pid) < limit:
@@ -148,13 +148,13 @@ def live(command: list[str], log: Path, limit: float) -> Life:
 
 
 def cpu_seconds(pid: int) -> float:
-    """Return user and system time of a process and its finished children."""
+    """Return user plus system time in seconds of a process and its finished child processes."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 def report(folder: Path, alone: Life, lives: list[Life], arguments: argparse.Namespace) -> str:
-    """Format the table and the differences."""
+    """Format the table of processes, and the differences between the result files."""
     expected, actual = (content(folder / name / "out") for name in ("alone", "disturbed"))
     names = expected.keys() | actual.keys()
     different = sorted(name for name in names if expected.get(name) != actual.get(name))

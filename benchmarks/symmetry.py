@@ -1,11 +1,12 @@
-"""Depth check on two rooms that look alike: rejected hypotheses and pose accuracy.
+"""Depth check on two identical rooms: rejected pose hypotheses and pose accuracy.
 
     python -m benchmarks.symmetry [--seeds 9] [--placed-only] [--output FILE]
 
-*Placed*: all views have true poses and refined depth. Each view is checked at its true pose against
-all others, and at the corresponding pose in the twin room against the views of that room and the
-corridor. *Mapped*: the whole mapper, with and without the check. A registration is wrong if it is
-nearer to the twin position than to the true position, relative to the first pair.
+The first table (*placed*) starts from true poses and refined depth. The depth check compares each
+view at its true pose with all other views. The check also compares each view at the corresponding
+pose in the other room with the views of that room and of the corridor. The second table (*mapped*)
+runs the whole mapper, with and without the depth check. A registration is wrong if it is nearer to
+the corresponding position in the other room than to the true position, relative to the first pair.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ HEADER_MAPPED = (
 
 
 def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
-    """Return for each placement if it is wrong, if it is rejected, and the seconds."""
+    """Check each view at a correct and at a wrong pose; yield (is wrong, is rejected, seconds)."""
     views = zip(case.problem.images, case.poses, strict=True)
     images = tuple(replace(i, known_pose=(p[:, :3].copy(), p[:, 3].copy())) for i, p in views)
     pairs = tuple(p for p, false in zip(case.problem.pairs, case.false, strict=True) if not false)
@@ -62,7 +63,7 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
             if pose is not None:
                 scene.registered = everything & (room != room[image])
                 scene.translations[image] = truth + pose[:, 3] - case.poses[image][:, 3]
-                # its observed points do not move with it
+                # the observed points stay, because only the pose of the view is wrong
                 scene.tracks.point_of[scene.graph.keypoints_of(int(image))] = NO_POINT
             start = time.perf_counter()
             check = DepthConsistencyCheck(scene, options.consistency).check_image(
@@ -75,7 +76,7 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
 
 
 class Observed(ModelMaintenance):
-    """Scene that records every check: if the pose was wrong, and the result."""
+    """Scene that records every depth check: if the pose was wrong, and if it was rejected."""
 
     case: SymmetricProblem
     verdicts: list[tuple[bool, bool]]
@@ -87,7 +88,7 @@ class Observed(ModelMaintenance):
         return reason
 
     def _misplaced(self, image: int) -> bool:
-        """Return if an image is nearer to its twin position, relative to the first image."""
+        """Return if an image is nearer to the wrong room than to its true position."""
         scene, poses = self.scene, np.array(self.case.poses)
         if self.first is None or self.size == 2:
             others = scene.registered.copy()
@@ -101,7 +102,7 @@ class Observed(ModelMaintenance):
 
 
 def mapped(case: SymmetricProblem, enabled: bool) -> tuple[np.ndarray, int, list, float]:  # type: ignore[type-arg]
-    """Return pose errors of the largest component, its size, check results, and seconds."""
+    """Map a scene; return pose errors, size of the largest component, check results and seconds."""
     options = MapperOptions.model_validate({"consistency": {"enabled": enabled}})
     verdicts: list[tuple[bool, bool]] = []
     mapper = Mapper(case.problem, options, NullMappingEvents())
@@ -117,7 +118,7 @@ def mapped(case: SymmetricProblem, enabled: bool) -> tuple[np.ndarray, int, list
 
 
 def shares(verdicts: list[tuple[bool, bool]]) -> str:
-    """Format the rejected shares of wrong and of correct hypotheses as two cells."""
+    """Format the rejected shares of wrong and of correct pose hypotheses as two table cells."""
     cells = []
     for kind in (True, False):
         chosen = [rejected for wrong, rejected in verdicts if wrong == kind]

@@ -1,4 +1,4 @@
-"""Comparison of our adapters with the authors' code on the same random weights and photos.
+"""Comparison of our providers with the networks' original code, on the same random weights.
 
 ``python -m benchmarks.conformance [NETWORK ...] --checkouts DIR``; see :mod:`__main__`.
 """

@@ -1,11 +1,11 @@
-"""Compare networks: ``... conformance [NETWORK ...] [--checkouts DIR] [--environment NAME]``.
+"""Compare providers with original code: ``... [NETWORK ...] [--checkouts DIR]``.
 
-DIR (default ``$MPSFM_CHECKOUTS``) contains a checkout of each network's repository in a folder
-named after the export, at the commit of the plugin, and of required libraries. Missing ones are
-skipped with the commands that create them. Packages of the authors' code are imported from this
-environment and from ``DIR/packages`` (``pip install --target``). RoMa and NetVLAD run in the
-environment NAME (default ``vismatch``, created by ``mpsfm env create`` with mpsfm-vismatch,
-vismatch and onnx).
+DIR (default ``$MPSFM_CHECKOUTS``) contains checkouts of the networks' repositories and of required
+libraries. Each folder is named after the export, with the commit that the plugin names. A network
+without checkout is skipped, and the table lists the commands that create the checkout. Packages
+that the authors' code imports may be in ``DIR/packages`` (``pip install --target``). RoMa and
+NetVLAD run in the Python environment that --environment names (default ``vismatch``). ``mpsfm env
+create`` creates this environment with mpsfm-vismatch, vismatch and onnx.
 """
 
 from __future__ import annotations
@@ -33,16 +33,17 @@ from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 
 Compared: TypeAlias = Callable[[Path], dict[str, float]]
-"""Function from the folder of the checkouts to the largest differences."""
+"""Function from the folder of the checkouts to the largest difference of each output."""
 _HOLDS = {"normals, deg": 0.06, "positions, px": 1e-2, APART: np.inf}
 _TOLERANCE = 1e-3
-"""Maximum relative difference; for angles in radians. Both sides compute in float32. For RoMa in
-views of 640 pixels: 2e-5 of the width.
+"""Maximum relative difference of depth and std between our provider and the authors' code.
+
+Both compute in float32.
 """
 
 
 def main() -> int:
-    """Compare, print the table, and return how many networks differ."""
+    """Compare all networks, print the table, and return the number of networks that differ."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("networks", nargs="*")
     parser.add_argument("--checkouts", type=Path, default=os.environ.get("MPSFM_CHECKOUTS"))
@@ -76,7 +77,7 @@ def main() -> int:
 def _missing(wanted: Mapping[str, tuple[str, str]], checkouts: Path | None) -> str:
     """Return the reason why a network cannot be compared, or an empty text.
 
-    ``wanted``: repository and commit of each folder.
+    ``wanted`` contains the required repository and commit of each folder of checkouts.
     """
     if checkouts is None:
         return "skipped: no --checkouts"
@@ -123,7 +124,7 @@ def _through_file(network: Network, checkouts: Path) -> dict[str, float]:
 
 
 def _differences(network: Network, made: Path, views: Sequence[View]) -> dict[str, float]:
-    """Compute the largest differences over the photos, or groups of consecutive photos."""
+    """Compute the largest difference of each output over all photos (or groups of photos)."""
     kind, name, options = network.provider(made)
     store = WeightStore(made.parent / "cache", offline=True)
     context = ProviderContext(resolve_weights=store.resolve)

@@ -1,6 +1,6 @@
-"""Comparison of NetVLAD in ``global-onnx`` with hloc's, which the reference uses.
+"""Comparison of NetVLAD in ``global-onnx`` with the NetVLAD of hloc.
 
-hloc's code exports itself with random weights, and ``global-onnx`` runs the file.
+A script exports hloc's NetVLAD with random weights, and ``global-onnx`` runs the ONNX file.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ _CAMERAS = ((640, 480, 500.0), (333, 500, 500.0), (1601, 1203, 500.0), (900, 130
 _LARGEST = 1024
 """Longer side in pixels to which hloc shrinks photos."""
 APART = "(two photos)"
-"""Distance between the descriptors of two photos, as a scale for the differences."""
+"""Label of the distance between descriptors of different photos, a scale for the differences."""
 
 
 def compare(environment: Environment, checkout: Path) -> dict[str, float]:
-    """Compute the largest distances of unit descriptors, of original and of shrunk photos."""
+    """Compute the largest descriptor distance to hloc's NetVLAD, for original and shrunk photos."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         views = photos(folder, _CAMERAS, cv2.INTER_CUBIC)

@@ -1,4 +1,4 @@
-"""Networks under comparison: the authors' code, and the metric of the differences."""
+"""Networks that are compared with their authors' code, and the metrics of the differences."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ Differences = dict[str, float]
 
 @dataclass(frozen=True)
 class Network:
-    """Network under comparison.
+    """Network whose exported ONNX file is compared with the authors' code.
 
-    ``export``: name for ``mpsfm models export``, with repository and commit. ``script``: in
-    ``authors/``. ``size``, ``described``: size for the export, and as text. ``libraries``: further
-    checkouts, folder -> repository and commit; ``packages``: for ``pip install --no-deps``.
-    ``provider``: our provider as kind, name and options for a model file. ``ask``: calls it with
-    ``views`` photos. ``compare``: largest differences from the authors' arrays.
+    ``export`` is the name for ``mpsfm models export``. ``script`` is the file in ``authors/`` that
+    runs the authors' code. ``size`` is the network size for the export, and ``described`` its text
+    in the table. ``libraries`` maps folders of further checkouts to repository and commit.
+    ``packages`` are installed by ``pip install --no-deps``. ``provider`` returns kind, name and
+    options of our provider for an ONNX file. ``ask`` calls our provider with ``views`` photos.
+    ``compare`` computes the largest differences from the authors' arrays.
     """
 
     export: str
@@ -45,10 +46,10 @@ class Network:
 
 @dataclass(frozen=True)
 class Hosted:
-    """Network whose authors' code needs an environment of its own with torchvision.
+    """Network whose authors' code needs torchvision, in a separate Python environment.
 
-    ``repository``, ``commit``: the authors' code; ``described``: its size as text. ``compare``:
-    largest differences for an environment and a checkout.
+    ``repository`` and ``commit`` are those of the authors' code. ``described`` is the network size
+    as text. ``compare`` computes the largest differences for an environment and a checkout.
     """
 
     name: str
@@ -59,12 +60,12 @@ class Hosted:
 
 
 def relative(ours: NDArray[Any], theirs: NDArray[Any], where: Bool) -> float:
-    """Compute the largest relative difference; NaN for empty arrays."""
+    """Compute the largest relative difference of two arrays; NaN for empty arrays."""
     return float(np.abs(ours[where] / theirs[where] - 1).max()) if where.any() else np.nan
 
 
 def angle_deg(ours: NDArray[Any], theirs: NDArray[Any], where: Bool) -> float:
-    """Compute the largest angle between unit vectors in degrees; NaN for empty arrays."""
+    """Compute the largest angle in degrees between unit vectors; NaN for empty arrays."""
     if not where.any():
         return np.nan
     a, b = ours[where].astype(np.float64), theirs[where].astype(np.float64)
@@ -96,7 +97,7 @@ def _dsine(answer: NormalPrior, theirs: Arrays) -> Differences:
 
 
 def _mast3r(answer: PairMatches, theirs: Arrays) -> Differences:
-    """Compare depth and std inside the authors' crop, and matches in pixels of their crops."""
+    """Compare depth and std inside MASt3R's image crop, and matches in pixels of the crop."""
     assert answer.dense is not None and answer.depth is not None
     differences: Differences = {"depth": np.nan, "std": np.nan, "pixels behind": 0.0}
     cells = []

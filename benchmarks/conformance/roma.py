@@ -1,8 +1,8 @@
-"""Comparison of RoMa in an environment with its authors' repository.
+"""Comparison of RoMa in ``vismatch-roma`` with the repository of RoMa's authors.
 
-RoMa has no ONNX file, so both sides run in the environment with the real architecture and the same
-random weights: the copy of the collection through our provider, and the repository through its
-``match`` and ``to_pixel_coordinates``.
+Our provider runs the copy of RoMa in vismatch. The authors' repository is called through ``match``
+and ``to_pixel_coordinates``. Both use the original architecture and the same random weights in one
+Python environment, because RoMa cannot be exported to ONNX.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mpsfm_core.providers.registry import Registry
 
 
 def compare(environment: Environment, checkout: Path) -> dict[str, float]:
-    """Compute the largest differences of the matches of photo pairs."""
+    """Compute the largest differences of RoMa's matches and certainties over pairs of photos."""
     options = {"network": "mpsfm_vismatch.seeded_roma:Matcher", "cell": 1, "min_certainty": 0.05}
     context = ProviderContext(resolve_weights=lambda uri, sha256: Path(uri))
     name = f"vismatch-roma@{environment.name}"
@@ -36,7 +36,8 @@ def compare(environment: Environment, checkout: Path) -> dict[str, float]:
             with np.load(output) as theirs:
                 certainty = theirs["certainty"]
                 half = certainty.shape[1] // 2
-                # ours are those of the first view and then those of the second, row by row
+                # our provider returns the matches of the first view, then of the second, in row
+                # order
                 rows = np.arange(certainty.size).reshape(certainty.shape)
                 order = np.concatenate([rows[:, :half].ravel(), rows[:, half:].ravel()])
                 order = order[certainty.ravel()[order] > options["min_certainty"]]

@@ -1,4 +1,4 @@
-"""Photos and script runner of the comparisons."""
+"""Photos of the comparisons with authors' code, and the runner of the authors' scripts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mpsfm_core.providers.environments.environment import Environment
 AUTHORS = Path(__file__).parent / "authors"
 _SAMPLES = Path(__file__).parents[2] / "examples" / "sample_scene" / "images"
 _CAMERAS = ((640, 480, 620.0), (333, 500, 410.0), (517, 389, 900.0))
-"""Width, height and focal length of the photos: landscape, portrait, and odd sizes."""
+"""Width, height and focal length in pixels of the photos: landscape, portrait, and odd sizes."""
 
 
 def photos(
@@ -40,7 +40,7 @@ def photos(
 
 
 def run_authors(environment: Environment, script: str, *arguments: Path) -> None:
-    """Run a script of ``authors/`` in an environment.
+    """Run a script of the folder ``authors`` in a Python environment.
 
     Raises:
         ProviderError: The script fails; the message is its last line.

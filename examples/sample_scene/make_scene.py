@@ -1,6 +1,6 @@
 """Generate the sample scene: build a room, render it, degrade its priors.
 
-Needs Blender as a Python module; README.md has the command.
+Needs Blender as a Python module (bpy); README.md has the command that installs bpy.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def make_scene(
     samples: int,
     seed: int,
 ) -> None:
-    """Build a scene, render it along a path, and write the scene folder."""
+    """Build a scene, render it from each pose of a camera path, and write the scene folder."""
     camera, errors = Camera(), PriorErrors()
     halved = camera.halved()
     empty_scene()

@@ -1,4 +1,4 @@
-"""Verify a scene folder: consistency of depth, normals and poses, and the declared variances.
+"""Verify depth, normals, poses and declared variances of a scene folder.
 
 ``python verify.py [FOLDER]`` prints the numbers of README.md. Needs numpy, OpenCV, pycolmap.
 """
@@ -26,7 +26,7 @@ SAME_SURFACE = 0.05
 
 @dataclass(frozen=True)
 class View:
-    """One view: ``K``, pose (``x_camera = R x + t``), exact maps, and priors."""
+    """View with intrinsics ``K``, pose (``x_camera = R x + t``), exact maps, and priors."""
 
     name: str
     K: Float
@@ -39,7 +39,7 @@ class View:
 
 
 def load_views(folder: Path) -> list[View]:
-    """Read a scene folder."""
+    """Read all views of a scene folder."""
     model = pycolmap.Reconstruction(folder / "gt")
     views = []
     for image in sorted(model.images.values(), key=lambda image: image.name):
@@ -63,9 +63,9 @@ def load_views(folder: Path) -> list[View]:
 
 
 def seen_depth(a: View, b: View) -> tuple[Float, Float]:
-    """Project the pixels of ``a`` to ``b``: their depth, and the depth map of ``b`` there.
+    """Project the pixels of view ``a`` to ``b``; return projected and stored depth in ``b``.
 
-    Both are NaN outside the image and where a map has no depth.
+    Both depths are NaN for pixels outside the image, and for pixels without depth in a map.
     """
     rays = pixel_rays(a)
     world = (rays * np.where(a.depth > 0, a.depth, np.nan)[..., None] - a.t) @ a.R
@@ -73,27 +73,27 @@ def seen_depth(a: View, b: View) -> tuple[Float, Float]:
     z = np.where(point[..., 2] > 0, point[..., 2], np.nan)
     x, y = (point / z[..., None] @ b.K.T)[..., :2].transpose(2, 0, 1)
     inverse = np.where(b.depth > 0, 1 / np.where(b.depth > 0, b.depth, 1), np.nan)
-    # OpenCV counts pixel centres from 0; inverse depth is linear over a plane's pixels.
+    # OpenCV has the first pixel center at 0; inverse depth is linear in the pixels of a plane.
     at = [np.nan_to_num(v - 0.5, nan=-9).astype(np.float32) for v in (x, y)]
     found = cv2.remap(inverse, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     return z, np.where(found > 0, 1 / np.where(found > 0, found, 1), np.nan)
 
 
 def seen_in(a: View, b: View) -> Bool:
-    """Return which pixels of ``a`` are visible in ``b``."""
+    """Return the mask of the pixels of view ``a`` that are visible in view ``b``."""
     expected, found = seen_depth(a, b)
     return np.abs(found - expected) < SAME_SURFACE * expected
 
 
 def pixel_rays(view: View) -> Float:
-    """Compute (h, w, 3) rays through the pixel centers, z = 1."""
+    """Compute the rays through the pixel centers in the camera frame, (h, w, 3) with z = 1."""
     h, w = view.depth.shape
     u, v = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
     return np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(view.K).T
 
 
 def overlaps(views: list[View]) -> tuple[Float, float]:
-    """Compute the (n, n) two-view overlaps, and the largest three-view overlap of any triplet."""
+    """Compute the two-view overlaps (n, n), and the largest three-view overlap of any triplet."""
     count = range(len(views))
     area = [(v.depth > 0).sum() for v in views]
     seen = {(i, j): seen_in(views[i], views[j]) for i, j in permutations(count, 2)}
@@ -119,7 +119,7 @@ def depth_errors(views: list[View]) -> Float:
 
 
 def depth_scores(view: View) -> tuple[Float, Float]:
-    """Compute relative error and error / declared std of the valid pixels of the depth prior."""
+    """Compute relative error, and error over declared std, of the depth prior's valid pixels."""
     prior = view.depth_prior
     truth, known = _reduced(view.depth, prior["depth"].shape)
     use = known & prior["valid"]
@@ -128,7 +128,7 @@ def depth_scores(view: View) -> tuple[Float, Float]:
 
 
 def normal_scores(view: View) -> tuple[Float, Float]:
-    """Compute the angular error in degrees and the normalized angle of the valid normals.
+    """Compute angular error in degrees and normalized angle of the valid normals of the prior.
 
     The normalized angle is the angle divided by the std of both tangent axes; its mean square is 1
     for a correct variance.
@@ -143,7 +143,7 @@ def normal_scores(view: View) -> tuple[Float, Float]:
 
 
 def rms(values: Float) -> float:
-    """Compute the root mean square."""
+    """Compute the root mean square of an array."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -151,8 +151,8 @@ def run_colmap(folder: Path, views: list[View]) -> tuple[list[float], list[int]]
     """Run incremental COLMAP with SIFT, exhaustive matching and known intrinsics.
 
     Returns:
-        For each verified pair of neighbors the median distance of its matches to the exact epipolar
-        lines in pixels, and the number of images of each model.
+        Returns the median distance in pixels of the matches to the exact epipolar lines for each
+        verified pair of neighbors, and the number of images of each model.
     """
     camera = pycolmap.Reconstruction(folder / "gt").cameras[1]
     reader = pycolmap.ImageReaderOptions(
@@ -195,7 +195,7 @@ def _prior(path: Path) -> dict[str, NDArray]:
 
 
 def _reduced(values: Float, shape: tuple[int, ...]) -> tuple[Float, Bool]:
-    """Compute block means on a grid of ``shape``, and the blocks without a zero (unknown pixel)."""
+    """Compute means over blocks of pixels, and the mask of blocks without unknown pixels (0)."""
     h, w = shape
     blocks = values.reshape(h, values.shape[0] // h, w, values.shape[1] // w)
     return blocks.mean((1, 3)), (blocks != 0).all((1, 3))

@@ -1,4 +1,4 @@
-"""MASt3R on pairs of consecutive photos, with its authors' code; see ``common.py``."""
+"""Run the original code of MASt3R on pairs of consecutive photos; see ``common.py``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mpsfm_core.providers.model_export.author_script import ExportJob
 for name in (
     "torchvision",
     "torchvision.transforms",
-):  # the authors' code only uses these three attributes
+):  # MASt3R's code reads only these three attributes of the checkpoint's arguments
     sys.modules[name] = ModuleType(name)
 sys.modules["torchvision.transforms"].__dict__.update(
     Compose=lambda steps: lambda image: steps[1](steps[0](image)),
@@ -28,11 +28,11 @@ sys.modules["torchvision.transforms"].__dict__.update(
 from dust3r.utils.image import load_images  # noqa: E402
 from mast3r.cloud_opt.sparse_ga import extract_correspondences, symmetric_inference  # noqa: E402
 
-_SIZE = 256  # the authors' descriptor comparison takes minutes for larger images on a CPU
+_SIZE = 256  # MASt3R's descriptor matching takes minutes for larger images on a CPU
 
 
 def answers(model: Any, first: Any, second: Any) -> dict[str, Any]:
-    """Compute the depth of both views in their own frames, and matches of both passes."""
+    """Compute the depth of two views, each in its camera frame, and the matches of both passes."""
     with torch.inference_mode():
         predictions = symmetric_inference(model, first, second, "cpu")  # 11, 21, 22, 12
     features, certainties = (

@@ -1,4 +1,4 @@
-"""Metric3D v2, with its authors' code; see ``common.py``."""
+"""Run the original code of Metric3D v2; see ``common.py``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PADDING = (123.675, 116.28, 103.53)
 job = ExportJob.from_arguments()
 model = network(job.size)
 last = model.model.depth_model.decoder.normal_predictor[-1]
-last.bias.data += torch.tensor([0.0, 0.0, -10.0])  # facing the camera, as trained ones do
+last.bias.data += torch.tensor([0.0, 0.0, -10.0])  # face the camera
 for index, (image, camera) in enumerate(photos(job)):  # the steps of the authors' hubconf.py
     height, width = image.shape[:2]
     scale = min(SIZE[0] / height, SIZE[1] / width)

@@ -1,4 +1,4 @@
-"""MoGe-2, with its authors' code; see ``common.py``."""
+"""Run the original code of MoGe-2; see ``common.py``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SHIFT, _FOCAL = 0.7, 1.4
 
 
 class Seeing(MoGeModel):
-    """Network whose points are moved near the pixel rays, so that the shift of z is defined."""
+    """MoGe-2 network whose points are moved near the pixel rays, which defines the shift of z."""
 
     def _remap_points(self, points):
         points = super()._remap_points(points)
@@ -28,11 +28,11 @@ class Seeing(MoGeModel):
 
 job = ExportJob.from_arguments()
 model = Seeing(**small_with_normals()).eval()
-for block in model.encoder.backbone.blocks:  # otherwise it is initialized as identity
+for block in model.encoder.backbone.blocks:  # replace identity layers
     torch.nn.init.constant_(block.ls1.gamma, 1.0)
     torch.nn.init.constant_(block.ls2.gamma, 1.0)
 last = [module for module in model.normal_head.modules() if isinstance(module, torch.nn.Conv2d)]
-last[-1].bias.data += torch.tensor([0.0, 0.0, -1.0])  # facing the camera, as trained ones do
+last[-1].bias.data += torch.tensor([0.0, 0.0, -1.0])  # face the camera
 for index, (image, camera) in enumerate(photos(job)):
     fov = math.degrees(2 * math.atan(camera["width"] / 2 / camera["fx"]))
     model.onnx_compatible_mode = True

@@ -1,7 +1,7 @@
 """NetVLAD of hloc: ``python netvlad.py CHECKOUT OUTPUT.onnx PHOTO ...``.
 
 Needs torchvision. Uses random weights in the layout of the published file, without whitening.
-Writes the network, and its descriptors of the photos as hloc loads them.
+Writes the network as ONNX file, and NetVLAD's descriptors of the photos, which hloc's loader reads.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 checkout, output, *photos = sys.argv[1:]
-package = ModuleType("hloc")  # the package itself imports all extractors
+package = ModuleType("hloc")  # importing the package hloc.extractors would import all extractors
 package.__path__ = [f"{checkout}/hloc"]
 sys.modules["hloc"] = package
 from hloc.extractors import netvlad  # noqa: E402
@@ -25,7 +25,7 @@ rng = np.random.default_rng(0)
 
 
 def published(*_: object, **__: object) -> dict[str, object]:
-    """Return random weights in the structure that loadmat returns for the published file."""
+    """Return random weights in the structure that scipy's loadmat reads from NetVLAD's file."""
     layers = [SimpleNamespace(weights=None) for _ in range(34)]
     places = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
     for place, (into, out) in zip(places, pairwise(CHANNELS), strict=True):
@@ -49,7 +49,7 @@ exec(source[source.index("def resize_image(") : source.index("class ImageDataset
 
 
 class Exported(torch.nn.Module):
-    """Network from an image (1, 3, h, w) in [0, 1] to its descriptor."""
+    """NetVLAD from an image (1, 3, h, w) in [0, 1] to its global descriptor."""
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         """Compute the descriptor."""
@@ -62,7 +62,7 @@ with torch.inference_mode():
     for path in photos:
         image = scope["cv2"].imread(path)[..., ::-1].astype(np.float32)
         size = image.shape[:2][::-1]
-        if max(size) > 1024:  # as hloc's ImageDataset, with the configuration "netvlad"
+        if max(size) > 1024:  # resize_max of hloc's "netvlad"
             new = tuple(round(x * (1024 / max(size))) for x in size)
             image = scope["resize_image"](image, new, "cv2_area")
         batch = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)) / 255)[None]

@@ -1,6 +1,6 @@
-"""RoMa's warp, with its authors' code: ``python roma_warp.py CHECKOUT PHOTO PHOTO OUTPUT``.
+"""Run the original code of RoMa: ``python roma_warp.py CHECKOUT PHOTO PHOTO OUTPUT``.
 
-Needs torchvision. Matches are converted by the authors' ``to_pixel_coordinates``.
+Needs torchvision. RoMa's function ``to_pixel_coordinates`` converts the warp to pixels.
 """
 
 from __future__ import annotations
@@ -21,4 +21,4 @@ with torch.inference_mode():
     warp, certainty = model.match(first, second, device="cpu")
     sizes = [Image.open(path).size[::-1] for path in (first, second)]
     a, b = model.to_pixel_coordinates(warp.reshape(-1, 4), *sizes[0], *sizes[1])
-np.savez(output, a=a, b=b, certainty=np.squeeze(certainty))  # newer versions have a batch dimension
+np.savez(output, a=a, b=b, certainty=np.squeeze(certainty))  # remove the batch dimension

@@ -1,4 +1,4 @@
-"""UniDepth V2, with its authors' code; see ``common.py``."""
+"""Run the original code of UniDepth V2; see ``common.py``."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from mpsfm_core.providers.model_export.author_script import ExportJob
 job = ExportJob.from_arguments()
 model = network(job.size)
 last = model.pixel_decoder.depth_layer.to_confidence_hr[-1]
-torch.nn.init.constant_(last.bias, 1.0)  # the output is an error, which is positive
+torch.nn.init.constant_(last.bias, 1.0)  # the network predicts an absolute error, which is positive
 model.resolution_level = 9
 model.shape_constraints |= {"pixels_min": 0, "pixels_max": SIZE[0] * SIZE[1]}
 mean, std = (torch.tensor(v)[:, None, None] for v in (IMAGENET_DATASET_MEAN, IMAGENET_DATASET_STD))
 for index, (image, camera) in enumerate(photos(job)):
-    # The file has one size, for which the authors have no steps: the photo is placed in the middle
-    # of the border that their infer() makes, which then does the rest.
+    # The ONNX file has one input size. UniDepth's infer() pads the photo to its own size, so the
+    # photo is placed in the center of an image of the size of the file.
     height, width = image.shape[:2]
     scale = min(SIZE[0] / height, SIZE[1] / width)
     h, w = round(height * scale), round(width * scale)

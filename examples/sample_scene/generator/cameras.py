@@ -1,4 +1,4 @@
-"""Cameras, poses and the exact maps of a view; independent of Blender."""
+"""Cameras, poses and exact depth and normal maps of a view, independent of Blender."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Camera:
         return Camera(self.width // 2, self.height // 2, self.focal / 2)
 
     def rays(self) -> Float64:
-        """Compute (height, width, 3) rays through the pixel centers, z = 1."""
+        """Compute camera-frame rays through the pixel centers, (height, width, 3) with z = 1."""
         u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         x, y = (u - self.width / 2) / self.focal, (v - self.height / 2) / self.focal
         return np.stack([x, y, np.ones_like(x)], -1)
@@ -44,10 +44,10 @@ class Pose:
 
 @dataclass(frozen=True)
 class Truth:
-    """Exact maps of a view.
+    """Exact depth and normal maps of a rendered view.
 
-    z depth (h, w) in meters, 0 without a surface; unit normals (h, w, 3) in the camera frame that
-    face the camera, 0 without a surface.
+    Depth (h, w) is along z in meters. Normals (h, w, 3) are unit vectors in the camera frame that
+    face the camera. Both are 0 for pixels without a surface.
     """
 
     depth: Float64
@@ -55,9 +55,10 @@ class Truth:
 
 
 def look(centre: Float64, heading_deg: float, pitch_deg: float, roll_deg: float) -> Pose:
-    """Create a pose at ``centre`` from heading, pitch and roll in degrees; world z up.
+    """Create a camera pose at ``centre`` from heading, pitch and roll in degrees; world z is up.
 
-    ``heading_deg`` turns from +x to +y, ``pitch_deg`` up, ``roll_deg`` about the optical axis.
+    ``heading_deg`` rotates from world +x to +y, ``pitch_deg`` upward, ``roll_deg`` about the
+    optical axis.
     """
     heading, pitch, roll = np.radians([heading_deg, pitch_deg, roll_deg])
     level = np.array([np.cos(heading), np.sin(heading), 0])

@@ -13,9 +13,9 @@ from .cameras import Camera, Pose, Truth
 from .priors import Prior
 
 JPEG_SCAN = 0xDA
-"""Marker of the segment with the pixels."""
+"""JPEG marker of the segment with the pixels."""
 JPEG_NOTES = (0xE1, 0xFE)
-"""Markers of application data and comments."""
+"""JPEG markers of segments with application data and comments."""
 
 
 def write_intrinsics(folder: Path, camera: Camera) -> None:
@@ -30,7 +30,7 @@ def write_intrinsics(folder: Path, camera: Camera) -> None:
 
 
 def write_poses(folder: Path, camera: Camera, poses: dict[str, Pose]) -> None:
-    """Write the COLMAP text model ``gt/`` without points; ``poses`` by image name."""
+    """Write camera and poses (by image name) as COLMAP text model ``gt/`` without points."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(
@@ -52,7 +52,7 @@ def write_poses(folder: Path, camera: Camera, poses: dict[str, Pose]) -> None:
 
 
 def write_truth(folder: Path, stem: str, truth: Truth) -> None:
-    """Write ``gt_depth/STEM.png`` (16 bit, mm, 0 invalid) and ``gt_normals/STEM.png`` (RGB)."""
+    """Write exact depth (16-bit PNG in mm, 0 invalid) and exact normals (RGB PNG) of a view."""
     _write_png(folder / "gt_depth" / f"{stem}.png", np.round(truth.depth * 1000).astype(np.uint16))
     colour = np.round((truth.normals / 2 + 0.5) * 255).astype(np.uint8)
     colour[truth.depth == 0] = 127
@@ -62,7 +62,7 @@ def write_truth(folder: Path, stem: str, truth: Truth) -> None:
 def write_prior(path: Path, kind: str, prior: Prior) -> None:
     """Write a prior as ``.npz``: arrays ``kind``, ``variance`` (float16), ``valid`` (bool).
 
-    Values are rounded to their significant digits for better compression.
+    Values are rounded to a few significant digits, which compresses better.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     hole = ~prior.valid
@@ -75,7 +75,7 @@ def write_prior(path: Path, kind: str, prior: Prior) -> None:
 
 
 def drop_jpeg_notes(path: Path) -> None:
-    """Remove date and render times from a JPEG of Blender, without changing its pixels."""
+    """Remove date and render time from a JPEG file of Blender, without changing the pixels."""
     data = path.read_bytes()
     kept, start = data[:2], 2
     while data[start + 1] != JPEG_SCAN:

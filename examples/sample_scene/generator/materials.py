@@ -1,4 +1,4 @@
-"""Procedural materials in world coordinates, so that no two places look alike."""
+"""Procedural Blender materials in world coordinates, so that no two surfaces look alike."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Colour = tuple[float, float, float]
 
 
 class Shader:
-    """Matte material built from nodes; ``position`` is the world position."""
+    """Matte Blender material built from shader nodes; ``position`` is the world position."""
 
     def __init__(self, roughness: float = 0.8) -> None:
         self.material = bpy.data.materials.new("material")
@@ -24,7 +24,7 @@ class Shader:
         self.position = self.node("ShaderNodeNewGeometry").outputs["Position"]
 
     def node(self, kind: str, inputs: dict[str | int, object] | None = None) -> bpy.types.Node:
-        """Add a node; an input is a constant or an output socket."""
+        """Add a shader node, whose inputs are constants or output sockets of other nodes."""
         node = self._tree.nodes.new(kind)
         for name, value in (inputs or {}).items():
             if isinstance(value, bpy.types.NodeSocket):
@@ -36,7 +36,7 @@ class Shader:
     def ramp(
         self, factor: bpy.types.NodeSocket, colours: Sequence[Colour], low: float, high: float
     ) -> bpy.types.NodeSocket:
-        """Map ``factor`` in [low, high] to evenly spaced colors."""
+        """Map a shader value in [low, high] to evenly spaced colors."""
         node = self.node("ShaderNodeValToRGB", {"Fac": factor})
         stops = np.linspace(low, high, len(colours))
         while len(node.color_ramp.elements) < len(colours):
@@ -67,7 +67,7 @@ class Shader:
         return node.outputs["Color"]
 
     def plane(self, floor: bool) -> bpy.types.NodeSocket:
-        """Return two coordinates of a floor (x, y) or of an axis-aligned wall (x + y, z)."""
+        """Return texture coordinates of a floor (x, y) or of an axis-aligned wall (x + y, z)."""
         if floor:
             return self.position
         xyz = self.node("ShaderNodeSeparateXYZ", {"Vector": self.position}).outputs
@@ -75,7 +75,7 @@ class Shader:
         return self.node("ShaderNodeCombineXYZ", {"X": along, "Y": xyz["Z"]}).outputs["Vector"]
 
     def stretched(self, scale: Sequence[float]) -> bpy.types.NodeSocket:
-        """Return the world position with scaled axes, for wood grain."""
+        """Return the world position with scaled axes, which stretches noise to wood grain."""
         node = self.node("ShaderNodeMapping", {"Vector": self.position, "Scale": tuple(scale)})
         return node.outputs["Vector"]
 
@@ -88,13 +88,13 @@ class Shader:
 def mottled(
     colours: Sequence[Colour], scale: float, *, low: float = 0.35, high: float = 0.65
 ) -> bpy.types.Material:
-    """Create fractal blotches: plaster, stone, foliage, cloth."""
+    """Create a material of fractal blotches, for plaster, stone, foliage and cloth."""
     shader = Shader()
     return shader.finish(shader.ramp(shader.noise(scale), colours, low, high))
 
 
 def wood(light: Colour, dark: Colour, grain: Sequence[float] = (3, 3, 30)) -> bpy.types.Material:
-    """Create wood with grain along the axis with the smallest ``grain`` frequency."""
+    """Create a wood material with grain along the axis with the smallest ``grain`` frequency."""
     shader = Shader(0.5)
     fine = shader.noise(1.0, shader.stretched(grain), 0.75)
     colour = shader.ramp(fine, [dark, light, dark, light], 0.3, 0.7)
@@ -105,7 +105,7 @@ def wood(light: Colour, dark: Colour, grain: Sequence[float] = (3, 3, 30)) -> bp
 def bricks(
     first: Colour, second: Colour, mortar: Colour, size: tuple[float, float], *, floor: bool = False
 ) -> bpy.types.Material:
-    """Create bricks, tiles or planks of ``size`` (length, height) with individual shades."""
+    """Create a material of bricks, tiles or planks of ``size`` (length, height) in many shades."""
     shader = Shader()
     inputs = {"Color1": (*first, 1), "Color2": (*second, 1), "Mortar": (*mortar, 1), "Scale": 1.0}
     pattern = shader.node("ShaderNodeTexBrick", {**inputs, "Vector": shader.plane(floor)})
@@ -117,7 +117,7 @@ def bricks(
 
 
 def patchwork(colours: Sequence[Colour], scale: float, *, grout: Colour) -> bpy.types.Material:
-    """Create irregular cells of random colors with seams: rugs, wallpaper, cushions."""
+    """Create a material of irregular colored cells with seams, for rugs, wallpaper and cushions."""
     shader = Shader(0.9)
     cell = {"Vector": shader.position, "Scale": scale}
     shade = shader.node("ShaderNodeTexVoronoi", cell).outputs["Color"]
@@ -131,7 +131,7 @@ def patchwork(colours: Sequence[Colour], scale: float, *, grout: Colour) -> bpy.
 
 
 def plain(colour: Colour) -> bpy.types.Material:
-    """Create a uniform color with slight wear."""
+    """Create a material of uniform color with slight wear."""
     shader = Shader(0.6)
     wear = shader.ramp(shader.noise(25.0), [(0.55, 0.55, 0.55), (1, 1, 1)], 0.35, 0.6)
     return shader.finish(shader.mix(colour, wear, 0.8, "MULTIPLY"))

@@ -23,7 +23,7 @@ def add_mesh(
     at: Vector = (0, 0, 0),
     turn_deg: float = 0,
 ) -> None:
-    """Add a mesh: (n, 3) vertices rotated about z by ``turn_deg``, then moved to ``at``."""
+    """Add a mesh whose vertices (n, 3) are rotated about z by ``turn_deg`` and moved to ``at``."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     turned = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + np.asarray(at)
     mesh = bpy.data.meshes.new("part")
@@ -41,7 +41,7 @@ def add_box(material: bpy.types.Material, size: Vector, at: Vector, *, turn_deg:
 def add_turned(
     material: bpy.types.Material, profile: Profile, at: Vector, *, stretch: Vector = (1, 1, 1)
 ) -> None:
-    """Add a solid of revolution: ``profile`` lists (radius, height) from bottom to top."""
+    """Add a solid of revolution whose ``profile`` lists (radius, height) from bottom to top."""
     angle = np.arange(SEGMENTS) * 2 * np.pi / SEGMENTS
     rings = [np.stack([r * np.cos(angle), r * np.sin(angle), 0 * angle + z], 1) for r, z in profile]
     faces = _grid_faces(len(rings), SEGMENTS)

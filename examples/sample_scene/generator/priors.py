@@ -1,7 +1,7 @@
 """Depth and normal priors with simulated errors of a monocular network, and their variances.
 
-Errors come from a seeded generator. Variances are computed from the standard deviations of the
-errors and from the local spread at blurred edges, never from the errors themselves.
+Errors are drawn from a seeded generator. Declared variances depend on the standard deviations of
+the errors and on the depth spread at blurred edges, never on the drawn errors.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from .cameras import Truth
 Float64 = NDArray[np.float64]
 
 FIELD_SCALES = ((0.7, 0.2), (0.55, 0.07), (0.45, 0.025))
-"""(weight, correlation length relative to the map width); squared weights sum to 1."""
+"""Weight and correlation length (in map widths) of each noise field; squared weights sum to 1."""
 
 
 @dataclass(frozen=True)
 class PriorErrors:
-    """Standard deviations of the errors; blur in pixels of the prior grid."""
+    """Standard deviations of the simulated prior errors, and edge blur in pixels of the map."""
 
     std_scale: float = 0.05
     std_depth: float = 0.05
@@ -42,7 +42,7 @@ class Prior:
 
 
 def degrade_depth(truth: Truth, errors: PriorErrors, rng: np.random.Generator) -> Prior:
-    """Apply edge blur, one scale error, and a smooth multiplicative error of varying size."""
+    """Degrade exact depth by edge blur, one scale error, and smooth multiplicative noise."""
     valid = truth.depth > 0
     shape = truth.depth.shape
     mean = _blur(truth.depth, valid, errors.blur_px)
@@ -57,7 +57,7 @@ def degrade_depth(truth: Truth, errors: PriorErrors, rng: np.random.Generator) -
 def degrade_normals(
     truth: Truth, rays: Float64, errors: PriorErrors, rng: np.random.Generator
 ) -> Prior:
-    """Apply edge blur and a smooth tilt about both tangent axes of varying size.
+    """Degrade exact normals by edge blur, and by smooth rotations about both tangent axes.
 
     ``rays``: (h, w, 3) directions of the pixels; normals that do not face the camera are invalid.
     """
@@ -77,7 +77,7 @@ def degrade_normals(
 
 
 def _misjudged(errors: PriorErrors, rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
-    """Create the smooth factor by which the declared variance is wrong."""
+    """Create the smooth random factor by which the declared variance deviates from the true one."""
     return np.exp(2 * errors.declared_spread * _field(rng, shape))
 
 
@@ -94,7 +94,7 @@ def _field(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64:
 
 
 def _blur(values: Float64, valid: NDArray[np.bool_], sigma: float) -> Float64:
-    """Blur the valid pixels only; invalid ones become 0."""
+    """Blur the valid pixels of a map; invalid pixels become 0."""
     weight = cv2.GaussianBlur(valid.astype(float), (0, 0), sigma)
     mean = cv2.GaussianBlur(np.where(valid, values, 0), (0, 0), sigma) / weight.clip(1e-9)
     return np.where(valid, mean, 0)

@@ -11,17 +11,17 @@ from mathutils.bvhtree import BVHTree
 from .cameras import Camera, Pose, Truth
 
 BLENDER_FROM_CV = np.diag([1.0, -1.0, -1.0])
-"""Blender's camera looks along -z with y up; ours along +z with y down."""
+"""Rotation between camera frames: Blender looks along -z with y up, COLMAP along +z with y down."""
 SENSOR_MM = 36.0
 
 
 def empty_scene() -> None:
-    """Start Blender with an empty scene."""
+    """Start Blender (bpy) with an empty scene."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
 def render_image(camera: Camera, pose: Pose, path: Path, samples: int) -> None:
-    """Render the open scene to ``path`` as JPEG."""
+    """Render the open Blender scene to the JPEG file ``path``."""
     scene = bpy.context.scene
     scene.camera = _blender_camera(camera, pose)
     scene.render.engine = "CYCLES"
@@ -54,7 +54,7 @@ def _blender_camera(camera: Camera, pose: Pose) -> bpy.types.Object:
 
 
 def scene_surface() -> BVHTree:
-    """Build a ray-casting tree of all triangles of the open scene."""
+    """Build a ray-casting tree (BVH) of all triangles of the open Blender scene."""
     vertices, faces = [], []
     bpy.context.view_layer.update()
     for item in bpy.context.scene.objects:
@@ -66,7 +66,7 @@ def scene_surface() -> BVHTree:
 
 
 def cast_truth(surface: BVHTree, camera: Camera, pose: Pose) -> Truth:
-    """Compute exact depth and normals at the pixel centers."""
+    """Compute exact depth and normals at the pixel centers by ray casting."""
     rays = camera.rays().reshape(-1, 3)
     length = np.linalg.norm(rays, axis=1)
     towards = (rays / length[:, None]) @ pose.rotation

@@ -34,7 +34,7 @@ def build_room(rng: np.random.Generator) -> None:
 
 
 def room_path(rng: np.random.Generator, views: int = 8) -> list[Pose]:
-    """Create hand-held views around the room; each turns by 45 deg and looks past the center."""
+    """Create irregular camera poses around the room, about 45 deg of heading apart."""
     poses = []
     for step in np.arange(views) * 360 / views:
         heading = step + rng.normal(0, 0.7)
@@ -93,7 +93,7 @@ def _picture(
     *,
     along_x: bool,
 ) -> None:
-    """Add a framed picture on a wall; ``at`` is the center of its lower edge."""
+    """Add a framed picture on a wall; ``at`` is the center of the lower edge of the frame."""
     flat = (size[0], 0.03) if along_x else (0.03, size[0])
     add_box(mat.wood(OCHRE, DARK_OAK), (*flat, size[1]), at)
     corner = (at[0] + at[1] - size[0] / 2 + 0.05, at[2] + 0.05)

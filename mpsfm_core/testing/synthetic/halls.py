@@ -70,8 +70,8 @@ CALIBRATED_PRIORS = PriorErrors(scale=0.05, field=0.04, declared=0.06)
 LOCALLY_BIASED_PRIORS = replace(CALIBRATED_PRIORS, patch=0.2)
 QUALITIES = {
     "exact": EXACT_PRIORS,
-    "honest": CALIBRATED_PRIORS,
-    "locally wrong": LOCALLY_BIASED_PRIORS,
+    "calibrated": CALIBRATED_PRIORS,
+    "locally biased": LOCALLY_BIASED_PRIORS,
 }
 
 
