@@ -264,7 +264,7 @@ def _malformed(spec: ProviderSpec) -> str:
     if isinstance(name, str) and callable(spec.factory):
         name = name.partition("@")[0]  # The text after the separator is the name of an environment.
     if not (isinstance(name, str) and _NAME.fullmatch(name)):
-        return f"name {spec.name!r} is not made of lower-case letters, digits and - . _"
+        return f"name {spec.name!r} may only have lower-case letters, digits and - . _"
     if not (callable(spec.factory) or _is_reference(spec.factory)):
         return f"factory {spec.factory!r} does not look like 'package.module:Class'"
     is_model = inspect.isclass(spec.options) and issubclass(spec.options, Options)

@@ -92,7 +92,8 @@ class ProviderContext:
 
     resolve_weights: Callable[[str, str | None], Path]
     """``resolve_weights(uri, sha256)`` returns the local path of a weights file and downloads the
-    file if necessary. It raises :class:`~mpsfm_core.data.errors.WeightsError`. URIs are described
+    file if necessary. The function raises
+    :class:`~mpsfm_core.data.errors.WeightsError`. URIs are described
     in :mod:`mpsfm_core.providers.weights`."""
     device: str = "cpu"
     """Device of the networks, ``"cpu"`` or ``"cuda"``."""
@@ -104,7 +105,7 @@ class ProviderContext:
 
 @runtime_checkable
 class DepthProvider(Protocol):
-    """Monocular depth network."""
+    """Provider that predicts the depth of a single view."""
 
     def predict(self, view: View) -> DepthPrior:
         """Predict the z-depth map of a view.
@@ -155,7 +156,7 @@ class FocalEstimator(DepthProvider, Protocol):
 
 @runtime_checkable
 class NormalsProvider(Protocol):
-    """Surface normal network."""
+    """Provider that predicts the surface normals of a single view."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         """Predict the surface normals of a view.
@@ -346,7 +347,7 @@ class WeightsFile:
     """Weights file of a network that a provider loads."""
 
     uri: str
-    """Location, see :mod:`mpsfm_core.providers.weights`."""
+    """Location of the file, see :mod:`mpsfm_core.providers.weights`."""
     sha256: str | None = None
     """Expected SHA-256 in hex. With None the hash of the first download is recorded
     and compared later."""
@@ -474,7 +475,8 @@ hookimpl = pluggy.HookimplMarker("mpsfm")
 class Hooks:
     """Hooks that a plugin may implement, as in pluggy.
 
-    Every hook except :meth:`mpsfm_providers` is optional. If a hook raises, the run skips this hook of the plugin from then on and warns the user.
+    Every hook except :meth:`mpsfm_providers` is optional. If a hook raises, the run skips this hook
+    of the plugin from then on and warns the user.
     """
 
     @hookspec

@@ -43,7 +43,7 @@ class ProviderConfig(Options):
     def _merge_environment(cls, values: Any) -> Any:
         if isinstance(values, Mapping) and values.get("environment") and "use" in values:
             if values["use"] == SAME_NETWORK or "@" in str(values["use"]):
-                raise ValueError(f"environment: {values['use']!r} says where it is")
+                raise ValueError(f"environment: 'use: {values['use']}' already selects one")
             values = {**values, "use": f"{values['use']}@{values['environment']}"}
             del values["environment"]
         return values

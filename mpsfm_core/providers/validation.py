@@ -299,7 +299,7 @@ def validate_retrieval(spec: ProviderSpec, view: View, output: object) -> Float3
 
 
 def validate_mask(spec: ProviderSpec, view: View, output: object) -> Bool:
-    """Validate a mask: The mask is (H, W) bool on the pixel grid of the view.
+    """Validate a mask (H, W) bool on the pixel grid of the view.
 
     Args:
         spec: Specification of the provider.

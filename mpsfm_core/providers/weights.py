@@ -179,7 +179,7 @@ class WeightStore:
         """
         path = self.locate(uri)
         if path is None:
-            raise WeightsError(f"{uri} is not on this machine; 'mpsfm models fetch' gets it")
+            raise WeightsError(f"{uri} is not on this machine; 'mpsfm models fetch' downloads it")
         expected = _normalize_hash(uri, sha256) or self._recorded(uri)
         actual = file_sha256(path)
         if expected not in (None, actual):
@@ -227,12 +227,8 @@ class WeightStore:
         if expected not in (None, actual):
             _delete_partial(part)
             raise _hash_mismatch(uri, None, str(expected), actual)
-        self._record(
-            uri,
-            part,
-            actual,
-            # The hash is stored before the file, so that every file in the cache has a recorded hash.
-        )
+        # The hash is recorded before the file appears in the cache.
+        self._record(uri, part, actual)
         part.replace(path)
         _delete_partial(part)
 
@@ -272,8 +268,8 @@ class WeightStore:
                 raise ValueError("not a record for each file")
         except (ValueError, AttributeError, RecursionError) as error:
             raise WeightsError(
-                f"{record} is damaged ({error}): remove it; what was downloaded is then compared "
-                f"with the hash of its plugin, or fetched again"
+                f"{record} is damaged ({error}): remove this file; weights files are then "
+                f"compared with the hash of their plugin, or downloaded again"
             ) from error
         return cast(dict[str, dict[str, Any]], entries)
 
@@ -327,11 +323,11 @@ def load_torch_state(path: Path) -> dict[str, Any]:
     # The readers of pickle, zip and safetensors share no exception base class.
     except Exception as error:
         raise WeightsError(
-            f"{path} cannot be loaded as plain tensors ({type(error).__name__}): it is damaged, "
-            f"or it holds Python objects, which are never executed here"
+            f"{path} cannot be loaded as plain tensors ({type(error).__name__}): the file is "
+            f"damaged or contains Python objects, which are never executed"
         ) from error
     if not isinstance(loaded, dict):
-        raise WeightsError(f"{path} holds a {type(loaded).__name__}, not named tensors")
+        raise WeightsError(f"{path} contains a {type(loaded).__name__}, not named tensors")
     return loaded
 
 
@@ -350,8 +346,8 @@ def _normalize_hash(uri: str, sha256: str | None) -> str | None:
 def _hash_mismatch(uri: str, path: Path | None, expected: str, actual: str) -> WeightsError:
     what = f"{uri} ({path})" if path else f"{uri}: the download"
     return WeightsError(
-        f"{what} has SHA-256 {actual}, expected {expected}: it is damaged or another version; "
-        f"it is not used"
+        f"{what} has SHA-256 {actual}, expected {expected}: the file is damaged or another "
+        f"version and is not used"
     )
 
 
@@ -391,12 +387,12 @@ def _find_exported_file(uri: str) -> Path:
     if Path(name).name != name or not manifest.is_file():
         raise WeightsError(
             f"{uri} is not on this machine and is not published: 'mpsfm models export {name} "
-            f"--code CHECKOUT --checkpoint FILE' makes it from the authors' code and weights"
+            f"--code CHECKOUT --checkpoint FILE' exports it from the authors' code and weights"
         )
     try:
         return Path(json.loads(manifest.read_text(encoding="utf-8"))["file"])
     except (ValueError, KeyError, TypeError) as error:
-        raise WeightsError(f"{manifest} is no manifest of an export") from error
+        raise WeightsError(f"{manifest} is not a valid manifest of an exported network") from error
 
 
 def _find_package_resource(uri: str) -> Path:

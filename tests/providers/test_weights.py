@@ -346,7 +346,7 @@ def test_safetensors_and_files_without_tensors(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="damaged"):
         load_torch_state(path)
     torch.save(torch.ones(2), tmp_path / "t.pt")
-    with pytest.raises(WeightsError, match="holds a Tensor"):
+    with pytest.raises(WeightsError, match="contains a Tensor"):
         load_torch_state(tmp_path / "t.pt")
 
 

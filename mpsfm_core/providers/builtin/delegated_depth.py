@@ -28,8 +28,7 @@ class MatcherDepth:
             ProviderError: Always.
         """
         raise ProviderError(
-            f"the depth of {view.name!r} comes from {self.source}; it cannot be predicted from one "
-            f"view"
+            f"the depth of {view.name!r} is predicted by {self.source}, not from a single view"
         )
 
 

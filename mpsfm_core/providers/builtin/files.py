@@ -63,7 +63,7 @@ class DepthFiles:
             check_map(path, stored, view, 1)
         if stored is None and options.relative_std is None and options.std_floor == 0:
             raise InputError(
-                f"{path} has no variance: declare how good the depth is, for example with "
+                f"{path} has no variance: declare the depth uncertainty, for example with "
                 f"depth.options.relative_std=0.02"
             )
         if stored is not None and stored.shape != depth.shape:

@@ -88,7 +88,7 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
     except Exception as error:  # Parsers raise exceptions of any type for a damaged file.
         raise InputError(f"{path} cannot be read: {type(error).__name__}: {error}") from error
     if main not in arrays:
-        raise InputError(f"{path} has no array {main!r}, it has {', '.join(arrays) or 'none'}")
+        raise InputError(f"{path} has no array {main!r}, only {', '.join(arrays) or 'none'}")
     return arrays
 
 
@@ -131,7 +131,7 @@ def _read_image(path: Path) -> NDArray[Any]:
     data = np.frombuffer(content, dtype=np.uint8)
     pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if pixels is None:
-        raise ValueError("it is damaged or no image")
+        raise ValueError("the file is damaged or not an image")
     if pixels.ndim == 3:
         pixels = pixels[..., 2::-1] if pixels.shape[2] >= 3 else pixels[..., 0]
     return np.asarray(pixels)

@@ -11,7 +11,10 @@ from mpsfm_core.data.options import Options
 
 
 class SiftOptions(Options):
-    """Options of SIFT. Option defaults are those of COLMAP unless another source is given."""
+    """Options of SIFT.
+
+    Option defaults are those of COLMAP unless another source is given.
+    """
 
     max_keypoints: int = Field(8192, gt=0)
     """Largest number of keypoints per image; keypoints with the largest scale remain [COLMAP]."""

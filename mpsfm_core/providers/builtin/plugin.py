@@ -1,4 +1,7 @@
-"""Plugin of the built-in providers, which need no weights. Imports nothing heavy."""
+"""Plugin of the built-in providers, which need no weights.
+
+This module imports no heavy library.
+"""
 
 from __future__ import annotations
 

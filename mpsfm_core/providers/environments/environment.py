@@ -93,7 +93,7 @@ class Environment:
             check_version(content, FORMAT, path)
             found: list[dict[str, Any]] = content["providers"]
         except InputError as error:
-            _log.warning("%s is left out: %s", self.label, error)
+            _log.warning("the providers of %s are not available: %s", self.label, error)
             return []
         except (OSError, ValueError, KeyError, AttributeError, RecursionError):
             return []
@@ -134,7 +134,7 @@ def find_environment(name: str) -> Environment:
     if name not in known:
         hint = did_you_mean(name, known)
         raise InputError(
-            f"no environment {name!r}{hint}; 'mpsfm env create {name} PACKAGE' makes it"
+            f"no environment {name!r}{hint}; 'mpsfm env create {name} PACKAGE' creates it"
         )
     return known[name]
 
@@ -223,10 +223,10 @@ def _run(command: list[str], label: str) -> None:
     try:
         done = subprocess.run(command, capture_output=True, text=True)
     except OSError as error:
-        raise ProviderError(f"{label} cannot be made: {error}") from error
+        raise ProviderError(f"{label} cannot be created: {error}") from error
     if done.returncode:
         lines = [line for line in (done.stderr or done.stdout).splitlines() if line.strip()]
         reason = next((line for line in lines if "rror" in line), lines[-1] if lines else "")
         raise ProviderError(
-            f"{label} cannot be made: {' '.join(command[:4])} ...: {reason.strip()}"
+            f"{label} cannot be created: {' '.join(command[:4])} ...: {reason.strip()}"
         )

@@ -107,7 +107,7 @@ def _description(registry: Registry) -> list[dict[str, Any]]:
     """Describe the providers of the plugins that are installed in this environment.
 
     Built-in providers are left out, because every environment has them. Wrappers are left out,
-    because a wrapper has to run in the process of its inner provider. Both are excluded.
+    because a wrapper has to run in the process of its inner provider.
     """
     entries = []
     for line in registry.status():
@@ -146,8 +146,8 @@ def _setup(registry: Registry, kind: Any, name: str, folder: Path) -> dict[str, 
     setup = load_setup(registry.spec(kind, name), folder)
     if setup.prepare is not None:
         raise ProviderError(
-            f"the contract setup of {name!r} prepares examples by a function, which does not work "
-            f"across environments: run the check inside its environment"
+            f"the ContractSetup of {name!r} has a prepare function, which cannot be sent to "
+            f"another process: run the contract tests in the provider's own environment"
         )
     return {
         "options": dict(setup.options),

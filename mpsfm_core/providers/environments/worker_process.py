@@ -84,14 +84,15 @@ class Worker:
             greeting = self._receive(_START_TIMEOUT_S, "did not start")
         except WorkerLost as error:
             raise ProviderError(
-                f"{error}; 'mpsfm env remove' and 'mpsfm env create' make it again"
+                f"{error}; create the environment again with 'mpsfm env remove' and "
+                f"'mpsfm env create'"
             ) from error
         versions = greeting["protocol"], greeting["api"]
         if versions != (PROTOCOL, API_VERSION):
             self.close()
             raise ProviderError(
-                f"{label} has mpsfm-core {greeting['core']}, whose protocols are of another "
-                f"version ({versions} there, {(PROTOCOL, API_VERSION)} here): create it again with "
+                f"{label} has mpsfm-core {greeting['core']}, whose protocol version "
+                f"{versions} differs from {(PROTOCOL, API_VERSION)}: create it again with "
                 f"'mpsfm env create'"
             )
 
@@ -191,7 +192,7 @@ def _resolved(
     """Resolve a weights file for the worker; return an error as a message."""
     try:
         if resolve is None:
-            raise ProviderError(f"weights {uri} cannot be fetched without a weight store")
+            raise ProviderError(f"weights {uri} cannot be resolved without a weight store")
         return {"value": resolve(uri, sha256)}
     except MpsfmError as error:
         return {"error": encode_error(error)}

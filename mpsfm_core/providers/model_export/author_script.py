@@ -40,7 +40,7 @@ class ExportJob:
     """Export request that MP-SfM sends to the export script of a plugin."""
 
     weights: Path | None
-    """Checkpoint; Path of the checkpoint, None for seeded random weights."""
+    """Path of the checkpoint, None for seeded random weights."""
     output: Path
     """Path of the ONNX file to write."""
     size: str = ""

@@ -25,9 +25,10 @@ _MIN_SHIFTED_RATIO = 0.01
 class DepthCalibration(Options):
     """Uncertainty model of depth priors.
 
-    The std is ``max(std_scale * network_std, relative_std * depth, std_floor)``. The default values are those of Metric3D v2 giant2 in the reference implementation. Plugins
-    declare the values of other networks. The variance describes the depth errors after each image
-    has received its own scale, as in the mapper. The error of that scale is excluded.
+    The std is ``max(std_scale * network_std, relative_std * depth, std_floor)``. The default values
+    are those of Metric3D v2 giant2 in the reference implementation. Plugins declare the values of
+    other networks. The variance describes the depth errors after each image has received its own
+    scale, as in the mapper. The error of that scale is excluded.
     """
 
     std_scale: float = Field(3.33, gt=0)
@@ -107,7 +108,8 @@ def depth_medians(prior: DepthPrior) -> tuple[float, float]:
 class NormalCalibration(Options):
     """Uncertainty model of normal priors.
 
-    The angular std is ``max(std_scale * network_std, std_floor_deg)``. ``std_default_deg`` replaces the std of a network that predicts no variance.
+    The angular std is ``max(std_scale * network_std, std_floor_deg)``. ``std_default_deg`` replaces
+    the std of a network that predicts no variance.
     """
 
     std_scale: float = Field(1.0, gt=0)

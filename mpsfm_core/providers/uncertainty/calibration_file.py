@@ -111,7 +111,7 @@ def read_values(path: Path, kind: str) -> Mapping[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"calibration file {str(path)!r} cannot be read: {error}") from error
     if not isinstance(content, Mapping):
-        raise ConfigError(f"{path} does not hold a mapping")
+        raise ConfigError(f"{path} does not contain a mapping")
     check_version(content, FORMAT, path, ConfigError)
     if "provenance" not in content:
         return {key: value for key, value in content.items() if key != VERSION}

@@ -50,7 +50,7 @@ def test_what_is_not_copied_cannot_be_written_to():
 
 @pytest.mark.parametrize("value", [object(), np.array([object()]), {1: lambda: 0}])
 def test_no_objects(value):
-    with pytest.raises(DataError, match="cannot be handed to another process"):
+    with pytest.raises(DataError, match="cannot be sent to another process"):
         EncodedMessage(value)
 
 

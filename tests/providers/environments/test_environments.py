@@ -76,7 +76,7 @@ def test_in_a_configuration(registry):
 
 def test_a_place_is_said_once():
     assert ProviderConfig.model_validate({"use": "a", "environment": "b"}).use == "a@b"
-    with pytest.raises(ValueError, match="says where it is"):
+    with pytest.raises(ValueError, match="already selects one"):
         ProviderConfig.model_validate({"use": "a@c", "environment": "b"})
 
 
@@ -142,7 +142,7 @@ def test_what_cannot_be_constructed_there(registry, context):
 
 def test_another_version_of_the_protocols(far, monkeypatch):
     monkeypatch.setattr(worker_process, "PROTOCOL", 99)
-    with pytest.raises(ProviderError, match="protocols are of another version"):
+    with pytest.raises(ProviderError, match="whose protocol version"):
         far.start()
 
 
@@ -194,6 +194,6 @@ def test_it_is_there_as_a_whole_or_not_at_all(monkeypatch, tmp_path):
 @pytest.mark.slow
 def test_what_cannot_be_installed_leaves_nothing_behind(monkeypatch, tmp_path):
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
-    with pytest.raises(ProviderError, match="cannot be made"):
+    with pytest.raises(ProviderError, match="cannot be created"):
         create_environment("new", [str(tmp_path / "nowhere")])
     assert not list(tmp_path.iterdir())

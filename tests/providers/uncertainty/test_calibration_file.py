@@ -80,7 +80,7 @@ def test_the_other_kind_is_refused_with_the_place(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("- 1\n", "does not hold a mapping"),
+        ("- 1\n", "does not contain a mapping"),
         ("relative_sdt: 0.1\n", "did you mean 'relative_std'"),
         ("kind: depth\ncalibration: 3\nprovenance: {}\n", "must be a mapping"),
         ("a: [\n", "not valid YAML"),
