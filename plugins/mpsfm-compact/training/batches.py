@@ -167,7 +167,7 @@ def augmented(
 
 
 def rays(width: int, height: int, focal: np.ndarray, center: np.ndarray) -> Tensor:
-    """Compute ray slopes x / z and y / z, (n, 2, h / 32, w / 32), at the centers of pixel blocks.
+    """Compute ray slopes x / z and y / z, (n, 2, h / 32, w / 32), at centers of pixel blocks.
 
     Blocks have 32 x 32 pixels. ``focal`` (n, 2) and ``center`` (n, 2) are in pixels.
     """

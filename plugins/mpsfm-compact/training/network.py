@@ -128,7 +128,7 @@ class CompactNetwork(nn.Module):
             raise ValueError(f"not the weights of EfficientNet-lite0: {strangers + unexpected}")
 
     def freeze_depthwise(self) -> None:
-        """Freeze the encoder's depthwise convolutions, which dominate the training time on a CPU."""
+        """Freeze the encoder's depthwise convolutions, which dominate the time on a CPU."""
         for stage in self.stages:
             for block in stage:
                 block.depthwise.conv.weight.requires_grad_(False)

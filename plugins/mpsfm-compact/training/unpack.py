@@ -1,4 +1,4 @@
-"""Conversion of training shards to scene folders, for ``mpsfm calibrate`` and for inspection."""
+"""Conversion of training shards to scene folders for ``mpsfm calibrate``."""
 
 from __future__ import annotations
 

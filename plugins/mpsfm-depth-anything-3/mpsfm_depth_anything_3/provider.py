@@ -83,8 +83,7 @@ class DepthAnything3:
 
 
 def network_of(name: str) -> Any:
-    """Create the network ``name`` from the configuration files of the ``depth_anything_3``
-    package."""
+    """Create the network ``name`` from the configuration files of ``depth_anything_3``."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # hides deprecation warnings of omegaconf and torch
         from depth_anything_3.cfg import create_object, load_config
@@ -104,8 +103,7 @@ def as_published(network: Any) -> torch.nn.Module:
 
 
 def _network_size(view: View, longest: int) -> tuple[int, int]:
-    """Compute the network ``(width, height)`` in whole patches, close to the view's aspect
-    ratio."""
+    """Compute the network ``(width, height)`` in patches, close to the view's aspect ratio."""
     scale = longest / max(view.camera.size)
     width, height = (max(1, round(side * scale / _PATCH)) for side in view.camera.size)
     return width * _PATCH, height * _PATCH
@@ -117,8 +115,7 @@ def _intrinsics(
     starts: Sequence[tuple[int, int]],
     sizes: Sequence[tuple[int, int]],
 ) -> Float64:
-    """Convert calibration matrices (n, 3, 3) of the network input to (fx, fy, cx, cy) of the
-    views."""
+    """Convert K (n, 3, 3) in pixels of the network input to (fx, fy, cx, cy) of the views."""
     scale = np.array([view.camera.size for view in views]) / np.array(sizes)
     focal = matrices[:, [0, 1], [0, 1]] * scale
     center = (matrices[:, :2, 2] - np.array(starts)) * scale

@@ -32,8 +32,7 @@ class LastRefinement(torch.nn.Module):
 
 
 class _CpuCoordinates:
-    """Replacement of pixel coordinates that stay on the CPU, where DSINE would use the first
-    GPU."""
+    """Pixel coordinates that stay on the CPU, where DSINE would move them to the first GPU."""
 
     def __init__(self, coordinates: torch.Tensor) -> None:
         self._coordinates = coordinates

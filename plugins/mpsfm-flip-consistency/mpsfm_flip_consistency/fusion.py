@@ -1,4 +1,4 @@
-"""Mean of the predictions for an image and its mirror image, with variance (paper, appendix B).
+"""Mean and variance of the predictions for an image and its mirror (paper, appendix B).
 
 The covariance is the sum of the outer products of both deviations from the mean, which is the
 unbiased sample covariance of two predictions. If the network predicts a variance, the larger of

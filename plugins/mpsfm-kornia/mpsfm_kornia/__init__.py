@@ -1,1 +1,1 @@
-"""Local features and matchers of kornia."""
+"""Local features and matchers from the library kornia."""

@@ -1,4 +1,4 @@
-"""AdaLAM as a sparse matcher: nearest neighbors with local affine consistency."""
+"""AdaLAM as a sparse matcher, which filters nearest neighbors by local affine consistency."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ from mpsfm_core.providers.torch_runtime import inference, use_threads
 from mpsfm_kornia.options import AdalamOptions
 
 _FEWEST = 2
-"""Minimum number of features: AdaLAM compares the nearest and second nearest neighbor."""
+"""Minimum number of features per image, because AdaLAM compares the nearest and the second nearest
+neighbor."""
 
 
 class AdalamMatcher:
-    """Matcher for features of any kind, without weights.
+    """Matcher of features with any descriptors, without learned weights.
 
-    A neighborhood of matches is kept if one affine map explains enough of them. Orientations are
-    not compared, because features carry none; scales are compared if known. The score of a match is
-    ``c / (c + min_confidence)`` with the confidence c of its neighborhood.
+    AdaLAM accepts the matches of a neighborhood if one affine map explains enough of them.
+    Orientations are not compared, because ``Features`` have none. Scales are compared if both
+    images have them. The score of a match is ``c / (c + min_confidence)``, where c is AdaLAM's
+    confidence in the neighborhood.
     """
 
     def __init__(self, options: AdalamOptions, context: ProviderContext) -> None:
@@ -38,7 +40,7 @@ class AdalamMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Return matches with local support, each feature at most once."""
+        """Match features with local affine support. Each feature has at most one match."""
         features_a, features_b = require_features("adalam matches features", features_a, features_b)
         if features_a.descriptors.shape[1] != features_b.descriptors.shape[1]:
             raise ProviderError(
@@ -87,5 +89,5 @@ class AdalamMatcher:
 
 
 def _matches(indices: Any, scores: Any) -> PairMatches:
-    """Select the best match of each feature; kornia may return several."""
+    """Select the best match of each feature, because kornia may return several."""
     return PairMatches(sparse=SparseMatches.from_best_scores(indices, scores))

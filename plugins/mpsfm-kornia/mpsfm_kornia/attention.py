@@ -1,7 +1,8 @@
-"""Cross attention of LightGlue without explicit matrices, for CPUs.
+"""Memory-efficient cross attention for LightGlue on CPUs.
 
-On a GPU, kornia uses ``scaled_dot_product_attention``. On a CPU it builds the matrix between all
-keypoints of both images for each head and layer, and spends most of the time on memory transfers.
+On a GPU, kornia calls ``scaled_dot_product_attention``. On a CPU, kornia builds the attention
+matrix between all keypoints of both images for each head and layer, and spends most of the time on
+memory transfers.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from torch.nn.functional import scaled_dot_product_attention
 
 
 class FusedCrossBlock(nn.Module):
-    """Replacement of a :class:`CrossBlock` with the layers of that block and their names."""
+    """Replacement of kornia's :class:`CrossBlock` that has the same layers under the same names."""
 
     def __init__(self, block: CrossBlock) -> None:
         super().__init__()
@@ -27,7 +28,7 @@ class FusedCrossBlock(nn.Module):
         )
 
     def forward(self, x0: torch.Tensor, x1: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Apply cross attention to descriptors (b, m, d) and (b, n, d) of two images."""
+        """Apply cross attention to the descriptors (b, m, d) and (b, n, d) of two images."""
         qk0, qk1 = self._by_head(self.to_qk(x0)), self._by_head(self.to_qk(x1))
         v0, v1 = self._by_head(self.to_v(x0)), self._by_head(self.to_v(x1))
         m0 = scaled_dot_product_attention(qk0, qk1, v1)
@@ -35,7 +36,7 @@ class FusedCrossBlock(nn.Module):
         return self._updated(x0, m0), self._updated(x1, m1)
 
     def _by_head(self, x: torch.Tensor) -> torch.Tensor:
-        """Reshape (b, n, d) to (b, heads, n, d / heads)."""
+        """Reshape a tensor from (b, n, d) to (b, heads, n, d / heads)."""
         return x.unflatten(-1, (self._heads, -1)).transpose(1, 2)
 
     def _updated(self, x: torch.Tensor, message: torch.Tensor) -> torch.Tensor:
@@ -45,6 +46,6 @@ class FusedCrossBlock(nn.Module):
 
 
 def fuse_cross_attention(network: LightGlue) -> None:
-    """Replace the cross blocks of this network; its weights stay the same."""
+    """Replace the cross-attention blocks of a LightGlue network, with unchanged weights."""
     for layer in network.transformers:
         layer.cross_attn = FusedCrossBlock(layer.cross_attn)

@@ -1,4 +1,4 @@
-"""Contract setup: networks with random weights, whose answers are valid but not accurate."""
+"""Random weights of kornia's networks for the provider contract tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpsfm_kornia.lightglue import LIGHTGLUE_256
 
 
 def loftr(folder: Path) -> ContractSetup:
-    """Write random weights of LoFTR in the published format."""
+    """Write random weights of LoFTR in the file format of the published weights."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = LoFTR(pretrained=None).eval()
@@ -24,7 +24,7 @@ def loftr(folder: Path) -> ContractSetup:
 
 
 def dedode(folder: Path) -> ContractSetup:
-    """Write random weights of detector and descriptor in separate files, as published."""
+    """Write random weights of DeDoDe's detector and descriptor in separate files."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = DeDoDe("L", "B", amp_dtype=torch.float32).eval()
@@ -36,7 +36,7 @@ def dedode(folder: Path) -> ContractSetup:
 
 
 def lightglue_dedode(folder: Path) -> ContractSetup:
-    """Write random weights of LightGlue for 256 dimensions."""
+    """Write random weights of LightGlue for 256-dimensional descriptors."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = LightGlue(None, **LIGHTGLUE_256, weights=None).eval()  # type: ignore[arg-type]

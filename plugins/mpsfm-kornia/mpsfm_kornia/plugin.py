@@ -1,4 +1,4 @@
-"""Registration of the providers; imports neither torch nor kornia."""
+"""Registration of kornia's detectors and matchers, importing neither torch nor kornia."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LIGHTGLUE_HINT = "pip install mpsfm-kornia && pip install --no-deps scm-lightgl
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register detectors, their matchers, a matcher for any features, and a dense matcher."""
+    """Register kornia's detectors, their LightGlue matchers, AdaLAM, and LoFTR."""
     return [
         ProviderSpec(
             kind="features",

@@ -1,4 +1,4 @@
-"""Weights and pixel grid of the networks."""
+"""Loading of weights, and conversion of pixels between a view and the network input."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from mpsfm_core.providers.weights import load_torch_state
 from mpsfm_kornia.options import KNOWN_HASHES
 
 _SMALLEST_SIDE = 32
-"""Minimum side in pixels; the networks reduce their input by up to 32."""
+"""Minimum side of the network input in pixels, because networks downsample by up to 32."""
 
 
 def load_weights(context: ProviderContext, uri: str, sha256: str | None) -> dict[str, Any]:
-    """Load the state dictionary of a weights file, and check its hash if known."""
+    """Load the state dictionary of a weights file, and verify its hash if one is known."""
     return load_torch_state(context.resolve_weights(uri, sha256 or KNOWN_HASHES.get(uri)))
 
 
 def load_state(module: torch.nn.Module, state: dict[str, Any], uri: str) -> None:
-    """Load all learned values of a network and switch it to evaluation.
+    """Load all learned tensors of a network, and switch the network to evaluation mode.
 
     Raises:
-        WeightsError: The file lacks tensors, or their shapes differ.
+        WeightsError: The file lacks tensors of the network, or their shapes differ.
     """
     try:
         mismatch = module.load_state_dict(state, strict=False)
@@ -42,23 +42,23 @@ def load_state(module: torch.nn.Module, state: dict[str, Any], uri: str) -> None
 
 
 def is_inside_mask(view: View, xy: Float64) -> Bool:
-    """Return which pixels (n, 2) are inside the view and its mask."""
+    """Return which of the pixels (n, 2) are inside of the view and of its mask, (n,) bool."""
     ok = inside(xy, view.camera.size)
     return ok if view.mask is None else ok & sample_nearest(view.mask, xy)
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Size of the network input and of the view."""
+    """Width and height of a view and of the network input for this view."""
 
     view: tuple[int, int]
     network: tuple[int, int]
 
     @classmethod
     def fit(cls, view: View, longest: int | None, multiple: int = 1) -> Grid:
-        """Compute a size of at most ``longest`` pixels, with sides rounded down to a multiple.
+        """Compute a network input of at most ``longest`` pixels, rounding sides down to multiples.
 
-        Views are never enlarged, except to the minimum side of the networks.
+        Views are only enlarged to reach the minimum side of the networks.
         """
         scale = min(1.0, (longest or np.inf) / max(view.camera.size))
         sides = (round(side * scale) // multiple * multiple for side in view.camera.size)
@@ -66,15 +66,15 @@ class Grid:
         return cls(view.camera.size, (width, height))
 
     def image(self, view: View, device: str) -> torch.Tensor:
-        """Resize an image to (1, 3, h, w) float32, RGB in [0, 1]."""
+        """Resize the image of a view to (1, 3, h, w) float32, RGB in [0, 1]."""
         resized = resize_map(view.image, *self.network) / np.float32(255)
         return torch.from_numpy(resized).permute(2, 0, 1)[None].contiguous().to(device)
 
     def to_view(self, xy: Float64) -> Float64:
-        """Convert pixels of the network input (first pixel at 0.5) to pixels of the view."""
+        """Convert pixels (n, 2) of the network input (first pixel at 0.5) to pixels of the view."""
         return scale_pixels(xy, self.network, self.view)
 
     @property
     def pixel_size(self) -> float:
-        """Return the longer side of a network pixel, in pixels of the view."""
+        """Return the longer side of a network input pixel, in pixels of the view."""
         return max(v / n for v, n in zip(self.view, self.network, strict=True))

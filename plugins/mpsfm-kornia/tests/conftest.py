@@ -1,4 +1,4 @@
-"""Views with many corners, real pairs with known cameras, and a factory of providers."""
+"""Synthetic views with corners, real image pairs with known poses, and provider factories."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def view_of(image: Any, name: str = "view.png", mask: Any = None) -> View:
 
 @pytest.fixture(scope="session")
 def make(context: ProviderContext) -> Callable[..., Any]:
-    """Return a factory of providers by kind and name; skips if the weights are missing."""
+    """Return a factory of providers, which skips the test if weights are missing."""
 
     def make(kind: str, name: str, **options: Any) -> Any:
         spec = SPECS[kind, name]
@@ -47,7 +47,7 @@ def make(context: ProviderContext) -> Callable[..., Any]:
 
 @pytest.fixture(scope="session")
 def blocks() -> View:
-    """Create 256 x 192 pixels of random gray blocks with corners everywhere."""
+    """Create a view of 256 x 192 pixels of random gray blocks, with corners everywhere."""
     rng = np.random.default_rng(7)
     image = np.full((192, 256, 3), 128, dtype=np.uint8)
     for _ in range(150):
@@ -59,7 +59,7 @@ def blocks() -> View:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two views with known cameras."""
+    """Two views with known relative pose."""
 
     view_a: View
     view_b: View
@@ -74,7 +74,7 @@ class Pair:
 
 @pytest.fixture(scope="session")
 def load_pair(shared_data: Path) -> Callable[[str, str, str], Pair]:
-    """Return a function that loads an image pair of a shared scene."""
+    """Return a function that loads an image pair of a scene in the shared data folder."""
     return lambda scene, *names: _read_pair(shared_data / "data" / scene, names)
 
 

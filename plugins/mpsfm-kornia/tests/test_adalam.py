@@ -1,4 +1,4 @@
-"""Tests of AdaLAM on synthetic features and with SIFT on real photos."""
+"""Tests of AdaLAM on synthetic features, and on SIFT features of real images."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def features_of(keypoints, descriptors, scales=None):
 
 @pytest.fixture
 def moved():
-    """Create features that move by (8, 5), the first 100 of them to random positions."""
+    """Create two sets of features that differ by (8, 5) pixels, 100 of them by random shifts."""
     rng = np.random.default_rng(0)
     keypoints, descriptors = rng.uniform(10, 170, (COUNT, 2)), rng.normal(size=(COUNT, 16))
     there = keypoints + np.array([8.0, 5.0])
@@ -54,8 +54,8 @@ def test_matches_of_inconsistent_scale_are_dropped(blocks, moved, context):
         for ratio in (1.5, None)
     ]
     kept = [np.isin(np.arange(COUNT), f.indices[:, 0]) for f in found]
-    assert kept[1][100:].mean() > 0.95  # all move alike
-    # a neighbourhood keeps those that change like its seed, so that each loses some
+    assert kept[1][100:].mean() > 0.95  # all features move alike
+    # A neighborhood only accepts matches with the scale change of its seed.
     assert kept[0][100:].sum() < kept[1][100:].sum()
 
 
@@ -72,7 +72,7 @@ def test_errors_and_few_features(blocks, moved, context):
 
 
 def test_more_correct_matches_than_the_ratio_test_on_real_photos(load_pair, context):
-    """Check SIFT on fountain 3-5."""
+    """Check that AdaLAM finds more correct SIFT matches than the ratio test in a real scene."""
     pair = load_pair("fountain", "0003.jpg", "0005.jpg")
     sift = Sift(SiftOptions(max_keypoints=3000, first_octave=0), context)
     a, b = sift.extract(pair.view_a), sift.extract(pair.view_b)

@@ -1,4 +1,4 @@
-"""Comparison of the fused cross attention with kornia's, by block and as a network."""
+"""Comparison of the fused cross attention with kornia's, per block and for whole LightGlue."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_block(dimension, heads, counts):
 
 @pytest.mark.parametrize("architecture", [_LIGHTERGLUE, _LIGHTGLUE, LIGHTGLUE_256])
 def test_state_and_other_networks_stay(architecture):
-    """Check that weights keep their names and other networks do not change."""
+    """Check that tensor names are unchanged, and that other networks are not affected."""
     network = LightGlue(None, **architecture).eval()
     other, before = copy.deepcopy(network), dict(network.state_dict())
     fuse_cross_attention(network)
@@ -47,7 +47,7 @@ def test_state_and_other_networks_stay(architecture):
     [("xfeat", "lighterglue"), ("aliked", "lightglue-aliked"), ("disk", "lightglue-disk")],
 )
 def test_published_weights(make, blocks, features, matcher):
-    """Check for the same matches, and scores within 1e-4, in float64."""
+    """Check that LightGlue returns the same matches, and scores within 1e-4, in float64."""
     turned = View("b.png", np.roll(blocks.image, (8, 24), (0, 1)), blocks.camera)
     detector, matcher = make("features", features), make("matcher", matcher)
     data = {

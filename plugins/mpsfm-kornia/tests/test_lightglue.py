@@ -1,4 +1,4 @@
-"""Tests of LightGlue and LighterGlue on views with known geometry."""
+"""Tests of LightGlue and LighterGlue on views that differ by a known shift."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mpsfm_core.data.errors import ProviderError
 
 FAMILIES = {"xfeat": "lighterglue", "aliked": "lightglue-aliked", "disk": "lightglue-disk"}
 SHIFT = (32, 32)
-"""Multiple of all strides of the networks, so that they see identical patches."""
+"""Shift in pixels, a multiple of all network strides, so that networks see identical patches."""
 
 
 @pytest.fixture(params=FAMILIES)
@@ -20,7 +20,7 @@ def family(request):
 
 
 def shifted(view, dx, dy):
-    """Shift a view right and down by whole pixels, with repeated borders."""
+    """Shift an image right and down by whole pixels, repeating its border."""
     padded = np.pad(view.image, ((dy, 0), (dx, 0), (0, 0)), mode="edge")
     return type(view)("shifted.png", padded[: -dy or None, : -dx or None].copy(), view.camera)
 

@@ -1,4 +1,4 @@
-"""Tests of LoFTR with random weights: loading, and positions compared with kornia's."""
+"""Tests of LoFTR with random weights: loading, and match positions compared with kornia."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpsfm_core.data.errors import WeightsError
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
-    """Save a randomly initialized network in the published format."""
+    """Save a randomly initialized LoFTR in the file format of the published weights."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = LoFTR(pretrained=None).eval()
@@ -28,7 +28,7 @@ def test_positions_and_scores(make, blocks, checkpoint):
     other = type(blocks)("b.png", np.roll(blocks.image, 9, axis=1).copy(), blocks.camera)
     dense = matcher.match(blocks, other).dense
     assert len(dense) > 0
-    assert dense.std_px == 1.0  # half of a pixel that is two pixels of the view
+    assert dense.std_px == 1.0  # half of a network pixel, which is two pixels of the view
 
     halves = [v.image.reshape(96, 2, 128, 2, 3).mean(axis=(1, 3)) / 255 for v in (blocks, other)]
     gray = [torch.tensor(half @ (0.299, 0.587, 0.114)).float()[None, None] for half in halves]

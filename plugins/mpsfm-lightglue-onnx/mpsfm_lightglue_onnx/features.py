@@ -1,4 +1,4 @@
-"""SuperPoint and DISK as feature providers."""
+"""SuperPoint and DISK in ONNX files as feature providers."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 
 
 class OnnxFeatures:
-    """Extractor of LightGlue-ONNX.
+    """Base class of the feature extractors that LightGlue-ONNX exports.
 
-    Input ``image`` (1, c, h, w) in [0, 1]. Outputs ``keypoints`` (1, n, 2) in pixels of that image
-    (first pixel at (0, 0)), ``scores`` (1, n) and ``descriptors`` (1, n, d).
+    The input ``image`` (1, c, h, w) of the ONNX file has values in [0, 1]. The output ``keypoints``
+    (1, n, 2) is in pixels of ``image``, with the center of the first pixel at (0, 0). The other
+    outputs are ``scores`` (1, n) and ``descriptors`` (1, n, d).
     """
 
     multiple = 8
-    """The sides of the network input are multiples of this."""
+    """The sides of the network input are rounded to multiples of this number of pixels."""
 
     def __init__(self, options: FeatureOptions, context: ProviderContext, model: str) -> None:
         self._model = Model(context.resolve_weights(model, options.sha256), context)
@@ -33,13 +34,14 @@ class OnnxFeatures:
         self._options = options
 
     def channels(self, rgb: Float32) -> Float32:
-        """Convert an image (1, 3, h, w) in [0, 1] to the channels of the network."""
+        """Convert an RGB image (1, 3, h, w) in [0, 1] to the input channels of the network."""
         return rgb
 
     def extract(self, view: View) -> Features:
-        """Extract the strongest keypoints inside the view and its mask, best first.
+        """Extract the strongest keypoints inside the view and its mask, by decreasing score.
 
-        ``std_px`` is 1, or the pixel size of the resized image if larger.
+        The keypoint noise ``std_px`` is 1 pixel of the view, or one pixel of the resized image if
+        that is larger.
         """
         longest = max(view.camera.size)
         side = min(longest, self._options.resize or longest)
@@ -64,18 +66,18 @@ class OnnxFeatures:
 
 
 class SuperPoint(OnnxFeatures):
-    """SuperPoint, for gray images."""
+    """SuperPoint features, detected in gray images."""
 
     def __init__(self, options: SuperPointOptions, context: ProviderContext) -> None:
         super().__init__(options, context, options.model)
 
     def channels(self, rgb: Float32) -> Float32:
-        """Compute the luma, (1, 1, h, w)."""
+        """Compute the luma (1, 1, h, w) of an RGB image."""
         return np.tensordot(rgb, _LUMA, axes=(1, 0))[:, np.newaxis]
 
 
 class Disk(OnnxFeatures):
-    """DISK, which halves its image four times."""
+    """DISK features. The network halves its input four times."""
 
     multiple = 16
 

@@ -1,4 +1,4 @@
-"""LightGlue as a sparse matcher."""
+"""LightGlue in an ONNX file as a sparse matcher."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ _OUTPUTS = ("matches0", "mscores0")
 class LightGlue:
     """Matcher of LightGlue-ONNX.
 
-    Inputs ``kpts0``, ``kpts1`` (1, n, 2), normalized, and ``desc0``, ``desc1`` (1, n, d). Outputs
-    ``matches0`` and ``mscores0``: either matches (m, 2) and scores (m,), or both for all keypoints
-    of the first view, (1, n), with -1 for no match.
+    The ONNX file has the inputs ``kpts0``, ``kpts1`` (1, n, 2), which are normalized keypoints, and
+    ``desc0``, ``desc1`` (1, n, d). The outputs ``matches0`` and ``mscores0`` have one of two forms.
+    They are matches (m, 2) and scores (m,), or an index and a score (1, n) for every keypoint of
+    the first view, with index -1 for no match.
     """
 
     def __init__(self, options: LightGlueOptions, context: ProviderContext) -> None:
@@ -35,7 +36,7 @@ class LightGlue:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match features of two views; returns mutual matches with their confidence as score."""
+        """Match the features of two views, and return mutual matches with confidence scores."""
         features_a, features_b = require_features(
             "LightGlue matches features", features_a, features_b
         )
@@ -55,7 +56,7 @@ class LightGlue:
 def _normalised(view: View, features: Features) -> Float64:
     """Normalize keypoints to the image center and half of the longer side, as in training.
 
-    Input pixels have the first pixel at (0, 0).
+    LightGlue was trained with the center of the first pixel at (0, 0).
     """
     size = np.array(view.camera.size, dtype=np.float64)
     normalised: Float64 = (features.keypoints - 0.5 - size / 2) / (size.max() / 2)
@@ -65,7 +66,7 @@ def _normalised(view: View, features: Features) -> Float64:
 def _listed(
     matches: NDArray[np.int64], scores: NDArray[np.float32]
 ) -> tuple[Int64, NDArray[np.float32]]:
-    """Convert both forms of the outputs to pairs (m, 2) and scores (m,)."""
+    """Convert both output forms of LightGlue files to index pairs (m, 2) and scores (m,)."""
     if scores.ndim == 1:
         return matches, scores
     there, scores = matches[0], scores[0]

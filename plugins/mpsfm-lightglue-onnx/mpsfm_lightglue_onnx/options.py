@@ -1,4 +1,4 @@
-"""Options and default weights; imports nothing heavy."""
+"""Options and default weights of the ONNX networks, importable without onnxruntime."""
 
 from __future__ import annotations
 
@@ -16,47 +16,48 @@ LIGHTGLUE_DISK = WeightsFile(f"{_RELEASE}/disk_lightglue.onnx", license="Apache-
 
 
 class FeatureOptions(Options):
-    """Options of both detectors; thresholds are part of the exported model."""
+    """Options of SuperPoint and DISK. Their score thresholds are part of the ONNX file."""
 
     max_keypoints: int = Field(6000, gt=0)
-    """Number of keypoints with the highest score to keep. [reference, for SuperPoint]"""
+    """Maximum number of keypoints, selected by score. [reference, for SuperPoint]"""
     resize: int | None = Field(1600, ge=32)
-    """Longer side for detection in pixels, never enlarged; null: the size of the view. [reference]
+    """Longer side of the resized image in pixels for detection. Images are never enlarged, and null
+    keeps their size.
     """
     sha256: str | None = None
-    """Expected hash of ``model``."""
+    """Expected SHA-256 hash of the file ``model``."""
 
 
 class SuperPointOptions(FeatureOptions):
-    """Options of SuperPoint (2018), 256 dimensions."""
+    """Options of the SuperPoint detector (2018), which has 256-dimensional descriptors."""
 
     model: str = SUPERPOINT.uri
-    """Path or URI of the ONNX file."""
+    """Path or URI of the SuperPoint ONNX file."""
 
 
 class DiskOptions(FeatureOptions):
-    """Options of DISK (NeurIPS 2020), 128 dimensions."""
+    """Options of the DISK detector (NeurIPS 2020), which has 128-dimensional descriptors."""
 
     max_keypoints: int = Field(2048, gt=0)
-    """Number of keypoints with the highest score to keep. [LightGlue: as in training]"""
+    """Maximum number of keypoints, selected by score. [LightGlue: as in training]"""
     model: str = DISK.uri
-    """Path or URI of the ONNX file."""
+    """Path or URI of the DISK ONNX file."""
 
 
 class LightGlueOptions(Options):
-    """Options of LightGlue for one feature family."""
+    """Options of LightGlue for one type of features."""
 
     min_score: float = Field(0.1, ge=0, lt=1)
-    """Minimum score of a match, in addition to the threshold of the exported model. [LightGlue
+    """Minimum score of a match, in addition to the threshold inside the ONNX file. [LightGlue
     filter_threshold]
     """
     model: str = LIGHTGLUE_SUPERPOINT.uri
-    """Path or URI of the ONNX file."""
+    """Path or URI of the LightGlue ONNX file."""
     sha256: str | None = None
-    """Expected hash of ``model``."""
+    """Expected SHA-256 hash of the file ``model``."""
 
 
 class DiskLightGlueOptions(LightGlueOptions):
-    """Options of LightGlue for DISK."""
+    """Options of LightGlue for DISK features."""
 
     model: str = LIGHTGLUE_DISK.uri

@@ -1,4 +1,4 @@
-"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
+"""Registration of SuperPoint, DISK and LightGlue, importing neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _HINT = "pip install mpsfm-lightglue-onnx"
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register two detectors and their matchers."""
+    """Register SuperPoint, DISK, and one LightGlue matcher for each of them."""
     return [
         ProviderSpec(
             kind="features",

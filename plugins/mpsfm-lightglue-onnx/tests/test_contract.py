@@ -1,4 +1,4 @@
-"""Contract tests with a blob detector and mutual nearest neighbors."""
+"""Provider contract tests with a blob detector and a mutual nearest-neighbor matcher."""
 
 from mpsfm_core.testing import contract_tests
 

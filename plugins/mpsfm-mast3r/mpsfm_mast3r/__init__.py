@@ -1,1 +1,1 @@
-"""MASt3R in an ONNX file: matches and depth of image pairs."""
+"""MASt3R in an ONNX file, as a matcher that also predicts the depth of an image pair."""

@@ -1,4 +1,4 @@
-"""Contract setup: a stand-in that matches by patches around each pixel."""
+"""Small ONNX network that replaces MASt3R in the contract tests by comparing patches."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _TENSORS = (
 
 
 def dense(folder: Path) -> ContractSetup:
-    """Write a small stand-in, so that comparing all pixels is quick."""
+    """Write the replacement network with a small input, where comparing all pixels is fast."""
     return ContractSetup(options={**_stand_in(folder), "subsample": 8}, truth_source="image")
 
 
 def sparse(folder: Path) -> ContractSetup:
-    """Write the same stand-in for keypoints of any detector."""
+    """Write the replacement network for matching the keypoints of any detector."""
     return ContractSetup(options=_stand_in(folder), truth_source="image")
 
 

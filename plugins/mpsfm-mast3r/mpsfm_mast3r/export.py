@@ -1,6 +1,6 @@
-"""Export of MASt3R to ONNX, with its authors' code.
+"""Export of MASt3R to ONNX by its authors' code.
 
-Runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+This module runs as a program, see :mod:`mpsfm_core.providers.model_export`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 
 from mpsfm_core.providers.model_export.author_script import ExportJob, run_network
 
-sys.modules["models.curope"] = None  # type: ignore[assignment]  # the rotations of torch instead
+sys.modules["models.curope"] = None  # replaced by rotary embeddings in plain torch
 
 from mast3r.model import AsymmetricMASt3R  # noqa: E402
 from models.pos_embed import RoPE2D  # noqa: E402
@@ -26,8 +26,8 @@ _PUBLISHED = """AsymmetricMASt3R(
     conf_mode=('exp', 1, inf), enc_embed_dim=1024, enc_depth=24, enc_num_heads=16,
     dec_embed_dim=768, dec_depth=12, dec_num_heads=12, two_confs=True,
     desc_conf_mode=('exp', 0, inf))"""
-"""Arguments of the published checkpoint (authors' README, training of
-MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric).
+"""Constructor arguments of the published checkpoint, from the training command of
+MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric in the authors' README.
 """
 _NARROW = {
     "enc_embed_dim": 128,
@@ -36,17 +36,19 @@ _NARROW = {
     "dec_embed_dim": 128,
     "dec_num_heads": 2,
 }
-"""Arguments of size ``tiny`` for tests: the same classes and heads, which need 12 decoder blocks.
+"""Constructor arguments of the network size ``tiny`` for tests. The classes and heads are those of
+MASt3R, which need 12 decoder blocks.
 """
 _POSITIONS = 256
-"""Patches along a side with rotary embeddings in the file: photos of up to 4096 pixels."""
+"""Number of patches along an image side for which rotary embeddings are stored in the file. It
+limits images to 4096 pixels."""
 _SIDES = (((96, 128), (128, 64)), ((64, 160), (64, 160)))
 _KEYS = ("pts3d", "conf", "desc", "desc_conf")
 _OUTPUTS = [f"{key}_{side}" for side in (1, 2) for key in _KEYS]
 
 
 class TwoViews(torch.nn.Module):
-    """Module that calls the network with two images, as the authors' scripts do."""
+    """Module that calls MASt3R with two images, like the authors' scripts."""
 
     def __init__(self, model: AsymmetricMASt3R) -> None:
         super().__init__()
@@ -64,9 +66,9 @@ class TwoViews(torch.nn.Module):
 
 
 class AnySize(torch.nn.Module):
-    """Module for images of any size in steps of a patch.
+    """Module for image sides in multiples of the patch size.
 
-    Each image is encoded by itself; sizes and positions are computed from the input.
+    Each image is encoded separately, and patch positions are computed from the input size.
     """
 
     def __init__(self, model: AsymmetricMASt3R) -> None:
@@ -94,7 +96,7 @@ class AnySize(torch.nn.Module):
 
 
 def arguments(constructor_call: str) -> dict[str, Any]:
-    """Parse the arguments of the constructor call in a checkpoint, without executing it."""
+    """Parse the constructor call that a MASt3R checkpoint stores, without executing it."""
     call = ast.parse(constructor_call.replace("inf", _INFINITE), mode="eval").body
     if not (isinstance(call, ast.Call) and ast.unparse(call.func) == AsymmetricMASt3R.__name__):
         raise SystemExit(f"the checkpoint is of another network: {constructor_call}")
@@ -103,7 +105,7 @@ def arguments(constructor_call: str) -> dict[str, Any]:
 
 
 def network(size: str) -> AsymmetricMASt3R:
-    """Create the published or ``tiny`` network, with random weights that predict positive depth."""
+    """Create the published or the ``tiny`` network, with random weights and positive depth."""
     narrowed = {"": {}, "tiny": _NARROW}[size]
     model = AsymmetricMASt3R(**(arguments(_PUBLISHED) | narrowed)).eval()
     for head in (model.downstream_head1, model.downstream_head2):
@@ -112,7 +114,7 @@ def network(size: str) -> AsymmetricMASt3R:
 
 
 def export(job: ExportJob, model: AsymmetricMASt3R) -> None:
-    """Export the network for two images, each of any size in steps of 16."""
+    """Export the network for two images with sides in multiples of 16 pixels."""
     given = [
         {f"img{n}": torch.rand(1, 3, *sides) * 2 - 1 for n, sides in enumerate(pair, start=1)}
         for pair in _SIDES
@@ -130,13 +132,13 @@ def export(job: ExportJob, model: AsymmetricMASt3R) -> None:
 
 
 def main() -> None:
-    """Export the network of the checkpoint, which contains its architecture."""
+    """Export MASt3R with the weights of a checkpoint, which also stores the architecture."""
     job = ExportJob.from_arguments()
     if job.weights is None:
         export(job, network(job.size))
         return
     stored = job.checkpoint(Namespace)
-    if "model" not in stored:  # files of the Hub contain only weights
+    if "model" not in stored:  # checkpoints from the Hugging Face Hub contain only weights
         stored = {"model": stored, "args": Namespace(model=_PUBLISHED)}
     model = AsymmetricMASt3R(**arguments(stored["args"].model))
     job.load(model, stored["model"])

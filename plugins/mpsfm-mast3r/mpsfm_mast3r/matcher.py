@@ -1,7 +1,7 @@
-"""MASt3R as a dense and a sparse matcher; both predict the depth of the pair.
+"""MASt3R as a dense and as a sparse matcher, both with depth of the image pair.
 
-The network runs twice, with either view first: depth is most accurate in the frame of the first
-view, and merged matches are better than those of one pass.
+The network runs twice, with either view as the first one. Depth is most accurate in the frame of
+the first view, and the merged matches of both passes are better than those of one pass.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from mpsfm_mast3r.network import OnnxPairNetwork, PairNetwork, ViewOutput
 from mpsfm_mast3r.options import DenseSearch, SparseSearch
 
 _STD_NETWORK_PX = 0.5
-"""Noise of dense matches in network pixels. [reference]"""
+"""Std of dense match positions in pixels of the network input."""
 
 
 class DenseMatcher:
-    """Matcher by reciprocal nearest neighbors of the descriptors of all pixels."""
+    """Dense matcher by reciprocal nearest neighbors among the descriptors of all pixels."""
 
     network: ClassVar[Callable[..., PairNetwork]] = OnnxPairNetwork
 
@@ -47,7 +47,7 @@ class DenseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Return the matches of both passes; duplicates keep the larger score."""
+        """Return the matches of both passes. A match found twice has the larger of both scores."""
         passes = self._network.both(view_a, view_b)
         pairs_by_pass = [self._reciprocal(a, b) for a, b in passes]
         scores = [_scores(a, b, pairs) for (a, b), pairs in zip(passes, pairs_by_pass, strict=True)]
@@ -60,7 +60,7 @@ class DenseMatcher:
         return PairMatches(dense=dense, depth=_depth(passes))
 
     def _reciprocal(self, a: ViewOutput, b: ViewOutput) -> Int64:
-        """Find pairs (m, 2) of cells, searching from both sides."""
+        """Find matching descriptor rows (m, 2) by reciprocal search from pixels of both views."""
         there = find_reciprocal(a.descriptors, b.descriptors, self._start(a))
         back = find_reciprocal(b.descriptors, a.descriptors, self._start(b))
         return np.unique(np.concatenate([there, back[:, ::-1]]), axis=0)
@@ -74,7 +74,7 @@ class DenseMatcher:
 
 
 class SparseMatcher:
-    """Matcher by mutual nearest neighbors of the descriptors at given keypoints."""
+    """Sparse matcher by mutual nearest neighbors of MASt3R's descriptors at given keypoints."""
 
     network: ClassVar[Callable[..., PairNetwork]] = OnnxPairNetwork
 
@@ -89,7 +89,7 @@ class SparseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match keypoints by the mean similarity of both passes."""
+        """Match keypoints by the mean descriptor similarity of both passes."""
         features_a, features_b = require_features(
             "mast3r-sparse matches keypoints", features_a, features_b
         )
@@ -110,9 +110,9 @@ class SparseMatcher:
 
 
 def _scores(a: ViewOutput, b: ViewOutput, cells: Int64) -> Float32:
-    """Compute scores ``c / (1 + c)`` in [0, 1) of pairs (m, 2) of cells.
+    """Compute scores ``c / (1 + c)`` in [0, 1) of pairs (m, 2) of descriptor rows.
 
-    c is the geometric mean of both descriptor confidences [reference].
+    The confidence c of a match is the geometric mean of both descriptor confidences.
     """
     certainty = np.sqrt(a.match_certainty[cells[:, 0]] * b.match_certainty[cells[:, 1]])
     scores: Float32 = (certainty / (1 + certainty)).astype(np.float32)
@@ -120,7 +120,7 @@ def _scores(a: ViewOutput, b: ViewOutput, cells: Int64) -> Float32:
 
 
 def _merge(pairs: Int64, scores: Float32) -> tuple[Int64, Float32]:
-    """Merge duplicate pairs with their best score."""
+    """Merge duplicate matches, and assign the largest of their scores."""
     order = np.argsort(-scores, kind="stable")
     unique, first = np.unique(pairs[order], axis=0, return_index=True)
     return unique, scores[order][first]
@@ -129,5 +129,5 @@ def _merge(pairs: Int64, scores: Float32) -> tuple[Int64, Float32]:
 def _depth(
     passes: tuple[tuple[ViewOutput, ViewOutput], tuple[ViewOutput, ViewOutput]],
 ) -> PairDepth:
-    """Return the depth of each view from the pass with this view first."""
+    """Return the depth of each view from the pass in which this view is the first one."""
     return PairDepth(passes[0][0].depth(), passes[1][1].depth())

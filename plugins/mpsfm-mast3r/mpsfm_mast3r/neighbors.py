@@ -1,4 +1,4 @@
-"""Reciprocal nearest neighbors of unit descriptors."""
+"""Reciprocal nearest-neighbor search among unit descriptors."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import numpy as np
 from mpsfm_core.data import Float32, Int64
 
 _BLOCK = 1 << 24
-"""Number of similarities computed together: 64 MB."""
+"""Number of similarities that are computed together, which take 64 MB."""
 _ROUNDS = 10
-"""Maximum number of iterations [MASt3R]; nearly all searches converge in three."""
+"""Maximum number of iterations of the reciprocal search [MASt3R]. Nearly all searches converge in
+three."""
 
 
 def find_nearest(queries: Float32, base: Float32) -> Int64:
@@ -23,10 +24,10 @@ def find_nearest(queries: Float32, base: Float32) -> Int64:
 
 
 def find_reciprocal(a: Float32, b: Float32, start: Int64) -> Int64:
-    """Find pairs (m, 2) of rows that are mutual nearest neighbors, from rows ``start`` of ``a``.
+    """Find pairs (m, 2) of mutual nearest neighbors, searching from the rows ``start`` of ``a``.
 
-    Iterate from a row to its nearest neighbor and back until the pair is stable (fast reciprocal
-    matching, Leroy et al., ECCV 2024).
+    The search iterates from a row to its nearest neighbor and back until the pair is stable (fast
+    reciprocal matching, Leroy et al., ECCV 2024).
     """
     pairs = [np.empty((0, 2), dtype=np.int64)]
     current = start
@@ -42,7 +43,7 @@ def find_reciprocal(a: Float32, b: Float32, start: Int64) -> Int64:
 
 
 def find_mutual(similarity: Float32) -> Int64:
-    """Find pairs (m, 2) of row and column that are each other's largest entry of a matrix."""
+    """Find matrix entries (m, 2) that are the largest of both their row and their column."""
     if not similarity.size:
         return np.empty((0, 2), dtype=np.int64)
     there, back = similarity.argmax(axis=1), similarity.argmax(axis=0)

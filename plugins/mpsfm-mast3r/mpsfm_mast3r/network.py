@@ -1,4 +1,4 @@
-"""Two-view network: points, descriptors and confidences of both views."""
+"""MASt3R's two-view network, which predicts points, descriptors and confidences."""
 
 from __future__ import annotations
 
@@ -24,10 +24,12 @@ _TENSORS = ("pts3d", "conf", "desc", "desc_conf")
 
 @dataclass(frozen=True)
 class ViewOutput:
-    """Outputs of one pass for one view, on its canvas (h, w).
+    """Outputs of MASt3R for one view in one pass, on the network input of size (h, w).
 
-    ``points``: (h, w, 3), in the camera frame of the first view. ``certainty``: (h, w), >= 1.
-    ``descriptors``: (h * w, d), unit. ``match_certainty``: (h * w,), positive.
+    * ``points`` (h, w, 3) are in the camera frame of the first view of the pass, in meters.
+    * ``certainty`` (h, w) >= 1 is the confidence of ``points``.
+    * ``descriptors`` (h * w, d) are unit vectors.
+    * ``match_certainty`` (h * w,) > 0 is the confidence of ``descriptors``.
     """
 
     view: View
@@ -38,22 +40,22 @@ class ViewOutput:
     match_certainty: Float32
 
     def depth(self) -> DepthPrior:
-        """Return the depth of the first view, invalid at cropped borders.
+        """Return the depth of the first view, which is invalid where the canvas crops the view.
 
-        The std is ``1 / certainty`` meters [reference].
+        The std of depth is ``1 / certainty`` meters [reference].
         """
         z = self.canvas.cut(self.points[..., 2:])[..., 0]
         certainty = self.canvas.cut(self.certainty[..., None])[..., 0]
         return DepthPrior.from_arrays(z, 1 / certainty.astype(np.float64) ** 2)
 
     def positions(self, cells: Int64) -> Float64:
-        """Return pixels (n, 2) of the view for rows of the descriptors."""
+        """Convert rows of the descriptors to pixels (n, 2) of the view."""
         rows, columns = np.divmod(cells, self.canvas.size[0])
         xy = np.stack([columns, rows], axis=-1) + 0.5
         return self.canvas.to_view(xy, self.view.camera.size)
 
     def cells(self, xy: Float64) -> Int64:
-        """Return rows of the descriptors for pixels (n, 2) of the view, -1 in cropped borders."""
+        """Convert pixels (n, 2) of the view to rows of the descriptors, -1 in cropped borders."""
         placed = np.floor(self.canvas.from_view(xy, self.view.camera.size)).astype(np.int64)
         width, height = self.canvas.size
         inside = ((placed >= 0) & (placed < (width, height))).all(axis=1)
@@ -66,7 +68,7 @@ class ViewOutput:
 
 
 class PairNetwork(ABC):
-    """Interface of MASt3R; ``size`` is the longer side of the images."""
+    """Interface of the MASt3R networks, with images resized to the longer side ``size``."""
 
     def __init__(self, size: int) -> None:
         self._rule = ImageInput(
@@ -79,17 +81,17 @@ class PairNetwork(ABC):
 
     @abstractmethod
     def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
-        """Run the network on two images (1, 3, h, w), RGB in [-1, 1].
+        """Run the network on two RGB images (1, 3, h, w) with values in [-1, 1].
 
         Returns:
-            For each image: points (h, w, 3) in the frame of the first, confidence (h, w),
-            descriptors (h, w, d) and their confidence (h, w).
+            For each image, points (h, w, 3) in the camera frame of the first image, their
+            confidence (h, w), descriptors (h, w, d), and descriptor confidence (h, w).
         """
 
     def both(
         self, view_a: View, view_b: View
     ) -> tuple[tuple[ViewOutput, ViewOutput], tuple[ViewOutput, ViewOutput]]:
-        """Run both passes: ``(a, b)`` with a first, and ``(a, b)`` with b first."""
+        """Return the outputs for a and b of two passes, the first with a first, the second with b."""
         backward = self._run(view_b, view_a)
         return self._run(view_a, view_b), (backward[1], backward[0])
 
@@ -108,10 +110,10 @@ class PairNetwork(ABC):
 
 
 class OnnxPairNetwork(PairNetwork):
-    """MASt3R as an ONNX model.
+    """MASt3R in an ONNX file.
 
-    Inputs ``img1``, ``img2``; outputs ``pts3d_1`` (1, h, w, 3), ``conf_1`` (1, h, w), ``desc_1``
-    (1, h, w, d), ``desc_conf_1`` (1, h, w), and the same for the second view.
+    The inputs are ``img1`` and ``img2``. The outputs are ``pts3d_1`` (1, h, w, 3), ``conf_1`` (1,
+    h, w), ``desc_1`` (1, h, w, d), ``desc_conf_1`` (1, h, w), and the same for the second view.
     """
 
     def __init__(self, options: Mast3rOptions, context: ProviderContext) -> None:
@@ -121,7 +123,7 @@ class OnnxPairNetwork(PairNetwork):
         self._model.require(("img1", "img2"), self._outputs, "MASt3R")
 
     def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
-        """Run the ONNX model; see :class:`PairNetwork`."""
+        """Run the ONNX model, see :class:`PairNetwork`."""
         feed = {"img1": first, "img2": second}
         tensors = [tensor[0] for tensor in self._model.run(feed, self._outputs)]
         return tensors[:4], tensors[4:]

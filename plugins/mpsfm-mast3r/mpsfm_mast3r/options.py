@@ -1,4 +1,4 @@
-"""Options of the matchers; imports nothing heavy. "reference" is the authors' implementation."""
+"""Options of the MASt3R matchers, importable without onnxruntime."""
 
 from __future__ import annotations
 
@@ -8,42 +8,43 @@ from mpsfm_core import Options
 
 
 class FileOptions(Options):
-    """File of the network."""
+    """Options that select the ONNX file of MASt3R."""
 
     model: str = "export:mast3r"
-    """Path or URI of the ONNX file; default: the output of ``mpsfm models export mast3r``."""
+    """Path or URI of the ONNX file. The default is the output of ``mpsfm models export mast3r``."""
     sha256: str | None = None
-    """Expected hash of ``model``."""
+    """Expected SHA-256 hash of the file ``model``."""
 
 
 class SizeOptions(Options):
-    """Size of the network input."""
+    """Options of the image size that MASt3R sees."""
 
     size: int = Field(512, ge=16)
-    """Longer side of the network input in pixels; small views are enlarged. [reference]"""
+    """Longer side of the network input in pixels. Smaller images are enlarged."""
 
 
 class DenseSearch(SizeOptions):
-    """Options of dense matching."""
+    """Options of MASt3R's dense matching."""
 
     subsample: int = Field(8, ge=1)
-    """Step in pixels of the start positions of the reciprocal search. [reference]"""
+    """Step in network pixels between the pixels from which the reciprocal search starts. Larger
+    steps are faster and find fewer matches."""
 
 
 class SparseSearch(SizeOptions):
-    """Options of matching at keypoints."""
+    """Options of MASt3R's matching at given keypoints."""
 
     min_similarity: float = Field(0.85, ge=-1, le=1)
-    """Minimum cosine of the descriptors of a match. [reference]"""
+    """Minimum cosine similarity of the descriptors of a match."""
 
 
 class Mast3rOptions(FileOptions, SizeOptions):
-    """Options of both matchers."""
+    """Options of the dense and the sparse MASt3R matcher."""
 
 
 class DenseOptions(Mast3rOptions, DenseSearch):
-    """Options of ``mast3r``."""
+    """Options of the provider ``mast3r``, the dense matcher."""
 
 
 class SparseOptions(Mast3rOptions, SparseSearch):
-    """Options of ``mast3r-sparse``."""
+    """Options of the provider ``mast3r-sparse``, which matches given keypoints."""

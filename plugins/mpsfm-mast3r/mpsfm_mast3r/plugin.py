@@ -1,4 +1,4 @@
-"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
+"""Registration of the MASt3R matchers, importing neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LICENSE = "CC-BY-NC-SA-4.0"
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register the dense and the sparse matcher."""
+    """Register the dense and the sparse MASt3R matcher."""
     return [
         _spec("mast3r", "dense", DenseOptions, "MASt3R: dense matches and depth of both views"),
         _spec("mast3r-sparse", "sparse", SparseOptions, "MASt3R at keypoints of any detector"),
@@ -21,7 +21,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
 
 @hookimpl
 def mpsfm_exports() -> dict[str, ModelExport]:
-    """Register the export from the authors' code and checkpoint."""
+    """Register the ONNX export that runs MASt3R's code and checkpoint."""
     return {
         "mast3r": ModelExport(
             script="mpsfm_mast3r.export",

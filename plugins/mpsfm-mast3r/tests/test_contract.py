@@ -1,4 +1,4 @@
-"""Contract tests with a stand-in that matches patches."""
+"""Provider contract tests with a small network that matches patches instead of MASt3R."""
 
 from mpsfm_core.testing import contract_tests
 

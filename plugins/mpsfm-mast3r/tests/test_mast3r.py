@@ -1,4 +1,4 @@
-"""Tests of the matchers with stand-ins of known output."""
+"""Tests of the matchers with small ONNX networks whose output is known."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
-SIZE = (80, 60)  # of the views; the network sees 64 x 48 of it, without a border
+SIZE = (80, 60)  # size of the test views, resized to 64 x 48 without cropping
 
-# Red is z and green the certainty, as far as the view in question came first (else both are 90).
-# The descriptor is the direction of (red, green, blue).
+# The network returns the red channel as z and green as certainty for its first input, and 90 for
+# both for its second input. Descriptors are the unit vectors of (red, green, blue).
 STAND_IN = """
 mast3r (float[b,3,h1,w1] img1, float[b,3,h2,w2] img2) => (
     float[b,h1,w1,3] pts3d_1, float[b,h1,w1] conf_1, float[b,h1,w1,3] desc_1,
@@ -64,7 +64,7 @@ def view_of(image, name="a.png"):
 
 @pytest.fixture
 def scattered():
-    """Create two views with 12 blocks of distinct colors in different places, and their centers."""
+    """Create two views with 12 blocks of distinct colors in different places, and block centers."""
     rng = np.random.default_rng(1)
     colours = rng.permutation(np.mgrid[5:255:80, 5:255:80, 5:255:80].reshape(3, -1).T)
     directions = colours / np.linalg.norm(colours, axis=1, keepdims=True)
@@ -110,7 +110,7 @@ class TestDense:
         np.testing.assert_allclose(found.scores, certainty / (1 + certainty), rtol=1e-5)
 
     def test_positions_lie_at_pixel_centres_of_the_cropped_view(self, model, context):
-        """Check 100 x 61 resized to 64 x 39 and cropped to 64 x 32 from row 3 on."""
+        """Check an image of 100 x 61 resized to 64 x 39 and cropped to 64 x 32 from row 3 on."""
         rng = np.random.default_rng(0)
         image = rng.integers(30, 225, (61, 100, 3), dtype=np.uint8)
         view = view_of(image)
@@ -155,7 +155,7 @@ def test_depth_of_each_view_comes_from_the_pass_where_it_is_first(model, context
     for prior, view in ((depth.depth_a, a), (depth.depth_b, b)):
         assert prior.shape == (39, 64) and prior.metric
         inside = np.zeros(39, dtype=bool)
-        inside[3:35] = True  # the border beyond multiples of 16 was cut off
+        inside[3:35] = True  # rows beyond multiples of 16 were cropped
         np.testing.assert_array_equal(prior.valid, np.broadcast_to(inside[:, None], (39, 64)))
         columns = (np.arange(64) + 0.5) * 100 / 64 - 0.5
         expected = np.interp(columns, np.arange(100), view.image[0, :, 0]) / 255

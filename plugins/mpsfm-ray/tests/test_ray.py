@@ -12,12 +12,11 @@ from mpsfm_core.testing import executor_contract
 pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
 from mpsfm_ray.executor import RayExecutor
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of the cluster's own threads at shutdown
+pytestmark = pytest.mark.filterwarnings("ignore")  # threads of the cluster warn
 
 
 class TestOneCluster:
-    """Tests that share one Ray cluster. Ray supports only one cluster per process, so tests that
-    start another one run later."""
+    """Tests that share one Ray cluster, because Ray supports only one per process."""
 
     @pytest.fixture(scope="class")
     def executor(self) -> Iterator[RayExecutor]:

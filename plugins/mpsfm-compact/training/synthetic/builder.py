@@ -62,8 +62,7 @@ class Builder:
     def box(
         self, at: ArrayLike, size: ArrayLike, look: Look, yaw: float = 0.0, **more: Any
     ) -> None:
-        """Add a box with side lengths ``size`` in meters, rotated by ``yaw`` (rad) about the
-        vertical."""
+        """Add a box with sides ``size`` in meters, rotated by ``yaw`` (rad) about the vertical."""
         half = np.asarray(size, float) / 2
         self._add(BOX, _lifted(at, half[2]), half, _turn(yaw), look, **more)
 

@@ -18,8 +18,7 @@ Furniture = Callable[[Builder, float, float, float], None]
 
 
 class Frame:
-    """Coordinate frame of a piece of furniture: ``u`` is along the wall and ``v`` away from the
-    wall, in meters."""
+    """Coordinate frame of a piece of furniture, with u along the wall and v away from the wall."""
 
     def __init__(self, build: Builder, x: float, y: float, yaw: float) -> None:
         self.build, self.x, self.y, self.yaw = build, x, y, yaw

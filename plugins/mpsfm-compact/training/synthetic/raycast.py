@@ -24,8 +24,7 @@ _compiled = njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, er
 
 @_compiled
 def _hit(kind, inverse, origin, direction):
-    """Compute the distance along a ray to a unit solid (inf for a miss), and the axis of the
-    face."""
+    """Compute the distance along a ray to a unit solid (inf for a miss), and the face axis."""
     ox = inverse[0, 0] * origin[0] + inverse[0, 1] * origin[1] + inverse[0, 2] * origin[2]
     oy = inverse[1, 0] * origin[0] + inverse[1, 1] * origin[1] + inverse[1, 2] * origin[2]
     oz = inverse[2, 0] * origin[0] + inverse[2, 1] * origin[1] + inverse[2, 2] * origin[2]
@@ -79,8 +78,7 @@ def _hit(kind, inverse, origin, direction):
 
 @_compiled
 def _first(solids, chosen, count, origin, direction):
-    """Find distance, solid index (-1 for a miss) and face axis of the first hit among chosen
-    solids."""
+    """Find distance, index (-1 for a miss) and face axis of the first hit among chosen solids."""
     kinds, inverses, centers, radii = solids
     best, solid, face = np.inf, -1, 0
     for k in range(count):
@@ -191,8 +189,7 @@ def _sky(direction, sky, colour):
 
 @_compiled
 def _shade(scene, i, axis, point, direction, distance, pixel, normal, colour):
-    """Compute the light that a surface point sends along a ray, from texture, lights and
-    shadows."""
+    """Compute the light that a surface point sends along a ray: texture, lights and shadows."""
     solids, sizes, looks, textures, shadows, lights, ambient = scene
     kinds, inverses, _, _ = solids
     uv = np.empty(2)
@@ -243,15 +240,17 @@ def _shade(scene, i, axis, point, direction, distance, pixel, normal, colour):
 
 @_compiled
 def draw(scene, shows, sky, origin, rotation, focal, width, height, image, depth, normals, kind):
-    """Render a view of ``scene``.
+    """Render color, depth, normals and surface kind of a scene.
 
-    ``scene``: solids (kinds (n,), inverses (n, 3, 4), centers (n, 3), radii (n,)), half sizes (n,
-    3), looks (n, 9), textures (levels, t, s, s, 3), shadow casters (indices of solids, and centers
-    and radii of bounding spheres of :data:`GROUP` of them each), lights (m, 7), ambient (2, 3) from
-    above and below. ``shows`` (n,): PLAIN, MIRROR or WINDOW. ``rotation``: world_from_camera.
+    The tuple ``scene`` has solids (kinds (n,), inverses (n, 3, 4), centers (n, 3), radii (n,)),
+    half sizes (n, 3), looks (n, 9), and textures (levels, t, s, s, 3). It continues with shadow
+    casters (solid indices, and centers and radii of bounding spheres of :data:`GROUP` solids each),
+    lights (m, 7), and ambient light (2, 3) from above and below. ``shows`` (n,) is PLAIN, MIRROR or
+    WINDOW for each solid, and ``rotation`` is world_from_camera.
 
-    Fills ``image`` (h, w, 3) in linear light, ``depth`` (h, w) along z, ``normals`` (h, w, 3) in
-    the camera frame, ``kind`` (h, w) uint8: 0 sky, 1 surface, 2 mirror or window.
+    The function fills ``image`` (h, w, 3) in linear light, ``depth`` (h, w) along z, ``normals``
+    (h, w, 3) in the camera frame, and ``kind`` (h, w) uint8. In ``kind``, 0 is sky, 1 is a surface,
+    and 2 is a mirror or window.
     """
     solids = scene[0]
     centers, radii = solids[2], solids[3]

@@ -15,8 +15,7 @@ from training.synthetic.raycast import BALL, BOX, CYLINDER, MIRROR, WINDOW
 
 @dataclass(frozen=True)
 class Shot:
-    """Camera center, rotation world_from_camera (3, 3), and focal length relative to the
-    diagonal."""
+    """Camera center, rotation world_from_camera (3, 3), and focal length over image diagonal."""
 
     origin: NDArray[np.float64]
     rotation: NDArray[np.float64]
@@ -100,8 +99,7 @@ def room(b: Builder) -> Callable[[], Shot]:
 
 
 def _floor_plan(rng: np.random.Generator) -> tuple[tuple[float, float], float]:
-    """Draw length, width and height in meters of a closet, an ordinary room, a hall or a
-    corridor."""
+    """Draw length, width and height in meters of a closet, a room, a hall or a corridor."""
     kind = rng.choice(5, p=(0.12, 0.46, 0.22, 0.1, 0.1))
     low, high = ((1.8, 3.5), (3.0, 6.5), (4.5, 10.0), (8.0, 18.0), (5.0, 20.0))[kind]
     length, width = rng.uniform(low, high, 2)
