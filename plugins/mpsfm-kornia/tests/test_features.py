@@ -55,8 +55,7 @@ class BrightestPixel(KorniaFeatures):
     ],
 )
 def test_pixel_convention(context, size, longest, grid):
-    """Check that pixel (c, r) of the network input becomes (c + 0.5, r + 0.5), scaled to the
-    view."""
+    """Check that network pixel (c, r) becomes (c + 0.5, r + 0.5), scaled to the view."""
     image = np.zeros((size[1], size[0], 3), dtype=np.uint8)
     bright = np.array([size[0] // 3, size[1] // 2])
     image[bright[1], bright[0]] = 255

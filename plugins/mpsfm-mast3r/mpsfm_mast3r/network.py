@@ -91,7 +91,7 @@ class PairNetwork(ABC):
     def both(
         self, view_a: View, view_b: View
     ) -> tuple[tuple[ViewOutput, ViewOutput], tuple[ViewOutput, ViewOutput]]:
-        """Return the outputs for a and b of two passes, the first with a first, the second with b."""
+        """Return the outputs for a and b of two passes, with a first and with b first."""
         backward = self._run(view_b, view_a)
         return self._run(view_a, view_b), (backward[1], backward[0])
 

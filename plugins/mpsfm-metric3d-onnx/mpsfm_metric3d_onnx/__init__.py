@@ -1,1 +1,1 @@
-"""Metric3D v2 depth and normals with ONNX Runtime."""
+"""Depth and normals from Metric3D v2 in an ONNX file."""

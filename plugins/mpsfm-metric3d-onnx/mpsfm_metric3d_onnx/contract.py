@@ -1,4 +1,4 @@
-"""Contract setup: a stand-in network without weights."""
+"""Small ONNX network that replaces Metric3D in the provider contract tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpsfm_metric3d_onnx.provider import describe
 
 
 def setup(folder: Path) -> ContractSetup:
-    """Write an export with confidence that decodes painted views."""
+    """Write a network of Metric3D's interface that decodes depth and normals from image colors."""
     model = stand_in(describe(Metric3dOptions(weights="", confidence=True)), folder)
     return ContractSetup(
         options={"weights": str(model), "confidence": True}, truth_source="painted"

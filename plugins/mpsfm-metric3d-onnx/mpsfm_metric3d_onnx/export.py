@@ -1,6 +1,6 @@
-"""Export of Metric3D v2 with all outputs to ONNX, with its authors' code.
+"""Export of Metric3D v2, with all of its outputs, to ONNX by its authors' code.
 
-Runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+This module runs as a program, see :mod:`mpsfm_core.providers.model_export`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from mpsfm_core.providers.model_export.author_script import ExportJob
 
 for _name in ("mmcv", "mmcv.utils", "timm", "timm.models", "timm.models.layers"):
-    sys.modules[_name] = ModuleType(_name)  # stubs of imports that are not used here
+    sys.modules[_name] = ModuleType(_name)  # empty modules for imports that the export does not use
 sys.modules["timm.models.registry"] = ModuleType("timm.models.registry")
 sys.modules["mmcv.utils"].__dict__["collect_env"] = dict
 sys.modules["timm.models.layers"].__dict__.update(trunc_normal_=None, DropPath=None)
@@ -29,7 +29,7 @@ from mono.model.decode_heads.RAFTDepthNormalDPTDecoder5 import (  # noqa: E402
 )
 
 SIZE = 616, 1064
-"""Rows and columns of the network input; the file supports no other size. [authors]"""
+"""Height and width of the network input in pixels. The exported file supports no other size."""
 _MEAN, _STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 _MODELS = {
     "": hubconf.metric3d_vit_small,
@@ -44,11 +44,11 @@ _LEFT = {
     ConvTransposeLoRA: torch.nn.ConvTranspose2d,
     LoRALinear: torch.nn.Linear,
 }
-"""Classes that leave their weights uninitialized, for a checkpoint to fill."""
+"""Layer classes that leave weights uninitialized, with the torch classes that initialize them."""
 
 
 class Named(torch.nn.Module):
-    """Module with all outputs, named as in the public exports (metric3d_onnx_export.py)."""
+    """Module with all outputs of Metric3D, named as in the public ONNX files."""
 
     def __init__(self, model: torch.nn.Module) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class Named(torch.nn.Module):
 
 
 def network(size: str) -> Named:
-    """Create the authors' network on the CPU, which their code does not support."""
+    """Create the authors' network on the CPU, which the authors' code does not support."""
     linspace, grid = torch.linspace, RAFTDepthNormalDPT5.create_mesh_grid
 
     def here(*values: Any, device: Any = None, **options: Any) -> torch.Tensor:
@@ -84,14 +84,14 @@ def network(size: str) -> Named:
 
 
 def export(job: ExportJob, model: Named) -> None:
-    """Export the network for images of the fixed size, values 0 to 255."""
+    """Export the network for images of the fixed input size, with values from 0 to 255."""
     given = [{"pixel_values": torch.rand(1, 3, *SIZE) * 255} for _ in range(2)]
     outputs = ["predicted_depth", "predicted_normal", "normal_confidence", "confidence"]
     job.export(model, given, outputs)
 
 
 def main() -> None:
-    """Export the network of the checkpoint."""
+    """Export Metric3D with the weights of a checkpoint."""
     job = ExportJob.from_arguments()
     model = network(job.size)
     if job.weights is not None:

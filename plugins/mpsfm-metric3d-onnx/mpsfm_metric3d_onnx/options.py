@@ -1,4 +1,4 @@
-"""Weights, options and calibration of each size; imports nothing heavy."""
+"""Weights, options and calibration of each Metric3D size, importable without onnxruntime."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 WEIGHTS_LICENSE = "CC0-1.0 (export; the authors name none for their weights)"
 
 RELATIVE_STD_ALONE = 0.08
-"""Std relative to depth for exports without confidence.
+"""Std of depth relative to depth, for ONNX files without the output ``confidence``.
 
 [assumed from the reference values 0.079 and 0.0875 of other networks]
 """
@@ -30,17 +30,17 @@ _GIANT2 = tuple(
 
 
 class Metric3dOptions(Options):
-    """Options of all sizes."""
+    """Options that all sizes of Metric3D share."""
 
     weights: str
     """Path or URI of the ONNX file."""
     companions: tuple[str, ...] = ()
-    """URIs of further files in its folder, for models with external data."""
+    """URIs of the external data files that an ONNX file of more than 2 GB needs."""
     sha256: str | None = None
-    """Expected hash of ``weights``."""
+    """Expected SHA-256 hash of the file ``weights``."""
     confidence: bool = False
-    """True if the file has the output ``confidence``: depth then has a variance, and the
-    calibration of the reference applies. The public exports lack it.
+    """Set to true if the ONNX file has the output ``confidence``. Depth then has a variance, and
+    the calibration of the reference applies. The public ONNX files have no output ``confidence``.
     """
 
 
@@ -65,7 +65,10 @@ class Giant2Options(Metric3dOptions):
 
 @dataclass(frozen=True)
 class Size:
-    """One size of the network; ``calibration`` is for exports with confidence [reference]."""
+    """Weights, options and calibration of one Metric3D size.
+
+    The calibration is for ONNX files with the output ``confidence`` [reference].
+    """
 
     name: str
     options: type[Metric3dOptions]
@@ -73,13 +76,13 @@ class Size:
     calibration: DepthCalibration
 
     def files(self, options: Metric3dOptions) -> tuple[WeightsFile, ...]:
-        """Return the files of these options."""
+        """Return the weights files that the options select."""
         companions = (WeightsFile(uri, license=WEIGHTS_LICENSE) for uri in options.companions)
         return (*companions, *weights_from_option("weights", *self.weights)(options))
 
     @property
     def calibration_alone(self) -> DepthCalibration:
-        """Return the calibration for exports without confidence."""
+        """Return the calibration for ONNX files without the output ``confidence``."""
         return self.calibration.model_copy(update={"relative_std": RELATIVE_STD_ALONE})
 
 

@@ -1,4 +1,4 @@
-"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
+"""Registration of the Metric3D providers, importing neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _NORMALS = NormalCalibration(std_scale=1.0, std_floor_deg=1.0)
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register depth (with normals of the same pass) and normals of every size."""
+    """Register providers of depth (with normals of the same pass) and of normals for every size."""
     return [_spec(kind, size) for kind in ("depth", "normals") for size in SIZES]
 
 
 @hookimpl
 def mpsfm_exports() -> dict[str, ModelExport]:
-    """Register the export with confidence from the authors' code and checkpoint."""
+    """Register the ONNX export, with confidence, that runs the authors' code and checkpoint."""
     return {
         "metric3d": ModelExport(
             script="mpsfm_metric3d_onnx.export",
@@ -36,7 +36,7 @@ def mpsfm_exports() -> dict[str, ModelExport]:
 def mpsfm_calibration(
     kind: str, provider: str, options: BaseModel | None
 ) -> DepthCalibration | NormalCalibration | None:
-    """Return the calibration of depth, which depends on the output ``confidence``."""
+    """Return the calibration of depth, which depends on the option ``confidence``."""
     if kind == "depth" and isinstance(options, Metric3dOptions):
         for size in SIZES:
             if provider == _name(size) and not options.confidence:

@@ -1,4 +1,4 @@
-"""Metric3D v2 as depth and normals provider."""
+"""Metric3D v2 as a provider of depth and normals."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from mpsfm_metric3d_onnx.options import Metric3dOptions
 
 
 class Metric3dDepth(DescribedJoint):
-    """Provider of metric depth and, in the same pass, normals."""
+    """Provider of metric depth and of normals from the same forward pass."""
 
     def __init__(self, options: Metric3dOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context)
 
 
 class Metric3dNormals(DescribedNormals):
-    """Provider of normals with angular variance."""
+    """Provider of normals with their angular variance."""
 
     def __init__(self, options: Metric3dOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context)
 
 
 def describe(options: Metric3dOptions) -> Description:
-    """Return the description of the network for these options."""
+    """Return the network description that matches the options."""
     general = load_description(str(Path(__file__).with_name("description.yaml")))
     weights = Weights(uri=options.weights, sha256=options.sha256, companions=options.companions)
     update: dict[str, object] = {"weights": weights}

@@ -1,10 +1,10 @@
-"""Contract tests of one size; the sizes differ only in weights and calibration."""
+"""Provider contract tests of one Metric3D size. All sizes share the tested code."""
 
 import pytest
 
 from mpsfm_core.testing import contract_tests
 
-pytestmark = pytest.mark.slow  # its grid has 616 rows
+pytestmark = pytest.mark.slow  # the output of Metric3D has 616 rows
 
 test_depth = contract_tests("depth", "metric3d-v2-small")
 test_normals = contract_tests("normals", "metric3d-v2-small")

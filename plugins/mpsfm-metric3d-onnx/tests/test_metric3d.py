@@ -1,4 +1,4 @@
-"""Tests of the providers with a stand-in that has the tensors of the public exports."""
+"""Tests of the providers with a small network that has the tensors of the public ONNX files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mpsfm_core.data.errors import ConfigError, WeightsError
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 
-# Depth is the red channel as it is fed, confidence a 200th of the blue one.
+# The network returns the red channel as depth, and the blue channel divided by 200 as confidence.
 STAND_IN = """
 metric3d (float[b,3,616,1064] pixel_values) => (
     float[b,1,616,1064] predicted_depth, float[b,1,616,1064] confidence,
@@ -45,7 +45,7 @@ def view_of(width, height, colour, focal=(500.0, 500.0)):
 def test_canonical_camera_padding_and_normals(model, context):
     view = view_of(640, 480, (90, 175, 6), (700.0, 720.0))
     depth, normals = Metric3dDepth(Metric3dOptions(**model), context).predict_joint(view)
-    # 616 / 480 rows limit the size: 821 x 616 of 1064 x 616, of which only the image remains
+    # The rows limit the scale to 616 / 480. The image covers 821 x 616 of the 1064 x 616 input.
     assert depth.shape == normals.shape == (616, 821)
     assert depth.valid.all() and depth.metric and depth.variance is None
     focal = (700 + 720) / 2 * 616 / 480
@@ -66,7 +66,7 @@ def test_confidence_becomes_the_variance_of_depth(model, context):
 
 
 def test_padding_has_the_mean_colour(write_onnx, context):
-    """Check the padding with a stand-in that returns the upper left pixel as depth."""
+    """Check the padding with a network that returns the upper left input pixel as depth."""
     path = write_onnx(
         """
         corner (float[1,3,616,1064] pixel_values) => (

@@ -1,1 +1,1 @@
-"""Depth and normal networks in ONNX files, described in YAML."""
+"""Depth and normal networks in ONNX files that YAML files describe."""

@@ -1,4 +1,4 @@
-"""Geometry between a view and the network input: resize, pad, crop, and their exact inverse."""
+"""Resizing, padding and cropping of a view to the network input, and the inverse mapping."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ _INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
 class Canvas:
     """Position of the resized image on the network input, in pixels.
 
-    ``size``: of the input; ``image``: of the resized image; ``offset``: of its upper left corner,
-    negative if the input crops it. Each is ``(width, height)``.
+    ``size`` is the ``(width, height)`` of the network input, and ``image`` that of the resized
+    image. ``offset`` (x, y) is the upper left corner of the resized image on the network input. It
+    is negative where the network input crops the image.
     """
 
     size: tuple[int, int]
@@ -32,7 +33,7 @@ class Canvas:
 
     @classmethod
     def plan(cls, rule: FixedSize | SideSize, view: tuple[int, int]) -> Canvas:
-        """Plan the canvas for a view of ``(width, height)`` pixels."""
+        """Compute the position of a view of ``(width, height)`` pixels on the network input."""
         if isinstance(rule, FixedSize):
             size = (rule.width, rule.height)
             scale = min(s / v for s, v in zip(size, view, strict=True))
@@ -58,7 +59,7 @@ class Canvas:
         return cls(size, image, (left, top))
 
     def paint(self, image: UInt8, rule: ImageInput) -> NDArray[Any]:
-        """Create the input tensor with its batch dimension from an (H, W, 3) RGB image."""
+        """Create the input tensor (1, 3, h, w) or (1, h, w, 3) from an RGB image (H, W, 3)."""
         rgb = np.empty((self.size[1], self.size[0], 3), dtype=np.float32)
         rgb[:] = rule.pad_value
         (to_x, from_x), (to_y, from_y) = (self._overlap(axis) for axis in (0, 1))
@@ -71,11 +72,10 @@ class Canvas:
         return np.ascontiguousarray(values[None])
 
     def cut(self, planes: Float32) -> Float32:
-        """Cut the part of an output (h, w, c) that covers the view; the output covers the canvas.
+        """Cut the part that covers the view from an output (h, w, c) that covers the canvas.
 
-        The result covers the view exactly and is NaN where the canvas cropped the view. If the
-        image border is not between two output pixels, it is sampled bilinearly with half-pixel
-        offsets.
+        The result covers the view exactly, and is NaN where the canvas crops the view. If the image
+        border is not between two output pixels, the output is sampled bilinearly.
         """
         height, width = planes.shape[:2]
         scale = (width / self.size[0], height / self.size[1])
@@ -106,15 +106,15 @@ class Canvas:
         return PinholeCamera(width, height, resized.fx, resized.fy, resized.cx + x, resized.cy + y)
 
     def from_view(self, xy: Float64, view: tuple[int, int]) -> Float64:
-        """Convert pixels (n, 2) of a view of the given size to pixels of the canvas."""
+        """Convert pixels (n, 2) of a view of ``(width, height)`` pixels to pixels of the canvas."""
         return scale_pixels(xy, view, self.image) + self.offset
 
     def to_view(self, xy: Float64, view: tuple[int, int]) -> Float64:
-        """Convert pixels (n, 2) of the canvas to pixels of a view of the given size."""
+        """Convert pixels (n, 2) of the canvas to pixels of a view of ``(width, height)`` pixels."""
         return scale_pixels(xy - np.array(self.offset, dtype=np.float64), self.image, view)
 
     def _overlap(self, axis: int) -> tuple[slice, slice]:
-        """Compute the range of the image along an axis, in canvas and image pixels."""
+        """Compute the range of the resized image along an axis, in canvas and in image pixels."""
         start = max(self.offset[axis], 0)
         stop = min(self.offset[axis] + self.image[axis], self.size[axis])
         return slice(start, stop), slice(start - self.offset[axis], stop - self.offset[axis])

@@ -1,4 +1,4 @@
-"""Contract setups: stand-ins that decode painted views, with their descriptions."""
+"""Small ONNX networks for contract tests that decode depth and normals from image colors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mpsfm_onnx.description import Description, ImageInput, load_description
 from mpsfm_onnx.stand_in import save_model
 
 KAPPA = (1 + np.sqrt(1 - NORMALS_STD**2)) / NORMALS_STD
-"""Concentration whose expected angle is the std of painted normals (``exp(-kappa pi)`` is 0)."""
+"""Concentration kappa whose expected angle is :data:`NORMALS_STD`."""
 
 _TINY = """
 name: tiny
@@ -71,7 +71,7 @@ moge (float[1,3,h,w] image, int64 num_tokens) => (
 
 
 def setup(folder: Path) -> ContractSetup:
-    """Write a network with canonical camera, padding, confidence and concentration."""
+    """Write a network and its description with canonical camera, padding and confidences."""
     return ContractSetup(options=_tiny(folder), truth_source="painted")
 
 
@@ -83,19 +83,19 @@ def moge(folder: Path) -> ContractSetup:
 
 
 def moge_stand_in(path: Path) -> Path:
-    """Create a model with inputs and outputs of MoGe-2's published file.
+    """Write a network with the inputs and outputs of MoGe-2's published file.
 
-    Brighter pixels are farther away (2 to 4 m); the focal length is the image width.
+    Depth grows with brightness from 2 to 4 m, and the focal length is the image width.
     """
     return save_model(_MOGE, path, half=0.5, none=0.0, whole=1.0, rows=2, columns=3, metres=[2.0])
 
 
 def stand_in(description: Description, folder: Path) -> Path:
-    """Create a model that decodes depth and normals of painted views, and its description.
+    """Write an ONNX network that decodes depth and normals from the colors of test images.
 
-    The description has a named input, NCHW tensors, ``output: depth`` and an uncertainty of the
-    normals. Pixels without painted depth are invalid. A canonical camera has the focal length of
-    the main test example on the network input.
+    The description must have a named input, NCHW tensors, ``output: depth`` and an uncertainty of
+    the normals. Pixels whose color encodes no depth are invalid. A canonical camera has the focal
+    length of the main test image on the network input.
     """
     outputs, rule = description.outputs, description.input
     weights, bias = _unnormalised(rule)
@@ -128,7 +128,7 @@ def stand_in(description: Description, folder: Path) -> Path:
 
 
 class _Graph:
-    """ONNX graph of one image (1, 3, h, w)."""
+    """ONNX graph under construction, with one image (1, 3, h, w) as input."""
 
     def __init__(self, image: str) -> None:
         self.image = image
@@ -136,7 +136,7 @@ class _Graph:
         self._arrays: list[onnx.TensorProto] = []
 
     def array(self, values: ArrayLike) -> str:
-        """Add a constant tensor, float32 or int64; return its name."""
+        """Add a constant float32 or int64 tensor, and return its name."""
         array, name = np.asarray(values), f"array_{len(self._arrays)}"
         dtype = np.int64 if np.issubdtype(array.dtype, np.integer) else np.float32
         self._arrays.append(numpy_helper.from_array(array.astype(dtype), name))
@@ -148,7 +148,7 @@ class _Graph:
         self._nodes.append(helper.make_node(kind, inputs, outputs, **attributes))
 
     def save(self, outputs: Sequence[str], intrinsics: str | None, path: Path) -> Path:
-        """Write the model; ``intrinsics`` names an unused input (1, 3, 3)."""
+        """Write the model to ``path``, with an unused input (1, 3, 3) if ``intrinsics`` is given."""
         flat = TensorProto.FLOAT
         inputs = [helper.make_tensor_value_info(self.image, flat, [1, 3, "h", "w"])]
         if intrinsics is not None:
@@ -168,7 +168,7 @@ def _tiny(folder: Path) -> dict[str, str]:
 
 
 def _unnormalised(rule: ImageInput) -> tuple[Float64, Float64]:
-    """Create the layer that decodes painted pixels from normalized values."""
+    """Create the layer that decodes depth and slopes from normalized colors."""
     weights, bias = decoder()
     if rule.channels == "BGR":
         weights = weights[:, ::-1]

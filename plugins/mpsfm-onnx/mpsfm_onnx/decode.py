@@ -19,16 +19,16 @@ from mpsfm_onnx.description import (
 )
 
 _GRID = np.arange(64)
-"""Side in pixels of the grid for the estimation of the shift. [MoGe: 64]"""
+"""Rows and columns of the pixel grid on which the z-shift of points is estimated."""
 _GAUSS_NEWTON_STEPS = 20
 _SMALLEST_RELATIVE_STD = 1e-4
-"""Minimum std relative to depth, because a variance must be positive; calibration has its own
-floor.
+"""Minimum std of depth relative to depth, because a variance must be positive. The calibration of a
+network has its own, larger minimum.
 """
 
 
 def to_planes(output: NDArray[Any], layout: Layout) -> Float32:
-    """Convert an output tensor of one image to (h, w, c) float32; add a missing channel axis."""
+    """Convert an output tensor for one image to (h, w, c) float32, adding c = 1 if needed."""
     array = np.asarray(output, dtype=np.float32)
     if array.ndim == 4 or (array.ndim == 3 and array.shape[0] == 1):
         array = array[0]
@@ -46,19 +46,19 @@ def decode_depth(
     std_rule: ConfidenceOutput | None = None,
     valid: Bool | None = None,
 ) -> DepthPrior:
-    """Decode depth and its variance.
+    """Decode the depth of a view and its variance from output tensors.
 
     Args:
-        value: The depth tensor, (h, w, c).
-        rule: Meaning of the depth tensor.
+        value: The depth tensor (h, w, c), in units of the network.
+        rule: Description of the depth tensor.
         camera: Camera of the view that ``value`` covers.
-        factor: Factor for depth and std: focal length and unit.
-        std: The uncertainty tensor, (h, w), or None.
-        std_rule: Meaning of the uncertainty tensor.
-        valid: Mask (h, w) of the network, or None.
+        factor: Multiplier of depth and std for the focal length and the unit of the network.
+        std: The uncertainty tensor (h, w), or None.
+        std_rule: Description of the uncertainty tensor.
+        valid: Mask (h, w) of valid pixels that the network predicts, or None.
 
     Returns:
-        The depth prior on the grid of the network.
+        The depth prior, at the resolution of the network output.
     """
     depth = _network_depth(value, rule, camera, valid)
     usable = np.isfinite(depth) & (depth > rule.valid_min)
@@ -75,7 +75,7 @@ def decode_depth(
 def _network_depth(
     value: Float32, rule: DepthOutput, camera: PinholeCamera, valid: Bool | None
 ) -> Float64:
-    """Compute depth (h, w) in units of the network; NaN or infinite if undefined."""
+    """Compute z-depth (h, w) in units of the network, NaN or infinite where undefined."""
     height, width = value.shape[:2]
     xy = rays(camera.resized(width, height), pixel_centers(width, height))[..., :2]
     quantity = value[..., rule.channel].astype(np.float64) * rule.scale + rule.shift
@@ -94,11 +94,11 @@ def _network_depth(
 
 
 def estimate_z_shift(points: Float64, xy: Float64, valid: Bool | None = None) -> float:
-    """Estimate the unknown shift of z of points (h, w, 3) on given rays ``(x, y, 1)``.
+    """Estimate the unknown shift t of z for points (h, w, 3) on known rays ``(x, y, 1)``.
 
-    The shift t minimizes the reprojection error ``sum |(x_i, y_i) / (z_i + t) - xy_i|^2`` over a
-    grid of 64 x 64 pixels (MoGe) by Gauss-Newton. The initial value minimizes ``sum |(x_i, y_i) -
-    xy_i (z_i + t)|^2 / z_i^2``.
+    The shift minimizes the reprojection error ``sum |(x_i, y_i) / (z_i + t) - xy_i|^2`` over a grid
+    of 64 x 64 pixels (MoGe) by Gauss-Newton, where ``xy`` (h, w, 2) are the x and y of the rays.
+    The initial value minimizes the linear error ``sum |(x_i, y_i) - xy_i (z_i + t)|^2 / z_i^2``.
     """
     usable = np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
     if valid is not None:
@@ -112,7 +112,7 @@ def estimate_z_shift(points: Float64, xy: Float64, valid: Bool | None = None) ->
     slope = on_ray / z
     shift = _step((x_y - on_ray * z) / z, slope)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        shift = max(shift, -0.99 * float(z.min()))  # keep all points in front of the camera
+        shift = max(shift, -0.99 * float(z.min()))  # keeps all points in front of the camera
         depth = z + shift
         step = _step(x_y / depth - on_ray, x_y / depth**2)
         shift += step
@@ -122,7 +122,7 @@ def estimate_z_shift(points: Float64, xy: Float64, valid: Bool | None = None) ->
 
 
 def _step(miss: Float64, slope: Float64) -> float:
-    """Compute the Gauss-Newton step for residual ``miss`` and Jacobian ``slope``."""
+    """Compute the Gauss-Newton step from the residual ``miss`` and the Jacobian ``slope``."""
     return float((miss * slope).sum() / max((slope**2).sum(), 1e-12))
 
 
@@ -145,10 +145,10 @@ def decode_normals(
     std: Float64 | None = None,
     valid: Bool | None = None,
 ) -> NormalPrior:
-    """Decode normals (h, w, 3 or more), and their variance from the (h, w) angular std in rad.
+    """Decode normals, and their variance from an angular std (h, w) in rad.
 
-    Pixels are invalid if the normal does not face the ``camera``, or if the network's ``valid``
-    mask excludes them.
+    The tensor ``value`` (h, w, 3 or more) starts with x, y, z. Normals that do not face the
+    ``camera`` are invalid, and so are pixels outside of the mask ``valid``.
     """
     variance = None if std is None else std**2
     normals = value[..., :3] * np.array(rule.axes, dtype=np.float32)
@@ -156,7 +156,7 @@ def decode_normals(
 
 
 def angular_std(value: Float32, rule: KappaOutput) -> Float64:
-    """Compute the std of normals about each axis in rad, (h, w), from the uncertainty tensor."""
+    """Compute the std (h, w) of normals about each axis in rad from the uncertainty tensor."""
     tensor = value[..., rule.channel].astype(np.float64)
     return compute_expected_angle(tensor) if rule.output == "kappa" else np.maximum(tensor, 0)
 
@@ -164,10 +164,11 @@ def angular_std(value: Float32, rule: KappaOutput) -> Float64:
 def compute_expected_angle(kappa: Float64) -> Float64:
     """Compute the mean angular error in rad of a normal with concentration ``kappa``.
 
-    The density over the sphere is ``(k^2 + 1) exp(-k a) / (2 pi (1 + exp(-k pi)))`` (Bae et al.,
-    ICCV 2021; DSINE and Metric3D v2). Its mean angle is ``2k / (k^2 + 1) + pi e / (1 + e)`` with
-    ``e = exp(-k pi)``. The square serves as variance along one tangent direction [reference]; for
-    large k this overestimates the std by 15 %.
+    The density of normals over the sphere is ``(k^2 + 1) exp(-k a) / (2 pi (1 + exp(-k pi)))``,
+    where a is the angle to the mean normal (Bae et al., ICCV 2021, DSINE and Metric3D v2). The mean
+    angle of this density is ``2k / (k^2 + 1) + pi e / (1 + e)`` with ``e = exp(-k pi)``. The
+    squared mean angle serves as the variance along one tangent direction [reference]. For large k,
+    this overestimates the std by 15 %.
     """
     k = np.maximum(kappa, 0)
     tail = np.exp(-k * np.pi)

@@ -1,7 +1,7 @@
-"""Description of a network: names and meaning of its tensors.
+"""Description of a network in an ONNX file by names and meaning of its tensors.
 
-A description is a YAML file with the fields of :class:`Description`. Shipped descriptions are in
-``descriptions/``; the file name is the name of the description.
+A description is a YAML file with the fields of :class:`Description`. The shipped descriptions are
+in the folder ``descriptions/``, and are named after their files.
 """
 
 from __future__ import annotations
@@ -25,143 +25,148 @@ Sign = Literal[-1, 1]
 
 
 class FixedSize(Options):
-    """Network input of one size; the fixed size of a model file has priority."""
+    """Fixed size of the network input in pixels, unless the ONNX file has another fixed size."""
 
     mode: Literal["fixed"]
     width: int = Field(gt=0)
     height: int = Field(gt=0)
     fit: Literal["stretch", "pad"] = "stretch"
-    """``stretch`` changes the aspect ratio; ``pad`` keeps it and centers the image."""
+    """``stretch`` changes the aspect ratio of the image. ``pad`` keeps it and centers the image."""
     rounding: Literal["nearest", "down"] = "nearest"
-    """Rounding of the sides of an image that keeps its aspect ratio."""
+    """Rounding of the image size in pixels after resizing with ``fit: pad``."""
 
 
 class SideSize(Options):
-    """Network input with the aspect ratio of the image."""
+    """Size of a network input that has the aspect ratio of the image."""
 
     mode: Literal["longest", "shortest"]
     side: int = Field(gt=0)
-    """Length in pixels of the longer or the shorter side."""
+    """Length in pixels of the longer or shorter side of the resized image, depending on ``mode``."""
     multiple_of: int = Field(1, gt=0)
-    """Both sides of the network input are multiples of this."""
+    """Both sides of the network input are multiples of this number of pixels."""
     fit: Literal["stretch", "pad", "crop"] = "stretch"
-    """``stretch`` to the nearest multiples, ``pad`` to the next ones, or ``crop`` to the previous
-    ones; cropped borders of the view have no prediction.
+    """Adaptation of the sides to ``multiple_of``. ``stretch`` resizes to the nearest multiples,
+    ``pad`` fills up to the next ones, and ``crop`` cuts to the previous ones. Cropped borders have
+    no prediction.
     """
     enlarge: bool = True
     """Enlarge small images."""
 
 
 class IntrinsicsInput(Options):
-    """Tensor of the calibration matrix (1, 3, 3) of the image on the network input."""
+    """Input tensor with the calibration matrix K (1, 3, 3) in pixels of the network input."""
 
     name: str
     first_pixel: float = Field(0.5, ge=0, le=0.5)
-    """Coordinate of the center of the first pixel in the convention of the network."""
+    """Coordinate of the center of the first pixel in the network's convention (COLMAP: 0.5)."""
 
 
 class ImageInput(Options):
-    """Image tensor: ``(value * scale - mean) / std`` of values in 0..255.
+    """Image tensor of the network, ``(value * scale - mean) / std`` for values in 0..255.
 
-    The result is rounded for integer types.
+    The tensor is rounded if it has an integer type.
     """
 
     name: str | None = None
-    """Name of the tensor; null: the first input of the model."""
+    """Name of the image tensor. null selects the first input of the model."""
     layout: Layout = "NCHW"
     channels: Literal["RGB", "BGR"] = "RGB"
     scale: float = 1.0
     mean: Triple = (0.0, 0.0, 0.0)
     std: Triple = (1.0, 1.0, 1.0)
-    """Mean and std in the order of ``channels``."""
+    """Mean and std of the image tensor, in the order of ``channels``."""
     pad_value: Triple = (0.0, 0.0, 0.0)
-    """RGB in 0..255, before normalization."""
+    """RGB color of padding in 0..255, before normalization."""
     interpolation: Literal["linear", "area", "cubic", "smooth-cubic", "lanczos"] = "area"
-    """``area`` averages when shrinking and is linear when enlarging. ``linear`` and ``cubic`` do
-    not average, as in OpenCV. ``smooth-cubic`` and ``lanczos`` average when shrinking, as in
-    Pillow, and are cubic when enlarging.
+    """Filter for resizing the image. ``area`` averages when shrinking and is linear when enlarging.
+    ``linear`` and ``cubic`` are OpenCV's filters, which do not average when shrinking.
+    ``smooth-cubic`` and ``lanczos`` are Pillow's filters, which average when shrinking and are
+    cubic when enlarging.
     """
     size: Annotated[FixedSize | SideSize, Field(discriminator="mode")]
     intrinsics: IntrinsicsInput | None = None
-    """Tensor of the intrinsics, for networks that use them."""
+    """Input tensor of the intrinsics, for networks that have one."""
     rays: str | None = None
-    """Tensor of the unit rays (1, 3, h, w) through the pixel centers of the input."""
+    """Name of the input tensor with unit rays (1, 3, h, w) through the pixel centers, if any."""
     constants: dict[str, float] = Field(default_factory=dict)
-    """Further inputs with a constant value."""
+    """Names and values of further inputs that are constant."""
 
 
 class DepthOutput(Options):
-    """Depth tensor; its quantity is ``v = value * scale + shift``."""
+    """Output tensor of depth, with the quantity ``v = value * scale + shift``."""
 
     name: str
     output: Literal["depth", "disparity", "log-depth", "ray-length", "points"] = "depth"
-    """``depth``, ``disparity``, ``log-depth``: depth is ``v``, ``1 / v`` or ``exp(v)``.
-    ``ray-length``: ``v`` is the distance to the camera. ``points``: channels x, y, z with an
-    unknown shift of z, which is estimated from the known camera. Pixels with ``v <= 0`` are
-    invalid, except for log-depth.
+    """Meaning of v. With ``depth``, ``disparity`` and ``log-depth``, depth is ``v``, ``1 / v`` and
+    ``exp(v)``. With ``ray-length``, v is the distance to the camera center along the ray. With
+    ``points``, the tensor has channels x, y, z with an unknown shift of z, which is estimated from
+    the known intrinsics. Pixels with ``v <= 0`` are invalid, except for ``log-depth``.
     """
     channel: int = Field(0, ge=0)
-    """Channel of the tensor, except for ``points``."""
+    """Channel of the depth tensor. ``points`` ignores this option."""
     scale: float = 1.0
     shift: float = 0.0
-    """Scale and shift convert the unit of the network to meters (or 1/m), or an affine disparity to
-    a positive one.
+    """Scale and shift of the tensor values. They convert to meters (or 1 / meters), or make an
+    affine disparity positive.
     """
     metric: bool
-    """True if depth is in meters, after the correction by ``canonical_focal``."""
+    """True if depth is in meters after the correction by ``canonical_focal``."""
     canonical_focal: float | None = Field(None, gt=0)
-    """Focal length in input pixels for which the network predicts meters: depth is multiplied by
-    ``focal / canonical_focal``, with the focal length of the resized image.
+    """Focal length in input pixels for which the network predicts meters. Depth is multiplied by
+    the focal length of the resized image divided by ``canonical_focal``.
     """
     assumed_focal: str | None = None
-    """Tensor with the horizontal focal length in input pixels that the network estimated: depth is
-    multiplied by ``focal / assumed_focal``.
+    """Name of the output with the horizontal focal length, in input pixels, that the network
+    assumed. Depth is multiplied by the known focal length divided by this value.
     """
     multiplier: str | None = None
-    """Tensor with a factor that converts depth to meters."""
+    """Name of the output with a factor that converts depth to meters."""
     valid_min: float = Field(0.0, ge=0)
     valid_max: float | None = Field(None, gt=0)
-    """Valid range of depth before the canonical correction."""
+    """Range of valid depth, before the correction by ``canonical_focal``."""
 
 
 class ConfidenceOutput(Options):
-    """Tensor of the depth uncertainty."""
+    """Output tensor of the depth uncertainty."""
 
     name: str
     output: Literal["confidence", "std", "variance", "exp-std"]
-    """``confidence`` c in [0, 1]: std = depth * (1 - c) (Metric3D). ``std``, ``variance`` and
-    ``exp-std`` (log of the std): in the unit of the depth tensor, before the canonical correction.
+    """Meaning of the tensor. For ``confidence`` c in [0, 1], the std is ``depth * (1 - c)``
+    (Metric3D). ``std``, ``variance`` and ``exp-std`` (whose log is the std) are in the unit of the
+    depth tensor, before the correction by ``canonical_focal``.
     """
 
 
 class MaskOutput(Options):
-    """Tensor of the validity of depth and normals."""
+    """Output tensor of the probability that depth and normals of a pixel are valid."""
 
     name: str
     minimum: float = 0.5
-    """Threshold above which a pixel is valid."""
+    """Threshold of the tensor above which a pixel is valid."""
 
 
 class NormalsOutput(Options):
-    """Tensor of the normals; its first three channels are x, y, z."""
+    """Output tensor of the normals. Its first three channels are x, y, z."""
 
     name: str
     axes: tuple[Sign, Sign, Sign] = (1, 1, 1)
-    """Signs that convert the axes of the network to x right, y down, z forward."""
+    """Signs that convert the network's axes to x right, y down, z forward."""
 
 
 class KappaOutput(Options):
-    """Tensor of the angular uncertainty of normals."""
+    """Output tensor of the angular uncertainty of normals."""
 
     name: str
     output: Literal["kappa", "angle"] = "kappa"
-    """``kappa``: concentration as in DSINE and Metric3D. ``angle``: std about each axis in rad."""
+    """Meaning of the tensor. ``kappa`` is the concentration of DSINE and Metric3D. ``angle`` is the
+    std about each axis in rad.
+    """
     channel: int = Field(0, ge=0)
-    """Channel of the tensor; 3 if it is the fourth channel of the normals."""
+    """Channel of the uncertainty in its tensor, 3 if it follows x, y, z of the normals."""
 
 
 class Outputs(Options):
-    """Outputs of the network: depth, normals, or both."""
+    """Output tensors of the network, which predicts depth, normals, or both."""
 
     layout: Layout = "NCHW"
     depth: DepthOutput | None = None
@@ -171,12 +176,12 @@ class Outputs(Options):
     mask: MaskOutput | None = None
 
     def names(self) -> set[str]:
-        """Return the names of the tensors that a model must have."""
+        """Return the names of the output tensors that a model must have."""
         described = [self.depth, self.normals, self.kappa, self.mask, self.confidence]
         return {tensor.name for tensor in described if tensor} | self.numbers()
 
     def numbers(self) -> set[str]:
-        """Return the names of the tensors with a single number."""
+        """Return the names of the output tensors that hold a single number."""
         names = (self.depth.assumed_focal, self.depth.multiplier) if self.depth else ()
         return {name for name in names if name}
 
@@ -192,14 +197,14 @@ class Outputs(Options):
 
 
 class Weights(Options):
-    """Download address of the model."""
+    """Download address of the ONNX file, with its hash and size."""
 
     uri: str
     sha256: str | None = None
     size: int | None = None
-    """Size in bytes, if known."""
+    """Size of the ONNX file in bytes, if known."""
     companions: tuple[str, ...] = ()
-    """Further URIs of the same folder, for models with external data."""
+    """URIs of the external data files of the ONNX file, in the same folder."""
 
 
 class Description(Options):
@@ -208,23 +213,23 @@ class Description(Options):
     name: str
     summary: str = ""
     license: str = "unknown"
-    """License of the weights."""
+    """License of the network weights."""
     weights: Weights | None = None
-    """Public file; null: the user names a local file."""
+    """Public ONNX file. null means that the user must give a local file."""
     input: ImageInput
     outputs: Outputs
     calibration: DepthCalibration = DepthCalibration()
     normals_calibration: NormalCalibration = NormalCalibration()
 
     def files(self, model: str | None = None, sha256: str | None = None) -> tuple[WeightsFile, ...]:
-        """Return the files to load, the model last.
+        """Return the weights files to load, with the ONNX file at the end.
 
         Args:
-            model: Path or URI of the user's file, or None for the public one.
-            sha256: Expected hash of ``model``.
+            model: Path or URI of the user's file, or None for the public file.
+            sha256: Expected SHA-256 hash of the file ``model``.
 
         Raises:
-            WeightsError: There is no public file.
+            WeightsError: The description has no public file, and ``model`` is None.
         """
         if model is not None:
             return (WeightsFile(model, sha256, self.license),)
@@ -239,15 +244,15 @@ class Description(Options):
 
 
 def shipped_descriptions() -> list[str]:
-    """Return the names of the shipped descriptions."""
+    """Return the names of the shipped network descriptions, sorted."""
     return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
 
 
 def load_description(name: str) -> Description:
-    """Load a shipped description by name, or one from a YAML file.
+    """Load a shipped network description by its name, or a description from a YAML file.
 
     Raises:
-        ConfigError: The name is unknown, or the file is invalid; the message names file and key.
+        ConfigError: The name is unknown, or the file is invalid. The message gives file and key.
     """
     path = Path(name).expanduser()
     if path.suffix not in (".yaml", ".yml"):

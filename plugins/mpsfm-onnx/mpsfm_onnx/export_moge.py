@@ -1,6 +1,6 @@
-"""Export of MoGe-2 with normals to ONNX, with its authors' code.
+"""Export of MoGe-2 with normals to ONNX by its authors' code.
 
-Runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+This module runs as a program, see :mod:`mpsfm_core.providers.model_export`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def _head(channels: int) -> dict[str, Any]:
 
 
 def small_with_normals() -> dict[str, Any]:
-    """Return the constructor arguments of the published ViT-S with normals."""
+    """Return the constructor arguments of the published MoGe-2 network, ViT-S with normals."""
     return {
         "encoder": {
             "backbone": "dinov2_vits14",
@@ -56,7 +56,7 @@ def small_with_normals() -> dict[str, Any]:
 
 
 def export(job: ExportJob, model: torch.nn.Module) -> None:
-    """Export the network for images of any size and a number of tokens."""
+    """Export the network for images of any size and any number of tokens."""
     model.onnx_compatible_mode = True
     tokens = torch.tensor(TOKENS)
     given = [{"image": torch.rand(1, 3, *size), "num_tokens": tokens} for size in _SIDES]
@@ -65,7 +65,7 @@ def export(job: ExportJob, model: torch.nn.Module) -> None:
 
 
 def main() -> None:
-    """Export the network of the checkpoint, which contains its architecture."""
+    """Export MoGe-2 with the weights and the architecture of a checkpoint."""
     job = ExportJob.from_arguments()
     if job.weights is None:
         export(job, MoGeModel(**small_with_normals()))

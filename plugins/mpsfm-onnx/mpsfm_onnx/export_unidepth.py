@@ -1,6 +1,6 @@
-"""Export of UniDepth V2 with camera input to ONNX, with its authors' code.
+"""Export of UniDepth V2 with camera input to ONNX by its authors' code.
 
-Runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+This module runs as a program, see :mod:`mpsfm_core.providers.model_export`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mpsfm_core.providers.model_export.author_script import ExportJob
 
 
 def _unused(name: str, **has: Any) -> None:
-    """Create an empty module for an import of the authors' code that is not used here."""
+    """Create an empty module for an import of the authors' code that the export does not use."""
     module = sys.modules[name] = ModuleType(name)
     module.__dict__.update(has)
 
@@ -40,12 +40,12 @@ from unidepth.models.unidepthv2.export import UniDepthV2ONNXcam  # noqa: E402
 from unidepth.utils.camera import Pinhole  # noqa: E402
 
 SIZE = 462, 630
-"""Rows and columns of the network input; the file supports no other size. [authors' default]"""
+"""Height and width of the network input in pixels. The exported file supports no other size."""
 _MODELS = {"": "l", "small": "s", "base": "b", "large": "l"}
 
 
 def network(size: str) -> UniDepthV2ONNXcam:
-    """Create the authors' network as in their export."""
+    """Create the UniDepth network as the authors' own ONNX export does."""
     name = f"config_v2_vit{_MODELS[size]}14.json"
     config = json.loads(Path("configs", name).read_text(encoding="utf-8"))
     config["training"]["export"] = True
@@ -53,7 +53,7 @@ def network(size: str) -> UniDepthV2ONNXcam:
 
 
 def export(job: ExportJob, model: UniDepthV2ONNXcam) -> None:
-    """Export the network for images of the fixed size, with the unit rays of their pixels."""
+    """Export the network for images of the fixed size and for the unit rays of their pixels."""
     given = []
     for focal in (400.0, 700.0):
         matrix = torch.tensor([[focal, 0, SIZE[1] / 2], [0, focal, SIZE[0] / 2], [0, 0, 1]])
@@ -64,12 +64,12 @@ def export(job: ExportJob, model: UniDepthV2ONNXcam) -> None:
 
 
 def _linspace(start: float, end: float, steps: int, **_: Any) -> torch.Tensor:
-    """Create a float32 constant; the exporter would create float64."""
+    """Create a float32 constant where the ONNX exporter would create a float64 one."""
     return torch.tensor(np.linspace(start, end, steps), dtype=torch.float32)
 
 
 def main() -> None:
-    """Export the network of the checkpoint."""
+    """Export UniDepth with the weights of a checkpoint."""
     job = ExportJob.from_arguments()
     model = network(job.size)
     if job.weights is not None:

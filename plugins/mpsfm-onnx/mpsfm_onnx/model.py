@@ -1,4 +1,4 @@
-"""An ONNX file as a function of named tensors."""
+"""Inference session for an ONNX file, with tensors by name."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _DTYPES: Mapping[str, type[np.generic]] = {
 
 
 class Model:
-    """Inference session, on the GPU if the context requests it and onnxruntime supports it.
+    """Inference session, on the GPU if the context requests one and onnxruntime supports it.
 
-    ``inputs``, ``outputs``: names of the tensors in the order of the model. ``shapes``: shapes of
-    the inputs; dynamic axes are not numbers.
+    ``inputs`` and ``outputs`` are the names of the tensors in the order of the model. ``shapes``
+    are the input shapes by name, where dynamic axes are strings or None.
 
     Raises:
         WeightsError: The file is not an ONNX model.
@@ -46,15 +46,15 @@ class Model:
         self.outputs = tuple(tensor.name for tensor in self._session.get_outputs())
 
     def require(self, inputs: Iterable[str], outputs: Iterable[str], what: str) -> None:
-        """Check that the model has exactly these inputs and at least these outputs.
+        """Check that the model has exactly these inputs, and at least these outputs.
 
         Args:
             inputs: Names of all inputs.
             outputs: Names of the required outputs.
-            what: Description of the network for the error message.
+            what: Name of the network for the error message.
 
         Raises:
-            ConfigError: The model has other tensors.
+            ConfigError: The inputs of the model differ, or the model lacks outputs.
         """
         inputs, outputs = sorted(set(inputs)), sorted(set(outputs))
         if inputs != sorted(self.inputs) or not set(outputs) <= set(self.outputs):
@@ -64,7 +64,7 @@ class Model:
             )
 
     def run(self, feed: Mapping[str, Any], outputs: Sequence[str]) -> list[NDArray[Any]]:
-        """Run the model; inputs are cast (and rounded) to the dtypes of the model."""
+        """Run the model on inputs that are cast (and rounded) to the dtypes of the model."""
         tensors = {name: self._cast(value, self._dtypes[name]) for name, value in feed.items()}
         results: list[NDArray[Any]] = self._session.run(list(outputs), tensors)
         return results
@@ -88,11 +88,11 @@ def _open(path: Path, context: ProviderContext) -> onnxruntime.InferenceSession:
     providers = [p for p in [*wanted, "CPUExecutionProvider"] if p in available]
     try:
         session = onnxruntime.InferenceSession(str(path), settings, providers=providers)
-    except Exception as error:  # onnxruntime's exceptions share no base class
+    except Exception as error:  # the exceptions of onnxruntime share no base class
         reason = str(error).strip().splitlines()[0]
         raise WeightsError(f"{path} cannot be opened as an ONNX model: {reason}") from error
     if not set(wanted) <= set(
         session.get_providers()
-    ):  # CUDA may be listed although its libraries are missing
+    ):  # onnxruntime may list CUDA although CUDA's libraries are missing
         _log.warning("%s runs on the CPU: onnxruntime cannot use the GPU here", path.name)
     return session

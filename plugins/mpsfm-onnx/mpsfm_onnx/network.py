@@ -1,4 +1,4 @@
-"""A described network, run on one view at a time."""
+"""Network with a description, which runs on one view at a time."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from mpsfm_onnx.model import Model
 
 @dataclass(frozen=True)
 class NetworkOutput:
-    """Outputs for a view: maps (h, w, c) that cover it, and single numbers, by name.
+    """Outputs of a network for a view, as maps (h, w, c) and single numbers, by tensor name.
 
-    ``canvas``: position of the view on the network input.
+    All maps cover exactly the view. ``canvas`` is the position of the view on the network input.
     """
 
     maps: dict[str, Float32]
@@ -28,15 +28,15 @@ class NetworkOutput:
 
 
 class Network:
-    """Network with its description.
+    """Network in an ONNX file, with a description of its tensors.
 
     Args:
-        weights: Path or URI of the ONNX file; None: file of the description.
-        sha256: Expected hash of ``weights``.
+        weights: Path or URI of the ONNX file. None selects the file of the description.
+        sha256: Expected SHA-256 hash of the file ``weights``.
 
     Raises:
         ConfigError: The model does not have the tensors of its description.
-        WeightsError: The file is missing, or is not an ONNX model.
+        WeightsError: The ONNX file is missing or invalid.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Network:
         self._size = _own_size(rule, self._model.shapes[self._image])
 
     def run(self, view: View) -> NetworkOutput:
-        """Run the network on a view."""
+        """Run the network on a view, and return maps that cover the view."""
         rule, outputs = self.description.input, self.description.outputs
         canvas = Canvas.plan(self._size, view.camera.size)
         feed = {self._image: canvas.paint(view.image, rule), **rule.constants}
@@ -81,7 +81,7 @@ class Network:
 
 
 def _own_size(rule: ImageInput, shape: tuple[object, ...]) -> FixedSize | SideSize:
-    """Return the size rule of a description; a fixed input size has priority."""
+    """Return the input size rule of a description, replaced by a size fixed in the ONNX file."""
     height, width = shape[2:4] if rule.layout == "NCHW" else shape[1:3]
     if isinstance(rule.size, FixedSize) and isinstance(height, int) and isinstance(width, int):
         return rule.size.model_copy(update={"width": width, "height": height})
@@ -89,14 +89,14 @@ def _own_size(rule: ImageInput, shape: tuple[object, ...]) -> FixedSize | SideSi
 
 
 def _unit_rays(camera: PinholeCamera) -> Float64:
-    """Compute directions (1, 3, h, w) through the pixel centers of a camera."""
+    """Compute unit rays (1, 3, h, w) through the pixel centers of a camera."""
     through = rays(camera, pixel_centers(*camera.size))
     unit: Float64 = through / np.linalg.norm(through, axis=-1, keepdims=True)
     return unit.transpose(2, 0, 1)[np.newaxis]
 
 
 def _matrix(camera: PinholeCamera, rule: IntrinsicsInput) -> Float64:
-    """Compute the calibration matrix (1, 3, 3) in the pixel convention of the network."""
+    """Compute the calibration matrix K (1, 3, 3) in the pixel convention of the network."""
     matrix = camera.matrix
     matrix[:2, 2] -= 0.5 - rule.first_pixel
     return matrix[np.newaxis]

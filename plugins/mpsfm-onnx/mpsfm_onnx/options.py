@@ -1,28 +1,28 @@
-"""Options of the providers."""
+"""Options of the ONNX providers, importable without onnxruntime."""
 
 from __future__ import annotations
 
 from mpsfm_core import Options
 
 MOGE_2 = "moge-2"
-"""Name of the description of MoGe-2."""
+"""Name of the shipped description of MoGe-2."""
 
 
 class OnnxOptions(Options):
-    """Options of a described network."""
+    """Options of a provider whose network is described in YAML."""
 
     description: str = "fastdepth"
-    """Name of a shipped description, or a YAML file."""
+    """Name of a shipped network description, or path of a YAML file."""
     model: str | None = None
-    """Path or URI of the ONNX file; null: file of the description."""
+    """Path or URI of the ONNX file. null selects the file of the description."""
     sha256: str | None = None
-    """Expected hash of ``model``."""
+    """Expected SHA-256 hash of the file ``model``."""
 
 
 class Moge2Options(Options):
     """Options of MoGe-2."""
 
     weights: str | None = None
-    """Path or URI of the ONNX file; null: the authors' small one."""
+    """Path or URI of the ONNX file. null selects the small model that the authors published."""
     sha256: str | None = None
-    """Expected hash of ``weights``."""
+    """Expected SHA-256 hash of the file ``weights``."""

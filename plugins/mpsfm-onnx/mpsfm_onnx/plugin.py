@@ -1,4 +1,4 @@
-"""Registration of the providers; does not import onnxruntime."""
+"""Registration of the ONNX providers, without importing onnxruntime."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MOGE_ACCURACY = "not measured by us; std of depth declared as 8 %"
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register depth, normals, and networks with both."""
+    """Register providers of depth, of normals, and of both from the same network."""
     return [
         _spec(
             "depth",
@@ -46,7 +46,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
 
 @hookimpl
 def mpsfm_exports() -> dict[str, ModelExport]:
-    """Register the exports from the authors' code and checkpoints."""
+    """Register the ONNX exports that run the authors' code and checkpoints."""
     return {
         "moge": ModelExport(
             script="mpsfm_onnx.export_moge",
@@ -69,7 +69,7 @@ def mpsfm_exports() -> dict[str, ModelExport]:
 def mpsfm_calibration(
     kind: str, provider: str, options: BaseModel | None
 ) -> DepthCalibration | NormalCalibration | None:
-    """Return the calibration that the chosen description declares."""
+    """Return the calibration that the selected network description declares."""
     if isinstance(options, Moge2Options):
         description = load_description(MOGE_2)
     elif provider in ("onnx", "onnx-joint") and isinstance(options, OnnxOptions):

@@ -1,6 +1,6 @@
-"""Described networks as depth and normals providers.
+"""Providers of depth and normals from networks in ONNX files.
 
-The ``Described...`` classes are for plugins with a description of their own.
+Plugins derive from the ``Described...`` classes and pass a description of their network.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from mpsfm_onnx.options import MOGE_2, Moge2Options, OnnxOptions
 
 
 class DescribedDepth:
-    """Provider of depth, with the variance of the network if it predicts one.
+    """Provider of depth, with the variance that the network predicts, if any.
 
     Args:
-        weights: Path or URI of the ONNX file; None: file of the description.
-        sha256: Expected hash of ``weights``.
+        weights: Path or URI of the ONNX file. None selects the file of the description.
+        sha256: Expected SHA-256 hash of the file ``weights``.
     """
 
     def __init__(
@@ -39,11 +39,11 @@ class DescribedDepth:
         self._network = Network(description, context, weights, sha256)
 
     def predict(self, view: View) -> DepthPrior:
-        """Predict depth on the grid of the network."""
+        """Predict the depth of a view, at the resolution of the network output."""
         return self._depth(view, self._network.run(view))
 
     def estimate_focal(self, view: View) -> float | None:
-        """Estimate the horizontal focal length in pixels of the view, or return None."""
+        """Estimate the horizontal focal length of a view in pixels, or return None."""
         if self._rule.assumed_focal is None:
             return None
         answer = self._network.run(view)
@@ -65,11 +65,11 @@ class DescribedDepth:
 
 
 class DescribedNormals:
-    """Provider of normals, with the variance of the network if it predicts one.
+    """Provider of normals, with the variance that the network predicts, if any.
 
     Args:
-        weights: Path or URI of the ONNX file; None: file of the description.
-        sha256: Expected hash of ``weights``.
+        weights: Path or URI of the ONNX file. None selects the file of the description.
+        sha256: Expected SHA-256 hash of the file ``weights``.
     """
 
     def __init__(
@@ -83,13 +83,13 @@ class DescribedNormals:
         self._network = Network(description, context, weights, sha256)
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """Predict normals on the grid of the network; ``depth`` is not used."""
+        """Predict the normals of a view, at the resolution of the network output."""
         outputs = self._network.description.outputs
         return _normals(view, self._network.run(view), outputs, self._rule)
 
 
 class DescribedJoint(DescribedDepth):
-    """Provider of depth and normals in one pass."""
+    """Provider of depth and normals from one forward pass."""
 
     def __init__(
         self,
@@ -102,14 +102,14 @@ class DescribedJoint(DescribedDepth):
         super().__init__(description, context, weights, sha256)
 
     def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
-        """Predict both priors on the grid of the network."""
+        """Predict depth and normals of a view, at the resolution of the network output."""
         answer = self._network.run(view)
         outputs = self._network.description.outputs
         return self._depth(view, answer), _normals(view, answer, outputs, self._normals_rule)
 
 
 class OnnxDepth(DescribedDepth):
-    """Depth of the network in the options."""
+    """Provider of depth from the network that the options name."""
 
     def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
         description = load_description(options.description)
@@ -117,7 +117,7 @@ class OnnxDepth(DescribedDepth):
 
 
 class Moge2(DescribedJoint):
-    """Depth and normals of MoGe-2."""
+    """Provider of depth and normals from MoGe-2."""
 
     def __init__(self, options: Moge2Options, context: ProviderContext) -> None:
         super().__init__(load_description(MOGE_2), context, options.weights, options.sha256)
@@ -131,7 +131,7 @@ class Moge2Normals(DescribedNormals):
 
 
 class OnnxNormals(DescribedNormals):
-    """Normals of the network in the options."""
+    """Provider of normals from the network that the options name."""
 
     def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
         description = load_description(options.description)
@@ -139,7 +139,7 @@ class OnnxNormals(DescribedNormals):
 
 
 class OnnxJoint(DescribedJoint):
-    """Depth and normals of the network in the options."""
+    """Provider of depth and normals from the network that the options name."""
 
     def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
         description = load_description(options.description)
@@ -161,7 +161,7 @@ def _mask(outputs: Outputs, answer: NetworkOutput) -> Bool | None:
 
 
 def _factor(rule: DepthOutput, answer: NetworkOutput, camera: PinholeCamera) -> float:
-    """Compute the depth factor: focal length of the resized image, and scale of the network."""
+    """Compute the factor of depth from the focal length and the predicted metric scale."""
     resized, factor = camera.resized(*answer.canvas.image), 1.0
     if rule.canonical_focal is not None:
         sides = zip(answer.canvas.image, camera.size, strict=True)

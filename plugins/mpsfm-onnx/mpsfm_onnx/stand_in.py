@@ -1,4 +1,4 @@
-"""Small ONNX models in text syntax, for tests and contracts."""
+"""Small ONNX models in text syntax, for unit tests and provider contract tests."""
 
 from __future__ import annotations
 

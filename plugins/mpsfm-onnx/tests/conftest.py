@@ -1,4 +1,4 @@
-"""Descriptions of tiny networks, and views with known content."""
+"""Fixtures that write network descriptions and create views with known content."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mpsfm_core import PinholeCamera, View
 
 @pytest.fixture
 def write_description(tmp_path: Path) -> Callable[..., str]:
-    """Return a function that writes a description file."""
+    """Return a function that writes a network description to a YAML file."""
 
     def write(**fields: Any) -> str:
         path = tmp_path / "description.yaml"
@@ -28,7 +28,7 @@ def write_description(tmp_path: Path) -> Callable[..., str]:
 
 @pytest.fixture
 def make_view() -> Callable[..., View]:
-    """Return a function that creates a view from a size, color or image."""
+    """Return a function that creates a view from a size, a color or an image."""
 
     def make(
         width: int,

@@ -1,4 +1,4 @@
-"""Tests of resizing and padding, and of the position of outputs in the view."""
+"""Tests of resizing, padding and cropping, and of output positions in the view."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ VIEWS = [(640, 480), (333, 517), (101, 20), (1, 1)]
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("stride", [1, 4, 7])
 def test_cut_output_covers_the_view_exactly(rule, view, stride):
-    """Check with an output of cell positions that the positions of the view are restored."""
+    """Check with an output of pixel positions that positions in the view are restored."""
     canvas = Canvas.plan(rule, view)
     cells = tuple(max(1, side // stride) for side in canvas.size)
     positions = scale_pixels(pixel_centers(*cells), cells, canvas.size)  # canvas pixels
     cut = canvas.cut(positions.astype(np.float32))
     size = cut.shape[1], cut.shape[0]
     expected = scale_pixels(pixel_centers(*size), size, canvas.image) + canvas.offset
-    # the outer half of the border's cells takes their value
+    # The outer half of a border pixel has the value at the pixel center.
     expected = expected.clip(positions.min(axis=(0, 1)), positions.max(axis=(0, 1)))
     np.testing.assert_allclose(cut, expected, rtol=1e-5)
 
@@ -85,7 +85,7 @@ def test_other_layout_and_channel_order():
 
 @pytest.mark.parametrize("interpolation", ["area", "linear"])
 def test_resizing_does_not_move_the_image(interpolation):
-    """Check that an edge at x = 80.0 of 200 stays there for all canvases."""
+    """Check that an image edge at x = 80 stays at x = 80 for all ways of resizing."""
     image = np.zeros((60, 200, 3), dtype=np.uint8)
     image[:, 80:] = 200
     for width, height in ((200, 60), (100, 60), (150, 45), (310, 90)):
@@ -98,7 +98,7 @@ def test_resizing_does_not_move_the_image(interpolation):
 
 @pytest.mark.parametrize("stride", [1, 4])
 def test_cropping_and_back(stride):
-    """Check that cropped pixels have no value, and others keep their position."""
+    """Check that cropped pixels have no value, and that other pixels keep their position."""
     size = SideSize(mode="longest", side=100, multiple_of=16, fit="crop")
     canvas = Canvas.plan(size, (200, 150))
     assert (canvas.size, canvas.image, canvas.offset) == ((96, 64), (100, 75), (-2, -5))
@@ -128,7 +128,7 @@ def test_the_camera_follows_the_image():
 
 @pytest.mark.parametrize(("rounding", "width"), [("nearest", 819), ("down", 818)])
 def test_sides_are_rounded_as_the_networks_authors_do(rounding, width):
-    """Check 517 x 389 in 616 rows, which is 818.7 pixels wide."""
+    """Check 517 x 389 pixels on 616 rows, which is 818.7 columns."""
     size = FixedSize(mode="fixed", width=1064, height=616, fit="pad", rounding=rounding)
     assert Canvas.plan(size, (517, 389)).image == (width, 616)
 

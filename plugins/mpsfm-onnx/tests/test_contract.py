@@ -1,4 +1,4 @@
-"""Contract tests with stand-in networks."""
+"""Provider contract tests with small ONNX networks."""
 
 from mpsfm_core.testing import contract_tests
 

@@ -1,4 +1,4 @@
-"""Tests of the formulas against independent computations."""
+"""Tests of the conversion of network outputs against independent computations."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def depth_rule(**fields):
 
 
 def camera_of(value):
-    """Return a camera for a map (h, w)."""
+    """Return a camera for a depth map (h, w)."""
     height, width = np.shape(value)[:2]
     return PinholeCamera(width, height, 0.8 * width, 0.9 * width, 0.45 * width, 0.6 * height)
 
 
 def decode(value, rule, *more):
-    """Decode a map (h, w) or (h, w, c)."""
+    """Decode depth from a map (h, w) or (h, w, c)."""
     value = np.asarray(value, dtype=np.float32)
     value = value[..., None] if value.ndim == 2 else value
     return decode_depth(value, rule, camera_of(value), *more)
@@ -50,7 +50,7 @@ def test_expected_angle_is_the_mean_of_the_density(kappa):
 
 
 def test_cautious_side_of_the_squared_angle():
-    """Check that the variance of the density is 3/4 of the squared angle for large kappa."""
+    """Check that the variance of the density is 3/4 of the squared mean angle for large kappa."""
     kappa = 60.0
     density = [lambda a, p=p: a**p * np.exp(-kappa * a) * np.sin(a) for p in (0, 2)]
     norm, second = (quad(f, 0, np.pi, points=[1 / kappa])[0] for f in density)
@@ -105,7 +105,7 @@ def test_shift_of_points_is_estimated_from_the_camera(shift):
     z = np.random.default_rng(0).uniform(1, 5, (6, 8))
     points = unproject(camera_of(z), pixel_centers(8, 6), z)
     points[..., 2] -= shift
-    points[2, 3] = (9.0, 9.0, 1.0)  # wrong, and the network says so
+    points[2, 3] = (9.0, 9.0, 1.0)  # a wrong depth that the network marks as invalid
     valid = np.ones(z.shape, dtype=np.bool_)
     valid[2, 3] = False
     prior = decode(points, depth_rule(output="points"), 2.0, None, None, valid)
@@ -114,7 +114,7 @@ def test_shift_of_points_is_estimated_from_the_camera(shift):
 
 
 def test_the_shift_minimises_the_reprojection_error_of_noisy_points():
-    """Check Gauss-Newton, as in MoGe; the linear solution alone is 8 % smaller here."""
+    """Check Gauss-Newton, as in MoGe. The linear solution alone is 8 % smaller here."""
     rng = np.random.default_rng(1)
     camera = PinholeCamera(64, 64, 60.0, 60.0, 32.0, 32.0)
     xy = rays(camera, pixel_centers(64, 64))[..., :2]

@@ -1,4 +1,4 @@
-"""Tests of the download of MoGe-2, with a tiny file that has its tensors."""
+"""Tests of the download of MoGe-2, with a tiny ONNX file that has MoGe-2's tensors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PATH = "/moge-2/model.onnx"
 
 
 class Constant:
-    """Replacement for mpsfm-compact if it is not installed."""
+    """Replacement of mpsfm-compact for tests where mpsfm-compact is not installed."""
 
     def __init__(self, options, context):
         pass
@@ -39,7 +39,7 @@ class Constant:
 
 @pytest.fixture
 def server(tmp_path, monkeypatch):
-    """Serve the file of the description from this machine."""
+    """Serve the weights file of the description from a local HTTP server."""
     monkeypatch.setattr(weights, "_RETRY_WAIT_S", 0.001)
     for name in weights.OFFLINE_VARIABLES:
         monkeypatch.delenv(name, raising=False)
@@ -72,7 +72,7 @@ def config(tmp_path, registry):
     settings = (
         f"runtime.cache_dir={tmp_path / 'cache'}",
         "runtime.workers=1",
-        "features.use=sift",  # quick, and the same everywhere
+        "features.use=sift",  # fast and deterministic
     )
     return load_config("default", settings, registry)
 
@@ -96,7 +96,7 @@ def test_first_use_fetches_and_the_next_one_does_not(server, registry, config, p
     report = extract(load_images(*photos), provision.config, registry).report["providers"]
     (depth,) = [line for line in report if line["kind"] == "depth"]
     assert (depth["name"], depth["computed"]) == ("moge-2-small", 3)
-    assert not [line for line in report if line["kind"] == "normals"]  # of the same pass
+    assert not [line for line in report if line["kind"] == "normals"]  # from the pass of depth
     assert resolve_providers(config, registry).config == provision.config
     assert len(server.requests) == 1
 

@@ -35,7 +35,7 @@ def photos(tmp_path):
 
 @pytest.fixture
 def runs(monkeypatch):
-    """Count the forward passes per image."""
+    """Count the forward passes of the network per image."""
     counts = Counter()
     run = Network.run
 
@@ -48,7 +48,7 @@ def runs(monkeypatch):
 
 
 def priors(photos, folder, normals):
-    """Compute the priors of the first image with a given provider of normals."""
+    """Compute the priors of the first image with the given provider of normals."""
     options = dict(contract.setup(folder).options)
     chosen = {
         "extends": "demo",

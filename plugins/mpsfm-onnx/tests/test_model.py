@@ -1,4 +1,4 @@
-"""Tests of the device selection."""
+"""Tests of the choice between CPU and GPU."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ IDENTITY = "one (float[n] x) => (float[n] y) { y = Identity (x) }"
 def test_gpu_is_used_if_requested_and_available(
     monkeypatch, caplog, write_onnx, context, device, here, asked
 ):
-    """Check that the CPU is used if the libraries of the GPU do not load."""
+    """Check that the model runs on the CPU if the libraries of the GPU cannot be loaded."""
     found = []
     session = onnxruntime.InferenceSession
 

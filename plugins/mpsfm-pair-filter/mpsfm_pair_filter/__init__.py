@@ -1,1 +1,1 @@
-"""Filter of image pairs by scores from a file."""
+"""Filter of image pairs by similarity scores from a file."""

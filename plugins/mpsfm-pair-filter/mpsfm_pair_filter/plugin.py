@@ -1,4 +1,4 @@
-"""Hook that removes pairs with a low score of an external classifier."""
+"""Plugin hook that removes image pairs to which an external classifier gave a low score."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ from mpsfm_core import hookimpl
 from mpsfm_core.data.errors import InputError
 
 SCORES_VARIABLE = "MPSFM_PAIR_SCORES"
-"""Environment variable with a CSV file of image, image, score; unset: all pairs are kept."""
+"""Environment variable with the path of a CSV file of image, image, score. If unset, no pair is
+removed.
+"""
 THRESHOLD_VARIABLE = "MPSFM_PAIR_MIN_SCORE"
-"""Environment variable with the minimum score of a pair."""
+"""Environment variable with the minimum score of an image pair."""
 DEFAULT_THRESHOLD = 0.8
-"""Minimum probability of a pair. [Doppelgangers, Cai et al., ICCV 2023]"""
+"""Minimum probability that an image pair is a true match."""
 
 Pair = tuple[str, str]
 
 
 @hookimpl
 def mpsfm_filter_pairs(pairs: Sequence[Pair]) -> Sequence[Pair] | None:
-    """Return the pairs whose score reaches the threshold, and those without a score."""
+    """Return the image pairs whose score reaches the threshold, and those without a score."""
     path = os.environ.get(SCORES_VARIABLE)
     if not path:
         return None
@@ -33,7 +35,7 @@ def mpsfm_filter_pairs(pairs: Sequence[Pair]) -> Sequence[Pair] | None:
 
 
 def read_scores(path: Path) -> Mapping[frozenset[str], float]:
-    """Read scores by pairs of names, in any order; duplicates keep the lower score.
+    """Read scores by unordered pairs of image names, keeping the lowest of repeated pairs.
 
     Raises:
         InputError: The file cannot be read, or a line does not have two names and a number.

@@ -1,4 +1,4 @@
-"""Tests of the filter alone, and with other filters in a registry."""
+"""Tests of the pair filter alone, and combined with other filters in a registry."""
 
 from __future__ import annotations
 
